@@ -2,7 +2,6 @@
 their parts and losses, chunks against the whole."""
 
 import math
-from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 import torch
 
 from codesign import events
-from codesign.errors import DomainError, FileFormatError, ShapeError
+from codesign.errors import CodesignError, FileFormatError
 from codesign.events import SensorModel, lin_log, spiking
 from codesign.events.spiking.losses import count_loss, van_rossum
 from codesign.events.spiking.spike_esim import SpikeEsim
@@ -22,10 +21,10 @@ from tests.rounding_case import RoundsByPlace
 D = torch.float64
 
 
-def clip(frames=40, side=12, seed=0, dtype=D):
+def clip(frames=40, side=12, seed=0, dtype=D, step=0.15):
     """Smooth random pictures that change by about a threshold every few frames."""
     draw = torch.randn(frames, side, side, generator=torch.Generator().manual_seed(seed), dtype=dtype)
-    return (3.5 + (0.15 * draw).cumsum(0)).clamp(0.1, 5.5).exp(), torch.arange(frames, dtype=D) / 500
+    return (3.5 + (step * draw).cumsum(0)).clamp(0.1, 5.5).exp(), torch.arange(frames, dtype=D) / 500
 
 
 def levels(frames):
@@ -33,10 +32,10 @@ def levels(frames):
     return torch.stack([lin_log(picture[None])[0] for picture in frames])
 
 
-def disturbed(seed=1, **options):
+def disturbed(**options):
     """A generator all of whose parameters have moved from where they start."""
     model = SpikeEsim(0.2, 0.25, **options)
-    draw = torch.Generator().manual_seed(seed)
+    draw = torch.Generator().manual_seed(1)
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.add_(0.05 * torch.randn(parameter.shape, generator=draw, dtype=parameter.dtype))
@@ -44,75 +43,47 @@ def disturbed(seed=1, **options):
     return model
 
 
+# a spiking comparator is the ideal sensor where no step holds two events, here at most a threshold of 8 sigma
 @pytest.mark.bits
+@pytest.mark.parametrize(
+    ("options", "step"),
+    [({}, 0.15), ({"refractory_s": 1e-3}, 0.15), ({"comparator": "srm"}, 0.03)],
+)
 @pytest.mark.parametrize("dtype", [torch.float32, D])
-def test_untrained_it_is_the_ideal_sensor(dtype):
-    frames, t_s = clip(dtype=dtype)
-    counts, _ = SpikeEsim(0.2, 0.25)(frames, t_s)
-    truth = events.dense_counts(levels(frames), t_s, SensorModel(0.2, 0.25), log_input=True)
-    assert truth.sum() > 1000
+def test_untrained_it_is_the_sensor(options, step, dtype):
+    frames, t_s = clip(dtype=dtype, step=step)
+    counts, _ = SpikeEsim(0.2, 0.25, **options)(frames, t_s)
+    sensor = SensorModel(0.2, 0.25, refractory_s=options.get("refractory_s", 0.0))
+    truth = events.dense_counts(levels(frames), t_s, sensor, log_input=True)
+    assert truth.sum() > 50
     assert torch.equal(counts, truth)
 
 
 @pytest.mark.bits
-def test_untrained_with_dead_time_it_is_the_sensor_with_that_dead_time():
-    frames, t_s = clip()
-    counts, _ = SpikeEsim(0.1, 0.1, refractory_s=1e-3)(frames, t_s)
-    truth = events.dense_counts(levels(frames), t_s, SensorModel(0.1, 0.1, refractory_s=1e-3), log_input=True)
-    assert torch.equal(counts, truth)
+@pytest.mark.parametrize("options", [{}, {"refractory_s": 1e-3}, {"comparator": "srm"}, None])
+def test_chunks_equal_the_whole_bit_for_bit_on_a_processor_that_rounds_by_place(options):
+    frames, t_s = clip(frames=41, side=11, dtype=torch.float32)
+    if options is None:  # the network of the thesis
+        network = TwoBranchSpikes(1, theta=0.05)
 
-
-@pytest.mark.bits
-def test_spiking_comparator_is_the_ideal_sensor_where_no_step_holds_two_events():
-    # levels that move by at most 0.2 per step against a threshold of 0.25: at most one event per step and
-    # none left over
-    draw = torch.rand(60, 6, 6, generator=torch.Generator().manual_seed(3), dtype=D)
-    frames = (4 + (0.4 * draw - 0.2).cumsum(0)).clamp(3.1, 5.4).exp()
-    t_s = torch.arange(60, dtype=D) / 500
-    counts, _ = SpikeEsim(0.25, 0.25, comparator="srm")(frames, t_s)
-    truth = events.dense_counts(levels(frames), t_s, SensorModel(0.25, 0.25), log_input=True)
-    assert truth.sum() > 100
-    assert torch.equal(counts, truth)
-
-
-@pytest.mark.bits
-@pytest.mark.parametrize("processor", [nullcontext, RoundsByPlace])
-@pytest.mark.parametrize("options", [{}, {"refractory_s": 1e-3}, {"comparator": "srm"}])
-def test_chunks_equal_the_whole_bit_for_bit(options, processor):
-    frames, t_s = clip(side=11, dtype=torch.float32)
-    model = disturbed(**options)
-    with processor():
+        def model(frames, t_s, state=None):
+            return network(frames, state)[::2]
+    else:
+        model = disturbed(**options)
+    with RoundsByPlace():
         whole, end = model(frames, t_s)
-        parts = []
-        state = None
-        for first, last in ((0, 3), (3, 4), (4, 21), (21, 40)):
+        state, parts = None, []
+        for first, last in ((0, 3), (3, 4), (4, 21), (21, 41)):
             counts, state = model(frames[first:last], t_s[first:last], state)
             parts.append(counts)
+    assert float(whole.detach().mean()) > 0.01
     assert torch.equal(torch.cat(parts), whole)
-    assert state is not None
-    for name in ("level", "filtered", "slow", "frame"):
+    for name in () if options is None else ("level", "filtered", "slow", "frame"):
         assert torch.equal(getattr(state, name), getattr(end, name))
 
 
 @pytest.mark.bits
-@pytest.mark.parametrize("processor", [nullcontext, RoundsByPlace])
-def test_chunks_of_the_network_of_the_thesis_equal_the_whole_bit_for_bit(processor):
-    frames = 5 * torch.randn(41, 3, 11, 11, generator=torch.Generator().manual_seed(4))
-    network = TwoBranchSpikes(3, theta=0.7)
-    with processor():
-        whole, potential, _ = network(frames)
-        parts = []
-        state = None
-        for first, last in ((0, 5), (5, 6), (6, 30), (30, 41)):
-            spikes, levels, state = network(frames[first:last], state)
-            parts.append((spikes, levels))
-    assert 0.02 < float(whole.detach().mean()) < 0.9
-    assert torch.equal(torch.cat([spikes for spikes, _ in parts]), whole)
-    assert torch.equal(torch.cat([levels for _, levels in parts]), potential)
-
-
-@pytest.mark.bits
-def test_batches_are_sequences_of_their_own():
+def test_batches_are_sequences_of_their_own_and_a_still_scene_gives_nothing():
     one, t_s = clip(seed=1)
     other, _ = clip(seed=2)
     model = disturbed()
@@ -126,84 +97,49 @@ def test_batches_are_sequences_of_their_own():
         assert alone.sum() > 1000
         assert moved.abs().max() <= 1
         assert int((moved != 0).sum()) <= 1
+    assert model(one[:1].expand(30, -1, -1), t_s[:30])[0].sum() == 0
 
 
-def test_bandwidth_is_the_photoreceptor_of_the_hard_sensor():
-    frames, t_s = clip()
-    model = SpikeEsim(0.2, 0.25, cutoff_hz=40.0)
-    with torch.no_grad():
-        model.bandwidth.gate.fill_(1.0)
-        model.bandwidth.double().log_cutoff.fill_(math.log(40.0))
-    truth = events.dense_counts(frames, t_s, SensorModel(0.2, 0.25, cutoff_hz=40.0))
-    # both solve the same equation exactly; a level within rounding (1e-14) of a threshold may count one frame
-    # later
-    counts, _ = model(frames, t_s)
-    assert truth.sum() > 200
-    assert float((counts - truth).detach().abs().sum()) <= 1e-3 * float(truth.sum())
+def double_slope(model):
+    model.tone.double().log_slope.fill_(math.log(2.0))
 
 
-def test_tone_curve_with_one_slope_scales_the_threshold():
+def photoreceptor(model):
+    model.bandwidth.gate.fill_(1.0)
+    model.bandwidth.double().log_cutoff.fill_(math.log(40.0))
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "sensor"),
+    [
+        (photoreceptor, {}, SensorModel(0.2, 0.25, cutoff_hz=40.0)),
+        (double_slope, {}, SensorModel(0.1, 0.125)),
+        (lambda model: None, {"theta_scale": torch.tensor([1.5, 2.0])}, SensorModel(0.3, 0.5)),
+    ],
+)
+def test_bandwidth_tone_and_scaled_thresholds_are_those_of_the_hard_sensor(change, options, sensor):
     frames, t_s = clip()
     model = SpikeEsim(0.2, 0.25)
     with torch.no_grad():
-        model.tone.double().log_slope.fill_(math.log(2.0))
-    truth = events.dense_counts(lin_log(frames), t_s, SensorModel(0.1, 0.125), log_input=True)
-    moved = (model(frames, t_s)[0] - truth).cumsum(0)
-    assert moved.abs().max() <= 1  # rounding moves an event by a frame, and loses none
-    assert int((moved != 0).sum()) <= 1e-3 * int(truth.sum())
-
-
-def test_thresholds_scale_at_test_time():
-    frames, t_s = clip()
-    truth = events.dense_counts(lin_log(frames), t_s, SensorModel(0.3, 0.5), log_input=True)
-    counts, _ = SpikeEsim(0.2, 0.25)(frames, t_s, theta_scale=torch.tensor([1.5, 2.0]))
-    assert float((counts - truth).detach().abs().sum()) <= 1e-3 * float(
-        truth.sum()
-    )  # 1.5 * 0.2 is not 0.3 to the last bit
-
-
-def test_a_still_scene_gives_nothing_and_a_slow_ramp_all_its_thresholds():
-    model = disturbed()
-    still = torch.full((30, 8, 8), 80.0, dtype=D)
-    t_s = torch.arange(401, dtype=D) / 500
-    assert model(still, t_s[:30])[0].sum() == 0
-    ramp = (
-        (3.5 + torch.linspace(0, 1.701, 401, dtype=D)).exp()[:, None, None].expand(-1, 4, 4)
-    )  # 8 thresholds of 0.2 and half a one
-    counts, _ = SpikeEsim(0.2, 0.2)(ramp, t_s)
-    assert torch.equal(
-        counts.sum(0), torch.stack((torch.full((4, 4), 8.0, dtype=D), torch.zeros(4, 4, dtype=D)))
-    )
+        change(model)
+        moved = (model(frames, t_s, **options)[0] - events.dense_counts(frames, t_s, sensor)).cumsum(0)
+    # rounding (1e-14) moves an event by a frame, and loses none
+    assert moved.abs().max() <= 1
+    assert int((moved != 0).sum()) <= 3
 
 
 def test_levels_have_exact_gradients_in_every_parameter():
     frames, t_s = clip(frames=5, side=4)
     model = disturbed(width=2).double()
-    names = [
-        name
-        for name, _ in model.named_parameters()
-        if name.startswith(("prefilter", "tone", "bandwidth", "branch"))
-    ]
+    stages = ("prefilter", "tone", "bandwidth", "branch")
+    names = [name for name, _ in model.named_parameters() if name.startswith(stages)]
+    values = [model.get_parameter(name).detach().clone().requires_grad_() for name in names]
+    model.forward = lambda frames, t_s: model._levels(frames, t_s, None)[0]
 
     def levels(*values):
-        return torch.func.functional_call(
-            _Levels(model), dict(zip([f"model.{name}" for name in names], values, strict=True)), (frames, t_s)
-        )
+        return torch.func.functional_call(model, dict(zip(names, values, strict=True)), (frames, t_s))
 
-    assert torch.autograd.gradcheck(
-        levels,
-        tuple(model.get_parameter(name).detach().clone().requires_grad_() for name in names),
-        atol=1e-6,
-    )
-
-
-class _Levels(torch.nn.Module):
-    def __init__(self, model):
-        super().__init__()
-        self.model = model
-
-    def forward(self, frames, t_s):
-        return self.model._levels(frames, t_s, None)[0]
+    assert torch.autograd.gradcheck(levels, values, atol=1e-6)
 
 
 def test_drawn_noise_is_poisson_of_the_expected_rate():
@@ -213,16 +149,14 @@ def test_drawn_noise_is_poisson_of_the_expected_rate():
         model.noise_rate.fade.fill_(2.0)
     frames = torch.full((201, 30, 30), 117.5, dtype=D)
     t_s = torch.arange(201, dtype=D) / 500
-    expected = torch.tensor([30.0, 10.0]) * math.exp(-2.0 * 0.5) / 500  # light (117.5 + 20)/275 = 1/2
-    assert torch.allclose(model.expected_noise(frames, t_s)[0, :, 0, 0], expected.double(), rtol=1e-6)
+    expected = torch.tensor([30.0, 10.0], dtype=D) * math.exp(-2.0 * 0.5) / 500  # (117.5 + 20)/275 = 1/2
+    torch.testing.assert_close(model.expected_noise(frames, t_s)[0, :, 0, 0], expected, rtol=1e-6, atol=0)
     counts, _ = model.draw(frames, t_s, torch.Generator().manual_seed(0))  # a still scene: nothing but noise
-    for polarity in (0, 1):
-        found = counts[:, polarity]
-        error = math.sqrt(float(expected[polarity]) / found.numel())
-        assert abs(float(found.mean() - expected[polarity])) < 4 * error
-        assert (
-            abs(float(found.var() - expected[polarity])) < 4 * error * 1.1
-        )  # variance of the sample variance: (m + 2 m^2)/n
+    for found, mean in zip(counts.unbind(1), expected.tolist(), strict=True):
+        error = math.sqrt(mean / found.numel())
+        assert abs(float(found.mean()) - mean) < 4 * error
+        # variance of the sample variance: (m + 2 m^2)/n
+        assert abs(float(found.var()) - mean) < 4 * error * 1.1
 
 
 @pytest.mark.bits
@@ -233,15 +167,14 @@ def test_saved_generators_come_back(tmp_path):
     again = SpikeEsim.load(tmp_path / "generator.npz")
     assert again.settings == model.settings
     assert torch.equal(again(frames, t_s)[0], model(frames, t_s)[0])
-    (tmp_path / "other.npz").write_bytes(b"no archive")
-    for name, words in (("absent.npz", "no file lies at"), ("other.npz", "SpikeEsim.save wrote")):
-        with pytest.raises(FileFormatError, match=words):
-            SpikeEsim.load(tmp_path / name)
     with torch.no_grad():
         model.tone.log_slope[0] = math.nan
     model.save(tmp_path / "poisoned.npz")
-    with pytest.raises(FileFormatError, match="NaN"):
-        SpikeEsim.load(tmp_path / "poisoned.npz")
+    (tmp_path / "other.npz").write_bytes(b"no archive")
+    wrong = {"absent": "no file lies at", "other": "SpikeEsim.save wrote", "poisoned": "NaN"}
+    for name, words in wrong.items():
+        with pytest.raises(FileFormatError, match=words):
+            SpikeEsim.load(tmp_path / f"{name}.npz")
 
 
 def test_the_generator_that_comes_along_has_learnt_its_sensor():
@@ -249,9 +182,7 @@ def test_the_generator_that_comes_along_has_learnt_its_sensor():
     # it was trained on hard events of a sensor with thresholds 0.18 and 0.22 and 1 ms dead time; tone and
     # bandwidth trade with thresholds by some percent
     assert model.thetas().tolist() == pytest.approx([0.18, 0.22], rel=0.1)
-    dead_s = model.refractory_s()
-    assert dead_s is not None
-    assert float(dead_s.detach()) == pytest.approx(1e-3, rel=0.2)
+    assert model.refractory_s().item() == pytest.approx(1e-3, rel=0.2)
     frames, t_s = clip(frames=60, side=24, dtype=torch.float32)
     found, _ = model(frames, t_s)
     target = events.dense_counts(frames, t_s, SensorModel(0.18, 0.22, cutoff_hz=60.0, refractory_s=1e-3))
@@ -260,77 +191,53 @@ def test_the_generator_that_comes_along_has_learnt_its_sensor():
     assert float(found.detach().sum() / target.sum()) == pytest.approx(1, abs=0.25)
 
 
-def steps_first(array):
-    return torch.from_numpy(np.moveaxis(array, -1, 0).astype(np.float64).copy())
-
-
-def of_thesis(data, through_reset):
+@pytest.mark.bits
+@pytest.mark.filterwarnings("ignore:max rho:RuntimeWarning")
+@pytest.mark.parametrize(("through_reset", "name"), [("off", "gw_slayer"), ("full", "gw_bptt")])
+def test_network_of_the_thesis_equals_the_reference(shared, through_reset, name):
+    file = np.load(shared("refs/srm/z_spike_esim.npz"))
+    data = {key: torch.from_numpy(np.asarray(file[key]).astype(np.float64)) for key in file.files}
+    for key in ("I", "spikes", "u", "target"):
+        data[key] = data[key].movedim(-1, 0).clone()
     network = TwoBranchSpikes(
         3,
         theta=0.7,
         surrogate=Laplace(float(data["alpha"]), float(data["beta"])),
         through_reset=through_reset,
     ).double()
-    with torch.no_grad():
-        network.weight_on.copy_(torch.from_numpy(data["wp"]))
-        network.weight_off.copy_(torch.from_numpy(data["wn"]))
-    return network
-
-
-@pytest.mark.bits
-@pytest.mark.filterwarnings("ignore:max rho:RuntimeWarning")
-@pytest.mark.parametrize(("through_reset", "name"), [("off", "gw_slayer"), ("full", "gw_bptt")])
-def test_network_of_the_thesis_equals_the_reference(shared, through_reset, name):
-    data = dict(np.load(shared("refs/srm/z_spike_esim.npz")))
-    network = of_thesis(data, through_reset)
-    spikes, potential, _ = network(steps_first(data["I"]))
-    assert torch.equal(spikes, steps_first(data["spikes"]))
-    assert (potential - steps_first(data["u"])).abs().max() <= 1e-12
-    loss = van_rossum(spikes, steps_first(data["target"]), tau_s=float(data["tau_s"]))
-    assert abs(float(loss.detach()) - float(data["loss"])) <= 1e-10  # of 212
     weights = [network.weight_on, network.weight_off]
-    found = torch.stack(torch.autograd.grad(loss, weights))
-    assert (found - torch.from_numpy(data[name])).abs().max() <= 1e-9  # values up to 340
+    with torch.no_grad():
+        network.weight_on.copy_(data["wp"])
+        network.weight_off.copy_(data["wn"])
+
+    def loss_and_slopes(spikes):
+        loss = van_rossum(spikes, data["target"], tau_s=float(data["tau_s"]))
+        return loss.detach(), torch.stack(torch.autograd.grad(loss, weights))
+
+    spikes, potential, _ = network(data["I"])
+    assert torch.equal(spikes, data["spikes"])
+    assert (potential - data["u"]).abs().max() <= 1e-12
+    loss, found = loss_and_slopes(spikes)
+    assert abs(loss - data["loss"]) <= 1e-10  # of 212
+    assert (found - data[name]).abs().max() <= 1e-9  # values up to 340
     if through_reset == "full":
-        drive, _ = network._drive(steps_first(data["I"]), None)
-        spikes, _, _ = srm(drive, theta=0.7, smooth=True, **network._options)
-        loss = van_rossum(spikes, steps_first(data["target"]), tau_s=float(data["tau_s"]))
-        found = torch.stack(torch.autograd.grad(loss, weights))
-        assert abs(float(loss.detach()) - float(data["smooth_loss"])) <= 1e-10
-        assert (found - torch.from_numpy(data["smooth_gw"])).abs().max() <= 1e-9
+        drive, _ = network._drive(data["I"], None)
+        loss, found = loss_and_slopes(srm(drive, theta=0.7, smooth=True, **network._options)[0])
+        assert abs(loss - data["smooth_loss"]) <= 1e-10
+        assert (found - data["smooth_gw"]).abs().max() <= 1e-9
         # central differences of the reference, of 1e-8 relative precision
-        assert (found[0] - torch.from_numpy(data["smooth_gw_fd_pos"])).abs().max() <= 1e-6
+        assert (found[0] - data["smooth_gw_fd_pos"]).abs().max() <= 1e-6
 
 
-def test_smoothing_is_the_alpha_response_of_the_drive_and_its_delay_two_time_constants():
-    tau = 10.0
-    network = TwoBranchSpikes(1, theta=1.0, smoothing_tau=tau).double()
+def test_smoothing_is_the_alpha_response_of_the_drive():
+    network = TwoBranchSpikes(1, theta=1.0, smoothing_tau=10.0).double()
     with torch.no_grad():
         network.weight_on.zero_()[0, 1, 1] = 0.01  # far below the threshold: no reset
-    frames = torch.zeros(201, 3, 3, dtype=D)
-    frames[1:] = 1.0  # one step of brightness
-    spikes, potential, _ = network(frames)
+    frames = torch.ones(201, 3, 3, dtype=D).index_fill(0, torch.tensor(0), 0.0)  # one step of brightness
+    _, potential, _ = network(frames)
     k = torch.arange(200, dtype=D)
-    truth = 0.01 * k / tau * torch.exp(1 - k / tau)
-    assert spikes.sum() == 0
+    truth = 0.01 * k / 10 * torch.exp(1 - k / 10)
     assert (potential[:, 0, 1, 1] - truth).abs().max() <= 1e-14
-    course = potential[:, 0, 1, 1].detach()
-    delay = float((k * course).sum() / course.sum())
-    assert delay == pytest.approx(
-        2 * tau, rel=1e-3
-    )  # mean of t exp(-t/tau) is 2 tau; sampled: tau coth(1/(2 tau)), 8e-4 more
-
-
-def test_it_forgets_a_slow_ramp_and_wakes_on_silence_are_refused():
-    network = TwoBranchSpikes(1)
-    slow = torch.linspace(0, 8, 801)[:, None, None].expand(
-        -1, 4, 4
-    )  # eight thresholds in steps of a hundredth
-    with torch.no_grad():
-        network.weight_on.fill_(1 / 9)
-    assert network(slow)[0].sum() == 0
-    with pytest.raises(DomainError, match="silent"):
-        network.wake(torch.full((10, 4, 4), 3.0))
 
 
 def test_a_woken_network_reaches_its_threshold_with_the_share_asked():
@@ -338,39 +245,22 @@ def test_a_woken_network_reaches_its_threshold_with_the_share_asked():
     network = TwoBranchSpikes(1, theta=0.7, kernel="step").double()
     network.wake(frames, share=0.1)
     drive, _ = network._drive(frames, None)
-    for branch in (0, 1):
-        assert float((drive[:, branch] >= 0.7 * (1 - 1e-6)).double().mean()) == pytest.approx(
-            0.1, abs=1 / drive[:, branch].numel()
-        )
+    reached = (drive >= 0.7 * (1 - 1e-6)).double().mean((0, 2, 3))
+    assert reached.tolist() == pytest.approx([0.1] * 2, abs=2 / drive.numel())
 
 
-def test_van_rossum_of_a_lone_event_has_its_closed_form():
-    target = torch.zeros(4000, 2, 1, 1, dtype=D)
+def test_losses_have_their_closed_forms():
     found = torch.zeros(4000, 2, 1, 1, dtype=D)
     found[3, 0] = 1
-    h = 0.1
-    dt = 2e-3
+    h, dt = 0.1, 2e-3
     q = math.exp(-2 * h)
     truth = 0.5 * dt * h**2 * math.e**2 * q * (1 + q) / (1 - q) ** 3  # sum of k^2 q^k
-    assert float(van_rossum(found, target, tau_s=dt / h, dt=dt)) == pytest.approx(truth, rel=1e-12)
-    assert truth == pytest.approx(
-        math.e**2 * (dt / h) / 8, rel=1e-2
-    )  # the integral; the sum differs by O(h^2)
-    apart = found.roll(40, 0)  # the overlap of two responses z = 4 tau apart: e^2 tau/4 e^-z (1 + z)
-    overlap = math.e**2 * (dt / h) / 4 * math.exp(-4) * (1 + 4)
-    assert float(van_rossum(found, apart, tau_s=dt / h, dt=dt)) == pytest.approx(
-        2 * truth - overlap, rel=1e-2
-    )
-
-
-def test_count_loss_is_half_the_chi_square_of_blocks():
-    target = torch.zeros(4, 2, 4, 4, dtype=D)
+    assert float(van_rossum(found, 0 * found, tau_s=dt / h, dt=dt)) == pytest.approx(truth, rel=1e-12)
+    target, found = torch.zeros(2, 4, 2, 4, 4, dtype=D)
     target[0, 0, 0, 0] = 3  # block (0, 0, 0) of ON holds 3
-    found = torch.zeros(4, 2, 4, 4, dtype=D)
     found[1, 0, 1, 1] = 1  # the same block: 1 against 3, (1 - 3)^2/(3 + 1) = 1
     found[3, 1, 3, 3] = 2  # OFF, another block: 2 against 0, 4/1
     assert float(count_loss(found, target, side_px=2, steps=2)) == 2.5
-    assert float(count_loss(target, target, side_px=2, steps=2)) == 0
 
 
 FRAMES, T_S = clip(frames=4)
@@ -381,34 +271,28 @@ COUNTS = torch.zeros(4, 2, 3, 3)
 
 
 @pytest.mark.parametrize(
-    ("call", "error", "words"),
+    ("call", "words"),
     [
-        (lambda: OURS(FRAMES * math.nan, T_S), DomainError, "NaN"),
-        (lambda: OURS(FRAMES * math.inf, T_S), DomainError, "infinit"),
-        (lambda: OURS(-FRAMES, T_S), DomainError, "negative"),
-        (lambda: OURS(FRAMES[:1], T_S[:1]), ShapeError, "at least 2"),
-        (lambda: OURS(FRAMES[:, 0], T_S), ShapeError, "H, W"),
-        (lambda: OURS(FRAMES, T_S[:3]), ShapeError, r"\[4\]"),
-        (lambda: OURS(FRAMES, T_S, STATE), DomainError, "go on increasing"),
-        (lambda: OURS(FRAMES[:, :6], T_S + 1, STATE), ShapeError, "keeps its frame size"),
-        (lambda: OURS(FRAMES.float(), T_S + 1, STATE), ShapeError, "keeps its frame size"),
-        (lambda: OURS(FRAMES, T_S, theta_scale=0.0), DomainError, "theta_scale"),
-        (lambda: OURS(FRAMES, T_S, theta_scale=torch.ones(3)), DomainError, "theta_scale"),
-        (lambda: SpikeEsim(theta_on=0.0), DomainError, "theta_on"),
-        (lambda: SpikeEsim(theta_off=math.nan), DomainError, "theta_off"),
-        (lambda: SpikeEsim(comparator="soft"), DomainError, "comparator"),
-        (lambda: SpikeEsim(refractory_s=-1.0), DomainError, "refractory_s"),
-        (lambda: SpikeEsim(refractory_s=1e-3, comparator="srm"), DomainError, "dead time"),
-        (lambda: NETWORK(FRAMES * math.nan), DomainError, "NaN"),
-        (lambda: NETWORK(FRAMES[:1]), ShapeError, "at least 2"),
-        (lambda: NETWORK(FRAMES[:, None].expand(-1, 3, -1, -1)), ShapeError, "channels=1"),
-        (lambda: NETWORK(FRAMES[:, :4], NETWORK(FRAMES)[2]), ShapeError, "keeps its frame size"),
-        (lambda: TwoBranchSpikes(0), DomainError, "channels"),
-        (lambda: van_rossum(COUNTS, COUNTS[..., :2], tau_s=1.0), ShapeError, "no distance"),
-        (lambda: van_rossum(COUNTS[:, 0, 0], COUNTS[:, 0, 0], tau_s=1.0), DomainError, "ON first"),
-        (lambda: count_loss(COUNTS, COUNTS, side_px=4, steps=2), ShapeError, "do not fit"),
+        (lambda: OURS(FRAMES[:, 0], T_S), "H, W"),
+        (lambda: OURS(FRAMES, T_S[:3]), r"\[4\]"),
+        (lambda: OURS(FRAMES, T_S, STATE), "go on increasing"),
+        (lambda: OURS(FRAMES.float(), T_S + 1, STATE), "keeps its frame size"),
+        (lambda: OURS(FRAMES, T_S, 3), "the state is a int"),
+        (lambda: OURS(FRAMES, T_S, theta_scale=torch.ones(3)), "theta_scale"),
+        (lambda: SpikeEsim(theta_on=0.0), "theta_on"),
+        (lambda: SpikeEsim(width=2**40), "width is"),
+        (lambda: SpikeEsim(comparator="soft"), "comparator"),
+        (lambda: SpikeEsim(refractory_s=1e-3, comparator="srm"), "dead time"),
+        (lambda: NETWORK(FRAMES * math.nan), "NaN"),
+        (lambda: NETWORK(FRAMES[:, None].expand(-1, 3, -1, -1)), "channels=1"),
+        (lambda: NETWORK(FRAMES[:, :4], NETWORK(FRAMES)[2]), "keeps its frame size"),
+        (lambda: NETWORK(FRAMES, 3), "is a int"),
+        (lambda: NETWORK.wake(torch.full((10, 4, 4), 3.0)), "silent"),
+        (lambda: van_rossum(COUNTS, COUNTS[..., :2], tau_s=1.0), "no distance"),
+        (lambda: van_rossum(COUNTS[:, 0, 0], COUNTS[:, 0, 0], tau_s=1.0), "ON first"),
+        (lambda: count_loss(COUNTS, COUNTS, side_px=4, steps=2), "do not fit"),
     ],
 )
-def test_bad_input_is_refused(call, error, words):
-    with pytest.raises(error, match=words):
+def test_bad_input_is_refused(call, words):
+    with pytest.raises(CodesignError, match=words):
         call()

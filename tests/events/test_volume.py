@@ -1,157 +1,189 @@
-"""Event volumes: conservation, centroids, shares, and agreement of the two builders."""
+"""Event volumes, time surfaces, fading traces and spikes against their definitions event by event: conservation,
+centroids, agreement of the builders, and gradients."""
+
+import math
 
 import pytest
 import torch
 
-from codesign.events import from_counts, from_stream
+from codesign.events import decay, from_counts, from_stream, surface_from_counts, surface_from_hard_counts
+from codesign.events.stream import ordered
+from codesign.events.volumes.surface import surface_from_stream, surface_from_times
+from codesign.events.volumes.traces import decay_from_stream
 from codesign.events.volumes.volume import spikes_from_counts, spikes_from_stream, stream_from_spikes
-from codesign.types import EventStream
-from tests.event_streams import random_stream
+from tests.event_streams import random_stream, rows
+
+D = torch.float64
+EPOCH_US = 1_700_000_000_000_000
+TAU_S = 0.013
 
 
-@pytest.mark.parametrize("bins", [1, 2, 5, 9])
-@pytest.mark.parametrize("batch", [(), (3,), (2, 2)])
-def test_counts_are_conserved_per_pixel_and_polarity(bins, batch):
-    counts = torch.randint(0, 4, (19, 2, *batch, 4, 6), generator=torch.Generator().manual_seed(0)).double()
-    volume = from_counts(counts, torch.linspace(3.0, 3.2, 20, dtype=torch.float64), bins)
-    flat = counts.reshape(19, 2, -1, 4, 6)
-    assert volume.counts.shape == (flat.shape[2], 2, bins, 4, 6)
-    torch.testing.assert_close(volume.counts.sum(2), flat.sum(0).transpose(0, 1), rtol=1e-13, atol=1e-13)
+def part(stream, keep):
+    columns = (column[keep] for column in (stream.t_us, stream.x, stream.y, stream.p))
+    return ordered(*columns, stream.height_px, stream.width_px)
 
 
-def test_one_event_is_shared_between_the_two_nearest_nodes():
-    counts = torch.zeros(8, 2, 1, 2)
-    counts[2, 1, 0, 1] = 3.0  # middle of interval 2 of 8: 2.5/8 of the way, 1.25 nodes of 4 spacings
-    volume = from_counts(counts, torch.arange(9) / 100, 5)
-    expected = torch.zeros(1, 2, 5, 1, 2)
-    expected[0, 1, 1, 0, 1], expected[0, 1, 2, 0, 1] = 3 * 0.75, 3 * 0.25
-    torch.testing.assert_close(volume.counts, expected)
-
-
-@pytest.mark.parametrize("bins", [1, 2, 4, 7])
-def test_centroid_is_the_mean_time_of_what_a_bin_collects_even_for_uneven_frames(bins):
-    # even rate: each interval holds events in proportion to its length; the weighted mean of their times, by
-    # a plain loop
-    steps_s = 0.005 + 0.01 * torch.rand(40, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    edges_s = torch.cat((torch.tensor([7.0], dtype=torch.float64), 7 + steps_s.cumsum(0)))
-    mass = [0.0] * bins
-    moment = [0.0] * bins
-    for k in range(40):
-        counts = torch.zeros(40, 2, 1, 1, dtype=torch.float64)
-        counts[k, 0] = steps_s[k]
-        shared = from_counts(counts, edges_s, bins).counts[0, 0, :, 0, 0]
-        middle_s = float(edges_s[k] + edges_s[k + 1]) / 2 - 7
-        for b in range(bins):
-            mass[b] += float(shared[b])
-            moment[b] += float(shared[b]) * middle_s
-    found = from_counts(torch.zeros(40, 2, 1, 1), edges_s, bins).centroid_s
-    torch.testing.assert_close(
-        found,
-        torch.tensor([m / w for m, w in zip(moment, mass, strict=True)], dtype=torch.float64),
-        rtol=1e-12,
-        atol=0,
-    )
-
-
-def test_gradient_of_a_volume_is_its_share():
-    counts = torch.rand(6, 2, 2, 3, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x: from_counts(x, torch.arange(7), 3).counts, (counts,))
+def at_one_pixel(*t_us):
+    zero = torch.zeros(len(t_us), dtype=torch.int64)
+    return ordered(torch.tensor(t_us), zero, zero, zero + 1, 1, 1)
 
 
 @pytest.mark.parametrize("bins", [1, 2, 5])
-@pytest.mark.parametrize("offset_us", [0, 1_700_000_000_000_000])
+@pytest.mark.parametrize("batch", [(), (2, 2)])
+def test_counts_are_conserved_and_centroids_are_mean_times_also_of_uneven_frames(bins, batch, generator):
+    steps_s = 0.005 + 0.01 * torch.rand(19, generator=generator, dtype=D)
+    edges_s = 7 + torch.cat((torch.zeros(1, dtype=D), steps_s.cumsum(0)))
+    counts = torch.randint(0, 4, (19, 2, *batch, 4, 6), generator=generator).double()
+    flat = counts.reshape(19, 2, -1, 4, 6)
+    volume = from_counts(counts, edges_s, bins)
+    assert volume.counts.shape == (flat.shape[2], 2, bins, 4, 6)
+    torch.testing.assert_close(volume.counts.sum(2), flat.sum(0).transpose(0, 1), rtol=1e-13, atol=1e-13)
+    # shares of each interval's middle between the two nearest nodes
+    middle_s = (edges_s[1:] + edges_s[:-1]) / 2 - 7
+    place = middle_s / (edges_s[-1] - 7) * (bins - 1)
+    share = (1 - (place - torch.arange(bins)[:, None]).abs()).clamp(min=0)  # [bins, T]
+    torch.testing.assert_close(volume.counts, torch.einsum("kt,tpnyx->npkyx", share, flat))
+    # even rate: each interval holds events in proportion to its length
+    mass = share * steps_s
+    torch.testing.assert_close(volume.centroid_s, (mass @ middle_s) / mass.sum(1), rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("bins", [1, 2, 5])
+@pytest.mark.parametrize("offset_us", [0, EPOCH_US])
 def test_stream_events_are_conserved_and_shared_by_time(bins, offset_us):
-    stream = random_stream(5000, 3, 4, 100_000, first_us=offset_us)
-    volume = from_stream(stream, offset_us, offset_us + 100_000, bins, dtype=torch.float64)
-    truth = torch.zeros(2, bins, 3, 4, dtype=torch.float64)
-    for t, x, y, p in zip(
-        (stream.t_us - offset_us).tolist(),
-        stream.x.tolist(),
-        stream.y.tolist(),
-        stream.p.tolist(),
-        strict=True,
-    ):
-        place = t / 100_000 * (bins - 1)
-        low = min(int(place), max(bins - 2, 0))
-        truth[int(p < 0), low, y, x] += 1 - (place - low)
-        if bins > 1:
-            truth[int(p < 0), low + 1, y, x] += place - low
+    stream = random_stream(500, 3, 4, 100_000, first_us=offset_us)
+    volume = from_stream(stream, offset_us, offset_us + 100_000, bins, dtype=D)
+    truth = torch.zeros(2, bins, 3, 4, dtype=D)
+    for t_us, x, y, p in rows(stream):
+        place = (t_us - offset_us) / 100_000 * (bins - 1)
+        for node in range(bins):
+            truth[int(p < 0), node, y, x] += max(1 - abs(place - node), 0)
     torch.testing.assert_close(volume.counts[0], truth, rtol=1e-12, atol=1e-12)
-    assert abs(float(volume.counts.sum()) - 5000) < 1e-8
+    assert abs(float(volume.counts.sum()) - 500) < 1e-9
 
 
-def test_stream_centroids_are_those_of_an_even_rate_and_of_many_short_intervals():
-    every_us = torch.arange(0, 120_001)
-    zero = torch.zeros_like(every_us)
-    stream = EventStream(every_us, zero, zero, zero + 1, 1, 1)
-    volume = from_stream(stream, 0, 120_000, 4, dtype=torch.float64)
-    torch.testing.assert_close(
-        volume.centroid_s,
-        torch.tensor([0.04 / 3, 0.04, 0.08, 0.12 - 0.04 / 3], dtype=torch.float64),
-        rtol=1e-14,
-        atol=0,
-    )
-    fine = from_counts(torch.zeros(1200, 2, 1, 1), torch.linspace(0, 0.12, 1201, dtype=torch.float64), 4)
-    # midpoint rule with 400 intervals per node spacing: relative error of the moments about (1/400)^2
-    torch.testing.assert_close(fine.centroid_s, volume.centroid_s, rtol=2e-5, atol=0)
-    # an event per microsecond: the weighted mean itself, one microsecond in 40000 at the cut ends
-    shares = (1 - (every_us / 40_000 - torch.arange(4)[:, None]).abs()).clamp(min=0).double()
-    alone = ((shares * every_us * 1e-6).sum(1) / shares.sum(1)).tolist()
-    torch.testing.assert_close(volume.centroid_s, torch.tensor(alone, dtype=torch.float64), rtol=1e-4, atol=0)
-
-
-def test_the_window_holds_both_ends_and_nothing_else():
-    zero = torch.zeros(5, dtype=torch.int64)
-    stream = EventStream(torch.tensor([9, 10, 15, 20, 21]), zero, zero, zero + 1, 1, 1)
-    assert from_stream(stream, 10, 20, 2).counts[0, 0, :, 0, 0].tolist() == [1.5, 1.5]
+def test_the_window_of_a_stream_holds_both_ends_and_its_centroids_are_those_of_an_even_rate():
+    volume = from_stream(at_one_pixel(9, 10, 15, 20, 21), 10, 20, 2)
+    assert volume.counts[0, 0, :, 0, 0].tolist() == [1.5, 1.5]
+    volume = from_stream(at_one_pixel(0), 0, 120_000, 4, dtype=D)
+    truth = torch.tensor([0.04 / 3, 0.04, 0.08, 0.12 - 0.04 / 3], dtype=D)
+    torch.testing.assert_close(volume.centroid_s, truth, rtol=1e-14, atol=0)
 
 
 def test_spikes_are_events_per_step_and_go_back_exactly():
-    offset_us = 1_700_000_000_000_000
-    stream = random_stream(3000, 3, 4, 99_999, first_us=offset_us)
-    spikes = spikes_from_stream(stream, offset_us, 1000, 100)
+    stream = random_stream(3000, 3, 4, 99_999, first_us=EPOCH_US)
+    spikes = spikes_from_stream(stream, EPOCH_US, 1000, 100)
     truth = torch.zeros(2, 4, 3, 100)
-    for t, x, y, p in zip(
-        (stream.t_us - offset_us).tolist(),
-        stream.x.tolist(),
-        stream.y.tolist(),
-        stream.p.tolist(),
-        strict=True,
-    ):
-        truth[int(p < 0), x, y, t // 1000] = 1
+    for t_us, x, y, p in rows(stream):
+        truth[int(p < 0), x, y, (t_us - EPOCH_US) // 1000] = 1
     assert torch.equal(spikes, truth)
-    back = stream_from_spikes(spikes, offset_us, 1000)
+    back = stream_from_spikes(spikes, EPOCH_US, 1000)
     assert len(back) == int(spikes.sum())
-    assert set(((back.t_us - offset_us) % 1000).tolist()) == {0}
-    assert torch.equal(spikes_from_stream(back, offset_us, 1000, 100), spikes)
-    # at a microsecond per step nothing merges but events that are the same
-    few = random_stream(50, 3, 4, 999, seed=1)
-    again = stream_from_spikes(spikes_from_stream(few, 0, 1, 1000), 0, 1)
-    found, events = (
-        set(zip(*(getattr(each, name).tolist() for name in ("t_us", "x", "y", "p")), strict=True))
-        for each in (again, few)
-    )
-    assert len(again) == len(events)
-    assert found == events
+    assert set(((back.t_us - EPOCH_US) % 1000).tolist()) == {0}
+    assert torch.equal(spikes_from_stream(back, EPOCH_US, 1000, 100), spikes)
+    # outside the steps; from 11 on one microsecond is too early
+    few = at_one_pixel(9, 10, 29, 30)
+    for first_us, steps, found in ((10, 2, [1, 1]), (20, 3, [1, 1, 0]), (11, 1, [0])):
+        assert spikes_from_stream(few, first_us, 10, steps)[0, 0, 0].tolist() == found
 
 
-def test_spikes_outside_the_steps_are_not_asked_for():
-    zero = torch.zeros(4, dtype=torch.int64)
-    stream = EventStream(torch.tensor([9, 10, 29, 30]), zero, zero, zero + 1, 1, 1)
-    assert spikes_from_stream(stream, 10, 10, 2)[0, 0, 0].tolist() == [1, 1]
-    assert spikes_from_stream(stream, 20, 10, 3)[0, 0, 0].tolist() == [1, 1, 0]
-    assert spikes_from_stream(stream, 11, 10, 1)[0, 0, 0].tolist() == [0]  # one microsecond early
-
-
-def test_spikes_of_counts_are_binary_for_whole_and_shares_for_soft_ones():
-    counts = torch.tensor([[0.0, 1.0], [3.0, 0.25]])[:, None, :, None].expand(
-        2, 2, 2, 1
-    )  # [T, 2, H = 2, W = 1]
-    spikes = spikes_from_counts(counts)
-    assert spikes.shape == (2, 1, 2, 2)
-    assert spikes[1, 0].tolist() == [[0, 1], [1, 0.25]]
-    soft = (
-        0.05 + 0.9 * torch.rand(3, 2, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    ).requires_grad_()
+def test_spikes_of_counts_are_binary_for_whole_and_shares_for_soft_ones(generator):
+    counts = torch.tensor([[0.0, 1.0], [3.0, 0.25]])[:, None, :, None].expand(2, 2, 2, 1)
+    assert spikes_from_counts(counts)[:, 0].tolist() == [[[0, 1], [1, 0.25]]] * 2  # [2, W = 1, H = 2, T]
+    soft = (0.05 + 0.9 * torch.rand(3, 2, 2, 2, dtype=D, generator=generator)).requires_grad_()
     assert torch.autograd.gradcheck(spikes_from_counts, (soft,))
     assert not torch.autograd.grad(spikes_from_counts(soft + 1).sum(), soft)[0].any()
+
+
+def by_hand(stream, at_us, last_only):
+    """Fading of the last event, or the sum over all, in Python integers and floats."""
+    found = torch.zeros(len(at_us), 2, stream.height_px, stream.width_px, dtype=D)
+    for k, time_us in enumerate(at_us):
+        for t_us, x, y, p in rows(stream):
+            if t_us <= time_us:
+                faded = math.exp(-(time_us - t_us) / (1e6 * TAU_S))
+                found[k, int(p < 0), y, x] = faded + (0 if last_only else found[k, int(p < 0), y, x])
+    return found
+
+
+@pytest.mark.parametrize("offset_us", [0, EPOCH_US])
+def test_streams_give_surface_and_trace_as_defined_at_any_time(offset_us):
+    stream = random_stream(400, 3, 4, 100_000, offset_us)
+    cut_us = offset_us + 17_001
+    at_us = [offset_us - 5, offset_us + 17_000, cut_us, int(stream.t_us[200]), offset_us + 130_000]
+    surface, trace = by_hand(stream, at_us, True), by_hand(stream, at_us, False)
+    # one rounding of an exponential, and a sum of at most 30 of them
+    found = surface_from_stream(stream, at_us, TAU_S, dtype=D)
+    torch.testing.assert_close(found, surface, rtol=1e-14, atol=0)
+    found = decay_from_stream(stream, at_us, TAU_S, dtype=D)
+    torch.testing.assert_close(found, trace, rtol=1e-12, atol=1e-14)
+    # a trace goes on where an earlier chunk ended
+    first = decay_from_stream(part(stream, stream.t_us <= cut_us), [cut_us], TAU_S, dtype=D)[0]
+    late = part(stream, stream.t_us > cut_us)
+    found = decay_from_stream(late, at_us[3:], TAU_S, start=(first, cut_us), dtype=D)
+    torch.testing.assert_close(found, trace[3:], rtol=1e-12, atol=1e-14)
+    if offset_us == 0:  # real times in any order; seconds are rounded to 1e-17, of tau 1e-15
+        any_way = torch.randperm(400, generator=torch.Generator().manual_seed(1))
+        t_s, x, y, p = (one[any_way] for one in (stream.t_us.to(D) * 1e-6, stream.x, stream.y, stream.p))
+        found = surface_from_times(t_s, x, y, p, 3, 4, [1e-6 * t for t in at_us], TAU_S)
+        torch.testing.assert_close(found, surface, rtol=1e-13, atol=0)
+
+
+def test_gradient_to_times_is_that_of_the_last_event():
+    t_s = torch.tensor([0.001, 0.004, 0.002, 0.0055, 0.009], dtype=D, requires_grad=True)
+    x, p = torch.tensor([0, 0, 1, 1, 0]), torch.tensor([1, 1, -1, 1, 1])
+
+    def surface(times_s):
+        return surface_from_times(times_s, x, torch.zeros_like(x), p, 1, 2, [0.005, 0.006], TAU_S)
+
+    assert torch.autograd.gradcheck(surface, (t_s,))
+    (slopes,) = torch.autograd.grad(surface(t_s)[1].sum(), t_s)
+    truth = [math.exp(-since_s / TAU_S) / TAU_S for since_s in (math.inf, 0.002, 0.004, 0.0005, math.inf)]
+    torch.testing.assert_close(slopes, torch.tensor(truth, dtype=D), rtol=1e-12, atol=0)
+
+
+def test_whole_counts_give_the_surface_of_events_at_the_middles_of_their_intervals(generator):
+    counts = torch.randint(0, 3, (12, 2, 3, 4), generator=generator)
+    counts = counts * (torch.rand(counts.shape, generator=generator) < 0.4)
+    steps_us = torch.randint(1, 9, (12,), generator=generator) * 2000
+    times_us = torch.cat((steps_us[:1] * 0, steps_us.cumsum(0)))
+    k, polarity, y, x = counts.nonzero(as_tuple=True)
+    stream = ordered((times_us[k] + times_us[k + 1]) // 2, x, y, 1 - 2 * polarity, 3, 4)
+    truth = by_hand(stream, times_us[1:].tolist(), True)
+    t_s = times_us.to(D) * 1e-6
+    # twelve products and roots of float64
+    torch.testing.assert_close(surface_from_counts(counts.to(D), t_s, TAU_S), truth, rtol=1e-12, atol=0)
+    found = surface_from_hard_counts(counts.to(D), t_s, t_s[[5, 6, 12]], TAU_S)
+    torch.testing.assert_close(found, truth[[4, 5, 11]], rtol=1e-12, atol=0)
+
+
+def test_a_share_of_an_event_mixes_the_surfaces_with_and_without_it():
+    counts = torch.tensor([1.0, 0.3, 0.0], dtype=D)[:, None, None, None].repeat(1, 2, 1, 1)
+    surface = surface_from_counts(counts, [0.0, 0.01, 0.02, 0.03], 0.01)[2, 0, 0, 0]
+    assert float(surface) == pytest.approx(0.7 * math.exp(-2.5) + 0.3 * math.exp(-1.5), rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda counts, t_s: surface_from_counts(counts, t_s, TAU_S),
+        lambda counts, t_s: decay(counts, t_s, TAU_S),
+        lambda counts, t_s: from_counts(counts, t_s, 3).counts,
+    ],
+)
+def test_gradients_to_soft_counts(function, generator):
+    # on both sides of the bend at 1
+    counts = torch.tensor([0.2, 0.9, 0.4, 1.6, 0.7], dtype=D)[:, None, None, None]
+    counts = counts * torch.rand(5, 2, 2, 3, dtype=D, generator=generator) + 0.01
+    assert int((counts > 1).sum())
+    t_s = [0.0, 0.01, 0.015, 0.03, 0.031, 0.04]
+    assert torch.autograd.gradcheck(lambda c: function(c, t_s), (counts.requires_grad_(),))
+
+
+def test_traces_of_counts_fade_exponentially():
+    counts = torch.zeros(4, 2, 1, 1, dtype=D)
+    counts[0, 0], counts[2, 0], counts[1, 1] = 3, 1, 2
+    traces = decay(counts, [0.0, 0.01, 0.03, 0.04, 0.09], tau_s=0.02)[:, :, 0, 0]
+    on = [3, 3 * math.exp(-1), 3 * math.exp(-1.5) + 1, (3 * math.exp(-1.5) + 1) * math.exp(-2.5)]
+    off = [0, 2, 2 * math.exp(-0.5), 2 * math.exp(-3)]
+    torch.testing.assert_close(traces, torch.tensor([on, off], dtype=D).T)
