@@ -189,7 +189,6 @@ def hard_mean(level, t_s, sensor, beginnings=32):
     ("name", "dead_s", "thetas", "fastest_hz", "cosine", "low"),
     [
         ("contrast", 20e-3, (0.15, 0.15), 9, 0.97, 0.9),
-        ("theta_on", 20e-3, (0.15, 0.15), 9, 0.93, 0.85),
         ("refractory_s", 5e-3, (0.15, 0.15), 9, 0.99, 0.85),
         ("theta_off", 4.9e-3, (0.11, 0.24), 30, 0.96, 0.88),
     ],

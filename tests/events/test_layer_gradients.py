@@ -183,23 +183,6 @@ def test_gradients_to_the_sensor_follow_differences_of_hard_counts(name, sensor,
     assert scales[0] < float(slope @ difference / (difference @ difference)) < scales[1]
 
 
-def test_without_physics_the_gradient_of_the_sensor_is_that_of_the_memory_layer(generator):
-    level = torch.randn(30, 6, 5, generator=generator, dtype=D).cumsum(0) * 0.1
-    t_s = torch.arange(30, dtype=D) * 2e-3
-    weight = torch.randn(29, 2, 6, 5, generator=generator, dtype=D)
-    found = []
-    for counts in (
-        lambda x, a, b: sensor_counts(
-            x, t_s, SensorModel(0.15, 0.2), theta_on=a, theta_off=b, log_input=True
-        )[0],
-        lambda x, a, b: memory(x, a, b, log_input=True)[0],
-    ):
-        inputs = [level.clone(), torch.tensor(0.15, dtype=D), torch.tensor(0.2, dtype=D)]
-        inputs = [one.requires_grad_() for one in inputs]
-        found.append(torch.autograd.grad((weight * counts(*inputs)).sum(), inputs))
-    torch.testing.assert_close(*found)
-
-
 def test_dense_events_and_their_surrogate_slope_by_hand():
     level = torch.tensor([0.0, 0.15, 0.25, 0.7, 0.55, 0.1], dtype=D)[:, None]
     counts, reference = dense(level, 0.2, 0.3, log_input=True)

@@ -176,18 +176,6 @@ def test_gradient_is_the_slope_of_the_mean_hard_count_behind_a_history(
     assert slope / difference == pytest.approx(1, abs=error)
 
 
-def test_threshold_gradient_follows_the_hard_count():
-    # the total count of a pixel that swings by S (many thresholds) is about S/C: d/dC = -S/C^2 = -(counts)/C.
-    # The hard count over a 25 % wider and narrower threshold gives -S/(C^2 (1 - 0.0625)): 7 % steeper;
-    # rounding adds under 1 % at 2000 pixels.
-    swing = 3 + torch.rand(2000, generator=seeded(6), dtype=D)
-    level = torch.linspace(0, 1, 40, dtype=D)[:, None] * swing
-    theta = torch.tensor(0.2, dtype=D, requires_grad=True)
-    (slope,) = torch.autograd.grad(memory(level, theta, 0.2, log_input=True)[0].sum(), theta)
-    totals = [memory(level, value, 0.2, log_input=True)[0].sum() for value in (0.15, 0.25)]
-    assert abs(float((totals[1] - totals[0]) / 0.1 / slope) - 1 / (1 - 0.0625)) < 0.05
-
-
 @pytest.mark.bits
 def test_soft_counts_gradient_against_finite_differences_and_sum_against_memory():
     level = random_walk(8, (3, 2))
@@ -197,13 +185,6 @@ def test_soft_counts_gradient_against_finite_differences_and_sum_against_memory(
     climb = level.abs().cumsum(0)
     soft = soft_counts(climb, 0.2, 0.2, log_input=True).sum(0)
     assert torch.equal(soft.floor(), memory(climb, 0.2, 0.2, log_input=True)[0].sum(0))
-
-
-@pytest.mark.bits
-def test_memory_applies_the_lin_log_front_end():
-    frames = torch.rand(6, 4, 4, dtype=D, generator=seeded(8)) * 200
-    # two logarithms, 1e-15 apart: no level of these comes nearer than 1e-6 to a threshold
-    assert torch.equal(memory(frames, 0.2, 0.2)[0], memory(lin_log(frames), 0.2, 0.2, log_input=True)[0])
 
 
 @pytest.mark.parametrize(("theta_off", "taken"), [(0.24, "play"), (0.26, "exact")])
