@@ -1,4 +1,5 @@
 """flow.estimate on windows with exact flow, where the closed form as it is set fails, and on noise."""
+# pyright: reportOptionalMemberAccess=false, reportOptionalOperand=false, reportOptionalSubscript=false
 
 from dataclasses import replace
 from functools import cache

@@ -1,5 +1,6 @@
 """Images of warped events against moves worked out by hand, closed forms of affine maps, and finite
 differences."""
+# pyright: reportArgumentType=false, reportCallIssue=false
 
 import math
 
@@ -115,14 +116,6 @@ def test_the_smooth_spread_is_alike_wherever_an_event_falls():
             assert float((shares * place).sum()) == pytest.approx(centre)
             # of the quadratic B-spline, at every offset
             assert float((shares * (place - centre) ** 2).sum()) == pytest.approx(0.25)
-
-
-def test_still_image_is_the_smooth_image_at_zero_flow(generator):
-    volume = window(torch.rand(2, 2, 3, 5, 7, generator=generator, dtype=D))
-    tracks = contrast.volume_tracks(volume, torch.zeros(2, 2, 5, 7, dtype=D))
-    torch.testing.assert_close(
-        contrast.still_image(volume.counts), contrast.smooth_image(tracks, 0.3), rtol=0, atol=1e-12
-    )
 
 
 def test_area_change_of_an_affine_flow_is_its_determinant():

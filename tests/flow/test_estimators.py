@@ -1,5 +1,6 @@
 """What every estimator of flow promises: an answer of its own for every sample, size and type, nothing where
 nothing is seen, gradients that differences confirm, and one sentence for what is no volume of events."""
+# pyright: reportArgumentType=false, reportCallIssue=false
 
 import math
 from copy import deepcopy
@@ -82,6 +83,7 @@ def test_a_batch_is_its_samples_and_an_empty_one_shows_nothing(name, size):
     ("name", "rate"),
     [
         ("refiner", 1.0),
+        ("refiner", 200.0),
         ("refiner by events", 1.0),
         ("flownet", 0.0),
         ("flownet", 1.0),

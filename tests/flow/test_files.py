@@ -53,17 +53,6 @@ def test_round_trips_keep_validity_exactly_and_flow_to_the_format(name, toleranc
     assert (tmp_path / f"b{name}").read_bytes() == (tmp_path / name).read_bytes()
 
 
-def test_the_png_holds_the_numbers_of_the_format(tmp_path):
-    flow = torch.tensor([[[1.5, -256.0]], [[0.0, 255.9921875]]], dtype=torch.float64)
-    write_flow(tmp_path / "a.png", flow)
-    content = (tmp_path / "a.png").read_bytes()
-    assert content[16:26] == struct.pack(">IIBB", 2, 1, 16, 2)
-    length = int.from_bytes(content[33:37], "big")
-    raw = zlib.decompress(content[41 : 41 + length])
-    assert raw[0] == 2  # difference to the row above, which for the first row is the row itself
-    assert struct.unpack(">6H", raw[1:]) == (32768 + 192, 32768, 1, 0, 65535, 1)
-
-
 def test_other_programs_read_the_png(field, tmp_path):
     flow, valid = field
     write_flow(tmp_path / "a.png", flow, valid)

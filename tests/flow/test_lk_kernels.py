@@ -1,5 +1,6 @@
 """The kernels of the closed form against the same as operations of torch, against scipy, and against a plane that
 moves; what a recording of a kernel promises."""
+# pyright: reportArgumentType=false, reportCallIssue=false, reportOptionalMemberAccess=false
 
 import gc
 import sys

@@ -1,5 +1,6 @@
 """The closed form's local part: its tree against a dense solve, its fields where one polynomial does
 not do."""
+# pyright: reportCallIssue=false
 
 from contextlib import nullcontext
 

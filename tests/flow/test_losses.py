@@ -1,4 +1,5 @@
 """Losses against values worked out by hand, the true motion of moving dots, and finite differences."""
+# pyright: reportArgumentType=false
 
 import math
 from dataclasses import replace

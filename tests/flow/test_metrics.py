@@ -1,4 +1,5 @@
 """Flow errors against values worked out by hand."""
+# pyright: reportCallIssue=false
 
 import math
 

@@ -1,5 +1,6 @@
 """Text events byte for byte, and the camera, its turn and its flow against closed forms and another
 implementation."""
+# pyright: reportOptionalMemberAccess=false
 
 import math
 

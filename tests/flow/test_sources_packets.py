@@ -1,4 +1,5 @@
 """Recordings cut into packets, each with its true flow, whichever way that is stored."""
+# pyright: reportOptionalMemberAccess=false
 
 import zipfile
 from dataclasses import replace

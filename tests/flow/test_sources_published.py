@@ -1,4 +1,5 @@
 """DSEC and MVSEC in their published layouts: windows against closed forms, damage before training."""
+# pyright: reportArgumentType=false
 
 import hdf5plugin
 import numpy as np

@@ -1,6 +1,6 @@
 """Flow along a stream: windows that hold every event once however the stream comes in, warm starts,
 faults, and a motion that is known."""
-# pyright: reportArgumentType=false
+# pyright: reportArgumentType=false, reportCallIssue=false
 
 import time
 from itertools import pairwise

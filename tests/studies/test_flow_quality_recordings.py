@@ -1,5 +1,6 @@
 """Recordings of the study of flow's quality: made streams against the geometry they were made with, and the
 contrast maximisation against events placed by hand."""
+# pyright: reportAssignmentType=false
 
 import math
 from dataclasses import dataclass

@@ -114,19 +114,6 @@ def test_the_loss_is_the_one_that_is_asked_for(tmp_path, kind):
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_run_begins_with_the_weights_it_is_given(tmp_path, capsys):
-    given = Linear()
-    with torch.no_grad():
-        given.layer.weight.copy_(TRUE_WEIGHTS[:, :, None, None])
-    checkpoint.save(given, tmp_path / "given.safetensors")
-    options = f"--start {tmp_path / 'given.safetensors'} --steps 1 --learning-rate 1e-9"
-    assert train(tmp_path / "run", options) == 0
-    assert metrics_of(tmp_path / "run")["unseen_ratio"] < 1e-6
-    assert train(tmp_path / "other", f"{options} --network flownet-events") == 2
-    assert "holds a 'linear', --network is 'flownet-events'" in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("undrawn")
 def test_processor_time_is_a_budget(tmp_path):
     """A step costs milliseconds, so the run ends within a tenth of a budget of 0.6 s."""
     assert train(tmp_path, "--cpu-minutes 0.01 --clip 1e-6") == 0

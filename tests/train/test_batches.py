@@ -1,4 +1,5 @@
 """Which windows are shown when, and how they are turned."""
+# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
 
 import pytest
 import torch
