@@ -131,18 +131,6 @@ def test_the_blur_is_that_of_scipy(shape, stride, generator):
     np.testing.assert_allclose(blurred(images, grid, taps).numpy(), truth, rtol=0, atol=2e-14)
 
 
-def test_bins_read_far_outside_are_the_border_and_pull_at_no_flow(generator):
-    rate = torch.randn(1, 2, 6, 7, generator=generator, dtype=D)
-    time = torch.tensor([0.5, 1.0], dtype=D)
-    (flow,) = leaves(torch.full_like(rate, 100.0))
-    mean, slope, seen = moving(rate, flow, time, torch.eye(2, dtype=D), Grid(6, 7), FADE_PX)
-    assert torch.equal(mean, rate[:, 0, -1:, -1:].expand_as(mean))
-    assert torch.equal(slope, rate[:, 1, -1:, -1:].expand_as(slope))
-    assert not seen.any()
-    (pull,) = torch.autograd.grad((mean + slope + seen).sum(), flow)
-    assert not pull.any()
-
-
 def test_groups_of_bins_give_the_gradient_of_all_at_once(generator, monkeypatch):
     grid, _, *given = drawn((2, 5, 9, 8, 1, 1), generator)
     rate, flow = leaves(*given[:2])

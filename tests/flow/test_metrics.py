@@ -9,7 +9,8 @@ import torch
 from codesign.errors import CodesignError, DomainError
 from codesign.events.stream import ordered
 from codesign.flow import metrics
-from codesign.types import EventVolume, FlowField
+from codesign.flow.export import evenly_timed
+from codesign.types import FlowField
 
 D = torch.float64
 
@@ -74,12 +75,10 @@ def test_masks_of_events_and_truth():
     counts[0, 0, 1, 0, 0] = 0.25  # a part of an event
     counts[0, 1, 2, 0, 2] = 3
     counts[1, 1, 0, 0, 3] = 1
-    valid = torch.tensor([[[True, True, False, False]], [[False, False, True, True]]])
-    volume = EventVolume(counts, torch.arange(3.0), torch.ones(3))
-    found = metrics.masks(volume, FlowField(torch.zeros(2, 2, 1, 4), valid, 3.0))
-    assert found["events"].tolist() == [[[True, False, True, False]], [[False, False, False, True]]]
-    assert found["both"].tolist() == [[[True, False, False, False]], [[False, False, False, True]]]
-    assert found["valid"] is valid
+    valid = torch.tensor([1, 1, 0, 1]).expand(2, 1, 4) == 1
+    found = metrics.masks(evenly_timed(counts), FlowField(counts[:, :, 0], valid, 3.0))
+    assert found["events"].int().tolist() == [[[1, 0, 1, 0]], [[0, 0, 0, 1]]]
+    assert found["both"].int().tolist() == [[[1, 0, 0, 0]], [[0, 0, 0, 1]]]
 
 
 @pytest.mark.parametrize(

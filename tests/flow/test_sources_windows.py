@@ -1,17 +1,14 @@
-"""Windows of our data sets and of recordings: against what is stored and the renderer; damage before training;
-rows of large files."""
+"""Windows of our data sets and of recordings: against what is stored and the renderer; damage before training."""
 # pyright: reportCallIssue=false, reportOptionalSubscript=false
 
 import shutil
 
-import hdf5plugin
 import numpy as np
 import pytest
 import torch
 
 from codesign import events
 from codesign.errors import CodesignError, ShapeError
-from codesign.events.formats.hdf5_rows import Rows
 from codesign.events.stream import ordered
 from codesign.flow.export import evenly_timed
 from codesign.flow.sources import DatasetWindows, RecordingWindows, open_windows
@@ -198,26 +195,3 @@ def test_a_sequence_whose_parts_do_not_fit(name, key, values, reason, dataset, t
     stores(tmp_path / "one" / name, key, values)
     with pytest.raises(CodesignError, match=reason):
         DatasetWindows(tmp_path / "one")
-
-
-# rows of files
-
-
-@pytest.mark.parametrize(
-    "packing",
-    [
-        {},
-        {"chunks": (7, 2, 3), "compression": "gzip", "shuffle": True, "fletcher32": True},
-        {"chunks": (16, 4, 5), **hdf5plugin.Blosc()},
-    ],
-)
-def test_rows_are_those_of_the_library(packing, tmp_path):
-    values = np.random.default_rng(0).normal(size=(50, 4, 5))
-    with h5(tmp_path / "a.h5", "w") as file:
-        file.create_dataset("a", data=values, **packing)
-    rows = Rows(tmp_path / "a.h5", "a", (4, 5), 50)
-    for first, last in ((0, 50), (6, 8), (7, 14), (49, 50), (20, 20)):
-        np.testing.assert_array_equal(rows.read(first, last), values[first:last])
-    np.testing.assert_array_equal(rows[33], values[33])
-    with pytest.raises(CodesignError, match="rows 40 to 51"):
-        rows.read(40, 51)

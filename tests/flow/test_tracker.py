@@ -159,7 +159,7 @@ def test_processor_time_over_event_time():
     found = list(tracker.track([stream_of(torch.arange(31) * 1000)]))
     assert len(found) == 4  # the last event begins one of its own, a microsecond long
     assert tracker.processor_s == pytest.approx(sum(window.processor_s for window in found))
-    assert all(window.processor_s >= 0.02 for window in found)
+    assert min(window.processor_s for window in found) >= 0.02
     assert tracker.real_time_factor == pytest.approx(tracker.processor_s / 0.030001)
     with pytest.raises(DomainError, match="no window is done"):
         _ = flow.Tracker(slow, window_s=0.01).real_time_factor

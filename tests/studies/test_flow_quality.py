@@ -110,14 +110,11 @@ def test_quick_form(tmp_path):
         "affine",
         "constant",
     ]
-    assert (
-        main(study, Config, ["--quick", "--world-windows", "2", "--sets", *chosen, "--out", str(tmp_path)])
-        == 0
-    )
+    assert main(study, Config, ["--quick", "--sets", *chosen, "--out", str(tmp_path)]) == 0
     found = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))
     assert found["fine_theta_0.1_refiner_ratio"] < 0.2
     assert found["worlds_refiner_ratio"] < 0.8
-    assert found["worlds_windows"] == 2
+    assert found["worlds_windows"] == 5
     # 0.3 of the scene, up to 15 % of noise on top
     assert found["layers_0.3_events_per_px_median"] < 0.36
     assert found["layers_0.3_closed_form_affine_sharpness"] > 1
