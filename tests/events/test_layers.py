@@ -2,7 +2,6 @@
 and gradients; noise, learnt values, and the same on a CUDA device."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -102,7 +101,7 @@ def test_the_physical_layer_gives_the_events_of_the_sensor():
 @pytest.mark.parametrize("name", LAYERS)
 def test_a_batch_is_its_samples_and_chunks_are_the_whole(name):
     frames, t_s = drifting(2, 3, 4, 5, frames=12)
-    made = layer(name, replace(NOISY, refractory_s=2e-3) if name == "physical" else NOISY)
+    made = layer(name, PHYSICAL if name == "physical" else NOISY)
     together, alone = seeded(7), seeded(7)
     counts = made(frames, t_s, together)
     singles = [made(sample, t_s, alone) for sample in frames.flatten(0, 1)]
