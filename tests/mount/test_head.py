@@ -3,6 +3,7 @@ symmetry by a world in a mirror, and a task whose best answer is known."""
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -46,6 +47,14 @@ def noisy(count, windows=3, seed=3):
     covariance = torch.stack([xx, 0.3 * (xx * yy).sqrt(), yy], 1)
     confidence = 0.4 + 0.6 * draw(1, 1).expand(-1, 32, 32)
     return FlowField(flow, confidence > 0, INTERVAL_S, confidence, covariance)
+
+
+def of_windows(field, pick, flow=None):
+    """The field with each of its tensors [N windows, ...] picked from; ``flow`` instead of its flow."""
+    flow = field.flow_px if flow is None else flow
+    return FlowField(
+        pick(flow), pick(field.valid), INTERVAL_S, pick(field.confidence), pick(field.covariance_px2)
+    )
 
 
 def moved(count, mount, seed=4):
@@ -108,14 +117,7 @@ def test_the_order_of_windows_does_not_matter(mount):
     field = noisy(3)
     poses = moved(3, mount)
     head = stirred(VelocityHead(plain_of()))
-    turned = FlowField(
-        *(getattr(field, name).unflatten(0, (3, 3))[:, order].flatten(0, 1) for name in ("flow_px", "valid")),
-        INTERVAL_S,
-        *(
-            getattr(field, name).unflatten(0, (3, 3))[:, order].flatten(0, 1)
-            for name in ("confidence", "covariance_px2")
-        ),
-    )
+    turned = of_windows(field, lambda part: part.unflatten(0, (3, 3))[:, order].flatten(0, 1))
     expected = head(field, camera_of(), None, mount, poses)
     found = head(turned, camera_of(tuple(WINDOWS[k] for k in order)), None, mount, poses)
     torch.testing.assert_close(found.velocity, expected.velocity, rtol=1e-9, atol=1e-11)
@@ -129,23 +131,15 @@ def test_a_world_in_a_mirror_gives_the_velocity_in_a_mirror(mount):
     left = torch.diag(torch.tensor([1.0, -1, 1, 1], dtype=D))
     image = torch.diag(torch.tensor([-1.0, 1, 1, 1], dtype=D))
     sign = torch.tensor([-1.0, 1], dtype=D)[:, None, None]
-    covariance = field.covariance_px2 * torch.tensor([1.0, -1, 1], dtype=D)[:, None, None]
-    flipped = FlowField(
-        (sign * field.flow_px).flip(-1),
-        field.valid.flip(-1),
-        INTERVAL_S,
-        field.confidence.flip(-1),
-        covariance.flip(-1),
-    )
+    mirrored = replace(field, covariance_px2=field.covariance_px2 * torch.tensor([1.0, -1, 1])[:, None, None])
+    flipped = of_windows(mirrored, lambda part: part.flip(-1), sign * field.flow_px)
     other = camera_of(tuple((112 - 32 - x, y) for x, y in WINDOWS))
     head = stirred(VelocityHead(plain_of(every_px=1)))
     expected = head(field, camera_of(), None, mount, poses)
     found = head(flipped, other, None, left @ mount @ image, left @ poses @ image)
     torch.testing.assert_close(found.velocity, expected.velocity * MIRROR, rtol=1e-7, atol=1e-9)
-    assert (
-        float((head(flipped, other, None, mount, poses).velocity - expected.velocity * MIRROR).abs().max())
-        > 1e-3
-    )
+    unmirrored = head(flipped, other, None, mount, poses)
+    assert float((unmirrored.velocity - expected.velocity * MIRROR).abs().max()) > 1e-3
 
 
 def test_gradient_to_flow_covariance_and_confidence(mount):
@@ -178,15 +172,11 @@ def test_gradient_to_mount_and_lens(mount):
         turned = mount @ pose.se3_exp(shift * torch.tensor([0.1, -0.2, 0.3, 0.2, 0.1, -0.3], dtype=D))
         return head(field, camera_of(), None, turned, body @ turned).velocity
 
-    def of_focus(shift):
-        optics = lens.ThinLens(20.0 + 0 * shift, 10.0, 20.5 + shift)
+    def of_lens(shift, share_focus):
+        optics = lens.ThinLens(20.0 + (1 - share_focus) * shift, 10.0, 20.5 + share_focus * shift)
         return head(field, camera_of(optics=optics), None, mount, poses).velocity
 
-    def of_focal_length(shift):
-        optics = lens.ThinLens(20.0 + shift, 10.0, 20.5 + 0 * shift)
-        return head(field, camera_of(optics=optics), None, mount, poses).velocity
-
-    for velocity in (of_mount, of_focus, of_focal_length):
+    for velocity in (of_mount, partial(of_lens, share_focus=1), partial(of_lens, share_focus=0)):
         _against_differences(velocity, torch.zeros((), dtype=D), 1e-5)
 
 
@@ -277,12 +267,7 @@ def test_every_body_may_have_a_mount_of_its_own(mount):
     found = head(field, camera_of(), None, mounts, poses).velocity
     each = mounts.expand(2, 2, 4, 4).reshape(4, 4, 4)
     torch.testing.assert_close(found, head(field, camera_of(), None, each, poses.flatten(0, 1)).velocity)
-    alone = FlowField(
-        *(part[6:] for part in (field.flow_px, field.valid)),
-        INTERVAL_S,
-        field.confidence[6:],
-        field.covariance_px2[6:],
-    )
+    alone = of_windows(field, lambda part: part[6:])
     torch.testing.assert_close(found[2:], head(alone, camera_of(), None, other, poses[1]).velocity)
 
 
@@ -296,7 +281,6 @@ def test_hidden_design_is_not_heard(mount):
     assert torch.equal(head.judged(seen)[0], head.judged(other)[0])
     shown = stirred(VelocityHead(plain))
     assert not torch.equal(shown.judged(seen)[0], shown.judged(other)[0])
-    assert math.isfinite(float(shown.judged(other)[0].sum()))
 
 
 def test_the_delivered_head_is_ahead_of_least_squares_in_an_unseen_world():
