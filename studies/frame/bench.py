@@ -46,19 +46,9 @@ class Timing:
     def cpu(self) -> float:
         return statistics.median(self.cpu_s)
 
-    @property
-    def wall_iqr(self) -> float:
-        """Difference of the upper and lower quartile of the wall-clock seconds."""
-        lower, _, upper = statistics.quantiles(self.wall_s, n=4, method="inclusive")
-        return upper - lower
-
     def __add__(self, other: "Timing") -> "Timing":
         """The repeats of both."""
         return Timing(self.wall_s + other.wall_s, self.cpu_s + other.cpu_s)
-
-    def metrics(self, name: str) -> dict[str, float]:
-        """What ``Run.record`` takes: <name>_wall_s, <name>_wall_iqr_s, <name>_cpu_s."""
-        return {f"{name}_wall_s": self.wall, f"{name}_wall_iqr_s": self.wall_iqr, f"{name}_cpu_s": self.cpu}
 
 
 def measure(
@@ -194,6 +184,14 @@ def peak_mb(function: Callable[[], object]) -> float:
         largest = _largest_mb()
     del result
     return largest - before
+
+
+def cost(work: Callable[[], object], repeats: int) -> dict[str, float]:
+    """Median seconds of calls after the first, wall_s and cpu_s, and the peak of memory of the first, peak_mb:
+    the figures of a process of its own, in which what compiles has run on something small."""
+    peak = peak_mb(work)
+    timing = measure(work, repeats, warm=0)
+    return {"wall_s": timing.wall, "cpu_s": timing.cpu, "peak_mb": peak}
 
 
 def _largest_mb():

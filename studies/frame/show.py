@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from codesign.report.chain_figures import draw_curves, draw_image
 from studies.frame.compare import Interval
 from studies.frame.run import Run
-from studies.frame.sweep import plain
+from studies.frame.sweep import metrics, plain
 
 COLOURS = ("#1b6ca8", "#c0392b", "#2e8b57", "#e08e0b", "#8e44ad", "#888888")
 Rows = Iterable[Mapping[str, Any]]
@@ -42,6 +42,20 @@ def table(rows: Rows, **titles: str) -> Shown:
     return tuple(titles.values()), [tuple(_cell(row.get(name)) for name in titles) for row in rows]
 
 
+def tabulate(
+    run: Run, title: str, rows: Rows, *axes: str, prefix: str = "", caption: str = "", **titles: str
+) -> None:
+    """Show rows as a table, and record their numbers by the values of the axes.
+
+    Args:
+      axes, prefix: as of ``sweep.metrics``.
+      titles: as of ``table``.
+    """
+    rows = list(rows)
+    run.record(**metrics(rows, *axes, prefix=prefix))
+    run.table(title, *table(rows, **titles), caption)
+
+
 def pivot(rows: Rows, down: str, across: str, value: str) -> Shown:
     """The same for one figure, with a line per value of one axis and a column per value of another."""
     rows = list(rows)
@@ -56,16 +70,12 @@ def pivot(rows: Rows, down: str, across: str, value: str) -> Shown:
 
 @dataclass(frozen=True)
 class Asked:
-    """A figure that something was asked of: at least, at most, or between both.
-
-    what: names it. value: what was found. beside: the same measured otherwise, for the reader.
-    """
+    """A figure that something was asked of: at least, at most, or between both; ``what`` names it."""
 
     what: str
     value: float
     least: float = -math.inf
     most: float = math.inf
-    beside: float | None = None
 
     @property
     def met(self) -> bool:
@@ -73,36 +83,23 @@ class Asked:
 
     @property
     def wanted(self) -> str:
-        ends = [f"≥ {self.least:.3g}"] * (self.least > -math.inf) + [f"≤ {self.most:.3g}"] * (
-            self.most < math.inf
-        )
+        ends = []
+        if self.least > -math.inf:
+            ends.append(f"≥ {self.least:.3g}")
+        if self.most < math.inf:
+            ends.append(f"≤ {self.most:.3g}")
         return ", ".join(ends) or "–"
 
 
-def asked(run: Run, figures: Iterable[Asked], title: str = "Against what was asked", beside: str = "") -> str:
-    """Show figures beside what was asked of them, as cards and a table, and record them by their names.
+def asked(run: Run, figures: Iterable[Asked], title: str = "Against what was asked") -> str:
+    """Show figures beside what was asked of them, as a table, and record them by their names.
 
-    Args:
-      beside: title of the column ``Asked.beside``; no such column when left out.
     Returns: "All figures are met." or the sentence about those that are not, for the head of the page.
     """
     figures = list(figures)
-    for figure in figures:
-        run.record(**{plain(figure.what): figure.value})
-        if figure.beside is not None:
-            run.record(**{plain(figure.what, beside): figure.beside})
-        run.card(
-            figure.what, f"{figure.value:.3g}", f"asked: {figure.wanted}{'' if figure.met else ' (missed)'}"
-        )
-    columns = ("what", "found", *([beside] if beside else []), "asked", "met")
-    run.table(
-        title,
-        columns,
-        [
-            (f.what, f.value, *([f.beside] if beside else []), f.wanted, "yes" if f.met else "NO")
-            for f in figures
-        ],
-    )
+    run.record(**{plain(figure.what): figure.value for figure in figures})
+    rows = [(f.what, f.value, f.wanted, "yes" if f.met else "NO") for f in figures]
+    run.table(title, ("what", "found", "asked", "met"), rows)
     missed = [f"{f.what} {f.value:.3g} ({f.wanted})" for f in figures if not f.met]
     return f"**Missed in this run:** {'; '.join(missed)}." if missed else "All figures are met."
 

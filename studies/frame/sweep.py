@@ -13,10 +13,12 @@ The table stands in the run's folder, a line of JSON a cell, written as soon as 
 import itertools
 import json
 import re
-from collections.abc import Callable, Generator, Iterable, Mapping
+import statistics
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed, wait
 from contextlib import closing
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from codesign.errors import DomainError, FileFormatError
@@ -31,6 +33,8 @@ def sweep(
     cell: Callable[..., Row | Iterable[Row]],
     name: str = "table",
     processes: int = 0,
+    turns: int = 1,
+    given: Mapping[str, Any] = MappingProxyType({}),
     **axes: Iterable[Any] | Mapping[str, Any],
 ) -> list[Row]:
     """Rows of every combination of the axes; those that an earlier session wrote are read back.
@@ -41,6 +45,9 @@ def sweep(
       name: of the table, <name>.jsonl, and of the progress bar.
       processes: 0 calls ``cell`` here; otherwise each call gets a fresh process, so many at a time, and
         ``cell`` stands at the top level of a module.
+      turns: how often every cell is asked, all cells in turns, so that what else the machine does meets all;
+        of figures that are numbers the rows have the medians.
+      given: further arguments of every call, which are no axes.
       axes: name -> values as JSON keeps them (numbers, text), or label -> value of any kind, where the row
         has the label. The last axis changes fastest.
     Returns: the long table, in the order of the axes: a row has the axes' values, then the figures.
@@ -48,20 +55,34 @@ def sweep(
       table in the folder is of other axes or damaged.
     """
     path = run.path(f"{name}.jsonl")
-    known = _read(path, set(axes))
-    labels = [list(values) for values in axes.values()]
-    cells = [dict(zip(axes, point, strict=True)) for point in itertools.product(*labels)]
-    missing = [point for point in cells if _key(point) not in known]
-    measured = _measured(cell, missing, axes, processes)
+    known = _read(path, {*axes, "turn"} if turns > 1 else set(axes))
+    cells = [dict(zip(axes, point, strict=True)) for point in itertools.product(*map(list, axes.values()))]
+    asked = cells if turns == 1 else [{**point, "turn": turn} for turn in range(turns) for point in cells]
+    missing = [point for point in asked if _key(point) not in known]
+    measured = _measured(cell, missing, axes, given, processes)
     with (
-        run.progress(len(cells), name, done=len(cells) - len(missing)) as progress,
+        run.progress(len(asked), name, done=len(asked) - len(missing)) as progress,
         closing(measured),  # an interruption ends the processes
     ):
         for point, found in measured:
             rows = [found] if isinstance(found, Mapping) else found
             known[_key(point)] = _append(path, point, [dict(row) for row in rows])
             progress.advance()
-    return [point | row for point in cells for row in known[_key(point)]]
+    # those of one cell are as many cells apart as there are
+    of_turns = [[known[_key(point)] for point in asked[k :: len(cells)]] for k in range(len(cells))]
+    return [
+        point | _median(rows)
+        for point, found in zip(cells, of_turns, strict=True)
+        for rows in zip(*found, strict=True)
+    ]
+
+
+def _median(rows: Sequence[Row]) -> Row:
+    """One row for those of several turns."""
+    return {
+        name: statistics.median(row[name] for row in rows) if isinstance(value, int | float) else value
+        for name, value in rows[0].items()
+    }
 
 
 def select(rows: Iterable[Row], **where: Any) -> list[Row]:
@@ -74,7 +95,7 @@ def column(rows: Iterable[Row], name: str, **where: Any) -> list[Any]:
     return [row[name] for row in select(rows, **where)]
 
 
-def metrics(rows: Iterable[Row], *axes: str, prefix: str = "") -> dict[str, float]:
+def metrics(rows: Iterable[Mapping[str, Any]], *axes: str, prefix: str = "") -> dict[str, float]:
     """What ``Run.record`` takes of a table: every number by the values of the axes and its own name, in
     plain letters.
 
@@ -97,14 +118,14 @@ def plain(*words: object) -> str:
     return "_".join(re.findall(r"\w+", " ".join(map(str, words)))).lower()
 
 
-def _measured(cell, points, axes, processes) -> Generator[tuple[Row, Any]]:
+def _measured(cell, points, axes, given, processes) -> Generator[tuple[Row, Any]]:
     """Each point with what ``cell`` returns for it, in the order in which they are done."""
 
     def values(point):
         return {
-            axis: axes[axis][label] if isinstance(axes[axis], Mapping) else label
-            for axis, label in point.items()
-        }
+            axis: values[point[axis]] if isinstance(values, Mapping) else point[axis]
+            for axis, values in axes.items()
+        } | given
 
     if not processes:
         for point in points:

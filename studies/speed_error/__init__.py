@@ -19,5 +19,3 @@ class Config(StudyConfig):
     """Timed repeats of each thing; at least 3."""
     rounds: int = 2
     """Turns that everything gets that is timed in turns."""
-    world: tuple[str, ...] = ()
-    """Worlds of the stage light, by name; all of them when left out."""

@@ -4,15 +4,16 @@ installed.
     python -m studies.speed_error --stages lens events flow
 
 measures those stages, one after the other, on one page; see --stages for what there is. Times are medians;
-the processor's stand beside the clock's, since machines are shared. What else is measured in turns with it,
-in the same run. Peers: pip install "codesign[bench]" (`make lens-bench`, `make srm-bench`).
+the processor's stand beside the clock's, since machines are shared. What is compared is measured in turns, in
+the same run. Peers: pip install "codesign[bench]" (`make lens-bench`, `make srm-bench`).
 """
 
 import sys
 
 from codesign.errors import DomainError
 from studies.frame.run import Run, main
-from studies.speed_error import Config, events, flow, frames, lens, levels, placement, spiking
+from studies.frame.show import asked
+from studies.speed_error import Config, chain, events, frames, lens, levels
 
 STAGES = {
     "levels": levels.stage,
@@ -21,9 +22,9 @@ STAGES = {
     "psf": frames.psf_stage,
     "light": frames.light_stage,
     "events": events.stage,
-    "spiking": spiking.stage,
-    "flow": flow.stage,
-    "placement": placement.stage,
+    "spiking": events.spiking_stage,
+    "flow": chain.flow_stage,
+    "placement": chain.placement_stage,
 }
 
 
@@ -31,15 +32,17 @@ def study(run: Run[Config]) -> None:
     config = run.config
     if config.repeats < 3 or config.rounds < 1 or not config.stages:
         raise DomainError(
-            f"repeats {config.repeats}, rounds {config.rounds}, stages {config.stages}: give at least 3, 1"
-            " and one."
+            f"repeats {config.repeats}, rounds {config.rounds}, stages {config.stages}: give at least 3, 1 and "
+            "one."
         )
-    lines = []
+    figures = []
     for name in dict.fromkeys(config.stages):
+        stage = STAGES[name]
         run.say(name)
-        run.section(name.capitalize())
-        lines.append(f"- **{name}**: {STAGES[name](run)}")
-    run.finish("Speed and error", "\n".join(lines))
+        run.section(name.capitalize(), stage.__doc__ or "")
+        figures += stage(run)
+    lead = asked(run, figures) if figures else "Time against error of every level."
+    run.finish("Speed and error", lead)
 
 
 if __name__ == "__main__":

@@ -1,27 +1,25 @@
-"""Stage "events": speed and memory of the event layers beside a memory copy of the frames, in one run.
+"""Stages "events" and "spiking": what event layers and the spike response layer cost."""
 
-Frames of a drifting texture at 1,000 frames per second, at two speeds: calm (about 2 events per 100 pixels
-and frame) and busy (about 25). What a pixel costs depends on how often it fires, so both are told. Then
-frames are streamed through a sensor with every kind of noise while memory is watched, and the times of
-float32 frames are set beside those of the same frames in float64.
-"""
-
+import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
 
 from codesign import events
-from studies.frame.bench import measure, resident_mb
+from codesign.events.spiking.srm import srm
+from studies.frame.bench import cost, installed, measure, resident_mb
 from studies.frame.run import Run
-from studies.frame.show import Asked, Panel, asked, panels, table
-from studies.frame.sweep import metrics, sweep
+from studies.frame.show import Asked, Panel, panels, tabulate
+from studies.frame.sweep import select, sweep
 from studies.speed_error import Config
 
 SIZES = {"346x260": (260, 346, 96), "1280x720": (720, 1280, 32)}
 SPEED_PX = {"calm": 0.05, "busy": 0.6}
 FPS = 1000
 THETA = 0.2
+# every kind of noise that v2e has by default
 NOISE = events.SensorModel(
     theta_sigma=0.03,
     cutoff_hz=300.0,
@@ -30,7 +28,7 @@ NOISE = events.SensorModel(
     rate_cov_decades=0.1,
     shot_rate_hz=1.0,
     refractory_s=0.5e-3,
-)  # every kind that v2e has by default
+)
 SENSORS = {
     "hard, ideal": events.SensorModel(),
     "hard, full noise": NOISE,
@@ -45,42 +43,37 @@ LAYERS: dict[str, Callable] = {
     "sigmoid": lambda frames: events.soft(frames, THETA),
     "dense": lambda frames: events.dense(frames, THETA, THETA)[0],
 }
-# million pixels per second, two cores
+# million pixels per second by the clock, two cores
 ASKED = {"hard, ideal": 120.0, "hard, full noise": 60.0, "memory, forward + backward": 120.0}
-SPEEDS_PER_S = ((0.01, 0.1), (0.1, 1), (1, 100))  # of the log level
+
+STEPS = (200, 1000)
+KINDS = ("forward", "forward_backward")
+PEERS = {"snntorch": "snntorch", "norse": "norse"}
+ASKED_COPIES = {"forward": 2.0, "forward_backward": 5.0}
+ASKED_SPEED = {"convolution": 20.0, **dict.fromkeys(PEERS, 4.0)}
+PIXELS = (2, 128, 128)
+THETA_SPIKE = 1.0
+TAU_S = 10.0
+TAU_R = 1.0
 
 
-def stage(run: Run[Config]) -> str:
-    """The event layers: speed, memory, precision."""
+def stage(run: Run[Config]) -> list[Asked]:
+    """Million pixels per second of a drifting texture at 1,000 frames per second, at two speeds: what a pixel
+    costs depends on how often it fires. Copies: time over that of a copy of the frames in memory."""
     config = run.config
-    threads = torch.get_num_threads()
-    torch.set_num_threads(2)  # the kernels use every core
     sizes = list(SIZES)[:1] if config.quick else list(SIZES)
-    rows = sweep(
-        run, timed, "events", size=sizes, pace=SPEED_PX, repeats=[config.repeats], seed=[config.seed]
-    )
-    run.record(**metrics(rows, "layer", "pace", "size"))
-    run.section(
-        "Event layers",
-        "Million pixels per second by the clock and of the processor; cost in copies of the frames in "
-        "memory.",
-    )
-    titles = {"mpixel_per_s": "Mpixel/s", "mpixel_per_cpu_s": "Mpixel per CPU-s", "copies": "copies"}
-    titles["events_per_pixel_frame"] = "events per pixel and frame"
-    run.table("Speed", *table(rows, size="size", pace="pace", layer="layer", **titles))
-    figures = [
-        Asked(
-            f"{row['layer']}, {row['pace']}, {row['size']}: Mpixel/s",
-            row["mpixel_per_s"],
-            ASKED[row["layer"]],
-        )
-        for row in rows
-        if row["layer"] in ASKED
-    ]
+    given = {"repeats": config.repeats, "seed": config.seed}
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    rows = sweep(run, timed, "events", given=given, size=sizes, pace=SPEED_PX)
+    tabulate(run, "Speed", rows, "layer", "pace", "size")
     stream(run, 5_000 if config.quick else 100_000)
-    precision(run)
     torch.set_num_threads(threads)
-    return asked(run, figures, "Event layers against what was asked")
+    return [
+        Asked(f"{row['layer']}, {row['pace']}, {row['size']}: Mpixel/s", row["mpixel_per_s"], least)
+        for layer, least in ASKED.items()
+        for row in select(rows, layer=layer)
+    ]
 
 
 def texture(height: int, width: int, count: int, speed_px: float, seed: int) -> torch.Tensor:
@@ -103,100 +96,174 @@ def timed(size: str, pace: float, repeats: int, seed: int) -> list[dict[str, obj
     height, width, count = SIZES[size]
     frames = texture(height, width, count, pace, seed)
     t_s = torch.arange(count, dtype=torch.float64) / FPS
-    target = torch.empty_like(frames)
-    copy = measure(lambda: target.copy_(frames), repeats).wall
+    copy = measure(frames.clone, repeats).wall
     leaf = frames.clone().requires_grad_()
     weight = torch.rand(count - 1, 2, height, width, generator=torch.Generator().manual_seed(0))
+    rows = []
 
     def differentiated(layer):
-        leaf.grad = None
-        layer(leaf).backward(weight)
+        return torch.autograd.grad(layer(leaf), leaf, weight)
 
-    works: dict[str, Callable] = {
-        name: lambda sensor=sensor: events.simulate(frames, t_s, sensor) for name, sensor in SENSORS.items()
-    }
-    works["memory, forward"] = lambda: LAYERS["memory"](frames)
+    def add(name, work, **more):
+        timing = measure(work, repeats)
+        speed = {"mpixel_per_s": timing.wall, "mpixel_per_cpu_s": timing.cpu}
+        speed = {clock: frames.numel() / 1e6 / seconds for clock, seconds in speed.items()}
+        rows.append({"layer": name, **speed, "copies": timing.wall / copy, **more})
+
+    for name, sensor in SENSORS.items():
+        work = partial(events.simulate, frames, t_s, sensor)
+        add(name, work, events_per_pixel=len(work()) / frames.numel())
+    add("memory, forward", lambda: LAYERS["memory"](frames))
     for name, layer in LAYERS.items():
-        works[f"{name}, forward + backward"] = lambda layer=layer: differentiated(layer)
-    rows = []
-    for name, work in works.items():
-        timing = measure(work, repeats, warm=2 if name in ASKED else 1)
-        rows.append(
-            {
-                "layer": name,
-                "mpixel_per_s": frames.numel() / 1e6 / timing.wall,
-                "mpixel_per_cpu_s": frames.numel() / 1e6 / timing.cpu,
-                "copies": timing.wall / copy,
-                "events_per_pixel_frame": len(work()) / frames.numel() if name in SENSORS else None,
-            }
-        )
+        add(f"{name}, forward + backward", partial(differentiated, layer))
     return rows
 
 
 def stream(run: Run[Config], count: int, chunk: int = 500) -> None:
-    """Resident memory while frames of 32 x 32 pixels go through a sensor with all noise; the events are
-    dropped."""
-    base = texture(32, 32, chunk, 0.05, run.config.seed)
+    """Memory in use while frames of 32 x 32 pixels go through a sensor with all noise; events are dropped."""
+    frames = texture(32, 32, chunk, 0.05, run.config.seed)
     state = events.SensorState()
     memory = []
-    for first in range(0, count, chunk):
-        t_s = torch.arange(first, first + chunk, dtype=torch.float64) / FPS
-        events.simulate(base, t_s, NOISE, state=state)
-        memory.append(resident_mb())
-    grown = max(memory) - memory[len(memory) // 10]
-    run.record(
-        streamed_frames=count, stream_first_mb=memory[0], stream_last_mb=memory[-1], stream_growth_mb=grown
-    )
-    run.card("Memory growth of a stream", f"{grown:.1f} MB", f"{count:,} frames, after the first tenth")
-    frames = np.linspace(0, count, len(memory))
-    run.figure(
-        panels(Panel({"memory": (frames, memory)}, "frames", "resident memory, MB"), width=6),
-        "memory",
-        f"{count:,} frames streamed, {chunk} at a time: flat after the first chunks.",
-    )
+    with run.progress(count // chunk, "stream") as progress:
+        for first in range(0, count, chunk):
+            t_s = torch.arange(first, first + chunk, dtype=torch.float64) / FPS
+            events.simulate(frames, t_s, NOISE, state=state)
+            memory.append(resident_mb())
+            progress.advance(memory_mb=memory[-1])
+    run.record(stream_growth_mb=max(memory) - memory[len(memory) // 10])
+    at = np.linspace(0, count, len(memory))
+    chart = Panel({"memory": (at, memory)}, "frames", "memory in use, MB")
+    run.figure(panels(chart, width=6), "memory", f"{count:,} frames, {chunk} at a time, through a sensor.")
 
 
-def precision(run: Run[Config], cases: int = 40, pixels: int = 2048, count: int = 120) -> None:
-    """float32 frames beside their float64 copies, ramps and sines of every speed: the share of pixels with
-    another count, and for the others |time off| of every event, us, by the speed of the log level there,
-    1/s."""
-    generator = torch.Generator().manual_seed(run.config.seed)
+def spiking_stage(run: Run[Config]) -> list[Asked]:
+    """The spike response layer beside a convolution of 77 taps, snnTorch's and norse's two-state cells, on
+    2 x 128 x 128 pixels in float32; every layer in processes of its own, in turns. Copies: time over that of a
+    copy of input, spikes and potential. Peak: memory of the first call beyond what was in use. The convolution
+    is SLAYER's: finite kernels, a sequential reset, no gradient through it."""
+    config = run.config
+    layers = [name for name in SPIKING if name not in PEERS or name in installed(PEERS)]
+    steps = STEPS[:1] if config.quick else STEPS
+    axes = {"steps": steps, "layer": layers, "kind": KINDS}
+    given = {"repeats": config.repeats, "seed": config.seed}
+    rows = sweep(run, spiking, "spiking", processes=1, turns=config.rounds, given=given, **axes)
+    tabulate(run, "One call, medians", rows, *axes, prefix="spiking")
+    figures = []
+    for count in steps:
+        ours = {row["kind"]: row for row in select(rows, layer="codesign", steps=count)}
+        figures += [
+            Asked(f"{kind}, T = {count}: copies", ours[kind]["copies"], most=most)
+            for kind, most in ASKED_COPIES.items()
+        ]
+        figures += [
+            Asked(f"{row['layer']} over ours, T = {count}: wall", row["wall_s"] / both, least)
+            for layer, least in ASKED_SPEED.items()
+            for row in select(rows, layer=layer, steps=count, kind="forward_backward")
+            for both in [ours["forward_backward"]["wall_s"]]
+        ]
+    return figures
 
-    def drawn(low, high, *shape):
-        uniform = torch.rand(shape or (1,), dtype=torch.float64, generator=generator)
-        return low * (high / low) ** uniform
 
-    other, speeds, off_us = 0.0, [], []
-    for case in range(cases):
-        t_s = torch.arange(count, dtype=torch.float64)[:, None] / drawn(60, 1000)
-        per_s = drawn(0.05, 20, 1, pixels)
-        phase = drawn(0.01, 6.3, 1, pixels)
-        swing = torch.sin(per_s * t_s + phase) if case % 2 else (per_s * t_s).clamp(max=2.9)
-        frames = (drawn(20, 5000, 1, pixels).log() + swing).exp().float()[:, None]
-        levels = events.lin_log(frames[:, 0].double()).numpy()
-        sensor = events.SensorModel(THETA, THETA)
-        single, double = (events.simulate(f, t_s[:, 0], sensor) for f in (frames, frames.double()))
-        same = torch.bincount(single.x, minlength=pixels) == torch.bincount(double.x, minlength=pixels)
-        other += float((~same).sum()) / (cases * pixels)
-        first, second = (s.t_us[s.x.argsort(stable=True)][same[s.x.sort().values]] for s in (single, double))
-        x = double.x.sort().values[same[double.x.sort().values]].numpy()
-        frame = np.clip(np.searchsorted(t_s[:, 0].numpy(), second.numpy() / 1e6), 1, count - 1)
-        speeds.append(np.abs(levels[frame, x] - levels[frame - 1, x]) / float(t_s[1]))
-        off_us.append((first - second).abs().numpy())
-    run.record(float32_other_counts_share=other)
-    speed, off = np.concatenate(speeds), np.concatenate(off_us)
-    rows = []
-    for low, high in SPEEDS_PER_S:
-        here = off[(speed >= low) & (speed < high)]
-        figures = {
-            "p99_us": float(np.quantile(here, 0.99)),
-            "max_us": float(here.max()),
-            "above_1us_share": float(np.mean(here > 1)),
-        }
-        rows.append({"level per s": f"{low:g} to {high:g}"} | figures)
-    run.record(**metrics(rows, "level per s", prefix="float32_off"))
-    run.table(
-        "Times of float32 frames beside float64, by the speed of the log level",
-        *table(rows),
-        f"{other:.1e} of the pixels have another count.",
-    )
+def spiking(layer: str, kind: str, steps: int, repeats: int, seed: int) -> dict[str, float]:
+    """Cost of one layer, of the drive's gradient too, and of copies; the convolution, which takes seconds, is
+    called twice."""
+    torch.set_num_threads(2)
+    generator = torch.Generator().manual_seed(seed)
+    drive, seeds = torch.rand(2, steps, *PIXELS, generator=generator)
+    function = SPIKING[layer]
+
+    def work(drive=drive, seeds=seeds):
+        if kind == "forward":
+            with torch.no_grad():
+                return function(drive)
+        leaf = drive.detach().requires_grad_()
+        return torch.autograd.grad(function(leaf), leaf, seeds)[0]
+
+    # compiles, and loads what the layer needs, without the memory of the whole
+    work(drive[:2], seeds[:2])
+    found = cost(work, 2 if layer == "convolution" else repeats)
+    copy = measure(lambda: (drive.clone(), seeds.clone(), drive.clone()), repeats)
+    return found | {"copies": found["wall_s"] / copy.wall, "cpu_copies": found["cpu_s"] / copy.cpu}
+
+
+def ours(drive):
+    return srm(drive, theta=THETA_SPIKE, tau_s=TAU_S, tau_r=TAU_R, response="alpha")[0]
+
+
+def taps(tau: float, amplitude: float, cut: float = 0.01) -> torch.Tensor:
+    """SLAYER's finite alpha kernel: 77 taps for tau = 10."""
+    found = []
+    k = 0
+    while k <= tau or abs(found[-1]) >= cut:
+        found.append(amplitude * k / tau * math.exp(1 - k / tau))
+        k += 1
+    return torch.tensor(found[:-1])
+
+
+class SequentialReset(torch.autograd.Function):
+    """SLAYER's spike function: threshold, add the reset kernel to the steps to come; backward multiplies by
+    the surrogate."""
+
+    @staticmethod
+    def forward(ctx, response, reset):
+        u = response.clone()
+        spikes = torch.empty_like(u)
+        later = reset[1:, None]
+        for t in range(u.shape[0]):
+            spikes[t] = u[t] >= THETA_SPIKE
+            rest = u[t + 1 : t + 1 + later.shape[0]]
+            rest.addcmul_(later[: rest.shape[0]], spikes[t])
+        ctx.save_for_backward(u)
+        return spikes
+
+    @staticmethod
+    def backward(ctx, *grads):
+        (u,) = ctx.saved_tensors
+        theta = THETA_SPIKE
+        return grads[0] * torch.exp(-(u - theta).abs() / theta) / (2 * theta), None
+
+
+def convolution(drive):
+    """The layer by a 77-tap convolution over time and the sequential reset, in torch; time is last while
+    convolving, as SLAYER lays its tensors out (and 5 times faster)."""
+    kernel = taps(TAU_S, 1.0)
+    rows = drive.reshape(drive.shape[0], -1).T.unsqueeze(1)
+    padded = torch.nn.functional.pad(rows, (kernel.numel() - 1, 0))
+    response = torch.conv1d(padded, kernel.flip(0).reshape(1, 1, -1))
+    reset = taps(TAU_R, -2 * THETA_SPIKE)
+    return SequentialReset.apply(response[:, 0].T.contiguous(), reset).reshape(drive.shape)
+
+
+def snntorch_cell(drive):
+    """snnTorch's two-state cell (synaptic current and membrane, reset by subtraction), step by step."""
+    import snntorch  # pyright: ignore[reportMissingImports]
+
+    decay = math.exp(-1 / TAU_S)
+    cell = snntorch.Synaptic(decay, decay, threshold=THETA_SPIKE, reset_mechanism="subtract")
+    states = cell.reset_mem()
+    spikes = []
+    for x in drive:
+        spike, *states = cell(x, *states)
+        spikes.append(spike)
+    return torch.stack(spikes)
+
+
+def norse_cell(drive):
+    """norse's two-state leaky integrate-and-fire cell, step by step."""
+    from norse.torch import LIFCell  # pyright: ignore[reportMissingImports]
+
+    cell = LIFCell()
+    state = None
+    spikes = []
+    for x in drive:
+        spike, state = cell(x, state)
+        spikes.append(spike)
+    return torch.stack(spikes)
+
+
+SPIKING: dict[str, Callable] = {
+    "codesign": ours,
+    "convolution": convolution,
+    "snntorch": snntorch_cell,
+    "norse": norse_cell,
+}

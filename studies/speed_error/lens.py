@@ -1,26 +1,28 @@
-"""Stage "lens": speed, memory and error of ray tracing beside optiland's, analysis functions, growth with
-rays and surfaces, and seconds until the first gradient."""
+"""Stage "lens": speed, memory and error of ray tracing, and analysis functions, beside optiland's
+(pip install "codesign[bench]").
+
+Every tracer gets the same double Gauss (indices of the d line), the same rays, and, going backward, a seed
+of ones on all image positions; gradients reach all curved radii and all distances.
+"""
 
 import math
-import tempfile
+import warnings
+from collections.abc import Callable
+from typing import Any
 
+import drjit
 import numpy as np
+import torch
 
-from codesign.lens import GeoLens
-from studies.frame.bench import Timing, apart, installed, turns
+from codesign import lens
+from codesign.lens import analysis
+from codesign.lens.seidel import seidel_sums
+from studies.frame.bench import cost, installed, turns
 from studies.frame.run import Run
-from studies.frame.show import Asked, Panel, asked, panels, table
-from studies.frame.sweep import column, metrics, select, sweep
-from studies.speed_error import Config, lens_peers
+from studies.frame.show import Asked, tabulate
+from studies.frame.sweep import column, sweep
+from studies.speed_error import Config
 
-PEERS = {"optiland-torch": "optiland", "optiland-numpy": "optiland"}
-CASES = [
-    (tracer, precision, kind)
-    for precision in ("float32", "float64")
-    for kind in ("forward", "forward_backward")
-    for tracer in ("codesign", *PEERS)
-    if tracer != "optiland-numpy" or (precision, kind) == ("float64", "forward")
-]
 ASKED_SPEED = {
     ("float32", "forward"): 15.0,
     ("float32", "forward_backward"): 10.0,
@@ -28,195 +30,271 @@ ASKED_SPEED = {
     ("float64", "forward_backward"): 8.0,
 }
 ASKED_MEMORY = 0.2
-ASKED_LINEAR = 0.15
 ASKED_ANALYSIS = 5.0
-SURFACES = 11  # of the double Gauss
-LONGER = (12, 22, 44, 88)
-COLD = (10, 20, 40, 80)
+SURFACES = 11
+HALF_DEG = 14.0
+FIELDS = (0.0, 0.7, 1.0)
+LINES = "dFC"
+SPOT_GRID = 32
+FAN_RAYS = 65
+OPD_GRID = 64
+PSF_GRID = 128
+PADDED = 512
+POINTS = 128
+LOOKED_AT = 256
 
 
-def stage(run: Run[Config]) -> str:
-    """Ray tracers and analysis functions beside those that are installed."""
-    count = 100_000 if run.config.quick else 1_000_000
-    peers = installed(PEERS)
-    figures = tracers(run, peers, count) + (analyses(run) if peers else [])
-    figures += growth(run, 10 * count)
-    chunks(run, 10 * count)
-    compiling(run)
-    lead = asked(run, figures)
-    return lead if peers else f"{lead} Not installed, hence not compared: optiland."
-
-
-def tracers(run: Run[Config], peers: list[str], count: int) -> list[Asked]:
-    """Every tracer in processes of its own, in turns."""
-    seed, repeats = run.config.seed, run.config.repeats
-    cases = [case for case in CASES if case[0] == "codesign" or case[0] in peers]
-    found = sweep(
-        run,
-        lens_peers.tracing,
-        "tracers",
-        processes=1,
-        turn=range(run.config.rounds),
-        case={" ".join(case): case for case in cases},
-        count=[count],
-        repeats=[repeats],
-        seed=[seed],
-    )
-    rows = {}
-    for case in cases:
-        parts = select(found, case=" ".join(case))
-        timing = sum((Timing(tuple(p["wall_s"]), tuple(p["cpu_s"])) for p in parts), Timing((), ()))
-        rows[case] = {
-            "case": " ".join(case),
-            "wall_s": timing.wall,
-            "cpu_s": timing.cpu,
-            "million_ray_surfaces_per_s": SURFACES * count / timing.wall / 1e6,
-            "million_ray_surfaces_per_cpu_s": SURFACES * count / timing.cpu / 1e6,
-            "peak_mb": float(np.median([p["peak_mb"] for p in parts])),
-            "max_error_mm": max(p["error_mm"] for p in parts),
-        }
-    run.record(**metrics(rows.values(), "case"))
-    run.section(
-        "Tracers",
-        f"Double Gauss of eleven surfaces, d line, {count:,} rays. Going backward, ours reaches all "
-        "curvatures and distances, the peer all radii and vertex positions. Memory: the peak above what "
-        "was in use before. Error: largest, of 256 rays, against our trace in float64, which the tests "
-        "hold to 3e-14 mm.",
-    )
-    run.table("Medians", *table(rows.values()))
-    points = {
-        row["case"]: ([row["million_ray_surfaces_per_s"]], [max(row["max_error_mm"], 1e-15)])
-        for row in rows.values()
+def stage(run: Run[Config]) -> list[Asked]:
+    """Rays through a double Gauss of eleven surfaces, d line, each tracer in processes of its own, in turns.
+    Memory: peak of the first call above what was in use. Error: largest, of 256 rays, against our trace in
+    float64, which the tests hold to 3e-14 mm. Analyses: float64, one thread, in turns in one process; three
+    fields and lines of 800 rays, fans of 65 rays, wavefronts of 64 cells, point spreads of 128 cells padded to
+    512; a design step is the merit of three fields and its gradient to all curvatures and distances."""
+    config = run.config
+    peer = bool(installed({"optiland": "optiland"}))
+    count = 100_000 if config.quick else 1_000_000
+    axes = {
+        "precision": ("float32", "float64"),
+        "kind": ("forward", "forward_backward"),
+        "tracer": ("codesign", "optiland") if peer else ("codesign",),
     }
-    chart = Panel(points, "million ray-surfaces per second", "largest position error, mm", "xy")
-    run.figure(panels(chart, width=8), "tracers", "Further right is faster, further down is truer.")
-    judged = []
+    given = {"count": count, "repeats": config.repeats, "seed": config.seed}
+    rows = sweep(run, tracing, "tracers", processes=1, turns=config.rounds, given=given, **axes)
+    tabulate(run, f"{count:,} rays, medians", rows, *axes, prefix="trace")
+    if not peer:
+        run.text("Not installed, hence not compared: optiland.")
+        return []
+    figures = []
     for (precision, kind), least in ASKED_SPEED.items():
-        if "optiland-torch" in peers:
-            ours, peer = (rows[tracer, precision, kind] for tracer in ("codesign", "optiland-torch"))
-            what = f"{kind} {precision}".replace("_", " + ")
-            judged += [
-                Asked(
-                    f"speed over optiland with torch, {what}", peer["wall_s"] / ours["wall_s"], least=least
-                ),
-                Asked(
-                    f"memory over optiland's, {what}", ours["peak_mb"] / peer["peak_mb"], most=ASKED_MEMORY
-                ),
-            ]
-    return judged
+        wall_s, peak_mb = (
+            column(rows, name, precision=precision, kind=kind) for name in ("wall_s", "peak_mb")
+        )
+        what = f"{precision} {kind}, optiland with torch"
+        figures.append(Asked(f"{what}: time over ours", wall_s[1] / wall_s[0], least=least))
+        figures.append(Asked(f"{what}: our memory over its", peak_mb[0] / peak_mb[1], most=ASKED_MEMORY))
+    given = {"rounds": 3 if config.quick else 11}
+    rows = sweep(run, analyses, "analyses", processes=1, given=given, backend=("torch", "numpy"))
+    tabulate(run, "Analyses against optiland, medians", rows, "work", "backend", prefix="analysis")
+    what = "least CPU time of an analysis by optiland over ours"
+    return [*figures, Asked(what, min(column(rows, "ratio")), least=ASKED_ANALYSIS)]
 
 
-def analyses(run: Run[Config]) -> list[Asked]:
-    """Analysis functions and a design step against both of optiland's backends."""
-    rounds = 3 if run.config.quick else 11
-    rows = sweep(
-        run, lens_peers.analyses, "analyses", processes=1, backend=("torch", "numpy"), rounds=[rounds]
-    )
-    run.record(**metrics(rows, "work", "backend", prefix="analysis"))
-    run.section(
-        "Analysis functions and a design step",
-        "Double Gauss, float64, in turns in one process with one thread each. Spots and fans: three "
-        "fields and three wavelengths, 800 rays and 2 x 65 rays each; wavefront of 64 cells, point spread"
-        " of 128 cells padded to 512, MTF of three fields with 256 frequencies, distortion and field "
-        "curvature at 128 fields; a design step is the merit of three fields with 800 rays each and its "
-        "gradient to all curvatures and distances.",
-    )
-    titles = {
-        "ours_ms": "ours, CPU-ms",
-        "peer_ms": "optiland, CPU-ms",
-        "ratio": "ratio",
-        "wall_ratio": "by the clock",
-    }
-    run.table("Against optiland, medians", *table(rows, work="work", backend="backend", **titles))
-    return [
-        Asked("least speed of an analysis over optiland", min(column(rows, "ratio")), least=ASKED_ANALYSIS)
-    ]
+def tracing(precision: str, kind: str, tracer: str, count: int, repeats: int, seed: int) -> dict[str, Any]:
+    """Cost and largest error of one tracer."""
+    warnings.simplefilter("ignore")
+    make = trace_by_optiland if tracer == "optiland" else trace_by_us
+    # imports, and compiles what does not depend on the number of rays
+    make(precision, kind, *rays(LOOKED_AT, precision, seed))()
+    origin, direction = rays(count, precision, seed)
+    work = make(precision, kind, origin, direction)
+    found = cost(work, repeats)
+    few, where = (part[:LOOKED_AT].double() for part in (origin, direction))
+    with torch.no_grad():
+        truth = double_gauss().trace(few, where / where.norm(dim=1, keepdim=True)).position_mm[:, :2]
+    error = float((work()[:LOOKED_AT, :2].double() - truth).abs().max())
+    speed = SURFACES * count / found["wall_s"] / 1e6
+    return found | {"million_ray_surfaces_per_s": speed, "error_mm": error}
 
 
-def growth(run: Run[Config], most: int) -> list[Asked]:
-    """Time against rays and surfaces: least of many turns, since what else runs on the machine only adds,
-    and a straight line a + b N fitted to the relative errors."""
-    counts = [n for n in (10_000, 30_000, 100_000, 300_000, 1_000_000, 3_000_000, 10_000_000) if n <= most]
-    charts = []
+def rays(count: int, precision: str, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Origins and directions [N, 3] of parallel rays over a square of 20 mm, 5.7 degrees off the axis."""
+    across = np.random.default_rng(seed).uniform(-10, 10, (count, 2))
+    origin = np.concatenate([across, np.full((count, 1), -5.0)], 1)
+    direction = np.tile([0.0, 0.1, 0.99**0.5], (count, 1))
+    return torch.tensor(origin.astype(precision)), torch.tensor(direction.astype(precision))
+
+
+def double_gauss(precision: str = "float64") -> lens.GeoLens:
+    """The published lens; its curvatures and distances ask for gradients."""
+    return lens.load("double-gauss", getattr(torch, precision)).freeze("conic", "asphere", "index_offset")
+
+
+def trace_by_us(precision, kind, origin, direction) -> Callable[[], torch.Tensor]:
+    """A function that traces the rays once, or goes back to all that the lens learns; returns positions."""
+    geo = double_gauss(precision)
+    seeds = torch.ones_like(origin)
+
+    def work():
+        if kind == "forward":
+            with torch.no_grad():
+                return geo.trace(origin, direction).position_mm
+        geo.zero_grad()
+        position = geo.trace(origin, direction).position_mm
+        position.backward(seeds)
+        return position.detach()
+
+    return work
+
+
+def trace_by_optiland(precision, kind, origin, direction) -> Callable[[], torch.Tensor]:
+    import optiland.backend as be  # pyright: ignore[reportMissingImports]
+    from optiland.rays import RealRays  # pyright: ignore[reportMissingImports]
+
+    _prepare(be, "torch", precision, kind == "forward_backward")
+    group = optiland_double_gauss().surfaces
+    learned = []
+    if kind == "forward_backward":
+        values = [v for s in group.surfaces[1:-1] for v in (s.geometry.radius, s.geometry.cs.z)]
+        learned = [v.requires_grad_(True) for v in values if bool(be.isfinite(v))]
+    parts = [be.array(part.numpy().copy()) for part in (*origin.T, *direction.T)]
+    ones = be.ones_like(parts[0])
+
+    def work():
+        traced = RealRays(*parts, ones, lens.WAVELENGTH_UM["d"] * ones)
+        group.trace(traced)
+        if learned:
+            (traced.x.sum() + traced.y.sum()).backward()
+            for value in learned:
+                value.grad = None
+        return torch.stack([traced.x.detach(), traced.y.detach()], 1)
+
+    return work
+
+
+def analyses(backend: str, rounds: int) -> list[dict[str, Any]]:
+    """Rows (work, ours and the peer's median processor time, ratios), in turns. Both have the same double
+    Gauss, fields and wavelengths, and as many rays (at least as many on our side)."""
+    warnings.simplefilter("ignore")
+    torch.set_num_threads(1)
+    drjit.set_thread_count(1)
+    ours = our_analyses()
     rows = []
-    for label, numbers in (("rays", counts), ("surfaces", LONGER)):
-        series = {}
-        for kind in ("forward", "forward_backward"):
-            if label == "rays":
-                geo = lens_peers.double_gauss("float32")
-                works = {n: lens_peers.work_of_tracing(geo, kind, n, run.config.seed) for n in numbers}
-            else:
-                works = {
-                    n: lens_peers.work_of_tracing(weak(n), kind, 300_000, run.config.seed) for n in numbers
-                }
-            with run.progress(8 * len(works), f"growth with {label}") as progress:
-                found = turns(works, rounds=8, repeats=2, after_each=progress.advance)
-            least = [min(timing.wall_s) for timing in found.values()]
-            fixed, each, worst = line(numbers, least)
-            name = kind.replace("_", " + ")
-            series |= {
-                name: (numbers, least),
-                f"{name}, line": (numbers, [fixed + each * n for n in numbers]),
-            }
-            rows.append(
-                {"work": name, "over": label, "fixed_ms": 1e3 * fixed, "ns_each": 1e9 * each, "worst": worst}
-            )
-        charts.append(Panel(series, label, "seconds", "xy"))
-    run.record(**metrics(rows, "work", "over"))
-    run.section("Growth", "Ours, float32. Lines: a fixed cost of the call and a cost per ray or surface.")
-    run.table("Straight lines", *table(rows))
-    run.figure(panels(*charts), "growth", "Time against rays (11 surfaces) and surfaces (300,000 rays).")
-    return [Asked("departure from a line", max(column(rows, "worst")), most=ASKED_LINEAR)]
+    for name, peer in optiland_analyses(backend).items():
+        found = turns({"ours": ours[name], "peer": peer}, rounds, warm=0 if rounds > 1 else 1)
+        ours_s, peer_s = found["ours"], found["peer"]
+        cpu = {"ours_ms": 1e3 * ours_s.cpu, "peer_ms": 1e3 * peer_s.cpu, "ratio": peer_s.cpu / ours_s.cpu}
+        rows.append({"work": name, **cpu, "wall_ratio": peer_s.wall / ours_s.wall})
+    return rows
 
 
-def weak(count: int) -> GeoLens:
-    """A lens of so many weak surfaces, glass and air in turns, in float32."""
-    return lens_peers.stack(count, alike=True).float().freeze("conic", "asphere", "index_offset")
+def our_analyses() -> dict[str, Callable[[], Any]]:
+    """Analysis functions and a design step by name."""
+    geo = lens.load("double-gauss").requires_grad_(False)
+    learned = double_gauss()
+    half = math.radians(HALF_DEG)
+    fields = [share * half for share in FIELDS]
+    line = [half * (k / (POINTS - 1)) for k in range(POINTS)]
+    frequency = torch.linspace(0, 500, PADDED // 2, dtype=geo.dtype)
+
+    def spot():
+        found = [lens.spots(geo, fields, lens.WAVELENGTH_UM[k], SPOT_GRID) for k in LINES]
+        return analysis.spot_radius_mm(found[0][0][2], found[0][1][2])
+
+    def design_step():
+        learned.zero_grad()
+        lens.rms_spot_mm(learned, fields, grid=SPOT_GRID).square().sum().backward()
+
+    still = {
+        "spot": spot,
+        "fan": lambda: [
+            analysis.ray_fan(geo, f, lens.WAVELENGTH_UM[k], FAN_RAYS) for f in fields for k in LINES
+        ],
+        "wavefront": lambda: analysis.wavefront(geo, fields[2], grid=OPD_GRID).waves.std(),
+        "psf": lambda: analysis.diffraction_psf(geo, fields[0], grid=PSF_GRID, padding=PADDED // PSF_GRID),
+        "mtf": lambda: [analysis.diffraction_mtf(geo, f, frequency, grid=PSF_GRID) for f in fields],
+        "seidel": lambda: seidel_sums(geo, half).total,
+        "distortion": lambda: analysis.distortion_percent(geo, line),
+        "field_curvature": lambda: analysis.focus_shift_mm(geo, line),
+    }
+    return {name: torch.no_grad()(work) for name, work in still.items()} | {"design_step": design_step}
 
 
-def line(x, y) -> tuple[float, float, float]:
-    """Fit y = a + b x with equal relative weights; returns a, b and the largest relative departure."""
-    x = np.array(x, dtype=float)
-    y = np.array(y)
-    a, b = np.linalg.lstsq(np.stack([1 / y, x / y], 1), np.ones_like(y), rcond=None)[0]
-    return float(a), float(b), float(np.abs((a + b * x) / y - 1).max())
+def optiland_analyses(backend: str) -> dict[str, Callable[[], Any]]:
+    """The same of optiland; the design step where its backend has gradients."""
+    import optiland.analysis as peer  # pyright: ignore[reportMissingImports]
+    import optiland.backend as be  # pyright: ignore[reportMissingImports]
+    from optiland.aberrations import Aberrations  # pyright: ignore[reportMissingImports]
+    from optiland.mtf import FFTMTF  # pyright: ignore[reportMissingImports]
+    from optiland.psf import FFTPSF  # pyright: ignore[reportMissingImports]
+    from optiland.wavefront import OPD  # pyright: ignore[reportMissingImports]
+
+    _prepare(be, backend, "float64", gradients=False)
+    optic = optiland_double_gauss()
+
+    def spot():
+        found = peer.SpotDiagram(optic, num_rings=SPOT_GRID, distribution="uniform").data[2][0]
+        x, y = found.x - found.x.mean(), found.y - found.y.mean()
+        return ((x * x + y * y).mean()) ** 0.5
+
+    def wavefront():
+        found = OPD(optic, (0, 1), "primary", num_rays=OPD_GRID, distribution="uniform")
+        return next(iter(found.data.values())).opd.std()
+
+    def seidel():
+        Aberrations(optic).third_order()
+        return Aberrations(optic).seidels()
+
+    works = {
+        "spot": spot,
+        "fan": lambda: peer.RayFan(optic, num_points=FAN_RAYS),
+        "wavefront": wavefront,
+        "psf": lambda: FFTPSF(optic, (0, 0), "primary", num_rays=PSF_GRID, grid_size=PADDED).psf.max(),
+        "mtf": lambda: FFTMTF(optic, num_rays=PSF_GRID, grid_size=PADDED).mtf,
+        "seidel": seidel,
+        "distortion": lambda: peer.Distortion(optic, wavelengths="primary", num_points=POINTS).data,
+        "field_curvature": lambda: peer.FieldCurvature(optic, wavelengths="primary", num_points=POINTS).data,
+    }
+    return works | ({"design_step": optiland_design_step(be)} if backend == "torch" else {})
 
 
-def chunks(run: Run[Config], most: int) -> None:
-    """Peak memory of a gradient, whole and as a sum over chunks."""
-    rows = sweep(
-        run,
-        lens_peers.tracing,
-        "memory",
-        processes=1,
-        case={way: (way, "float32", "forward_backward") for way in ("codesign", "codesign-chunks")},
-        count=(most // 10, most),
-        repeats=[1],
-        seed=[run.config.seed],
-    )
-    run.record(**metrics(rows, "case", "count", prefix="memory"))
-    run.table(
-        "Peak memory of a gradient beside the rays, float32",
-        *table(rows, case="way", count="rays", peak_mb="MB"),
-    )
+def optiland_design_step(be: Any) -> Callable[[], None]:
+    """One step of a torch optimiser of optiland without the optimiser: update, merit, gradient."""
+    from optiland.optimization import OptimizationProblem  # pyright: ignore[reportMissingImports]
+
+    be.grad_mode.enable()
+    optic = optiland_double_gauss()
+    problem = OptimizationProblem()
+    spot = {"optic": optic, "surface_number": -1, "Hx": 0, "num_rays": SPOT_GRID}
+    spot |= {"wavelength": optic.primary_wavelength, "distribution": "uniform"}
+    for share in FIELDS:
+        problem.add_operand("rms_spot_size", target=0, weight=1, input_data={**spot, "Hy": share})
+    for k in range(1, optic.surfaces.num_surfaces - 1):
+        if bool(be.isfinite(optic.surfaces.radii[k])):
+            problem.add_variable(optic, "radius", surface_number=k)
+        problem.add_variable(optic, "thickness", surface_number=k)
+    parameters = [torch.nn.Parameter(be.array(v.value)) for v in problem.variables]
+    be.grad_mode.disable()
+
+    def step():
+        with be.grad_mode.temporary_enable():
+            for parameter, variable in zip(parameters, problem.variables, strict=True):
+                parameter.grad = None
+                variable.update(parameter)
+            problem.update_optics()
+            problem.sum_squared().backward()
+
+    return step
 
 
-def compiling(run: Run[Config]) -> None:
-    """Seconds until the first gradient of a lens is there, with an empty kernel cache."""
-    rows = sweep(run, first_gradient, "compiling", parts={"alike": True, "unlike": False}, count=COLD)
-    run.record(**metrics(rows, "parts", "count", prefix="compile_first_gradient"))
-    for parts in ("alike", "unlike"):
-        first, last = (column(rows, "cpu_s", parts=parts, count=n)[0] for n in (COLD[1], COLD[-1]))
-        exponent = math.log(last / first) / math.log(COLD[-1] / COLD[1])
-        run.record(**{f"compile_first_gradient_exponent_{parts}": exponent})
-    run.table(
-        "First gradient of a long lens, kernels compiled from nothing",
-        *table(rows, count="surfaces", parts="parts", cpu_s="CPU-s", wall_s="wall s"),
-        "Alike: all numbers ask for a gradient, so every part of eight surfaces shares a kernel.",
-    )
+def optiland_double_gauss() -> Any:
+    """The published double Gauss in optiland, with its field angles and the lines d, F, C."""
+    from optiland.materials import IdealMaterial  # pyright: ignore[reportMissingImports]
+    from optiland.optic import Optic  # pyright: ignore[reportMissingImports]
+
+    optic = Optic()
+    optic.surfaces.add(index=0, thickness=np.inf)
+    published = lens.load("double-gauss")
+    for i, s in enumerate(published.surfaces):
+        optic.surfaces.add(
+            index=i + 1,
+            radius=s.radius_mm,
+            thickness=s.thickness_mm,
+            material=IdealMaterial(s.medium.index_d) if s.medium else "air",
+            is_stop=i == published.stop_index,
+        )
+    optic.surfaces.add(index=len(published.surfaces) + 1)
+    optic.set_aperture("EPD", published.entrance_pupil_diameter_mm)
+    optic.set_field_type("angle")
+    for share in FIELDS:
+        optic.add_field(y=share * HALF_DEG)
+    for k in LINES:
+        optic.add_wavelength(value=lens.WAVELENGTH_UM[k], is_primary=k == "d")
+    return optic
 
 
-def first_gradient(count: int, parts: bool) -> dict[str, float]:
-    """``lens_peers.first_gradient`` in a fresh process with a kernel cache of its own."""
-    with tempfile.TemporaryDirectory() as home:
-        return apart(lens_peers.first_gradient, count, parts, environment={"HOME": home})
+def _prepare(be, backend, precision, gradients):
+    be.set_backend(backend)
+    if backend == "torch":
+        be.set_device("cpu")
+        be.set_precision(precision)
+        (be.grad_mode.enable if gradients else be.grad_mode.disable)()

@@ -1,13 +1,9 @@
 """Stage "levels": every stage's cheaper and finer levels on one small scene, a camera that passes a
-textured wall, and the cheapest that is good enough.
+textured wall, and the cheapest that is good enough."""
 
-Lens (pinhole, thin, traced), samples per pixel, scene (bitmap, analytic), event layers and frame rates,
-time bins, flow models. A level's error is measured against the finest level or against the truth.
-"""
-
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import torch
@@ -17,7 +13,7 @@ from codesign.errors import DomainError
 from scenes import textures, trajectories, worlds
 from studies.frame.bench import measure
 from studies.frame.run import Run
-from studies.frame.show import Panel, panels, table
+from studies.frame.show import Asked, Panel, panels, tabulate
 from studies.frame.sweep import metrics, plain, select, sweep
 from studies.speed_error import Config
 
@@ -32,20 +28,11 @@ SENSOR = events.SensorModel(THETA, THETA)
 
 
 @dataclass(frozen=True)
-class Level:
-    """One way to compute a stage: ``work`` does it and is timed."""
-
-    name: str
-    work: Callable[[], Any]
-
-
-@dataclass(frozen=True)
 class Part:
-    """A stage of the chain: levels from cheap to fine, the error of what a level returns, what that error
-    measures, and how much of it is tolerated."""
+    """A stage of the chain: ways to compute it from cheap to fine, the error of what one returns, what that
+    error measures, and how much of it is tolerated."""
 
-    name: str
-    levels: tuple[Level, ...]
+    levels: Mapping[str, Callable[[], Any]]
     error: Callable[[Any], float]
     measure: str
     tolerance: float
@@ -76,9 +63,8 @@ class Setup:
         total = torch.zeros(at.numel(), at.numel(), dtype=torch.float64)
         for (fx, fy), a, shift in zip(frequency.tolist(), amplitude.tolist(), phase.tolist(), strict=True):
             total += a * (2 * torch.pi * (fx * at[None] + fy * at[:, None]) + shift).cos()
-        return worlds.wall(
-            100 * total.exp().flip(0).numpy(), texel_m, half_m
-        )  # the first row of a bitmap is the top
+        # the first row of a bitmap is the top
+        return worlds.wall(100 * total.exp().flip(0).numpy(), texel_m, half_m)
 
     def plane(self, dtype):
         """The same texture in closed form, in the plane of the wall."""
@@ -88,22 +74,18 @@ class Setup:
 
     def path(self, rate_hz):
         """Times and poses over the interval at a frame rate."""
-        t_s = trajectories.times(round(DURATION_S * rate_hz) + 1, rate_hz) * (
-            DURATION_S * rate_hz / round(DURATION_S * rate_hz)
-        )
-        return t_s, trajectories.translation(
-            pose.look_at((0.0, -DISTANCE_M, 0.0), (0.0, 0.0, 0.0)), VELOCITY_M_S, t_s
-        )
+        t_s = torch.linspace(0, DURATION_S, round(DURATION_S * rate_hz) + 1, dtype=torch.float64)
+        start = pose.look_at((0.0, -DISTANCE_M, 0.0), (0.0, 0.0, 0.0))
+        return t_s, trajectories.translation(start, VELOCITY_M_S, t_s)
 
     def camera(self, optics, samples):
         return render.Camera(optics, self.size_px, self.size_px, PITCH_MM, samples, self.seed)
 
     @torch.no_grad()
-    def frames(self, rate_hz, optics=None, samples=8, world=None):
+    def frames(self, rate_hz=60, optics=None, samples=8, world=None):
         """[T, H, W] frames at a rate, traced lens and wall unless others are given."""
-        return render.frames(
-            self.camera(optics or self.lens, samples), world or self.wall, self.path(rate_hz)[1]
-        )
+        camera = self.camera(optics or self.lens, samples)
+        return render.frames(camera, world or self.wall, self.path(rate_hz)[1])
 
     @cached_property
     def stream(self):
@@ -116,44 +98,37 @@ class Setup:
         ends = self.path(60)[1][[0, -1]]
         return render.true_flow(self.camera(lens.load("cooke-triplet").freeze(), 1), self.wall, ends)[0]
 
+    def volume(self, bins):
+        return events.from_stream(self.stream, 0, round(DURATION_S * 1e6), bins)
 
-def stage(run: Run[Config]) -> str:
-    """Time against error of every level, and the choice."""
-    setup = Setup(32 if run.config.quick else 64, run.config.seed)
-    found = {part.name: part for part in parts(setup)}
+
+def stage(run: Run[Config]) -> list[Asked]:
+    """Every level of every stage, and the cheapest whose error is tolerated."""
+    found = parts(Setup(32 if run.config.quick else 64, run.config.seed))
 
     def cell(part):
         rows = []
-        for level in part.levels:
-            error = part.error(level.work())
-            timing = measure(level.work, run.config.repeats, warm=1)
-            rows.append({"level": level.name, "cpu_s": timing.cpu, "wall_s": timing.wall, "error": error})
+        for name, work in part.levels.items():
+            timing = measure(work, run.config.repeats, warm=1)
+            error = part.error(work())
+            rows.append({"level": name, "cpu_s": timing.cpu, "wall_s": timing.wall, "error": error})
         return rows
 
     rows = sweep(run, cell, "levels", part=found)
-    lines = []
     for name, part in found.items():
         levels = select(rows, part=name)
         best, enough = cheapest(levels, part.tolerance)
-        run.record(**metrics(levels, "part", "level"))
         run.record(**metrics([{**best, "within_tolerance": int(enough)}], "part", prefix="chosen"))
-        verdict = (
-            f"**{best['level']}** is the cheapest level with an error of at most {part.tolerance:g}"
-            if enough
-            else f"no level stays within {part.tolerance:g}; **{best['level']}** comes closest"
-        )
-        lines.append(f"{name}: {verdict} ({best['error']:.2g}, {1e3 * best['cpu_s']:.3g} CPU-ms).")
-        run.text(lines[-1])
+        verdict = "is the cheapest level within" if enough else "comes closest; none is within"
+        figures = f"({best['error']:.2g}, {1e3 * best['cpu_s']:.3g} CPU-ms)"
+        tabulate(run, name.capitalize(), levels, "part", "level")
+        run.text(f"**{best['level']}** {verdict} an error of {part.tolerance:g} {figures}.")
         floor = min([part.tolerance, *(row["error"] for row in levels if row["error"] > 0)]) / 5
         points = {row["level"]: ([1e3 * row["cpu_s"]], [max(row["error"], floor)]) for row in levels}
         chart = Panel(points, "processor time, ms (median)", "error", "xy", [part.tolerance])
-        run.figure(
-            panels(chart, width=7),
-            f"speed_error_{plain(name)}",
-            f"Error: {part.measure}. Dashed: the tolerance. A level without error stands at the bottom.",
-        )
-        run.table("", *table(levels, level="level", cpu_s="CPU-s", wall_s="wall s", error="error"))
-    return " ".join(lines)
+        caption = f"Error: {part.measure}. Dashed: the tolerance. A level without error stands at the bottom."
+        run.figure(panels(chart, width=7), f"speed_error_{plain(name)}", caption)
+    return []
 
 
 def cheapest(levels: list[dict[str, Any]], tolerance: float) -> tuple[dict[str, Any], bool]:
@@ -170,110 +145,58 @@ def cheapest(levels: list[dict[str, Any]], tolerance: float) -> tuple[dict[str, 
     return min(levels, key=lambda level: level["error"]), False
 
 
-def parts(setup: Setup) -> list["Part"]:
+def parts(setup: Setup) -> dict[str, Part]:
     """All stages of the chain with their levels."""
-    return [_lens(setup), _samples(setup), _scene(setup), _events(setup), _bins(setup), _flow(setup)]
-
-
-def _contrast_error(truth):
-    """RMS difference from ``truth`` over its RMS contrast."""
-    return lambda found: float(
-        (found.double() - truth.double()).square().mean().sqrt() / truth.double().std()
-    )
-
-
-def _lens(setup):
     optics = {
         "pinhole": lens.Pinhole(setup.lens.first_order().efl_mm.detach()),
         "thin lens": setup.lens.thin(),
         "traced": setup.lens,
     }
-    levels = tuple(Level(name, lambda o=o: setup.frames(60, o, 16)) for name, o in optics.items())
-    return Part(
-        "lens",
-        levels,
-        _contrast_error(levels[-1].work()),
-        "RMS difference of frames from the traced lens, over their contrast",
-        0.05,
-    )
-
-
-def _samples(setup):
-    levels = tuple(
-        Level(f"{n} samples", lambda n=n: setup.frames(60, samples=n)) for n in (1, 2, 4, 8, 16, 32, 64)
-    )
-    return Part(
-        "sampling",
-        levels,
-        _contrast_error(setup.frames(60, samples=256)),
-        "RMS difference of frames from 256 samples, over their contrast",
-        0.01,
-    )
-
-
-def _scene(setup):
-    made = {
+    scenes = {
         "Mitsuba bitmap, float32": setup.wall,
         "analytic, float32": setup.plane(torch.float32),
         "analytic, float64": setup.plane(torch.float64),
     }
-    levels = tuple(
-        Level(name, lambda world=world: setup.frames(60, world=world)) for name, world in made.items()
-    )
-    return Part(
-        "scene",
-        levels,
-        _contrast_error(levels[-1].work()),
-        "RMS difference of frames from the analytic scene in float64, over their contrast",
-        0.01,
-    )
-
-
-def _events(setup):
-    truth = events.to_counts(setup.stream, setup.path(60)[0][[0, -1]])[0]
     layers = {
         "sigmoid": lambda frames: events.soft(frames, THETA),
         "soft counts": lambda frames: events.soft_counts(frames, THETA, THETA),
         "memory": lambda frames: events.memory(frames, THETA, THETA)[0],
     }
-    levels = tuple(
-        Level(f"{name}, {rate} fps", lambda layer=layer, rate=rate: layer(setup.frames(rate)).sum(0))
+    through = {name: partial(setup.frames, optics=o, samples=16) for name, o in optics.items()}
+    sampled = {f"{n} samples": partial(setup.frames, samples=n) for n in (1, 2, 4, 8, 16, 32, 64)}
+    seen = {name: partial(setup.frames, world=world) for name, world in scenes.items()}
+    counted = {
+        f"{name}, {rate} fps": lambda layer=layer, rate=rate: layer(setup.frames(rate)).sum(0)
         for name, layer in layers.items()
         for rate in RATES_HZ
-    )
-    return Part(
-        "events",
-        levels,
-        lambda found: float((found - truth).abs().sum() / truth.sum()),
-        f"wrong counts per true event; truth: hard events at {FINEST_HZ} fps",
-        0.1,
-    )
+    }
+    binned = {f"{n} bins": lambda n=n: flow.estimate_lk(setup.volume(n)) for n in range(2, 10)}
+    models = {
+        f"{model}, {len(blurs)} levels": partial(flow.estimate_lk, setup.volume(5), model, levels_px=blurs)
+        for model in ("constant", "affine", "quadratic")
+        for blurs in ((1.0,), (2.0, 1.0), (4.0, 2.0, 1.0))
+    }
+    truth = events.to_counts(setup.stream, setup.path(60)[0][[0, -1]])[0]
+    of_frames = "RMS difference over contrast, from "
+    of_flow = "endpoint error from hard events, px"
+
+    def wrong(found):
+        return float((found - truth).abs().sum() / truth.sum())
+
+    def endpoint(field):
+        return float(flow.metrics.aee(field.flow_px.double(), setup.true_flow))
+
+    return {
+        "lens": Part(through, _off(through["traced"]()), f"{of_frames}the traced lens", 0.05),
+        "sampling": Part(sampled, _off(setup.frames(samples=256)), f"{of_frames}256 samples", 0.01),
+        "scene": Part(seen, _off(seen["analytic, float64"]()), f"{of_frames}analytic float64", 0.01),
+        "events": Part(counted, wrong, f"wrong counts per true one, hard events at {FINEST_HZ} fps", 0.1),
+        "time bins": Part(binned, endpoint, f"affine, {of_flow}", 0.5),
+        "flow": Part(models, endpoint, f"5 bins, {of_flow}", 0.5),
+    }
 
 
-def _flow_error(setup):
-    return lambda field: float(flow.metrics.aee(field.flow_px.double(), setup.true_flow))
-
-
-def _volume(setup, bins):
-    return events.from_stream(setup.stream, 0, round(DURATION_S * 1e6), bins)
-
-
-def _bins(setup):
-    levels = tuple(Level(f"{n} bins", lambda n=n: flow.estimate_lk(_volume(setup, n))) for n in range(2, 10))
-    return Part(
-        "time bins", levels, _flow_error(setup), "endpoint error of affine flow from hard events, px", 0.5
-    )
-
-
-def _flow(setup):
-    volume = _volume(setup, 5)
-    blurs = ((1.0,), (2.0, 1.0), (4.0, 2.0, 1.0))
-    chosen = [(model, blur) for model in ("constant", "affine", "quadratic") for blur in blurs]
-    levels = tuple(
-        Level(
-            f"{model}, {len(blur)} level{'s' * (len(blur) > 1)}",
-            lambda m=model, b=blur: flow.estimate_lk(volume, m, levels_px=b),
-        )
-        for model, blur in chosen
-    )
-    return Part("flow", levels, _flow_error(setup), "endpoint error from hard events in 5 bins, px", 0.5)
+def _off(truth):
+    """RMS difference from ``truth`` over its RMS contrast."""
+    truth = truth.double()
+    return lambda found: float((found.double() - truth).square().mean().sqrt() / truth.std())

@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from matplotlib.figure import Figure
 from torch import nn
 
 from codesign import events
@@ -18,6 +17,8 @@ from codesign.events import SensorModel, SpikeEsim, TwoBranchSpikes
 from codesign.types import EventStream
 from scenes.digits import CLASSES, LEG_S, WINDOW_PX, draw_pictures, frame_times, frames
 from studies.frame.compare import student
+from studies.frame.show import pictures, table
+from studies.frame.sweep import column, metrics, select, sweep
 from studies.spike_esim.train import Store, descend, objective
 
 TEST, CALIBRATION, TRAINING = 1, 2, 3  # each draws pictures, noise and weights of its own
@@ -206,35 +207,27 @@ def study(run):
     for name, number in least.items():
         if getattr(config, name) < number:
             raise DomainError(f"{name} is {getattr(config, name)}; at least {number} are needed.")
-    store = Store(run)
     tiles, labels = draw_pictures(config.test, "test", (config.seed, TEST))
     heard = record(config, tiles, PHYSICAL, TEST)
-    sources = {**SOURCES, **best_thresholds(run, store), **fitted(run, store, calibration(config)[0])}
-    right = {key: [] for key in sources}
-    with run.progress(config.seeds * len(sources), "classifiers") as progress:
-        for seed in range(config.seeds):
-            pictures = draw_pictures(config.training, "training", (config.seed, TRAINING, seed))
-            for key, source in sources.items():
+    sources = {**SOURCES, **best_thresholds(run), **fitted(run, Store(run), calibration(config)[0])}
 
-                def learnt(source=source, pictures=pictures, seed=seed):
-                    voxels = record(config, pictures[0], source, 100 * TRAINING + seed)
-                    net = train(voxels, pictures[1], config.epochs, config.seed + seed, run.device)
-                    found = {"heard": predict(net, heard, run.device), "events": voxels.sum() / len(voxels)}
-                    return (
-                        found
-                        if seed
-                        else {**found, "own": predict(net, record(config, tiles, source, TEST), run.device)}
-                    )
+    def cell(seed, source):
+        pictures, of = draw_pictures(config.training, "training", (config.seed, TRAINING, seed))
+        voxels = record(config, pictures, source, 100 * TRAINING + seed)
+        net = train(voxels, of, config.epochs, config.seed + seed, run.device)
+        found = {"accuracy": accuracy(run, net, heard, labels)}
+        if seed == 0:
+            found["own_events_accuracy"] = accuracy(run, net, record(config, tiles, source, TEST), labels)
+            found["events_per_picture"] = float(voxels.sum() / len(voxels))
+        return found
 
-                stored = store(f"{key}/{seed}", learnt)
-                right[key].append((stored["heard"] == labels).double().mean())
-                if seed == 0:
-                    own = (stored["own"] == labels).double().mean()
-                    run.record(
-                        **{f"{key}_own_events_accuracy": own, f"{key}_events_per_picture": stored["events"]}
-                    )
-                progress.advance(accuracy=float(right[key][-1]))
-    show(run, sources, {key: torch.stack(values) for key, values in right.items()}, tiles[:CLASSES])
+    rows = sweep(run, cell, "classifiers", seed=range(config.seeds), source=sources)
+    show(run, sources, rows, tiles[:CLASSES])
+
+
+def accuracy(run, net, voxels, labels):
+    """Share of recordings whose class a classifier finds."""
+    return float((predict(net, voxels, run.device) == labels).double().mean())
 
 
 def calibration(config):
@@ -242,67 +235,71 @@ def calibration(config):
     return draw_pictures(config.calibration, "training", (config.seed, CALIBRATION))
 
 
-def best_thresholds(run, store):
+def best_thresholds(run):
     """Naive and ESIM, each with the threshold whose events train the best classifier of the calibration
     recordings."""
     config = run.config
     tiles, labels = calibration(config)
     heard = record(config, tiles, PHYSICAL, CALIBRATION)
     pictures, of = draw_pictures(config.training, "training", (config.seed, TRAINING, config.seeds))
+
+    def cell(family, theta):
+        voxels = record(config, pictures, Source("", FAMILIES[family][1](theta)), TRAINING)
+        net = train(voxels, of, config.epochs, config.seed, run.device)
+        return {"accuracy": accuracy(run, net, heard, labels)}
+
+    thetas = (0.15, 0.3) if config.quick else THETAS
+    rows = sweep(run, cell, "thresholds", family=list(FAMILIES), theta=thetas)
     found = {}
     for key, (label, make) in FAMILIES.items():
-        scores = {}
-        for theta in (0.15, 0.3) if config.quick else THETAS:
-
-            def learnt(theta=theta, make=make):
-                voxels = record(config, pictures, Source("", make(theta)), TRAINING)
-                return {
-                    "heard": predict(
-                        train(voxels, of, config.epochs, config.seed, run.device), heard, run.device
-                    )
-                }
-
-            scores[theta] = float((store(f"search_{key}/{theta}", learnt)["heard"] == labels).double().mean())
-        best = max(scores, key=scores.__getitem__)
+        best = max(select(rows, family=key), key=lambda row: row["accuracy"])["theta"]
         run.record(**{f"{key}_best_theta": best})
         found[f"{key}_best"] = Source(f"{label}, best θ {best:g}", make(best))
     return found
 
 
-def show(run, sources, accuracy, tiles):
+def show(run, sources, rows, tiles):
     """Tables of accuracies and of what was asked, and a picture of every source's events."""
-    means = {key: student(values) for key, values in accuracy.items()}
-    gains = {(a, b): student(accuracy[a] - accuracy[b]) for a, b in ASKED}
+    right = {key: torch.tensor(column(rows, "accuracy", source=key)) for key in sources}
+    means = {key: student(values) for key, values in right.items()}
+    gains = {(a, b): student(right[a] - right[b]) for a, b in ASKED}
     order = sorted(sources, key=lambda key: -means[key].value)
     for name, mean in {**means, **{f"{a}_over_{b}": gain for (a, b), gain in gains.items()}}.items():
         run.record(**{f"{name}_mean": mean.value, f"{name}_low": mean.low, f"{name}_high": mean.high})
-    now = run.metrics
-    columns = ("trained on events of", "physical events, %", "its own events, %", "events per picture")
-    rows = []
-    for key in order:
-        own, number = 100 * now[f"{key}_own_events_accuracy"], now[f"{key}_events_per_picture"]
-        rows.append((sources[key].label, f"{means[key]:.1%}", own, number))
-    run.table(
-        "Accuracy",
-        columns,
-        rows,
-        f"95 % intervals over {run.config.seeds} seeds; chance is {1 / CLASSES:.0%}.",
+    first = {row["source"]: row for row in select(rows, seed=0)}
+    run.record(
+        **metrics(
+            [{k: v for k, v in row.items() if k not in ("seed", "accuracy")} for row in first.values()],
+            "source",
+        )
     )
-    rows = [(f"{sources[a].label} over {sources[b].label}", f"{gain:+.1%}",
-             "met" if gain.value >= 0 else "missed") for (a, b), gain in gains.items()]  # fmt: skip
-    run.table("What was asked", ("gain in accuracy", "paired over seeds", "first at least second"), rows)
-    figure = Figure(figsize=(CLASSES + 2.2, len(order)), layout="constrained")
-    for row, key in zip(figure.subplots(len(order), CLASSES), order, strict=True):
+    shown = [{**first[key], "source": sources[key].label, "mean": f"{means[key]:.1%}"} for key in order]
+    titles = {
+        "source": "trained on events of",
+        "mean": "physical events",
+        "own_events_accuracy": "its own events",
+    }
+    caption = f"95 % intervals over {run.config.seeds} seeds; chance is {1 / CLASSES:.0%}."
+    run.table("Accuracy", *table(shown, **titles, events_per_picture="events per picture"), caption)
+    asked = [
+        {
+            "gain in accuracy": f"{sources[a].label} over {sources[b].label}",
+            "paired over seeds": f"{gain:+.1%}",
+            "first at least second": "met" if gain.value >= 0 else "missed",
+        }
+        for (a, b), gain in gains.items()
+    ]
+    run.table("What was asked", *table(asked))
+    grid = {}
+    for key in order:
         t_s = frame_times(SENSOR_HZ if sources[key].physical else run.config.video_hz)
         made = sources[key].make(frames(tiles, t_s), t_s, torch.Generator().manual_seed(run.config.seed))
         if isinstance(made, EventStream):
             made = events.to_counts(made, t_s).unflatten(2, (CLASSES, -1))
         leg = made[: (len(t_s) - 1) // 3].sum(0)
-        for axis, picture in zip(row, leg[0] - leg[1], strict=True):
-            axis.imshow(picture.numpy(), cmap="RdBu_r", vmin=-3, vmax=3, interpolation="nearest")
-            axis.set(xticks=[], yticks=[])
-        row[0].set_ylabel(sources[key].label, rotation=0, ha="right", va="center", fontsize=9)
-    run.figure(figure, "events", f"Signed counts of the first {LEG_S:g} s. Red: more ON, blue: more OFF.")
+        grid[sources[key].label] = dict(enumerate(leg[0] - leg[1]))
+    caption = f"Signed counts of the first {LEG_S:g} s. Red: more ON, blue: more OFF."
+    run.figure(pictures(grid, signed=range(CLASSES), side=1), "events", caption)
     best = ", ".join(f"{sources[key].label} {means[key].value:.1%}" for key in order[:4])
     run.finish(
         "Emulated events for a real sensor's classifier", f"Accuracy on a physical sensor's events: {best}."

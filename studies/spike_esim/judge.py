@@ -1,5 +1,4 @@
-"""What generated events are judged by: distance, number, rates over time, flicker, delay, patches, median
-filter."""
+"""What generated events are judged by: distance, number, rates over time, flicker, delay."""
 
 import torch
 import torch.nn.functional as F
@@ -11,30 +10,25 @@ TAU_S = 0.01  # of the van Rossum distance, as in the thesis
 BIN_S = 0.01  # of rates over time
 CELL_PX = 8
 BLOCK_PX = 16  # of the bootstrap
-MEDIAN_PX = 5
-PATCHES = 16  # per sequence
 LAGS_S = 0.03
 HIGH_HZ = 50.0  # flicker is the power of the rate above; half of what the steps can show where that is less
 
 
 def judge(pairs, resamples, seed):
-    """Figures by name of pairs (counts [T-1, 2, H, W], Sequence with the target's); ON and OFF: the smaller
+    """Figures by name, numbers or Intervals, of pairs (counts [T-1, 2, H, W], Sequence with the target's); ON and OFF: the smaller
     one."""
     found, target = [made for made, _ in pairs], [sequence.counts for _, sequence in pairs]
     dt_s = pairs[0][1].dt_s
     loss, rate = intervals(pairs, resamples, seed)
     cells = [[binned(counts, dt_s, CELL_PX) for counts in side] for side in (found, target)]
-    medians = [[median_filtered(counts, dt_s) for counts in side] for side in (found, target)]
     power = [sum(flicker(counts, dt_s) for counts in side) for side in (found, target)]
     return {
-        **loss.metrics("loss"),
-        **rate.metrics("rate_ratio"),
+        "loss": loss,
+        "rate_ratio": rate,
         "rate_correlation": correlation(*([binned(x, dt_s) for x in side] for side in (found, target))),
         "cell_correlation": correlation(*cells),
-        "patch_correlation": patch_correlation(*cells, torch.Generator().manual_seed(seed)),
         "flicker_ratio": power[0] / power[1],
         "delay_s": dt_s * delay(found, target, round(LAGS_S / dt_s)),
-        "median_rate_ratio": float(sum(x.sum() for x in medians[0]) / sum(x.sum() for x in medians[1])),
     }
 
 
@@ -79,18 +73,6 @@ def correlation(found, target):
     )
 
 
-def patch_correlation(found, target, generator):
-    """Median over random cells that the target has events in, both polarities one after the other."""
-    values = []
-    for pair in zip(found, target, strict=True):
-        cells = [side.flatten(2) for side in pair]
-        for place in torch.randperm(cells[0].shape[-1], generator=generator)[:PATCHES].tolist():
-            made, wanted = (x[:, :, place].flatten() for x in cells)
-            if float(wanted.std()) > 0:
-                values.append(_pearson(made, wanted))
-    return float(torch.tensor(values).median())
-
-
 def flicker(counts, dt_s):
     """Power of the whole-picture rates above HIGH_HZ, ON and OFF together."""
     rate = counts.sum((-2, -1)).double()
@@ -109,12 +91,6 @@ def delay(found, target, most):
         return [torch.cat([F.avg_pool2d(x[at], CELL_PX).flatten() for x in side]) for side, at in sides]
 
     return max(range(-most, most + 1), key=lambda lag: _pearson(*aligned(lag)))
-
-
-def median_filtered(counts, dt_s):
-    """Event pictures of 10 ms behind a 5x5 median: lone events vanish, edges stay. [bins, 2, H, W]."""
-    wide = F.pad(binned(counts, dt_s, 1), (MEDIAN_PX // 2,) * 4, mode="replicate")
-    return wide.unfold(2, MEDIAN_PX, 1).unfold(3, MEDIAN_PX, 1).flatten(-2).median(-1).values
 
 
 def _pearson(first, second):

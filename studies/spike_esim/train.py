@@ -1,12 +1,12 @@
 """What is raced, trained on rendered sequences with the hard events of a physical sensor: the spiking
-network of the thesis in four forms, ESIM with its best threshold, and Spike-ESIM."""
+network of the thesis, ESIM with its best threshold, and Spike-ESIM."""
 
 import math
 from dataclasses import dataclass
 from functools import partial
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from codesign import events, render
 from codesign.events import SensorModel, SpikeEsim, TwoBranchSpikes
@@ -26,7 +26,6 @@ BATCH = 2
 # of potentials of the busiest sequence at the threshold when training starts: the better by training loss is
 # kept
 SHARES = (0.01, 0.04)
-SMOOTHING_MS = 10.0
 # frames are divided by it for the thesis network: weights of the order of 1, as its step of Adam supposes
 LIGHT = 32.0
 
@@ -59,34 +58,6 @@ def rendered(world, family, seed, frames):
     draws = (torch.Generator().manual_seed(1000 * k + seed) for k in (1, 2))
     hard = [events.dense_counts(pictures, t_s, SENSOR, draw) for draw in draws]
     return Sequence(f"{world} {family}", pictures, t_s, *hard)
-
-
-class SecondModule(nn.Module):
-    """The thesis network, own reset, and a spike module behind it: its spikes, times one weight per polarity,
-    through an alpha response to a threshold of their own."""
-
-    def __init__(self, channels, *, dt, seed):
-        super().__init__()
-        self.first = TwoBranchSpikes(channels, kernel="thesis", dt=dt, seed=seed)
-        self.wake = self.first.wake
-        self.dt = dt
-        self.weight = nn.Parameter(torch.full((2, 1, 1), 1.05))  # a lone spike gives one
-
-    def forward(self, frames):
-        return self.second(self.first(frames)[0])
-
-    def second(self, spikes, **options):
-        times = {"tau_r": 1.0, "tau_s": SMOOTHING_MS, "dt": self.dt}
-        drive = self.weight * spikes
-        return events.srm(drive, theta=1.0, kernel="thesis", response="alpha", **times, **options)
-
-
-VARIANTS = {
-    "thesis": TwoBranchSpikes,
-    "own_reset": partial(TwoBranchSpikes, kernel="thesis"),
-    "smoothed": partial(TwoBranchSpikes, smoothing_tau=SMOOTHING_MS),
-    "second_module": SecondModule,
-}
 
 
 class Store:
@@ -122,7 +93,7 @@ def generators(run, sequences):
     threshold."""
     store = Store(run)
     seed = run.config.seed + 1
-    made = {name: _thesis(store, name, sequences, run.config.steps // 2, seed) for name in VARIANTS}
+    made = {"thesis": _thesis(store, sequences, run.config.steps // 2, seed)}
     theta = best_theta(sequences)
     ours = SpikeEsim(0.2, 0.2, refractory_s=5e-4, width=4, seed=seed)
 
@@ -149,8 +120,8 @@ def esim(sequence, theta):
     return events.dense_counts(sequence.frames, sequence.t_s, SensorModel(theta, theta))
 
 
-def _thesis(store, name, sequences, steps, seed):
-    """The variant from the better of two starts, trained the thesis's way: Adam at 0.01, van Rossum loss
+def _thesis(store, sequences, steps, seed):
+    """The network of the thesis from the better of two starts, trained the thesis's way: Adam at 0.01, van Rossum loss
     alone, one sequence after the other."""
 
     def spikes(network, sequence):
@@ -169,9 +140,9 @@ def _thesis(store, name, sequences, steps, seed):
     busiest = max(sequences, key=lambda sequence: float(sequence.counts.sum()))
     found = []
     for share in SHARES:
-        network = VARIANTS[name](1, dt=1e3 * sequences[0].dt_s, seed=seed)
+        network = TwoBranchSpikes(1, dt=1e3 * sequences[0].dt_s, seed=seed)
         network.wake(busiest.frames / LIGHT, share)
-        network = store.module(f"{name}_{share}", network, steps, train)
+        network = store.module(f"thesis_{share}", network, steps, train)
         found.append((distance([(spikes(network, one), one) for one in sequences]), network))
     return partial(spikes, min(found, key=lambda pair: pair[0])[1])
 

@@ -57,14 +57,15 @@ def walk(side):
 
 def test_figures_of_silence_of_the_target_and_of_its_multiples():
     target = noise(0)
-    for factor, loss in ((0, 1.0), (1, 0.0), (2, 1.0), (3, 4.0)):  # (factor - 1)^2
+    for factor in (0, 1, 3):
         found = judge.judge([(factor * target, sequence(target))], 10, 0)
-        assert found["loss"] == pytest.approx(loss, abs=1e-6)
-        assert found["rate_ratio"] == pytest.approx(factor, abs=1e-6)
+        loss = (factor - 1) ** 2
+        assert found["loss"].value == pytest.approx(loss, abs=1e-6)
+        assert found["loss"].low - 1e-6 <= loss <= found["loss"].high + 1e-6
+        assert found["rate_ratio"].value == pytest.approx(factor, abs=1e-6)
         assert found["flicker_ratio"] == pytest.approx(factor**2, abs=1e-9)
-        correlations = [found[f"{kind}_correlation"] for kind in ("rate", "cell", "patch")]
-        assert correlations == pytest.approx([float(factor > 0)] * 3, abs=1e-6)
-        assert found["loss_low"] - 1e-6 <= loss <= found["loss_high"] + 1e-6
+        correlations = [found[f"{kind}_correlation"] for kind in ("rate", "cell")]
+        assert correlations == pytest.approx([float(factor > 0)] * 2, abs=1e-6)
 
 
 def test_two_draws_of_one_poisson_rate_lie_twice_their_variance_apart():
@@ -110,63 +111,12 @@ def test_delay_is_found_with_its_sign():
         assert judge.delay([target.roll(steps, 0)], [target], 15) == steps
 
 
-def test_median_removes_lone_events_and_keeps_an_edge():
-    counts = torch.zeros(5, 2, 16, 16)
-    counts[0, 0, 3, 3] = 1
-    counts[1, 1, :, 8:] = 1
-    kept = judge.median_filtered(counts, DT_S)
-    assert kept.shape == (1, 2, 16, 16)
-    assert kept[0, 0].sum() == 0
-    assert torch.equal(kept[0, 1], counts[1, 1])
-
-
 def test_best_theta_is_that_of_the_target():
     frames = walk(16)
     truth = train.THETAS[4]
     one = made(frames, None)
     target = made(frames, train.esim(one, truth))
     assert train.best_theta([target]) == truth
-
-
-def spikes_by_loop(drive, reset, response):
-    """Spikes of threshold 1, step by step from all steps so far; kernels [T], by lag."""
-    spikes = torch.zeros_like(drive)
-    for t in range(len(drive)):
-        back = [kernel[: t + 1].flip(0) for kernel in (response, reset)]
-        spikes[t] = (
-            torch.tensordot(back[0], drive[: t + 1], 1) + torch.tensordot(back[1], spikes[: t + 1], 1) >= 1
-        )
-    return spikes
-
-
-def test_thesis_variants_spike_when_a_loop_over_their_own_kernels_does():
-    frames = torch.rand(60, 6, 6, generator=torch.Generator().manual_seed(3), dtype=D)
-    lag = torch.arange(59, dtype=D)
-    fast, slow = (lag * DT_S / tau_s for tau_s in (1e-3, 1e-2))
-    none, alpha = (lag == 0).double(), slow * (1 - slow).exp()
-    slayer, own = -2 * fast * (1 - fast).exp(), -2 * (1 - fast).exp() * (lag > 0)
-    kernels = {"thesis": (slayer, none), "own_reset": (own, none), "smoothed": (slayer, alpha)}
-    for name, made in train.VARIANTS.items():
-        network = made(1, dt=1e3 * DT_S, seed=0).double()
-        network.wake(frames, 0.2)
-        first = getattr(network, "first", network)
-        weights = torch.stack((first.weight_on, -first.weight_off)).detach()
-        drive = torch.nn.functional.conv2d(frames.diff(dim=0)[:, None], weights, padding=1)
-        truth = spikes_by_loop(drive, *kernels.get(name, kernels["own_reset"]))
-        if name == "second_module":
-            truth = spikes_by_loop(network.weight.detach() * truth, own, alpha)
-        assert truth.any()
-        assert torch.equal(network(frames)[0], truth), name
-
-
-def test_gradient_of_the_second_module_is_that_of_differences():
-    module = train.SecondModule(1, dt=1e3 * DT_S, seed=0).double()
-    given = torch.rand(12, 2, 2, 2, generator=torch.Generator().manual_seed(4), dtype=D)
-
-    def smooth_twin(weight, given):  # the spike is the integral of its surrogate
-        return module.second(given, smooth=True, through_reset="full")[0]
-
-    assert torch.autograd.gradcheck(smooth_twin, (module.weight, given.requires_grad_()))
 
 
 def test_calibration_finds_the_thresholds_of_a_sensor():

@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from codesign.errors import DomainError
-from studies.speed_error import placement, spiking
-from studies.speed_error.lens import line
+from studies.speed_error import chain, events
 from studies.speed_error.levels import cheapest
 from studies.stability import __main__ as stability
 from studies.stability.systems import KINDS, differences, draw_system, errors_of_systems, worst_error
@@ -72,27 +71,19 @@ def test_a_case_that_stops_is_a_miss_with_its_sentence():
     assert "upside down" in outcome.seen
 
 
-def test_a_straight_line_is_found_and_what_departs_from_it():
-    x = [10.0, 100.0, 1000.0, 10000.0]
-    fixed, each, worst = line(x, [3 + 0.02 * n for n in x])
-    assert (fixed, each) == pytest.approx((3, 0.02), rel=1e-12)
-    assert worst < 1e-12
-    assert line(x, [3 + 0.02 * n + 0.5 * (n == 10.0) for n in x])[2] > 0.05
-
-
 def test_the_convolution_of_the_bench_is_the_layer_up_to_its_cut_kernel():
     """77 taps leave out 1 % of the response; where the drive stays below threshold it is the potential's size."""
-    assert len(spiking.taps(spiking.TAU_S, 1.0)) == 77
+    assert len(events.taps(events.TAU_S, 1.0)) == 77
     drive = 0.9 * torch.rand(40, 1, 4, 4, generator=torch.Generator().manual_seed(0))
-    agree = (spiking.convolution(drive) == spiking.ours(drive)).double().mean()
-    assert float(spiking.ours(drive).sum()) > 50
+    agree = (events.convolution(drive) == events.ours(drive)).double().mean()
+    assert float(events.ours(drive).sum()) > 50
     assert float(agree) > 0.97
 
 
 def test_the_stages_of_a_placement_make_up_its_step_and_gradients_arrive_everywhere():
-    system, batch, pair = placement.case_of("ground", 0, worlds_of=1, drives=1)
-    found = placement.one_step(system, batch, pair)
-    stages = [found[name] for name in placement.STAGES.values()]
+    system, batch, pair = chain.case_of("ground", 0, worlds_of=1, drives=1)
+    found = chain.one_step(system, batch, pair)
+    stages = [found[name] for name in chain.PARTS.values()]
     # the loss itself and the sum of gradients into mount and lens are in the step only
     assert 0.9 * found["step"] < sum(stages) <= found["step"] + 1e-6
     assert min(stages) > 0
