@@ -36,7 +36,7 @@ def draw_image(axis: Any, image: Any, of_scale: Sequence[Any], signed: bool = Fa
         to 1.
     """
     image = np.asarray(image)
-    top = max(float(np.quantile(np.abs(other), 0.99)) for other in of_scale) or 1.0
+    top = max(float(np.quantile(np.abs(np.asarray(other)), 0.99)) for other in of_scale) or 1.0
     if image.ndim == 3:
         axis.imshow(image)
     elif signed:

@@ -164,7 +164,7 @@ def pictures(rows: Mapping[str, Mapping[str, Any]], signed: Iterable[str] = (), 
             of_scale = [image for other, image in row.items() if (other in signed) == (title in signed)]
             draw_image(axis, row[title], of_scale, title in signed)
             axis.set_title(title if line is axes[0] else "", fontsize=9)
-        line[0].set_ylabel(label, fontsize=9)
+        line[0].set_ylabel(label, fontsize=9, rotation=0, ha="right", va="center")
     return figure
 
 

@@ -297,9 +297,9 @@ def show(run, sources, rows, tiles):
         if isinstance(made, EventStream):
             made = events.to_counts(made, t_s).unflatten(2, (CLASSES, -1))
         leg = made[: (len(t_s) - 1) // 3].sum(0)
-        grid[sources[key].label] = dict(enumerate(leg[0] - leg[1]))
+        grid[sources[key].label] = {str(k): image for k, image in enumerate(leg[0] - leg[1])}
     caption = f"Signed counts of the first {LEG_S:g} s. Red: more ON, blue: more OFF."
-    run.figure(pictures(grid, signed=range(CLASSES), side=1), "events", caption)
+    run.figure(pictures(grid, signed=map(str, range(CLASSES)), side=1), "events", caption)
     best = ", ".join(f"{sources[key].label} {means[key].value:.1%}" for key in order[:4])
     run.finish(
         "Emulated events for a real sensor's classifier", f"Accuracy on a physical sensor's events: {best}."

@@ -35,10 +35,6 @@ def power(base, exponent):
     return {"power": base**exponent, "process": os.getpid()}
 
 
-def variable(name):
-    return os.environ.get(name)
-
-
 # sweep
 
 
@@ -73,12 +69,11 @@ def test_an_interrupted_sweep_goes_on_where_it_ended(run, cut):
 
 
 def test_cells_in_processes_give_the_same_table(run):
-    here = sweep(run, power, "here", base=(2, 3), exponent=(0, 5))
-    there = sweep(run, power, "there", processes=2, base=(2, 3), exponent=(0, 5))
-    assert column(here, "power") == column(there, "power") == [1, 32, 1, 243]
-    assert len(set(column(there, "process")) - {os.getpid()}) == 4
-    with pytest.raises(CodesignError, match=r"power\(2, -1\) ended with code 1.*not below 0"):
-        sweep(run, power, "refused", processes=2, base=(2,), exponent=(0, -1))
+    found = sweep(run, power, processes=2, given={"base": 3}, exponent=(0, 5))
+    assert column(found, "power") == [1, 243]
+    assert len({os.getpid(), *column(found, "process")}) == 3
+    with pytest.raises(CodesignError, match=r"power\(-1, 2\) ended with code 1.*not below 0"):
+        sweep(run, power, "refused", processes=2, given={"base": 2}, exponent=(-1,))
     assert not bench.RUNNING
 
 
@@ -252,20 +247,19 @@ def test_functions_take_turns():
     assert {len(timing.wall_s) for timing in found.values()} == {4}
 
 
-def test_a_function_in_its_own_process():
-    found = apart(power, 2, exponent=3)
-    assert found["power"] == 8
-    assert found["process"] != os.getpid()
-    assert apart(variable, "CODESIGN_TEST", environment={"CODESIGN_TEST": "set"}) == "set"
-    with pytest.raises(CodesignError, match="not below 0"):
-        apart(power, 2, -1)
-    assert bench.installed({"yes": "torch", "no": "no_such_package"}) == ["yes"]
+def told(name, peak_of):
+    """A variable of the environment, and the peaks of calls with so many megabytes and with none."""
+    calls = (lambda: np.ones(peak_of * 10**6, dtype=np.uint8).sum(), lambda: None)
+    return [os.environ.get(name), *map(bench.peak_mb, calls)]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not start the count of a peak anew")
-def test_a_peak_is_what_a_call_takes():
-    assert bench.peak_mb(lambda: np.ones(50_000_000, dtype=np.uint8).sum()) == pytest.approx(50, abs=5)
-    assert bench.peak_mb(lambda: None) < 5
+def test_a_function_in_its_own_process_and_the_memory_that_it_takes():
+    variable, peak, nothing = apart(told, "CODESIGN_TEST", peak_of=50, environment={"CODESIGN_TEST": "set"})
+    assert variable == "set"
+    assert peak == pytest.approx(50, abs=5)
+    assert nothing < 5
+    assert bench.installed({"yes": "torch", "no": "no_such_package"}) == ["yes"]
 
 
 # show

@@ -58,17 +58,19 @@ def test_the_differences_see_a_wrong_gradient():
 
 @pytest.mark.parametrize("name", stability.CASES)
 def test_a_hard_case_ends_as_theory_says(name):
-    outcome = stability.CASES[name]()
-    assert outcome.passed, f"expected {outcome.expected}; seen {outcome.seen}"
+    rows = stability.judge(stability.CASES[name])
+    assert all(row["passed"] for row in rows), rows
 
 
-def test_a_case_that_stops_is_a_miss_with_its_sentence():
+def test_a_miss_is_told_and_a_case_that_stops_has_its_sentence():
     def refuses():
+        yield stability.Check("radius", torch.tensor([2.0, 40.0]), torch.tensor([2.0, 42.0]), 0.04)
         raise DomainError("the lens is upside down")
 
-    outcome = stability.judge(refuses)
-    assert not outcome.passed
-    assert "upside down" in outcome.seen
+    missed, stopped = stability.judge(refuses)
+    assert (missed["off_by"], missed["passed"], missed["seen"]) == (pytest.approx(0.05), False, "2 to 42")
+    assert not stopped["passed"]
+    assert "upside down" in str(stopped["seen"])
 
 
 def test_the_convolution_of_the_bench_is_the_layer_up_to_its_cut_kernel():
