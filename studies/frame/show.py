@@ -2,11 +2,10 @@
 pictures.
 
     run.table("Errors", *table(rows, method="method", error_px="error, px"))
-    run.table("Errors", *pivot(rows, down="lens", across="method", value="error_px"))
+    tabulate(run, "Errors", rows, "method")
     lead = asked(run, [Asked("speed over optiland", 22.0, least=10.0), Asked("memory, MB", 3.0, most=5.0)])
     run.figure(panels(Panel({"ours": (x, y)}, "rays", "seconds", log="xy")), "growth", "Time against rays.")
     run.figure(pictures({"room": {"traced": frame, "difference": off}}, signed=["difference"]), "room", "…")
-    run.figure(bars({"ours": 0.1, "peer": interval}, "seconds", log=True, level=0.05), "times", "…")
 
 Single charts (``curves``), image strips, heat maps and lens layouts: codesign.report.chain_figures,
 lens_layout.
@@ -25,7 +24,6 @@ from studies.frame.compare import Interval
 from studies.frame.run import Run
 from studies.frame.sweep import metrics, plain
 
-COLOURS = ("#1b6ca8", "#c0392b", "#2e8b57", "#e08e0b", "#8e44ad", "#888888")
 Rows = Iterable[Mapping[str, Any]]
 Shown = tuple[tuple[str, ...], list[tuple[Any, ...]]]
 
@@ -54,18 +52,6 @@ def tabulate(
     rows = list(rows)
     run.record(**metrics(rows, *axes, prefix=prefix))
     run.table(title, *table(rows, **titles), caption)
-
-
-def pivot(rows: Rows, down: str, across: str, value: str) -> Shown:
-    """The same for one figure, with a line per value of one axis and a column per value of another."""
-    rows = list(rows)
-    columns = list(dict.fromkeys(row[across] for row in rows))
-    lines: dict[Any, dict[Any, Any]] = {}
-    for row in rows:
-        lines.setdefault(row[down], {})[row[across]] = row[value]
-    return (down.replace("_", " "), *map(str, columns)), [
-        (name, *(_cell(line.get(column)) for column in columns)) for name, line in lines.items()
-    ]
 
 
 @dataclass(frozen=True)
@@ -165,24 +151,6 @@ def pictures(rows: Mapping[str, Mapping[str, Any]], signed: Iterable[str] = (), 
             draw_image(axis, row[title], of_scale, title in signed)
             axis.set_title(title if line is axes[0] else "", fontsize=9)
         line[0].set_ylabel(label, fontsize=9, rotation=0, ha="right", va="center")
-    return figure
-
-
-def bars(
-    values: Mapping[str, float | Interval], xlabel: str, log: bool = False, level: float | None = None
-) -> Figure:
-    """Figure of horizontal bars, with whiskers where a value is an Interval; ``level`` is drawn as a red
-    line."""
-    figure, axis = plt.subplots(figsize=(7, 0.8 + 0.4 * len(values)), layout="constrained")
-    for at, value in enumerate(values.values()):
-        of = value if isinstance(value, Interval) else Interval(value, value, value, 1)
-        whiskers = [[of.value - of.low], [of.high - of.value]] if of.low < of.high else None
-        axis.barh(at, of.value, 0.65, xerr=whiskers, color=COLOURS[0], ecolor="0.3", capsize=3)
-    if level is not None:
-        axis.axvline(level, color="firebrick", linewidth=1)
-    axis.set_yticks(range(len(values)), list(values))
-    axis.set(xlabel=xlabel, xscale="log" if log else "linear")
-    axis.invert_yaxis()
     return figure
 
 

@@ -7,13 +7,14 @@ one another.
 
 import sys
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from codesign.errors import DomainError
 from codesign.report import chain_figures
 from studies.frame.run import Run, StudyConfig, main
+from studies.frame.sweep import sweep
 from studies.gradient_flow import chain
 from studies.gradient_flow.events import topics
 from studies.gradient_flow.silhouettes import flow, frames
@@ -53,26 +54,29 @@ def study(run: Run[Config]) -> None:
     for name, least in (("hard_cases", 1), ("scenes", 1), ("samples", 64), ("seeds", 2)):
         if getattr(config, name) < least:
             raise DomainError(f"{name} = {getattr(config, name)} must be at least {least}.")
-    stored = run.load_state()
-    found: dict[str, list[Any]] = {} if stored is None else dict(stored.numbers)
-    work = [(name, job) for name in config.cases for job in CASES[name].jobs(config.quick)]
-    left = [(name, job) for name, job in work if label((name, *job)) not in found]
-    with run.progress(len(work), "differentiating", done=len(work) - len(left)) as progress:
-        for name, job in left:
-            rows = list(CASES[name].measure(config, *job))
-            for row in rows:
-                run.record(**row.metrics(name))
-            found[label((name, *job))] = [(row.names, row.numbers) for row in rows]
-            run.save_state({}, found)
-            progress.advance()
     missed = []
     for name in config.cases:
-        stored_rows = [row for job in CASES[name].jobs(config.quick) for row in found[label((name, *job))]]
-        missed += show(run, name, [Row(tuple(names), numbers) for names, numbers in stored_rows])
+        missed += show(run, name, measured(run, name))
     run.finish(
         "Gradients beside differences",
         f"**Below what is asked:** {'; '.join(missed)}." if missed else "All that is asked is met.",
     )
+
+
+def measured(run: Run[Config], name: str) -> list[Row]:
+    """The rows of a case, job by job."""
+    topic = CASES[name]
+
+    def cell(job):
+        rows = list(topic.measure(run.config, *job))
+        for row in rows:
+            run.record(**row.metrics(name))
+        return [{"names": list(row.names), **row.numbers} for row in rows]
+
+    rows = sweep(run, cell, name, job={label(job): job for job in topic.jobs(run.config.quick)})
+    return [
+        Row(tuple(row["names"]), {k: v for k, v in row.items() if k not in ("job", "names")}) for row in rows
+    ]
 
 
 def show(run: Run[Config], name: str, rows: list[Row]) -> list[str]:

@@ -13,15 +13,14 @@ from pathlib import Path
 from typing import ClassVar
 
 import torch
-from matplotlib.figure import Figure
 
 from codesign import events
 from codesign.errors import DomainError
 from studies.frame.run import Run, StudyConfig, main
+from studies.frame.show import pictures
 from studies.sensor_fit.recording import default_path, load
 from studies.sensor_fit.sensor import START, Fit, FittedSensor
 
-FULL_SCALE = 8  # signed count of full colour
 LABELS = {"ideal": "ideal sensor, θ 0.2", "v2e": "v2e's default sensor", "fitted": "fitted sensor"}
 
 
@@ -141,13 +140,11 @@ def maps(recorded, simulated, half):
     columns = {"recorded": recorded, **{LABELS[name]: counts for name, counts in simulated.items()}}
     ranked = (recorded[half:].sum((1, 2, 3)).argsort(descending=True) + half).tolist()
     chosen = (ranked[0], ranked[len(ranked) // 2], ranked[-1])
-    figure = Figure(figsize=(3.4 * len(columns), 8), layout="compressed")
-    for row, k in zip(figure.subplots(3, len(columns)), chosen, strict=True):
-        for axis, (title, counts) in zip(row, columns.items(), strict=True):
-            signed = (counts[k, 0] - counts[k, 1]).numpy()
-            axis.imshow(signed, cmap="RdBu_r", vmin=-FULL_SCALE, vmax=FULL_SCALE)
-            axis.set(xticks=[], yticks=[], title=f"{title}, interval {k}")
-    return figure
+    rows = {
+        f"interval {k}": {title: counts[k, 0] - counts[k, 1] for title, counts in columns.items()}
+        for k in chosen
+    }
+    return pictures(rows, signed=columns, side=3.4)
 
 
 if __name__ == "__main__":

@@ -67,14 +67,10 @@ def test_listing_imports_nothing_heavy():
         assert python(*command).stdout.splitlines() == listed
 
 
-def test_run_is_the_same_as_the_module():
-    run = python("-m", "codesign", "run", "stability", "--help")
-    module = python("-m", "studies.stability", "--help")
-    assert run.returncode == module.returncode == 0, run.stderr + module.stderr
-    assert run.stdout == module.stdout
-    assert "python -m studies.stability" in run.stdout
+def test_run_starts_the_module_and_hands_over_its_options():
     wrong = python("-m", "codesign", "run", "stability", "--colour", "red")
     assert wrong.returncode == 2
+    assert "python -m studies.stability" in wrong.stderr
     assert "--colour" in wrong.stderr
 
 
@@ -84,7 +80,6 @@ def test_run_is_the_same_as_the_module():
         ("lens_op", "there is no study 'lens_op'; did you mean lens_opt?"),
         ("lens-opt", "there is no study 'lens-opt'; did you mean lens_opt?"),
         ("xylophone", "there is no study 'xylophone'; 'python -m studies' lists them."),
-        ("frame", "studies.frame is a part of the studies and no study"),
         ("lens_opt.page", "studies.lens_opt.page is a part of the studies and no study"),
         ("frame.config", "studies.frame.config is a part of the studies and no study"),
     ],

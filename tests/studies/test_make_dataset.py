@@ -39,20 +39,7 @@ from tests.rounding_case import RoundsByPlace
 D = torch.float64
 ROOT = Path(__file__).resolve().parents[2]
 # frames 0.0111 s apart: no whole microseconds
-SMALL = [
-    "--trajectories",
-    "2",
-    "--frames",
-    "14",
-    "--size",
-    "24",
-    "--samples",
-    "2",
-    "--chunk",
-    "4",
-    "--rate-hz",
-    "90",
-]
+SMALL = ["--trajectories", "2", "--frames", "14", "--size", "24", "--samples", "2", "--chunk", "4", "--rate-hz", "90"]
 
 
 def camera(name="cooke-triplet", size=24, level: Literal["traced", "thin", "pinhole"] = "traced"):
@@ -67,18 +54,16 @@ def poses(count):
 
 
 @pytest.mark.bits
-@pytest.mark.parametrize("moving", [False, True])
-def test_the_truth_of_many_frames_is_that_of_each(moving):
+def test_the_truth_of_many_frames_is_that_of_each():
     with torch.no_grad():
         cam = camera(size=40)
         T = poses(5)
-        scene = worlds.room()
-        if moving:
-            steps = torch.zeros(5, 6, dtype=D)
-            steps[:, :2] = torch.arange(5, dtype=D)[:, None] * torch.tensor([0.05, 0.02], dtype=D)
-            upright = se3_exp(torch.tensor([-0.2, 0.0, 0.9, 0, 0, 0], dtype=D))
-            tilt = se3_exp(torch.tensor([0, 0, -0.9, 1.2, 0, 0], dtype=D))
-            scene = MovingScene(scene, {"board": (worlds.smooth_plane(), se3_exp(steps) @ upright @ tilt)})
+        steps = torch.zeros(5, 6, dtype=D)
+        steps[:, :2] = torch.arange(5, dtype=D)[:, None] * torch.tensor([0.05, 0.02], dtype=D)
+        upright = se3_exp(torch.tensor([-0.2, 0.0, 0.9, 0, 0, 0], dtype=D))
+        tilt = se3_exp(torch.tensor([0, 0, -0.9, 1.2, 0, 0], dtype=D))
+        path = se3_exp(steps) @ upright @ tilt
+        scene = MovingScene(worlds.room(), {"board": (worlds.smooth_plane(), path)})
         chief = cam.chief_rays(cam.film.pixels())
         table = ProjectionTable(cam)
         found = truth_of_frames(table, scene, T, 5, chief)
@@ -93,7 +78,7 @@ def test_the_truth_of_many_frames_is_that_of_each(moving):
             each = view(cam, scene, T, k)
             assert torch.equal(found.object_id[k], each.object_id)
             torch.testing.assert_close(found.depth_m[k], each.depth_m, rtol=0, atol=1e-12)
-        assert set(found.object_id.unique().tolist()) == ({0, 1} if moving else {0})
+        assert found.object_id.unique().tolist() == [0, 1]
         for processor in (nullcontext(), RoundsByPlace()):
             with processor:
                 whole = truth_of_frames(table, scene, T, 5, chief)
@@ -137,7 +122,7 @@ def test_every_world_has_a_clear_path_of_every_family(world):
             )
             t = motions.LEAD_S + torch.linspace(0, 1.5, 7, dtype=D)
             assert torch.equal(one(t), two(t))
-            for k in range(7):
+            for k in (0, 3, 6):
                 seen = view(cam, scene, one(t), k)
                 assert float(seen.valid.double().mean()) > motions.SEEN - 0.1
                 assert float(seen.depth_m[seen.valid].min()) > 0.8 * motions.CLEAR_M
@@ -277,14 +262,13 @@ def kill_when(folder, appears, *options):
 
 
 @pytest.mark.slow
-def test_a_run_killed_many_times_ends_with_the_same_bytes(dataset, tmp_path):
+def test_a_run_killed_twice_ends_with_the_same_bytes(dataset, tmp_path):
     folder = tmp_path / "set"
     resume = ("--resume", str(folder))
     begin = (*SMALL, "--flo", "--out", str(folder))
     assert kill_when(folder, "sequence_000_orbital/flow/forward/000002.png", *begin)
     assert not (folder / "manifest.json").exists()
-    for appears in ("*/parts/000001.h5", "*/events.h5", "sequence_001*/parts/000002.h5"):
-        assert kill_when(folder, appears, *resume)
+    assert kill_when(folder, "*/events.h5", *resume)
     # a finished one is finished
     for _ in range(2):
         assert main(study.study, study.Config, list(resume)) == 0
@@ -313,8 +297,6 @@ def test_folders_with_other_things_and_damaged_parts_are_refused_in_one_sentence
         (["--rate-hz", "0"], "--rate-hz is 0"),
         (["--world", "moon"], "there are checkerboard"),
         (["--lens", "none"], "none"),
-        (["--size", "4"], "--size is 4"),
-        (["--seed", "-1"], "--seed is -1"),
         (["--world", "checkerboard", "--light", "baked"], "has no lamps"),
         (["--focal-length-mm", "0"], "--focal-length-mm"),
     ],
