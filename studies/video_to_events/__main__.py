@@ -73,7 +73,7 @@ def study(run: Run[Options]) -> None:
                 saved = time.monotonic()
             progress.advance(events=state.events)
     view = pages.View(run, config, source, light, log, t_s[first:last], first)
-    pages.show(view, state, sensor, clock, write_outputs(run, config, log))
+    pages.write_page(view, state, sensor, clock, write_outputs(run, config, log))
     (run.folder / LOG).unlink()
 
 

@@ -8,10 +8,10 @@ from itertools import pairwise
 from typing import Any
 
 import torch
-from matplotlib.figure import Figure
 
 from codesign.events import decay_from_stream, picture, to_counts, write_video
 from codesign.events.views.figures import PREFIXES, rate_figure, sample, space_time_figure
+from studies.frame import show
 from studies.frame.run import Run
 from studies.video_to_events.input import Light
 from studies.video_to_events.state import LARGE, WORRYING, EventLog
@@ -76,7 +76,7 @@ class View:
             yield self.log.read(a, b), start_us, end_us
 
 
-def show(view, state, sensor, clock, written):
+def write_page(view, state, sensor, clock, written):
     """Record the metrics, draw everything, and write the page."""
     run = view.run
     frames = len(view.t_s)
@@ -272,25 +272,18 @@ def rates_over_time(view):
 def first_pictures(view, window_s):
     """Figure: frames at a few times above, the events around them below."""
     count = len(view.t_s)
-    shown = sorted({round((k + 0.5) / SHOWN * (count - 1)) for k in range(SHOWN)})
-    ratio = view.log.height_px / view.log.width_px
-    figure = Figure(figsize=(3 * len(shown), 2 * (3 * ratio + 0.35)), layout="constrained")
-    axes = figure.subplots(2, len(shown), squeeze=False)
-    for (upper, lower), index in zip(axes.T, shown, strict=True):
-        frame = next(view.source.read(view.first + index))
-        upper.imshow(view.light([frame], view.first + index)[0].cpu().numpy(), cmap="gray", vmin=0)
+    rows = {"frame": {}, "events": {}}
+    for index in sorted({round((k + 0.5) / SHOWN * (count - 1)) for k in range(SHOWN)}):
         time_s = float(view.t_s[index])
+        title = f"frame {view.first + index}, {1e3 * (time_s - float(view.t_s[0])):.4g} ms"
+        frame = next(view.source.read(view.first + index))
+        rows["frame"][title] = view.light([frame], view.first + index)[0].cpu().numpy()
         start_us = round((time_s - window_s / 2) * 1e6)
         end_us = max(round((time_s + window_s / 2) * 1e6), start_us + 1)
         stream = view.log.read(*view.log.positions([start_us, end_us]))
         counts = to_counts(stream, [start_us / 1e6, end_us / 1e6])[0]
-        lower.imshow(picture(counts, view.config.preview_full_scale).numpy())
-        title = f"frame {view.first + index}, {1e3 * (time_s - float(view.t_s[0])):.4g} ms"
-        upper.set_title(title, fontsize=8)
-        lower.set_title(f"{len(stream):,} events", fontsize=8)
-        for axis in (upper, lower):
-            axis.set(xticks=[], yticks=[])
-    return figure
+        rows["events"][title] = picture(counts, view.config.preview_full_scale).numpy()
+    return show.pictures(rows, side=3)
 
 
 def short(value):

@@ -39,7 +39,20 @@ from tests.rounding_case import RoundsByPlace
 D = torch.float64
 ROOT = Path(__file__).resolve().parents[2]
 # frames 0.0111 s apart: no whole microseconds
-SMALL = ["--trajectories", "2", "--frames", "14", "--size", "24", "--samples", "2", "--chunk", "4", "--rate-hz", "90"]
+SMALL = [
+    "--trajectories",
+    "2",
+    "--frames",
+    "14",
+    "--size",
+    "24",
+    "--samples",
+    "2",
+    "--chunk",
+    "4",
+    "--rate-hz",
+    "90",
+]
 
 
 def camera(name="cooke-triplet", size=24, level: Literal["traced", "thin", "pinhole"] = "traced"):

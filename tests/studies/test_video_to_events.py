@@ -265,10 +265,10 @@ def test_the_log_finds_events_by_time_and_forgets_what_does_not_count(tmp_path):
         log.append(EventStream(stream.t_us[part], stream.x[part], stream.y[part], stream.p[part], 7, 9))
     times = [1_700_000_000_000_000 + k for k in (-1, 0, 57, 299, 400)]
     assert log.positions(times) == np.searchsorted(stream.t_us.numpy(), times, side="right").tolist()
-    parts = {slice(123, 321): log.read(123, 321)}
-    parts |= {(3, 77, 499): log.pick(torch.tensor([3, 77, 499]))}
-    for part, read in parts.items():
-        part = list(part) if isinstance(part, tuple) else part
+    for read, part in (
+        (log.read(123, 321), slice(123, 321)),
+        (log.pick(torch.tensor([3, 77, 499])), [3, 77, 499]),
+    ):
         assert all(torch.equal(getattr(read, name), getattr(stream, name)[part]) for name in FIELDS)
     EventLog(tmp_path / "log", 450, 7, 9)
     assert (tmp_path / "log").stat().st_size == 450 * RECORD.itemsize

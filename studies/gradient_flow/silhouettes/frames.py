@@ -1,13 +1,12 @@
 """Frames of occluders over a wall, to the camera's pose and to the lens: one scene before one lens, and the ways to its
 gradient beside differences with common random numbers."""
 
-import math
-
 import torch
 
 from codesign import lens, pose, render
 from codesign.render.sequence import Way
 from scenes import silhouettes as silhouette_scenes
+from studies.gradient_flow.silhouettes.flow import PER_PX, judged
 from studies.gradient_flow.topic import Asked, Row, Topic
 
 SIZE_PX = 32
@@ -73,33 +72,16 @@ class Task:
 def measure(config, scene, kind, group):
     """Relative L2 errors of the ways against differences, scaled so that every number counts by its own step."""
     task = Task(silhouette_scenes.build(scene), kind)
-    scale = torch.tensor(STEPS[group], dtype=torch.float64)
-    seeds = [config.seed + number for number in range(config.seeds)]
-    truths = torch.stack([task.differences(group, config.samples, 100 + seed) for seed in seeds]) * scale
-    truth = truths.mean(0)
-    error = truths.std(0) / math.sqrt(config.seeds)
 
-    def away(g):
-        return float((g * scale - truth).norm() / truth.norm())
+    def estimates(seed):
+        ways = [task.differences(group, config.samples, 100 + seed)]
+        for way in ("interior", "boundary"):
+            ways.append(task.gradient(group, config.samples, 200 + seed, way, PER_PX))
+        ways.append(task.gradient(group, SAMPLES, 300 + seed, "boundary"))
+        return torch.stack(ways) * torch.tensor(STEPS[group], dtype=torch.float64)
 
-    def several(way):
-        return torch.stack([task.gradient(group, config.samples, 200 + seed, way, 64.0) for seed in seeds])
-
-    whole = several("boundary")
-    few = range(config.seed + 300, config.seed + 300 + 2 * config.seeds)
-    single = sorted(away(task.gradient(group, SAMPLES, seed, "boundary")) for seed in few)
-    spread = (whole * scale).std(0) / math.sqrt(config.seeds)
-    bias = (whole.mean(0) * scale - truth) / (error.square() + spread.square()).sqrt().clamp_min(1e-30)
-    yield Row(
-        (scene, kind, group),
-        {
-            "interior_only": away(several("interior").mean(0)),
-            "with_boundary": away(whole.mean(0)),
-            "one_estimate": single[len(single) // 2],
-            "noise": float(error.norm() / truth.norm()),
-            "largest_bias": float(bias.abs().max()),
-        },
-    )
+    values = torch.stack([estimates(config.seed + number) for number in range(config.seeds)])
+    yield Row((scene, kind, group), judged(values[None]))
 
 
 def jobs(quick):
@@ -124,8 +106,7 @@ TOPIC = Topic(
     "Where objects hide one another",
     "Frames of occluders over a wall, to the camera's pose and to three curvatures and thicknesses of its lens; the loss is a "
     "fixed smooth weighting of one frame. Relative L2 errors of the interior gradient (plain automatic differentiation), "
-    f"of the one with the boundary term, and of single estimates of {SAMPLES} samples (median); noise of the differences; "
-    "largest bias of a single number in standard errors.",
+    f"of the one with the boundary term, and of single estimates of {SAMPLES} samples (median); noise of the differences.",
     ("scene", "lens", "to"),
     jobs,
     measure,
