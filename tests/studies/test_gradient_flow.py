@@ -225,13 +225,13 @@ def test_the_pose_gradient_of_counts_needs_the_boundary_term(case):
 
 @pytest.fixture(scope="module")
 def batch():
-    return chain.draw_batch(2, 1000)
+    return chain.draw_batch(4, 1000)
 
 
 def test_every_group_of_one_graph_has_the_gradient_of_differences(batch):
     system = chain.make_system(10_000, 0)
     assert sum(p.numel() for p in system.flow.parameters()) >= 10_000
-    for row in chain.joint_rows(system, batch, directions=3):
+    for row in chain.joint_rows(system, batch, directions=4):
         assert row.relative_error <= 0.05, row
         assert row.cosine >= 0.99, row
 
