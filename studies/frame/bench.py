@@ -187,8 +187,8 @@ def peak_mb(function: Callable[[], object]) -> float:
 
 
 def cost(work: Callable[[], object], repeats: int) -> dict[str, float]:
-    """Median seconds of calls after the first, wall_s and cpu_s, and the peak of memory of the first, peak_mb:
-    the figures of a process of its own, in which what compiles has run on something small."""
+    """Median seconds of calls after the first, wall_s and cpu_s, and the peak of memory of the first,
+    peak_mb: the figures of a process of its own, in which what compiles has run on something small."""
     peak = peak_mb(work)
     timing = measure(work, repeats, warm=0)
     return {"wall_s": timing.wall, "cpu_s": timing.cpu, "peak_mb": peak}

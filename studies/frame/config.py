@@ -25,7 +25,8 @@ class StudyConfig:
     """What --quick sets those options to that were not given."""
 
     quick: bool = False
-    """Smaller and shorter: shows that everything works, not the best result. Options given beside it count."""
+    """Smaller and shorter: shows that everything works, not the best result. Options given beside it
+    count."""
     out: Path | None = None
     """Folder for the results; runs/<study>/<time> when left out."""
     seed: int = 0
@@ -150,6 +151,7 @@ def _typed(path, name, value, hint) -> Any:
         if type(value) is kind or (kind is type(None) and value is None):
             return value
     raise FileFormatError(
-        f"'{path}': {name} is {json.dumps(value)[:80]}, which is no {getattr(hint, '__name__', hint)}; it was changed or "
+        f"'{path}': {name} is {json.dumps(value)[:80]}, which is no {getattr(hint, '__name__', hint)}; "
+        "it was changed or "
         "is damaged: start a new run."
     )

@@ -88,8 +88,8 @@ def refusal(name: str) -> str:
 
 
 def refuse_parts(command: list[str]):
-    """End with exit code 2 when Python was started as `python -m studies.NAME` for something that would run in
-    silence, or not at all: a part of a study, or a name that is none.
+    """End with exit code 2 when Python was started as `python -m studies.NAME` for something that would
+    run in silence, or not at all: a part of a study, or a name that is none.
 
     Args:
       command: sys.orig_argv.

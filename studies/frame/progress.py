@@ -113,7 +113,8 @@ class StepProgress:
     @property
     def seconds_per_step(self):
         """Mean wall-clock seconds of a step over all sessions of the run whose state was stored, the first
-        step of each (which compiles kernels) left out where there are others; None where no step was timed."""
+        step of each (which compiles kernels) left out where there are others; None where no step was
+        timed."""
         return self._pace.seconds_per_step
 
     def _time_left(self):

@@ -228,7 +228,8 @@ class Run(Generic[Config]):
         if made_by != self._identity or stored.numbers.keys() != {"numbers", TIMES, *made_by}:
             other = next((name for name in made_by if made_by[name] != self._identity[name]), "version")
             raise FileFormatError(
-                f"'{path}' was written by another {other} ({made_by[other]}, not {self._identity[other]}); start a new run."
+                f"'{path}' was written by another {other} ({made_by[other]}, not "
+                f"{self._identity[other]}); start a new run."
             )
         return stored
 
@@ -243,8 +244,8 @@ def open_run(
     held: contextlib.ExitStack | None = None,
 ) -> Run[Config]:
     """Make the folder of a new run and write its config.json, or find the run that ``config.resume`` names,
-    which goes on with its stored configuration; what a killed session left half written is removed there. No other
-    process may work in the folder until ``held`` ends.
+    which goes on with its stored configuration; what a killed session left half written is removed
+    there. No other process may work in the folder until ``held`` ends.
 
     Raises: CodesignError with one sentence when the folder, the stored configuration or the device is unfit.
     """
@@ -283,8 +284,8 @@ def main(study: Callable[[Run[Config]], None], kind: type[Config], arguments: li
     matplotlib.use("Agg")  # figures go to files; no screen is needed
     torch.set_num_threads(
         1
-        # the heavy work is in drjit's own thread pool, which torch's waiting threads only slow down (measured:
-        # 2x)
+        # the heavy work is in drjit's own thread pool, which torch's waiting threads only slow down
+        # (measured: 2x)
     )
     run = None
     interruption = Interruption()

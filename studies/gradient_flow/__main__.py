@@ -1,8 +1,9 @@
-"""Are the gradients right, from the lens to the loss? Against central differences with common random numbers, by case.
+"""Are the gradients right, from the lens to the loss? Against central differences with common random
+numbers, by case.
 
 chain, joint: junction by junction, and the whole graph with lens, mount, thresholds and network. layers,
-sensors, timing: the event layers against differences of hard counts. silhouettes, silhouettes_chain: where objects hide
-one another.
+sensors, timing: the event layers against differences of hard counts. silhouettes, silhouettes_chain:
+where objects hide one another.
 """
 
 import sys
@@ -41,7 +42,8 @@ class Config(StudyConfig):
     scenes: int = 2
     """Textures and paths over which cosine and scale are taken together (event layers, silhouettes_chain)."""
     samples: int = 1024
-    """Samples per pixel of differences and precise gradients at silhouettes; a quarter of them along the chain."""
+    """Samples per pixel of differences and precise gradients at silhouettes; a quarter of them along
+    the chain."""
     seeds: int = 4
     """Seeds of these; twice as many along the chain."""
 

@@ -1,5 +1,5 @@
-"""Gradients along the chain, junction by junction, and of one graph with lens, mount, thresholds and network: functions of
-named parameters, with their required figures. The tests certify them too."""
+"""Gradients along the chain, junction by junction, and of one graph with lens, mount, thresholds and
+network: functions of named parameters, with their required figures. The tests certify them too."""
 
 import math
 from dataclasses import replace
@@ -48,7 +48,8 @@ def rays_rows():
 
 
 def _camera_rows(loss, size_px, samples, seed, curvature, **options):
-    """Rows of loss(camera, twist) with respect to curvatures, thicknesses and pose. curvature: its step unit."""
+    """Rows of loss(camera, twist) with respect to curvatures, thicknesses and pose. curvature: its step
+    unit."""
     geo = lens.load("cooke-triplet").scaled(0.22).freeze()
     params = {
         "curvature": geo.curvature_per_mm,
@@ -272,8 +273,8 @@ BLOCK_MM = 0.074  # blocks of 4 x 4 pixels of a DAVIS346
 BINS = 4
 DURATION_S = 0.05
 DEPTH_M = 1.5  # of the room, about
-# pixels of motion: an untrained network answers to a tenth of a pixel with another flow, so steps are small; the
-# rounding of float32 frames allows it
+# pixels of motion: an untrained network answers to a tenth of a pixel with another flow, so steps are
+# small; the rounding of float32 frames allows it
 LADDER = (0.005, 0.0035, 0.0025, 0.0018)
 
 
@@ -377,14 +378,16 @@ def measure_joint(config):
 
 
 TEXT = (
-    "Relative error is |autograd - difference| / |difference| over the group; the noise floor is the disagreement of "
+    "Relative error is |autograd - difference| / |difference| over the group; the noise floor is the "
+    "disagreement of "
     "neighbouring step sizes, in the same unit."
 )
 CHAIN = Topic(
     "Along the chain",
-    TEXT
-    + " Lens rays in float64, frames (textured room, no silhouettes) with respect to lens and pose, event counts, "
-    "flow, and the final loss with respect to three curvatures and all six pose components, once with the smooth event "
+    TEXT + " Lens rays in float64, frames (textured room, no silhouettes) with respect to lens and pose, "
+    "event counts, "
+    "flow, and the final loss with respect to three curvatures and all six pose components, once with "
+    "the smooth event "
     "layer and once with the straight-through layer against differences of the hard loss.",
     ("junction", "parameters"),
     lambda quick: [(label,) for label in (*JUNCTIONS, HARD)],

@@ -55,9 +55,9 @@ GROUND = "ground"
 def flow_stage(run: Run[Config]) -> list[Asked]:
     """Closed form, refiner, plain and spiking networks at 256 x 256 pixels, the closed form on 32 windows of
     64 x 64 pixels, and how cost grows with size. One call in float32 by one thread (two spin while they wait
-    for each other, which counts as processor time), each in processes of its own, in turns. Backward: gradient
-    of volume and weights. Peak: memory of the first call beyond what was in use. Networks are untrained: the
-    same arithmetic."""
+    for each other, which counts as processor time), each in processes of its own, in turns. Backward:
+    gradient of volume and weights. Peak: memory of the first call beyond what was in use. Networks are
+    untrained: the same arithmetic."""
     config = run.config
     sizes = SIZES_PX[:2] if config.quick else SIZES_PX
     grown = (CLOSED, CELLS, REFINER, PUBLISHED)
@@ -152,9 +152,9 @@ def scattered(size_px: int, bins: int, seed: int, windows: int = 1) -> EventVolu
 
 def placement_stage(run: Run[Config]) -> list[Asked]:
     """A step of a placement, forward and backward to lens, mount and thresholds: twelve drives before nine
-    windows of 32 x 32, eight rays a pixel, for the three pairs of robot and world, with the robot in view, and
-    for flat ground through a pinhole. Medians of processor seconds; the first step, which compiles, is left
-    out."""
+    windows of 32 x 32, eight rays a pixel, for the three pairs of robot and world, with the robot in
+    view, and for flat ground through a pinhole. Medians of processor seconds; the first step, which
+    compiles, is left out."""
 
     def costs(pair):
         case = case_of(pair, run.config.seed)

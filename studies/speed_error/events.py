@@ -138,9 +138,9 @@ def stream(run: Run[Config], count: int, chunk: int = 500) -> None:
 
 def spiking_stage(run: Run[Config]) -> list[Asked]:
     """The spike response layer beside a convolution of 77 taps, snnTorch's and norse's two-state cells, on
-    2 x 128 x 128 pixels in float32; every layer in processes of its own, in turns. Copies: time over that of a
-    copy of input, spikes and potential. Peak: memory of the first call beyond what was in use. The convolution
-    is SLAYER's: finite kernels, a sequential reset, no gradient through it."""
+    2 x 128 x 128 pixels in float32; every layer in processes of its own, in turns. Copies: time over
+    that of a copy of input, spikes and potential. Peak: memory of the first call beyond what was in
+    use. The convolution is SLAYER's: finite kernels, a sequential reset, no gradient through it."""
     config = run.config
     layers = [name for name in SPIKING if name not in PEERS or name in installed(PEERS)]
     steps = STEPS[:1] if config.quick else STEPS

@@ -76,8 +76,9 @@ def render_stage(run: Run[Config]) -> list[Asked]:
 
 def psf_stage(run: Run[Config]) -> list[Asked]:
     """Frames by point spread functions: lenses of 11 mm on a 346 x 260 sensor of 18.5 um. Errors are RMS
-    differences from many traced samples over the picture's contrast, in percent, beside those of traced frames
-    of 64 samples (their noise) and of the thin lens; the reference's own noise is estimated from its halves.
+    differences from many traced samples over the picture's contrast, in percent, beside those of traced
+    frames of 64 samples (their noise) and of the thin lens; the reference's own noise is estimated from
+    its halves.
     Times: processor time of traced frames over that of the level, with everything of the lens ready (rays,
     map), and with the gradient to lens and poses, which makes both anew."""
     scenes = views()

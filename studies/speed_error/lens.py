@@ -48,8 +48,9 @@ def stage(run: Run[Config]) -> list[Asked]:
     """Rays through a double Gauss of eleven surfaces, d line, each tracer in processes of its own, in turns.
     Memory: peak of the first call above what was in use. Error: largest, of 256 rays, against our trace in
     float64, which the tests hold to 3e-14 mm. Analyses: float64, one thread, in turns in one process; three
-    fields and lines of 800 rays, fans of 65 rays, wavefronts of 64 cells, point spreads of 128 cells padded to
-    512; a design step is the merit of three fields and its gradient to all curvatures and distances."""
+    fields and lines of 800 rays, fans of 65 rays, wavefronts of 64 cells, point spreads of 128 cells
+    padded to 512; a design step is the merit of three fields and its gradient to all curvatures and
+    distances."""
     config = run.config
     peer = bool(installed({"optiland": "optiland"}))
     count = 100_000 if config.quick else 1_000_000

@@ -15,8 +15,8 @@ HIGH_HZ = 50.0  # flicker is the power of the rate above; half of what the steps
 
 
 def judge(pairs, resamples, seed):
-    """Figures by name, numbers or Intervals, of pairs (counts [T-1, 2, H, W], Sequence with the target's); ON and OFF: the smaller
-    one."""
+    """Figures by name, numbers or Intervals, of pairs (counts [T-1, 2, H, W], Sequence with the
+    target's); ON and OFF: the smaller one."""
     found, target = [made for made, _ in pairs], [sequence.counts for _, sequence in pairs]
     dt_s = pairs[0][1].dt_s
     loss, rate = intervals(pairs, resamples, seed)

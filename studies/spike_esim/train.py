@@ -121,8 +121,8 @@ def esim(sequence, theta):
 
 
 def _thesis(store, sequences, steps, seed):
-    """The network of the thesis from the better of two starts, trained the thesis's way: Adam at 0.01, van Rossum loss
-    alone, one sequence after the other."""
+    """The network of the thesis from the better of two starts, trained the thesis's way: Adam at 0.01,
+    van Rossum loss alone, one sequence after the other."""
 
     def spikes(network, sequence):
         return network(sequence.frames / LIGHT)[0]

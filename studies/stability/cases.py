@@ -58,7 +58,8 @@ def black_frames():
 
 
 def total_reflection():
-    """The deficit n^2 (h c)^2 - 1 has the slope 2 n^2 h^2 c in the curvature c = -1/10 of the second surface."""
+    """The deficit n^2 (h c)^2 - 1 has the slope 2 n^2 h^2 c in the curvature c = -1/10 of the second
+    surface."""
     geo = lens.GeoLens([lens.Surface(math.inf, 5.0, GLASS, 99.0), lens.Surface(-10.0, 10.0, None, 9.9)], 4.0)
     out = geo.trace(_f64([(8.0, 0.0, -5.0)]), _f64([AHEAD]))
     yield Check("status", int(lens.Status.TOTAL_REFLECTION), int(out.status))
@@ -140,7 +141,8 @@ def tiny_flow():
 
 
 def smallest_threshold():
-    """Frames 100 to 200: ln(2)/1e-3 = 693 events; slope 1/(200 · 1e-3) to the last frame, 0 to those between."""
+    """Frames 100 to 200: ln(2)/1e-3 = 693 events; slope 1/(200 · 1e-3) to the last frame, 0 to those
+    between."""
     total, slope = _ramp(1e-3)
     yield Check("events", 693, total)
     yield Check("slopes to the later frames", _f64([0, 0, 0, 5]), slope[1:])
@@ -170,7 +172,8 @@ def one_pixel():
 
 
 def static_camera():
-    """A common change of the pose moves all frames alike, so smooth counts stay 0 and so does their gradient."""
+    """A common change of the pose moves all frames alike, so smooth counts stay 0 and so does their
+    gradient."""
     twist = _twist()
     images = _render(_plane(), twist, twist_per_frame=(0.0,) * 6)
     yield Check("differences of frames", 0, images.diff(dim=0), 0)

@@ -1,10 +1,10 @@
-"""Random lenses full of coincidences (equal neighbours, flats, concentric surfaces, zeros), and their gradients
-against differences of a trace in extended precision that shares nothing with the kernel.
+"""Random lenses full of coincidences (equal neighbours, flats, concentric surfaces, zeros), and their
+gradients against differences of a trace in extended precision that shares nothing with the kernel.
 
 A kernel that leaves out what has no effect today must not leave out its derivative. The trace here leaves out
-nothing: every surface is a conic with a polynomial, decentred and tilted by matrices, diffracts, and is found by
-Newton's steps on its sag. Differences are central and extrapolated (Richardson), so they err by the fourth power
-of a step of 1e-4 and by rounding of 1e-19 over it.
+nothing: every surface is a conic with a polynomial, decentred and tilted by matrices, diffracts, and is
+found by Newton's steps on its sag. Differences are central and extrapolated (Richardson), so they err
+by the fourth power of a step of 1e-4 and by rounding of 1e-19 over it.
 """
 
 import math
@@ -39,14 +39,16 @@ STEPS = {  # per column, so that each moves rays by 1e-4 to 1e-3 mm
 WAVELENGTH_UM = 0.5875618
 RAYS = 6
 NEWTON_STEPS = 12
-# g: glass, e: the same glass as before, o: other glass of the same index, a: air, s: flat stop in air, m: mirror
+# g: glass, e: the same glass as before, o: other glass of the same index, a: air, s: flat stop in air,
+# m: mirror
 FORMS = ("gasge", "geaso", "sgega", "goagae", "gamsga")
 real = np.longdouble
 
 
 @dataclass(frozen=True)
 class System:
-    """A lens, rays through it, and the weights [RAYS, 7] of what comes out in the scalar that is differentiated."""
+    """A lens, rays through it, and the weights [RAYS, 7] of what comes out in the scalar that is
+    differentiated."""
 
     lens: GeoLens
     origin_mm: torch.Tensor
@@ -160,9 +162,9 @@ def _step(name, place):
 
 
 def worst_error(found: dict[str, np.ndarray], truth: dict[str, np.ndarray]) -> dict[str, float]:
-    """Largest relative error of each kind's gradients. Entries below 1/1000 of a kind's largest count relative to
-    that, and those that change the scalar by less than 1e-9 over a step of the differences relative to 1e-9: the
-    conic between equal glasses has none, and the differences only their rounding."""
+    """Largest relative error of each kind's gradients. Entries below 1/1000 of a kind's largest count
+    relative to that, and those that change the scalar by less than 1e-9 over a step of the differences
+    relative to 1e-9: the conic between equal glasses has none, and the differences only their rounding."""
     errors = {}
     for name, value in found.items():
         wanted = truth[name]
@@ -266,7 +268,8 @@ def geo_ndim(name):
 
 
 def _turn(tilt):
-    """[V, 3, 3] matrices Rx Ry, by which rows of vectors are multiplied to get components along the turned axes."""
+    """[V, 3, 3] matrices Rx Ry, by which rows of vectors are multiplied to get components along the
+    turned axes."""
     (a, b), zero, one = tilt.T, np.zeros_like(tilt[:, 0]), np.ones_like(tilt[:, 0])
     about_x = np.stack([one, zero, zero, zero, np.cos(a), -np.sin(a), zero, np.sin(a), np.cos(a)], 1)
     about_y = np.stack([np.cos(b), zero, np.sin(b), zero, one, zero, -np.sin(b), zero, np.cos(b)], 1)

@@ -1,5 +1,5 @@
-"""The study of gradients: its judges against enumeration, closed forms and made-up numbers, its core in a few seconds, and
-that it goes on where it was cut."""
+"""The study of gradients: its judges against enumeration, closed forms and made-up numbers, its core in
+a few seconds, and that it goes on where it was cut."""
 
 import dataclasses
 import math
@@ -112,7 +112,8 @@ def test_cosine_and_scale_of_known_vectors(generator):
 
 
 def test_derivatives_over_sections_add_up_to_the_difference():
-    """Of a quadratic function of the frames, whose difference over a section is exactly the derivative in its middle."""
+    """Of a quadratic function of the frames, whose difference over a section is exactly the derivative
+    in its middle."""
     ends = torch.rand(5, 3, 8, 8, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
     def square(frames, t_s):
@@ -131,7 +132,8 @@ def test_a_number_that_all_pixels_share_is_differentiated_block_by_block():
 
 
 def test_a_physical_layer_and_its_judge_draw_the_same_thresholds():
-    """Thresholds spread by a third; a rise of 1.503 gives floor((1.503 + D)/C_on) events from a distance D at the start."""
+    """Thresholds spread by a third; a rise of 1.503 gives floor((1.503 + D)/C_on) events from a
+    distance D at the start."""
     frames = climbing(16, 1.503, 0.0)
     sensor = events.SensorModel(0.15, 0.15, theta_sigma=0.05)
     on, off = events.draw_thresholds(sensor, (16, 16), torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -175,7 +177,8 @@ def test_hard_counts_are_whole_and_in_the_mean_the_smooth_ones_of_a_rise(case):
     frames = 60 * level.exp()  # above 20 the front end is a logarithm
     hard = case.hard(frames, case.places(64, 0)).sum(0)
     assert torch.equal(hard, hard.round())
-    # one threshold from the middle of its place, half a threshold is not yet reached: floor(x - u) over a unit of u
+    # one threshold from the middle of its place, half a threshold is not yet reached: floor(x - u) over
+    # a unit of u
     expected = 1.7 / case.theta - 0.5
     assert float((hard[0].mean(0) - expected).abs().max()) <= 1 / 64
     assert float(hard[1].abs().max()) == 0

@@ -1,4 +1,5 @@
-"""The list of studies and the commands that start them: complete, quick, and with a word for every wrong name."""
+"""The list of studies and the commands that start them: complete, quick, and with a word for every
+wrong name."""
 
 import dataclasses
 import importlib
@@ -57,7 +58,8 @@ def test_a_study_without_a_group_is_listed_too(tmp_path, monkeypatch):
 def test_listing_imports_nothing_heavy():
     script = (
         "import sys; from codesign.__main__ import main; main(['list']);"
-        "print([name for name in ('torch', 'numpy', 'mitsuba', 'drjit', 'matplotlib') if name in sys.modules])"
+        "print([name for name in ('torch', 'numpy', 'mitsuba', 'drjit', 'matplotlib') if name in "
+        "sys.modules])"
     )
     done = python("-c", script)
     assert done.returncode == 0, done.stderr

@@ -314,8 +314,8 @@ clock = Clock()
 
 
 def counted(run: Run[Config]):
-    """A study of ``sizes[0]`` steps of 20 ms, the first of every session 60 ms longer, and some judging, which
-    ends with Ctrl-C where limit is 9."""
+    """A study of ``sizes[0]`` steps of 20 ms, the first of every session 60 ms longer, and some
+    judging, which ends with Ctrl-C where limit is 9."""
     earlier = run.load_state()
     done = first = earlier.numbers["done"] if earlier else 0
     run.on_interrupt(lambda: run.save_state({}, {"done": done}))
@@ -418,7 +418,8 @@ def test_unwritable_folder_is_one_sentence(tmp_path, command, place):
     (tmp_path / "file").write_text("kept")
     code, complaint = command("--out", tmp_path / place)
     assert code == 2
-    told = r"error: the output folder '.*' cannot be (made|read) \(.*\); choose a folder you may write to with --out\.\n"
+    reason = r"cannot be (made|read) \(.*\); choose a folder you may write to with --out\."
+    told = rf"error: the output folder '.*' {reason}\n"
     assert re.fullmatch(told, complaint)
     assert contents(tmp_path) == {"file": b"kept"}
 

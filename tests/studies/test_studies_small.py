@@ -47,8 +47,8 @@ def test_gradients_of_random_lenses_with_coincidences_agree_with_differences():
 
 
 def test_the_differences_see_a_wrong_gradient():
-    """Every kind's gradient moves the scalar: one that is left out, as the index of equal neighbours once was,
-    is an error of 1."""
+    """Every kind's gradient moves the scalar: one that is left out, as the index of equal neighbours
+    once was, is an error of 1."""
     system = draw_system(torch.Generator().manual_seed(2), "geaso")
     truth = differences(system) | {"glass": system.lens.glass.numpy()}
     for name in KINDS:
@@ -74,7 +74,8 @@ def test_a_miss_is_told_and_a_case_that_stops_has_its_sentence():
 
 
 def test_the_convolution_of_the_bench_is_the_layer_up_to_its_cut_kernel():
-    """77 taps leave out 1 % of the response; where the drive stays below threshold it is the potential's size."""
+    """77 taps leave out 1 % of the response; where the drive stays below threshold it is the
+    potential's size."""
     assert len(events.taps(events.TAU_S, 1.0)) == 77
     drive = 0.9 * torch.rand(40, 1, 4, 4, generator=torch.Generator().manual_seed(0))
     agree = (events.convolution(drive) == events.ours(drive)).double().mean()

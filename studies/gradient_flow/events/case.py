@@ -46,8 +46,8 @@ STILL = Direction("still", "nothing")
 
 
 class Case:
-    """One texture and one path before a thin lens. seed: of both. size_px: of the picture, a multiple of 4 for
-    ``compare.blocks``."""
+    """One texture and one path before a thin lens. seed: of both. size_px: of the picture, a multiple
+    of 4 for ``compare.blocks``."""
 
     def __init__(self, seed: int, size_px: int = SIZE_PX):
         self.size_px = size_px

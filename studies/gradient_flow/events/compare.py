@@ -1,7 +1,7 @@
 """Derivatives of a layer beside differences of the hard sensor, pooled over blocks: cosine and scale.
 
-The hard sensor's counts are means over many places where a pixel may have begun inside its thresholds. The same
-beginnings serve both ends of a step (common random numbers).
+The hard sensor's counts are means over many places where a pixel may have begun inside its thresholds.
+The same beginnings serve both ends of a step (common random numbers).
 """
 
 import itertools
@@ -25,12 +25,14 @@ BLOCKS = 4  # per side of the picture
 RESAMPLES = 400
 
 Maps = Callable[[Tensor, Tensor], Tensor]
-"""What is differentiated: frames [T, H, W] and times [T] to maps [K, H, W], of a layer or of the hard sensor."""
+"""What is differentiated: frames [T, H, W] and times [T] to maps [K, H, W], of a layer or of the hard
+sensor."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Derivative of a layer, averaged over a step, and difference of the hard sensor over the step, [K, blocks]."""
+    """Derivative of a layer, averaged over a step, and difference of the hard sensor over the step, [K,
+    blocks]."""
 
     slope: Tensor
     difference: Tensor
@@ -46,8 +48,8 @@ def offsets(shape: tuple[int, ...], count: int, seed: int = 0) -> Tensor:
 
 
 def distance(place: Tensor, theta_on: Tensor | float, theta_off: Tensor | float) -> Tensor:
-    """How far the level lies above the memorised one at the first frame, for a place in [0, 1): even over -C_off/2
-    to C_on/2, which is what the memory layer assumes of a pixel without a history."""
+    """How far the level lies above the memorised one at the first frame, for a place in [0, 1): even
+    over -C_off/2 to C_on/2, which is what the memory layer assumes of a pixel without a history."""
     return place * (theta_on + theta_off) / 2 - theta_off / 2
 
 
@@ -55,8 +57,8 @@ def distance(place: Tensor, theta_on: Tensor | float, theta_off: Tensor | float)
 class Judge:
     """Mean over beginnings of something that the hard sensor gives.
 
-    sensor: SensorModel. count: beginnings. seed: of the beginnings and of what the sensor draws itself, the same for
-      every one of them.
+    sensor: SensorModel. count: beginnings. seed: of the beginnings and of what the sensor draws itself,
+      the same for every one of them.
     """
 
     sensor: events.SensorModel
@@ -67,8 +69,8 @@ class Judge:
     def mean(self, frames: Tensor, t_s: Tensor, observe: Callable[[Tensor], Tensor]) -> Tensor:
         """Mean of ``observe(counts)`` over beginnings.
 
-        Args: frames: [T, H, W], 0-255 scale. t_s: [T]. observe: counts [T-1, 2, B, H, W] of some beginnings to
-          what is wanted [K, B, H, W].
+        Args: frames: [T, H, W], 0-255 scale. t_s: [T]. observe: counts [T-1, 2, B, H, W] of some
+          beginnings to what is wanted [K, B, H, W].
         Returns: [K, H, W].
         """
         places = offsets(tuple(frames.shape[1:]), self.count, self.seed).to(frames)
@@ -152,8 +154,8 @@ def slope(ends: Tensor, t_s: Tensor, layer: Maps) -> Tensor:
 
 
 def derivative(layer: Maps, frames: Tensor, tangent: Tensor, t_s: Tensor) -> Tensor:
-    """[K, blocks] derivative of every map, summed over blocks, along a tangent of the frames. Pixels are independent:
-    one backward pass serves all blocks of a map."""
+    """[K, blocks] derivative of every map, summed over blocks, along a tangent of the frames. Pixels
+    are independent: one backward pass serves all blocks of a map."""
     frames = frames.clone().requires_grad_()
     found = []
     for one in (maps := layer(frames, t_s)):
@@ -163,8 +165,8 @@ def derivative(layer: Maps, frames: Tensor, tangent: Tensor, t_s: Tensor) -> Ten
 
 
 def row(names: Sequence[object], found: Sequence[Pair], seed: int = 0) -> Row:
-    """Cosine and scale (length of the derivative along the differences over theirs) of all pairs together, with the
-    interval of 90 % of the cosine over draws of cases and blocks."""
+    """Cosine and scale (length of the derivative along the differences over theirs) of all pairs
+    together, with the interval of 90 % of the cosine over draws of cases and blocks."""
     slope = torch.cat([one.slope for one in found], 1)
     difference = torch.cat([one.difference for one in found], 1)
     # [3, units]

@@ -1,10 +1,11 @@
-"""The event layers beside the hard sensor: every layer with equal thresholds, the physical layer, and when events come
-from few frames.
+"""The event layers beside the hard sensor: every layer with equal thresholds, the physical layer, and
+when events come from few frames.
 
-A camera passes a textured plane behind a thin lens. What a layer gives is pooled over blocks, quarters of the time and
-polarity; one direction each changes the contrast of the scene, the focus of the lens, or a component of the camera's
-pose, by enough to move log levels by about a threshold. The derivative of every pooled number along the direction,
-averaged over the step, is set beside the difference of the hard sensor's over the step.
+A camera passes a textured plane behind a thin lens. What a layer gives is pooled over blocks, quarters
+of the time and polarity; one direction each changes the contrast of the scene, the focus of the lens,
+or a component of the camera's pose, by enough to move log levels by about a threshold. The derivative
+of every pooled number along the direction, averaged over the step, is set beside the difference of the
+hard sensor's over the step.
 """
 
 import warnings
@@ -137,7 +138,8 @@ def of_field(one, sensor, field):
 
 
 def of_number(found: Tensor, value: Tensor) -> Tensor:
-    """[K, blocks] derivative of maps [K, H, W] to one number that all pixels share: a backward pass for each."""
+    """[K, blocks] derivative of maps [K, H, W] to one number that all pixels share: a backward pass for
+    each."""
     pooled = compare.blocks(found)
     grads = [torch.autograd.grad(one, value, retain_graph=True)[0] for one in pooled.flatten()]
     return torch.stack(grads).reshape(pooled.shape)
@@ -150,7 +152,8 @@ def asked_of_sensor(row):
 
 SENSORS = Topic(
     "Physical layer",
-    f"Bandwidth of the photoreceptor, leak, spread of the thresholds, dead time, {PHYSICAL_HZ} frames per second: "
+    f"Bandwidth of the photoreceptor, leak, spread of the thresholds, dead time, {PHYSICAL_HZ} frames "
+    f"per second: "
     f"directions of the case, and fields of the sensor, moved by {STEP:.0%} either way (one scene).",
     ("sensor", "direction"),
     lambda quick: [(name,) for name in list(PHYSICAL)[-1 if quick else 0 :]],
@@ -177,8 +180,8 @@ def observed(counts: Tensor, t_s: Tensor) -> Tensor:
 
 @cache
 def stream_change(one: Case, name: str) -> Tensor:
-    """Change of the maps over half the step of a direction, summed over blocks: the mean over beginnings of the stream at
-    TRUTH_HZ."""
+    """Change of the maps over half the step of a direction, summed over blocks: the mean over
+    beginnings of the stream at TRUTH_HZ."""
     judge = Judge(IDEAL)
     t_s = times(TRUTH_HZ)
     low, high = (
@@ -217,7 +220,8 @@ def asked_of_timing(row):
 
 TIMING = Topic(
     "When events come, from few frames",
-    "5 to 32 intervals between frames, against the stream at 10 kHz: counts of the whole time, and a volume of 5 bins.",
+    "5 to 32 intervals between frames, against the stream at 10 kHz: counts of the whole time, and a "
+    "volume of 5 bins.",
     ("intervals", "loss", "direction"),
     timing_jobs,
     measure_timing,

@@ -1,5 +1,5 @@
-"""A room with two boxes before a lens: frames, events, flow and loss as a function of nine numbers of the camera, the
-ways to its gradient, and its differences with common random numbers."""
+"""A room with two boxes before a lens: frames, events, flow and loss as a function of nine numbers of
+the camera, the ways to its gradient, and its differences with common random numbers."""
 
 import math
 from collections.abc import Callable
@@ -18,8 +18,8 @@ DURATION_S = 0.05
 BINS = 4
 THETA = 0.15
 MISMATCH = 0.03  # of thresholds, from pixel to pixel
-# metres and radians, then two curvatures per mm and the focus in mm: each moves the image by 0.1 to 0.3 px of 48, or
-# changes its blur by about as much
+# metres and radians, then two curvatures per mm and the focus in mm: each moves the image by 0.1 to 0.3
+# px of 48, or changes its blur by about as much
 STEPS = torch.tensor([*(4e-3,) * 3, *(2e-3,) * 3, 2e-4, 2e-4, 2e-2], dtype=torch.float64)
 GROUPS = {"pose": slice(0, 6), "lens": slice(6, 9)}
 CURVATURES = (0, 2)
@@ -28,8 +28,8 @@ Losses = dict[str, Callable[[Tensor], Tensor]]
 
 
 class Case:
-    """One draw of textures, path, thresholds and weights before the traced triplet, for films of size_px pixels a
-    side."""
+    """One draw of textures, path, thresholds and weights before the traced triplet, for films of
+    size_px pixels a side."""
 
     def __init__(self, seed: int, size_px: int):
         self.size_px = size_px
@@ -73,16 +73,16 @@ class Case:
         return render.frames(camera, self.scene, moved, gradient=way, per_px=per_px)
 
     def places(self, count: int, seed: int) -> Tensor:
-        """Where pixels stand inside their threshold, [K, H, W] in -1/2..1/2: each goes through K even places, in an
-        order of its own."""
+        """Where pixels stand inside their threshold, [K, H, W] in -1/2..1/2: each goes through K even
+        places, in an order of its own."""
         draw = torch.Generator().manual_seed(seed)
         shape = self.theta.shape
         order = torch.rand(count, *shape, generator=draw).argsort(0)
         return (order + torch.rand(shape, generator=draw)) / count - 0.5
 
     def losses(self, places: Tensor) -> Losses:
-        """Name -> function of frames: a weighted event volume, and the flow's error, of smooth and of hard counts;
-        "hard flow, one place" is that of the first place alone."""
+        """Name -> function of frames: a weighted event volume, and the flow's error, of smooth and of
+        hard counts; "hard flow, one place" is that of the first place alone."""
         return {
             "smooth counts": lambda frames: self.weighted(self.smooth(frames)),
             "smooth flow": lambda frames: self.flow_error(self.smooth(frames)),
@@ -145,8 +145,8 @@ LOSSES = ("smooth counts", "smooth flow", "hard counts", "hard flow", "hard flow
 
 
 def estimates(case: Case, samples: int, places: int, seed: int) -> Tensor:
-    """Differences, the interior gradient, the one with the boundary term and a single estimate of it, at one seed of the
-    camera and one draw of places: [4, LOSSES, 9]."""
+    """Differences, the interior gradient, the one with the boundary term and a single estimate of it,
+    at one seed of the camera and one draw of places: [4, LOSSES, 9]."""
     losses = case.losses(case.places(places, seed))
     ways = (
         case.differences(losses, samples, seed),
@@ -158,8 +158,8 @@ def estimates(case: Case, samples: int, places: int, seed: int) -> Tensor:
 
 
 def judged(values: Tensor) -> dict[str, float]:
-    """Relative L2 errors against differences, noises and cosines out of values [cases, seeds, 4, n]; cases stand side by
-    side, so that no error cancels another's."""
+    """Relative L2 errors against differences, noises and cosines out of values [cases, seeds, 4, n];
+    cases stand side by side, so that no error cancels another's."""
     truth, interior, boundary, _ = values.mean(1).transpose(0, 1).flatten(1)
     size = float(truth.norm())
     deviation = values.std(1).transpose(0, 1).flatten(1) / math.sqrt(values.shape[1])
@@ -190,8 +190,8 @@ def measure(config):
 
 
 def asked(row):
-    """5 % and twice the noise of smooth counts; of the mean over places of hard ones a noise below 10 % and a cosine of
-    0.9. Nothing is asked of one place."""
+    """5 % and twice the noise of smooth counts; of the mean over places of hard ones a noise below 10 %
+    and a cosine of 0.9. Nothing is asked of one place."""
     if row.names[0].startswith("smooth"):
         return Asked({}, {"with_boundary": 0.05 + 2 * row.numbers["noise"]})
     return None if row.names[0].endswith("place") else Asked({"cosine": 0.9}, {"noise": 0.10})
@@ -199,9 +199,12 @@ def asked(row):
 
 TOPIC = Topic(
     "From silhouettes to the flow loss",
-    "A room with two boxes, through events and flow, to the camera's pose and to its lens. Relative L2 error against "
-    f"differences; one estimate has {SINGLE} samples. The loss of hard counts is a mean over places of every pixel inside "
-    "its threshold; that of one place alone is another, rough function, whose differences nothing can be judged by.",
+    "A room with two boxes, through events and flow, to the camera's pose and to its lens. Relative "
+    "L2 error against "
+    f"differences; one estimate has {SINGLE} samples. The loss of hard counts is a mean over places of "
+    f"every pixel inside "
+    "its threshold; that of one place alone is another, rough function, whose differences nothing can "
+    "be judged by.",
     ("loss", "to"),
     lambda quick: [()],
     measure,

@@ -1,5 +1,5 @@
-"""Frames of occluders over a wall, to the camera's pose and to the lens: one scene before one lens, and the ways to its
-gradient beside differences with common random numbers."""
+"""Frames of occluders over a wall, to the camera's pose and to the lens: one scene before one lens, and
+the ways to its gradient beside differences with common random numbers."""
 
 import torch
 
@@ -70,7 +70,8 @@ class Task:
 
 
 def measure(config, scene, kind, group):
-    """Relative L2 errors of the ways against differences, scaled so that every number counts by its own step."""
+    """Relative L2 errors of the ways against differences, scaled so that every number counts by its own
+    step."""
     task = Task(silhouette_scenes.build(scene), kind)
 
     def estimates(seed):
@@ -104,9 +105,12 @@ def asked(row):
 
 TOPIC = Topic(
     "Where objects hide one another",
-    "Frames of occluders over a wall, to the camera's pose and to three curvatures and thicknesses of its lens; the loss is a "
-    "fixed smooth weighting of one frame. Relative L2 errors of the interior gradient (plain automatic differentiation), "
-    f"of the one with the boundary term, and of single estimates of {SAMPLES} samples (median); noise of the differences.",
+    "Frames of occluders over a wall, to the camera's pose and to three curvatures and thicknesses of "
+    "its lens; the loss is a "
+    "fixed smooth weighting of one frame. Relative L2 errors of the interior gradient (plain "
+    "automatic differentiation), "
+    f"of the one with the boundary term, and of single estimates of {SAMPLES} samples (median); noise "
+    f"of the differences.",
     ("scene", "lens", "to"),
     jobs,
     measure,
