@@ -154,5 +154,23 @@ def pictures(rows: Mapping[str, Mapping[str, Any]], signed: Iterable[str] = (), 
     return figure
 
 
+def bars(
+    values: Mapping[str, float | Interval], xlabel: str, log: bool = False, level: float | None = None
+) -> Figure:
+    """Figure of horizontal bars, with whiskers where a value is an Interval; ``level`` is drawn as a red
+    line."""
+    figure, axis = plt.subplots(figsize=(7, 0.8 + 0.4 * len(values)), layout="constrained")
+    for at, value in enumerate(values.values()):
+        of = value if isinstance(value, Interval) else Interval(value, value, value, 1)
+        whiskers = [[of.value - of.low], [of.high - of.value]] if of.low < of.high else None
+        axis.barh(at, of.value, 0.65, xerr=whiskers, color="#1b6ca8", ecolor="0.3", capsize=3)
+    if level is not None:
+        axis.axvline(level, color="firebrick", linewidth=1)
+    axis.set_yticks(range(len(values)), list(values))
+    axis.set(xlabel=xlabel, xscale="log" if log else "linear")
+    axis.invert_yaxis()
+    return figure
+
+
 def _cell(value):
     return str(value) if isinstance(value, Interval) else value

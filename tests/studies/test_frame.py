@@ -10,6 +10,7 @@ from statistics import stdev
 import numpy as np
 import pytest
 import torch
+from matplotlib.patches import Rectangle
 
 from codesign.errors import CodesignError, DomainError, FileFormatError, ShapeError
 from studies.frame import bench, compare, show
@@ -305,5 +306,7 @@ def test_figures_hold_what_they_are_given():
     assert [axis.axison for axis in grid.axes] == [True, True, True, False]
     low, high = grid.axes[1].images[0].get_clim()
     assert low == -high == pytest.approx(-0.5, abs=0.01)
-    for figure in (chart, grid):
+    drawn = show.bars({"a": 2.0, "b": Interval(1, 0.5, 2, 9)}, "s", log=True, level=1.5)
+    assert [bar.get_width() for bar in drawn.axes[0].patches if isinstance(bar, Rectangle)] == [2, 1]
+    for figure in (chart, grid, drawn):
         show.plt.close(figure)
