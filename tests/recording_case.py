@@ -46,7 +46,7 @@ def poses(folder, speed_m_s, rate_rad_s, start_s=99.9):
     t_s = start_s + np.arange(81) / 200
     turns = Rotation.from_rotvec(np.outer(t_s - t_s[0], rate_rad_s)).as_quat()
     rows = np.column_stack([t_s, np.outer(t_s, speed_m_s), turns])
-    np.savetxt(folder / "groundtruth.txt", rows, fmt="%.9f")
+    np.savetxt(folder / "groundtruth.txt", rows)
 
 
 # damage

@@ -58,13 +58,13 @@ def test_what_says_little_has_finite_gradients_and_what_says_nothing_no_flow(mod
 
 
 @pytest.mark.parametrize("model", ["constant", "affine", "quadratic", "local"])
-@pytest.mark.parametrize(("bins", "count"), [(3, 1.0), (slice(8), 125.0)], ids=["one event", "hot pixel"])
-def test_one_pixel_of_a_large_image_says_nothing(model, bins, count):
+@pytest.mark.parametrize(("bins", "count", "most"), [(3, 1.0, 0.1), (slice(8), 125.0, 0.05)])
+def test_one_pixel_of_a_large_image_says_nothing(model, bins, count, most):
     counts = torch.zeros(1, 2, 8, 128, 128)
     counts[0, 0, bins, 5, 5] = count
     field = certain(estimate_lk(evenly_timed(counts), model))
     assert float(field.flow_px.abs().max()) <= 0.3  # a tenth of what the prior expects
-    assert float(field.confidence.max()) <= 0.1
+    assert float(field.confidence.max()) <= most
 
 
 @pytest.mark.parametrize(("height", "width"), [(2, 2), (2, 30), (13, 3)])
