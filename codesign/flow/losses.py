@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, shown
+from codesign.errors import DomainError, ShapeError
 from codesign.flow.checks import check_field, check_kind, check_number, check_real
 from codesign.flow.contrast import (
     area_change,
@@ -29,6 +29,10 @@ REFERENCES = (
     (0.5, 0.5),
     (1.0, 0.25),
 )  # (time, weight): start, middle and end of the window, as in Shiba et al., ECCV 2022, sec. 3.2
+PRIOR_PX = 8.0  # of a prediction that claims a confidence only
+LAPLACE_FLOOR_PX = 0.05
+LEAST_AREA = 0.8  # of the published guard
+SLOWEST_PX = 1.0  # motion that errors are shares of, at least
 # sharpness, (events per pixel)^2, far below that of any scene: no events count as sharp as at zero flow
 _FAINT = 1e-6
 # area changes from _FOLD to _FREE count in full; folds count 0, no event counts more than _MOST
@@ -89,14 +93,13 @@ def likelihood_loss(
     truth: FlowField,
     gamma: float = 0.8,
     floor_px: float = 0.1,
-    prior_px: float = 8.0,
 ) -> Tensor:
     """Negative log likelihood of the error under the covariance that each prediction claims for itself, a
     Gaussian less its constant ln 2 pi.
 
     Args:
       predictions, truth, gamma: as in supervised_loss. Each prediction has covariance_px2, or else
-        confidence c, read as the share of the prior that the events have removed: variance prior_px^2
+        confidence c, read as the share of the prior that the events have removed: variance 64 px^2
         (1 - c) per axis.
       floor_px: standard deviation added to every claim (in squares), so that no claim is exact and the
         loss stays bounded below by 2 ln floor_px.
@@ -109,10 +112,9 @@ def likelihood_loss(
     """
 
     floor_px = check_number(floor_px, "floor_px", above=0.0)
-    prior_px = check_number(prior_px, "prior_px", above=0.0)
 
     def nll(field, error):
-        squared, log_determinant = _distance(field, error, floor_px, prior_px)
+        squared, log_determinant = _distance(field, error, floor_px)
         return (squared + log_determinant) / 2
 
     return _over_predictions(predictions, truth, gamma, nll)
@@ -122,8 +124,6 @@ def laplace_loss(
     predictions: Sequence[FlowField],
     truth: FlowField,
     gamma: float = 0.8,
-    floor_px: float = 0.05,
-    prior_px: float = 8.0,
 ) -> Tensor:
     """As likelihood_loss, for errors with long tails: a density that falls as exp(-sqrt(3) m), less its
     constant.
@@ -138,20 +138,19 @@ def laplace_loss(
     """
 
     def nll(field, error):
-        squared, log_determinant = _distance(field, error, floor_px, prior_px)
+        squared, log_determinant = _distance(field, error, LAPLACE_FLOOR_PX)
         return math.sqrt(3) * (squared + 1e-4).sqrt() + log_determinant / 2
 
     return _over_predictions(predictions, truth, gamma, nll)
 
 
-def relative_unit(truth: FlowField, floor_px: float = 1.0) -> Tensor:
-    """[B] 1 / sqrt(mean squared length of the valid true flow + floor_px^2): turns an error in px into a
+def relative_unit(truth: FlowField) -> Tensor:
+    """[B] 1 / sqrt(mean squared length of the valid true flow + 1 px^2): turns an error in px into a
     share of the sample's motion. Gradient: none."""
-    floor_px = check_number(floor_px, "floor_px", 0.0)
     squared = _known(truth).detach().square().sum(1).flatten(1).sum(1) / truth.valid.flatten(1).sum(
         1
     ).clamp_min(1)
-    return (squared + floor_px**2).rsqrt()
+    return (squared + SLOWEST_PX**2).rsqrt()
 
 
 def require_valid(truth: FlowField) -> FlowField:
@@ -171,7 +170,6 @@ def contrast_loss(
     volume: EventVolume,
     flow_px: Tensor,
     carry_steps: int = 1,
-    references: Sequence[tuple[float, float]] = REFERENCES,
 ) -> Tensor:
     """Contrast maximisation without event collapse: zero-flow sharpness of the events over their sharpness
     when warped.
@@ -180,10 +178,8 @@ def contrast_loss(
       volume: EventVolume, counts [B, 2, bins, H, W].
       flow_px: [B, 2, H, W] pixels per window.
       carry_steps: as in contrast.volume_tracks.
-      references: (time, weight) pairs; the images of warped events at these times count with these
-        weights, which sum to 1.
-    Returns: scalar mean over the batch of the weighted mean of the ratios; 1 for zero flow, less for flow
-      that explains the events; 1 for a sample without events.
+    Returns: scalar mean over the batch of the weighted mean of the ratios at the times of REFERENCES; 1
+      for zero flow, less for flow that explains the events; 1 for a sample without events.
     Guard: an event counts as much as the warp stretches the area around it (from 0 where it folds or turns
       over to 2.5). Squeezing the events into less space then leaves the mean squared slope of their image
       unchanged (in two dimensions it is invariant under change of scale), so only alignment pays; and ratios
@@ -195,10 +191,9 @@ def contrast_loss(
       et al., Sensors 2022, sec. 3.4.2, here as a weight.
     """
     tracks = volume_tracks(volume, flow_px, carry_steps)
-    _check_references(references)
     still = sharpness(still_image(volume.counts)) + _FAINT
     total = torch.zeros_like(still)
-    for at, share in references:
+    for at, share in REFERENCES:
         stretch = _stretch(warp_jacobian(tracks, volume.counts.shape[2], at)).flatten(1)
         total = total + share * still / (sharpness(smooth_image(tracks, at, stretch)) + _FAINT)
     return total.mean()
@@ -208,7 +203,6 @@ def plain_contrast_loss(
     volume: EventVolume,
     flow_px: Tensor,
     carry_steps: int = 0,
-    references: Sequence[tuple[float, float]] = REFERENCES,
 ) -> Tensor:
     """The objective as published, zero-flow sharpness over mean sharpness, without a guard: a flow into one
     point beats the true one.
@@ -216,35 +210,31 @@ def plain_contrast_loss(
     To compare with, and for flows that cannot contract. Arguments, gradient and source as in contrast_loss.
     """
     tracks = volume_tracks(volume, flow_px, carry_steps)
-    _check_references(references)
-    moved = torch.stack([share * sharpness(smooth_image(tracks, at)) for at, share in references]).sum(0)
+    moved = torch.stack([share * sharpness(smooth_image(tracks, at)) for at, share in REFERENCES]).sum(0)
     return ((sharpness(still_image(volume.counts)) + _FAINT) / (moved + _FAINT)).mean()
 
 
 def collapse_penalty(
     volume: EventVolume,
     flow_px: Tensor,
-    least: float = 0.8,
-    references: Sequence[tuple[float, float]] = REFERENCES,
 ) -> Tensor:
-    """Mean over the events of max(0, least - area change of the warp)^2: the published guard, to be added to
+    """Mean over the events of max(0, 0.8 - area change of the warp)^2: the published guard, to be added to
     plain_contrast_loss with a weight.
 
-    Contractions to less than ``least`` of the area are punished whether they are true or not. Returns:
+    Contractions to less than that share of the area are punished whether they are true or not. Returns:
     scalar; 0 for a sample without events.
     Gradient: counts and flow. Source: Shiba et al., Sensors 2022, sec. 3.4.2 and 3.6 (here squared beyond the
       threshold, to be smooth).
     """
     tracks = volume_tracks(volume, flow_px)
-    check_number(least, "least")
-    _check_references(references)
     events = volume.counts.sum(1)
     total = sum(
         share
         * (
-            events * (least - area_change(warp_jacobian(tracks, events.shape[1], at))).clamp_min(0).square()
+            events
+            * (LEAST_AREA - area_change(warp_jacobian(tracks, events.shape[1], at))).clamp_min(0).square()
         ).sum((1, 2, 3))
-        for at, share in references
+        for at, share in REFERENCES
     )
     return (total / (events.sum((1, 2, 3)) + _FAINT)).mean()
 
@@ -320,19 +310,6 @@ def smoothness_loss(
     return total
 
 
-def _check_references(references):
-    """Raise unless references are (time, weight) pairs."""
-    pairs = isinstance(references, Sequence) and not isinstance(references, str) and len(references) > 0
-    if not pairs or not all(isinstance(pair, Sequence) and len(pair) == 2 for pair in references):
-        raise ShapeError(f"references are {shown(references)}; a list of (time, weight) pairs is needed.")
-    total = 0.0
-    for at, share in references:
-        check_number(at, "the time of a reference")
-        total += check_number(share, "the weight of a reference", 0.0)
-    if abs(total - 1) > 1e-6:
-        raise DomainError(f"the weights of the references {shown(references)} do not sum to 1; scale them.")
-
-
 def _over_predictions(predictions, truth, gamma, per_pixel):
     check_number(gamma, "gamma", above=0.0)
     if not isinstance(predictions, Sequence) or not predictions:
@@ -377,9 +354,9 @@ def _per_pixel(unit, flow):
         ) from None
 
 
-def _distance(field, error, floor_px, prior_px):
+def _distance(field, error, floor_px):
     """m^2 = e^T S^-1 e and ln det S of errors [B, 2, H, W], S the claim + floor_px^2."""
-    xx, xy, yy = _covariance(field, prior_px)
+    xx, xy, yy = _covariance(field)
     spare = floor_px**2
     # xx yy - xy^2 >= 0 apart from rounding; taken by itself it cannot cancel the floor's part of the
     # determinant
@@ -389,7 +366,7 @@ def _distance(field, error, floor_px, prior_px):
     return squared, determinant.log()
 
 
-def _covariance(field, prior_px):
+def _covariance(field):
     full = torch.promote_types(field.flow_px.dtype, torch.float32)
     if field.covariance_px2 is None and field.confidence is None:
         raise DomainError(
@@ -409,7 +386,7 @@ def _covariance(field, prior_px):
             raise DomainError(
                 "a confidence lies outside 0 to 1; 0 means nothing was seen, 1 a flow known exactly."
             )
-        variance = prior_px**2 * (1 - field.confidence.to(full))
+        variance = PRIOR_PX**2 * (1 - field.confidence.to(full))
         return variance, torch.zeros_like(variance), variance
     xx, xy, yy = field.covariance_px2.to(full).unbind(1)
     slack = 1e-4 * xx * yy if xx.dtype == torch.float32 else 1e-9 * xx * yy  # rounding of the products

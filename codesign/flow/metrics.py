@@ -152,22 +152,19 @@ def pinhole_directions(
     width_px: int,
     focal_px: float,
     centre_px: tuple[float, float] | None = None,
-    dtype: torch.dtype = torch.float64,
 ) -> Tensor:
     """Directions [H, W, 3], z = 1, of a pinhole camera; centre_px: (x, y) of the axis, the image's middle
     when None."""
     height_px, width_px = check_size((height_px, width_px), "the picture")
     check_number(focal_px, "focal_px", above=0.0)
-    if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
-        raise DomainError(f"dtype is {shown(dtype)}; torch.float32 or torch.float64 is needed.")
     if centre_px is not None and (not isinstance(centre_px, (tuple, list)) or len(centre_px) != 2):
         raise ShapeError(f"centre_px is {shown(centre_px)}; (x, y) in pixels is needed.")
     for coordinate in centre_px or ():
         check_number(coordinate, "a coordinate of centre_px")
     centre_x, centre_y = ((width_px - 1) / 2, (height_px - 1) / 2) if centre_px is None else centre_px
     y, x = torch.meshgrid(
-        torch.arange(height_px, dtype=dtype) - centre_y,
-        torch.arange(width_px, dtype=dtype) - centre_x,
+        torch.arange(height_px, dtype=torch.float64) - centre_y,
+        torch.arange(width_px, dtype=torch.float64) - centre_x,
         indexing="ij",
     )
     return torch.stack([x / focal_px, y / focal_px, torch.ones_like(x)], -1)

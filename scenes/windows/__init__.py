@@ -1,12 +1,11 @@
 """Windows of events with exact flow: what flow networks learn on and estimators are judged on.
 
 ``rendered``: flat layers before a moving camera (read first), which ``sensors`` sees by sensors
-that all differ; ``sets``: the named mixes and sets; ``worlds``: out of the 3-D worlds; ``files``:
-along flow files; ``streams``: recordings with flow at any time. Below them ``layers`` (what moves),
+that all differ; ``sets``: the named mixes and sets; ``worlds``: out of the 3-D worlds;
+``streams``: recordings with flow at any time. Below them ``layers`` (what moves),
 ``motion`` (how) and ``textures``.
 """
 
-from scenes.windows.files import FileWindows
 from scenes.windows.rendered import Draws, PacketWindows, RenderedWindows, planes
 from scenes.windows.sensors import Sensors, SensorWindows
 from scenes.windows.sets import HARSH, SETS, TRAINING, UNSEEN, VALIDATION, Shape
@@ -21,7 +20,6 @@ __all__ = [
     "UNSEEN",
     "VALIDATION",
     "Draws",
-    "FileWindows",
     "PacketWindows",
     "RenderedWindows",
     "SensorWindows",

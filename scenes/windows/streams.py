@@ -66,7 +66,7 @@ class Recording:
         return FlowField(flow[None], valid, (t1_us - t0_us) * 1e-6)
 
 
-def turning(duration_s=0.3, size_px=(180, 240), seed=0, texture="coffee") -> Recording:
+def turning(duration_s=0.3, size_px=(180, 240), seed=0) -> Recording:
     """A camera that turns about all axes before a photograph far away."""
     k = np.diag([FOCAL_PX, FOCAL_PX, 1.0])
 
@@ -76,7 +76,7 @@ def turning(duration_s=0.3, size_px=(180, 240), seed=0, texture="coffee") -> Rec
         return k @ Rotation.from_rotvec(angles).as_matrix() @ np.linalg.inv(k)
 
     draw = np.random.default_rng((31, seed))
-    layers = [_layer(draw, move, texture, size_px, False)]
+    layers = [_layer(draw, move, "coffee", size_px, False)]
     return _recorded("turning", layers, duration_s, size_px, seed)
 
 

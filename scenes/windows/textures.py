@@ -69,18 +69,18 @@ def _stripes(draw):
     return textures.check_texture(np.broadcast_to(values, (SIZE, SIZE)).clip(textures.LIFT, 255.0), "stripes")
 
 
-def pile(draw, size_px=SIZE, shapes=1500):
+def pile(draw, shapes=1500):
     """Discs and bars of many sizes, each hiding what lies below, over a soft ramp; some carry grain, most are
     smooth.
 
     Occluding shapes with sizes of density r^-3 have the statistics of natural images (Lee, Mumford and Huang,
     IJCV 2001).
     """
-    y, x = np.mgrid[:size_px, :size_px].astype(np.float32)
+    y, x = np.mgrid[:SIZE, :SIZE].astype(np.float32)
     log_level = np.float32(draw.uniform(3.0, 4.5)) + _ramp(x, y, draw)
-    grain = gaussian_filter(
-        draw.standard_normal((size_px, size_px)), draw.uniform(0.7, 2.5), mode="wrap"
-    ).astype(np.float32)
+    grain = gaussian_filter(draw.standard_normal((SIZE, SIZE)), draw.uniform(0.7, 2.5), mode="wrap").astype(
+        np.float32
+    )
     grain /= grain.std()
     smallest = draw.uniform(2, 6)
     largest = draw.uniform(60, 160)
@@ -88,9 +88,9 @@ def pile(draw, size_px=SIZE, shapes=1500):
     for _ in range(int(shapes * draw.uniform(0.1, 1.0))):
         u = draw.random()
         radius = (smallest**-2 * (1 - u) + largest**-2 * u) ** -0.5
-        cx, cy = draw.uniform(-0.05 * size_px, 1.05 * size_px, 2)
-        x0, x1 = (int(np.clip(cx + s * 2 * radius, 0, size_px)) for s in (-1, 1))
-        y0, y1 = (int(np.clip(cy + s * 2 * radius, 0, size_px)) for s in (-1, 1))
+        cx, cy = draw.uniform(-0.05 * SIZE, 1.05 * SIZE, 2)
+        x0, x1 = (int(np.clip(cx + s * 2 * radius, 0, SIZE)) for s in (-1, 1))
+        y0, y1 = (int(np.clip(cy + s * 2 * radius, 0, SIZE)) for s in (-1, 1))
         if x1 <= x0 or y1 <= y0:
             continue
         here = (slice(y0, y1), slice(x0, x1))
@@ -104,7 +104,7 @@ def pile(draw, size_px=SIZE, shapes=1500):
             along, across = turned(dx, dy, angle)
             inside = (np.abs(along) < radius) & (np.abs(across) < flat * radius)
         value = np.float32(draw.uniform(1.5, 5.4)) + 0.5 * _ramp(
-            dx * (size_px / (4 * radius)) + size_px / 2, dy * (size_px / (4 * radius)) + size_px / 2, draw
+            dx * (SIZE / (4 * radius)) + SIZE / 2, dy * (SIZE / (4 * radius)) + SIZE / 2, draw
         )
         if draw.random() < share:
             value = value + np.float32(draw.uniform(0.05, 0.4)) * grain[here]

@@ -14,6 +14,10 @@ PATH_S = 1.0  # length of the path a window is taken from
 PROBE_S = 0.01  # over which the speed in the image is measured
 LONGEST_S = 0.4
 FOCAL_MM = 4.0
+# least and most of what is drawn
+THETA = (0.1, 0.2)
+NOISE = (0.0005, 0.005)  # events per pixel, polarity and eighth of the window, evenly in the logarithm
+FOV_DEG = (45.0, 80.0)  # horizontal
 ALL = tuple(name for name in worlds.WORLDS if not name.startswith(("blank", "dark")))
 
 
@@ -26,10 +30,6 @@ class WorldWindows(Windows):
       names: worlds, taken in turn.
       size_px: width and height.
       flow_px: (least, most).
-      theta: threshold, (least, most).
-      noise: background events per pixel, polarity and eighth of the window, (least, most), evenly
-        in the logarithm.
-      fov_deg: horizontal field, (least, most).
       samples: rays per pixel.
       seed, bins, intervals: as Windows.
     """
@@ -43,9 +43,6 @@ class WorldWindows(Windows):
         bins=8,
         intervals=32,
         flow_px=(1.0, 6.0),
-        theta=(0.1, 0.2),
-        noise=(0.0005, 0.005),
-        fov_deg=(45.0, 80.0),
         samples=8,
     ):
         unknown = sorted(set(names) - set(worlds.WORLDS))
@@ -55,9 +52,6 @@ class WorldWindows(Windows):
         self.names = tuple(names)
         self.size_px = size_px
         self.flow_px = flow_px
-        self.theta = theta
-        self.noise = noise
-        self.fov_deg = fov_deg
         self.samples = samples
         self._built = {}
 
@@ -73,7 +67,7 @@ class WorldWindows(Windows):
         if name not in self._built:
             self._built[name] = make_world(name)
         scene, stage = self._built[name]
-        width_mm = 2 * FOCAL_MM * torch.tensor(between(*self.fov_deg) / 2).deg2rad().tan().item()
+        width_mm = 2 * FOCAL_MM * torch.tensor(between(*FOV_DEG) / 2).deg2rad().tan().item()
         film = (self.size_px, self.size_px, width_mm / self.size_px)
         camera = render.Camera(lens.Pinhole(FOCAL_MM), *film, self.samples)
         path = motion(FAMILIES[turn % len(FAMILIES)], stage, scene, camera, PATH_S, draw)
@@ -86,8 +80,8 @@ class WorldWindows(Windows):
         poses = path(start + length * t).detach()
         frames = render.frames(camera, scene, poses)
         flow, valid = render.true_flow(camera, scene, poses[[LEAD, -1]])
-        theta = between(*self.theta)
-        noise = self.noise[0] * (self.noise[1] / self.noise[0]) ** between(0, 1)
+        theta = between(*THETA)
+        noise = NOISE[0] * (NOISE[1] / NOISE[0]) ** between(0, 1)
         # in windows of one second: two polarities, eight eighths
         sensor = events.SensorModel(theta, theta, 0.03 * theta, shot_rate_hz=16 * noise)
         counts = events.dense_counts(frames, t - t[0], sensor, generator=draw)[LEAD:]

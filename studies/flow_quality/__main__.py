@@ -17,7 +17,6 @@ from codesign import flow
 from codesign.errors import DomainError
 from codesign.report.flow_colours import flow_colours
 from codesign.train.validation import batches
-from scenes.windows.files import FileWindows
 from scenes.windows.rendered import planes
 from scenes.windows.sets import HARSH, SETS, UNSEEN, VALIDATION, Shape
 from scenes.windows.worlds import ALL, WorldWindows
@@ -96,8 +95,6 @@ class Config(StudyConfig):
     sets: tuple[str, ...] = ()
     """Sets to judge on, "cells" for all cells of single planes; all but those when left out, with
     the recordings."""
-    middlebury: Path | None = None
-    """Folder with Middlebury's .flo files, to move photographs by as they are and three times as far."""
     recording: tuple[Path, ...] = ()
     """Recordings (docs/flow_recordings.md) to judge on beside the two that are made."""
     focal_px: float | None = None
@@ -132,12 +129,6 @@ def study(run: Run[Config]) -> None:
                 "that the network claims. Colour: direction, strength: length.",
             )
     _tables(run, found, about, who)
-    if config.middlebury is None:
-        run.text(
-            "Middlebury's flows were left out: give the folder of its .flo files with "
-            "`--middlebury`. The sets "
-            "`many_depths` stand for them."
-        )
     if "worlds" in found:
         _worlds(run, about["worlds"][1])
     if config.recording or not config.sets:
@@ -180,10 +171,6 @@ def judged(config, bins):
     found["worlds"] = (WorldWindows(ALL, seed=UNSEEN + seed, bins=bins), config.world_windows)
     for name, make in (SETS | HARSH).items():
         found[name] = (make(UNSEEN + seed, bins), config.real_windows)
-    if config.middlebury is not None:
-        for factor in (1, 3):
-            source = FileWindows(config.middlebury, factor, seed=UNSEEN + seed, bins=bins)
-            found[f"middlebury_x{factor}"] = (source, config.real_windows)
     if not config.sets:
         return found
     cells = {

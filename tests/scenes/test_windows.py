@@ -10,12 +10,10 @@ import torch
 from scipy.ndimage import map_coordinates
 
 from codesign.errors import CodesignError
-from codesign.flow import write_flow
 from codesign.flow.warp import along_flow
 from scenes.windows import (
     SETS,
     Draws,
-    FileWindows,
     PacketWindows,
     RenderedWindows,
     Sensors,
@@ -24,7 +22,6 @@ from scenes.windows import (
     planes,
     textures,
 )
-from scenes.windows.files import moved
 from scenes.windows.rendered import LEAD
 from scenes.windows.sets import EVERYDAY
 
@@ -40,13 +37,6 @@ QUIET = Sensors(
     pace=0.0,
 )
 """Next to ideal sensors."""
-
-
-def waves(folder):
-    """A folder with one flow file of two smooth waves."""
-    y, x = torch.meshgrid(torch.arange(60.0), torch.arange(70.0), indexing="ij")
-    write_flow(folder / "a.flo", torch.stack([2 + torch.sin(y / 9), torch.cos(x / 11)]))
-    return folder
 
 
 @functools.cache
@@ -65,26 +55,23 @@ BLURRED = Draws("fine", layers=(0, 0), flow_px=(2.0, 5.0), scale=(0.7, 0.9), blu
 # bilinear lookup of sharp edges.
 SOURCES = {
     "layers": (
-        lambda folder: RenderedWindows(
-            Draws(layers=(2, 2), flow_px=(3.0, 6.0)), seed=3, height_px=48, width_px=64
-        ),
+        lambda: RenderedWindows(Draws(layers=(2, 2), flow_px=(3.0, 6.0)), seed=3, height_px=48, width_px=64),
         0.35,
         0.05,
     ),
-    "warped plane": (lambda folder: warped((0, 0)), 0.1, 0.05),
-    "warped layers": (lambda folder: warped((2, 3)), 0.6, 0.05),
-    "bent plane": (lambda folder: SensorWindows(BLURRED, replace(QUIET, bend=0.4), seed=3), 0.1, 0.1),
-    "file": (lambda folder: FileWindows(waves(folder), seed=1, side_px=40, bins=4, intervals=8), 0.35, 0.35),
-    "world": (lambda folder: worlds(), 0.5, 0.5),
+    "warped plane": (lambda: warped((0, 0)), 0.1, 0.05),
+    "warped layers": (lambda: warped((2, 3)), 0.6, 0.05),
+    "bent plane": (lambda: SensorWindows(BLURRED, replace(QUIET, bend=0.4), seed=3), 0.1, 0.1),
+    "world": (worlds, 0.5, 0.5),
 }
 
 
 @pytest.mark.parametrize("kind", SOURCES)
-def test_the_flow_leads_to_the_same_radiance(kind, tmp_path):
+def test_the_flow_leads_to_the_same_radiance(kind):
     """Where a point stays in sight, the end frame at q + flow(q) shows what the first frame shows
     at q; in place, or along the reversed flow, it does not."""
     make, mean_share, median_share = SOURCES[kind]
-    windows = make(tmp_path).batch(range(2))
+    windows = make().batch(range(2))
     assert windows.frames is not None
     first, last = windows.frames.clamp_min(1e-3 if kind != "world" else 1.0).log().unbind(1)
 
@@ -101,9 +88,9 @@ def test_the_flow_leads_to_the_same_radiance(kind, tmp_path):
 
 
 @pytest.mark.bits
-@pytest.mark.parametrize("kind", ["layers", "bent plane", "file", "world"])
-def test_a_sample_is_the_same_in_any_batch(kind, tmp_path):
-    source = SOURCES[kind][0](tmp_path)
+@pytest.mark.parametrize("kind", ["layers", "bent plane", "world"])
+def test_a_sample_is_the_same_in_any_batch(kind):
+    source = SOURCES[kind][0]()
     together = source.batch([3, 4])
     alone = source.batch([4])
     assert torch.equal(together.truth.flow_px[1:], alone.truth.flow_px)
@@ -211,50 +198,6 @@ def test_windows_of_worlds_last_until_the_flow_is_as_long_as_asked_and_count_who
     assert abs(float(windows.volume.collected_s.sum()) - 1.0) < 1e-12
 
 
-def test_an_even_motion_by_whole_pixels_shifts_the_photograph():
-    """At any place the shares of a point are alike after whole pixels, so the picture is the same,
-    further on."""
-    y, x = torch.meshgrid(torch.arange(40.0), torch.arange(48.0), indexing="ij")
-    photo = 100 + 50 * torch.sin(x / 4) * torch.cos(y / 5)
-    flow = torch.tensor([6.0, -4.0])[:, None, None].expand(2, 40, 48)
-    still, half, whole = (moved(photo, flow, share) for share in (0.0, 0.5, 1.0))
-    torch.testing.assert_close(whole[8:28, 14:40], still[12:32, 8:34], rtol=1e-5, atol=1e-3)
-    torch.testing.assert_close(half[8:28, 14:40], still[10:30, 11:37], rtol=1e-5, atol=1e-3)
-    # points are looked up and shared bilinearly: variances of at most 1/4 + 1/4 px^2 along each axis, which
-    # take 1 - exp(-(1/16 + 1/25) / 4) = 2.5 % of the wave
-    assert float((still - photo)[1:-1, 1:-1].abs().max()) < 0.025 * 50 * 1.1
-
-
-def test_the_faster_hides_the_slower_and_uncovers_what_was_behind():
-    photo = torch.full((40, 48), 50.0)
-    photo[10:30, 10:20] = 200.0
-    flow = torch.zeros(2, 40, 48)
-    flow[0, 10:30, 10:20] = 12.0
-    found = moved(photo, flow, 1.0)
-    torch.testing.assert_close(found[12:28, 23:31], torch.full((16, 8), 200.0))
-    torch.testing.assert_close(found[12:28, 34:], torch.full((16, 14), 50.0))
-    torch.testing.assert_close(found[12:28, :9], torch.full((16, 9), 50.0))
-
-
-def test_windows_have_the_flow_of_the_file(tmp_path):
-    y, x = torch.meshgrid(torch.arange(60.0), torch.arange(70.0), indexing="ij")
-    flow = torch.stack([2 + 0.02 * x, -1 - 0.01 * y])
-    valid = torch.ones(60, 70, dtype=torch.bool)
-    valid[:, 30:32] = False
-    (tmp_path / "Scene").mkdir()
-    write_flow(tmp_path / "Scene" / "flow10.flo", flow, valid=valid)
-    once, thrice = (
-        FileWindows(tmp_path, factor, seed=3, side_px=32, bins=4, intervals=12).batch([0, 1])
-        for factor in (1.0, 3.0)
-    )
-    # linear in the pixel, as in the file
-    across = once.truth.flow_px[:, 0].diff(dim=2)[once.truth.valid[..., 1:] & once.truth.valid[..., :-1]]
-    torch.testing.assert_close(across, torch.full_like(across, 0.02), rtol=0, atol=1e-5)
-    torch.testing.assert_close(3 * once.truth.flow_px, thrice.truth.flow_px)
-    assert torch.equal(once.truth.valid, thrice.truth.valid)
-    assert float(thrice.volume.counts.sum()) > 1.5 * float(once.volume.counts.sum())
-
-
 @pytest.mark.parametrize("name", ["planes_0.05", "layers_3", "warped", "vibration", "rotation"])
 def test_sets_give_windows_of_their_own_for_every_seed(name):
     one, other = (SETS[name](seed, 4).batch([0]) for seed in (1, 2))
@@ -266,15 +209,13 @@ def test_sets_give_windows_of_their_own_for_every_seed(name):
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
-        (lambda folder: PacketWindows(EVERYDAY, 0.0), "events_per_px is 0"),
-        (lambda folder: RenderedWindows(Draws(motion="rotation")), "one plane"),
-        (lambda folder: RenderedWindows(Draws(motion="walk")), "'walk'"),
-        (lambda folder: textures.pool("wood"), "texture pool 'wood' is unknown"),
-        (lambda folder: WorldWindows(("moon",)), r"worlds \['moon'\] are unknown"),
-        (lambda folder: FileWindows(folder), r"holds no \.flo file"),
-        (lambda folder: FileWindows(waves(folder), side_px=64).batch([0]), "60 x 70 pixels"),
+        (lambda: PacketWindows(EVERYDAY, 0.0), "events_per_px is 0"),
+        (lambda: RenderedWindows(Draws(motion="rotation")), "one plane"),
+        (lambda: RenderedWindows(Draws(motion="walk")), "'walk'"),
+        (lambda: textures.pool("wood"), "texture pool 'wood' is unknown"),
+        (lambda: WorldWindows(("moon",)), r"worlds \['moon'\] are unknown"),
     ],
 )
-def test_what_is_unfit_is_refused(make, sentence, tmp_path):
+def test_what_is_unfit_is_refused(make, sentence):
     with pytest.raises(CodesignError, match=sentence):
-        make(tmp_path)
+        make()

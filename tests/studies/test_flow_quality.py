@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from codesign.events.stream import ordered
-from codesign.flow import metrics, write_flow
+from codesign.flow import metrics
 from codesign.flow.checkpoint import DELIVERED
 from codesign.flow.export import evenly_timed
 from codesign.types import FlowField, FlowWindows
@@ -134,11 +134,5 @@ def test_unfit_options_are_refused(tmp_path, capsys, options, said):
     assert said in capsys.readouterr().err
 
 
-def test_flows_of_middlebury_are_judged_where_they_are(tmp_path):
-    write_flow(tmp_path / "flow10.flo", torch.ones(2, 130, 140))
-    without, given = (judged(Config(middlebury=folder), 4) for folder in (None, tmp_path))
+def test_cells_of_single_planes_are_sets():
     assert len(judged(Config(sets=("cells",)), 4)) == 12
-    assert sorted(set(given) - set(without)) == ["middlebury_x1", "middlebury_x3"]
-    source, number = given["middlebury_x3"]
-    assert number == Config.real_windows
-    assert torch.equal(source.batch([0]).truth.flow_px, torch.full((1, 2, 128, 128), 3.0))
