@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from codesign import events, render
+from codesign.errors import MissingPackageError
 from codesign.report import lens_figures
 from scenes import worlds
 from studies.frame.compare import Interval, log_ratio
@@ -228,6 +229,27 @@ def _seen_by_the_sensor(run, job, shown):
         pictures(rows, signed=[f"events {h:g}" for h in FIELDS]),
         "frames_and_events",
         "Frames, and ON minus OFF events (red minus blue).",
+    )
+    _fading_events(run, job, shown[label("optimised", run.config.objective)])
+
+
+def _fading_events(run, job, optics):
+    """The same scene's events as a frame-difference emulator makes them: a CSV file, and a video in which they fade."""
+    case = job.probe
+    with torch.no_grad():
+        camera = job.task.camera(optics, run.config.samples, case.seed)
+        frames = render.frames(camera, case.scene, case.T_world_body)
+    stream = events.naive(frames.flatten(1, 2), case.t_s, SENSOR.theta_on)
+    events.write(run.path("events_naive.csv"), stream)
+    try:
+        events.decay_video(run.path("events_decay.mp4"), stream, case.t_s, 0.015, fps=8)
+    except MissingPackageError as error:
+        run.text(f"**Left out**: the video of fading events. {error}")
+        return
+    run.video(
+        "events_decay.mp4",
+        f"{len(stream)} events of frame differences (events_naive.csv), fading over 15 ms; the three windows above one "
+        "another.",
     )
 
 
