@@ -97,6 +97,12 @@ class Camera:
         twin.lens = lens
         return twin
 
+    def with_film(self, film: Film) -> "Camera":
+        """The same lens and samples before other pixels."""
+        twin = copy.copy(self)
+        twin.film = film.check()
+        return twin
+
     def with_seed(self, seed: int) -> "Camera":
         """The same lens and film with other samples."""
         twin = copy.copy(self)

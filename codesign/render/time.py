@@ -9,6 +9,7 @@ MovingScene with n poses per object.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -20,6 +21,7 @@ from codesign.pose import Poses, check_poses
 from codesign.render.camera import Camera
 from codesign.render.film import coarse_pixels
 from codesign.render.moving import MovingScene, Scene, at_frames, views_of
+from codesign.render.sequence import PROVEN, Way, frames
 from codesign.render.truth import track
 from codesign.render.wavefront import shade
 
@@ -57,27 +59,69 @@ def exposed_frames(
     exposure_s: float,
     samples: int = 8,
     rule: Callable[[int], tuple[Tensor, Tensor]] = midpoints,
+    gradient: Way = "interior",
+    per_px: float = 2.5,
+    *,
+    line_s: float = 0.0,
 ) -> Tensor:
-    """Frames averaged over an exposure centred on each time: motion blur.
+    """Frames averaged over an exposure centred on each time: motion blur; read line by line where asked.
 
-    Args: camera: Camera. scene, trajectory: see the top of this file. t_s: [T]. exposure_s: length of the
-      exposure, >= 0. samples: time samples per frame.
-      rule: ``midpoints`` (error of a moving edge: at most its jump / (2 samples)) or ``gauss_legendre`` (for
-        smooth textures).
+    >>> from codesign import lens, pose, render
+    >>> from scenes import trajectories, worlds
+    >>> camera = render.Camera(lens.Pinhole(8.0), 8, 6, pixel_pitch_mm=0.5)
+    >>> start = pose.look_at((0, -2, 1), (0, 0, 1))
+    >>> path = lambda t_s: trajectories.translation(start, (1.0, 0.0, 0.0), t_s)  # a metre per second
+    >>> render.exposed_frames(camera, worlds.room(), path, [0.0, 0.05], exposure_s=0.02, line_s=1e-4).shape
+    torch.Size([2, 6, 8])
+
+    Args:
+      camera: Camera.
+      scene, trajectory: see the top of this file.
+      t_s: [T], middles of the exposures.
+      exposure_s: length of the exposure, >= 0.
+      samples: time samples per frame.
+      rule: ``midpoints`` (error of a moving edge: at most its jump / (2 samples)) or ``gauss_legendre`` (for smooth
+        textures).
+      gradient, per_px: as ``frames`` takes them, for every time sample; "boundary" has the motion of silhouettes in it.
+      line_s: rolling shutter: row r of the sensor is exposed r * line_s later than row 0, whose middle is t_s; each
+        row is a launch of its own.
     Returns: [..., T, *film.shape], the mean of the irradiance over the exposure, in the scene's units.
-    Gradient: lens, and whatever the trajectory's poses depend on; interior term only.
-    Raises: DomainError on a negative exposure, fewer than one sample, or poses that are not rigid.
+    Gradient: lens, and whatever the trajectory's poses depend on; what it holds says ``gradient``.
+    Raises: DomainError on a negative exposure, a line time that is not finite, fewer than one sample, poses that are not
+      rigid, or a gradient that ``frames`` refuses.
     """
     t_s = check_finite(torch.as_tensor(t_s, dtype=torch.float64).reshape(-1), "times of the frames")
     if not 0 <= as_number(exposure_s, "exposure_s") < math.inf:
         raise DomainError(f"exposure_s = {exposure_s} must be finite and at least 0 seconds.")
+    if not math.isfinite(as_number(line_s, "line_s")):
+        raise DomainError(
+            f"line_s = {line_s} must be finite: the seconds from one row of the sensor to the next."
+        )
     samples = check_whole(samples, "time samples of an exposure")
-    rays = camera.rays()
-    total = torch.zeros(())
-    for node, weight in zip(*(column.tolist() for column in rule(samples)), strict=True):
+    times = [pair.tolist() for pair in rule(samples)]
+    if not line_s:
+        return _exposed(camera, scene, trajectory, t_s, exposure_s, times, gradient, per_px)
+    film = camera.film
+    corners = film.windows_px or ((0, 0),)
+    shown = [(left, top + row) for left, top in corners for row in range(film.height_px)]
+    found = {}
+    for top in sorted({top for _, top in shown}):
+        here = [number for number, place in enumerate(shown) if place[1] == top]
+        row = camera.with_film(replace(film, height_px=1, windows_px=tuple(shown[number] for number in here)))
+        lines = _exposed(row, scene, trajectory, t_s + top * line_s, exposure_s, times, gradient, per_px)
+        found.update(zip(here, lines.squeeze(-2).unbind(-2), strict=True))
+    lines = torch.stack([found[number] for number in range(len(shown))], -2)
+    return lines.reshape(*lines.shape[:-2], *film.shape)
+
+
+def _exposed(camera, scene, trajectory, t_s, exposure_s, times, gradient, per_px):
+    """Weighted sum of the frames at (node, weight) of ``times``; the lens is traced once where ``gradient`` allows it."""
+    rays = camera.rays() if gradient in PROVEN else None
+    total = 0.0
+    for node, weight in zip(*times, strict=True):
         at = t_s + node * exposure_s
-        total = total + weight * shade(rays, _at(scene, at), trajectory(at), camera.samples_per_pixel)
-    return total.reshape(*total.shape[:-1], *camera.film.shape)
+        total = total + weight * frames(camera, _at(scene, at), trajectory(at), gradient, per_px, rays=rays)
+    return total
 
 
 def frame_chunks(

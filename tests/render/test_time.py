@@ -9,6 +9,7 @@ import torch
 from scipy.special import iv
 
 from codesign import lens, render
+from codesign.errors import DomainError
 from codesign.pose import look_at, se3_exp
 from codesign.render import Camera, Film, MitsubaScene, MovingScene, TexturedPlane
 from codesign.render.film import coarse_pixels
@@ -105,6 +106,68 @@ def test_a_moving_edge_blurs_to_a_ramp_of_the_length_of_its_motion():
     assert float((found - (20 + 180 * share)).abs().max()) <= 180 / (2 * samples) + 1e-3
     sharp = render.exposed_frames(camera(40), scene, still, t_s, 0.0, 1)
     assert set(sharp.reshape(-1).round().tolist()) == {20.0, 200.0}
+
+
+def test_the_motion_of_a_blurred_edge_is_in_the_boundary_gradient(generator):
+    """Each midpoint's edge lies speed * time px from the middle: the pixel that holds it brightens by the step of light
+    times the share of the sample, for every px that it comes further."""
+    exposure, samples, t_s = 0.03, 20, torch.tensor([0.0, 0.005], dtype=D)
+    lower = torch.eye(4, dtype=D)
+    lower[2, 3] = -0.5
+    ground = TexturedPlane([[1.0, 0.0]], [0.0], [0.0], mean=20.0, T_world_plane=lower)
+    speed = torch.tensor(400.0, dtype=D, requires_grad=True)
+    scene = shifting(lambda t: ALONG * (speed * PX_M * t - 1.0), ground, type="rectangle")
+    weights = torch.randn(2, 40, generator=generator, dtype=D)
+    found = render.exposed_frames(
+        camera(40), scene, still, t_s, exposure, samples, gradient="boundary", per_px=1000
+    )[:, 0]
+    (slope,) = torch.autograd.grad((found * weights).sum(), speed)
+    times = t_s[:, None] + midpoints(samples)[0] * exposure
+    pixel = (speed.detach() * times + 19.5).round().long()
+    expected = (180 / samples * times * weights.gather(1, pixel)).sum()
+    assert abs(float(slope / expected) - 1) < 1e-3
+    inside = render.exposed_frames(camera(40), scene, still, t_s, exposure, samples)[:, 0]
+    assert torch.equal(found.detach(), inside.detach())
+
+
+@pytest.mark.parametrize(("exposure", "samples"), [(0.0, 1), (0.004, 12)])
+def test_a_rolling_shutter_shifts_a_moving_grating_row_by_row(exposure, samples):
+    """As the harmonics above, at the time of each row; of a window, at that of its rows on the sensor."""
+    period, speed, line, contrast = 9.0, 300.0, 2e-4, 0.8
+    film = Film(24, 12, 10, 4, PITCH_MM, ((3, 1), (14, 8)))
+    whole, windows = (
+        render.exposed_frames(
+            cam,
+            grating(period, contrast),
+            sliding(speed),
+            [0.0, 0.01],
+            exposure,
+            samples,
+            gauss_legendre,
+            line_s=line,
+        )
+        for cam in (camera(height=12), Camera(lens.Pinhole(FOCAL_MM), 24, 12, PITCH_MM, 1, film=film))
+    )
+    row = torch.arange(12, dtype=D)[:, None]
+    x = (
+        torch.arange(24, dtype=D)
+        - 11.5
+        + speed * (torch.tensor([0.0, 0.01], dtype=D)[:, None, None] + line * row)
+    )
+    phase = (2 * math.pi * x / period + 0.3).numpy()
+    shares = [
+        2 * iv(k, contrast) * np.sinc(k * speed * exposure / period) * np.cos(k * phase) for k in range(1, 16)
+    ]
+    np.testing.assert_allclose(whole.numpy(), 100 * (iv(0, contrast) + sum(shares)), rtol=1e-10)
+    for number, (left, top) in enumerate(film.windows_px):
+        torch.testing.assert_close(
+            windows[:, number], whole[:, top : top + 4, left : left + 10], rtol=1e-12, atol=0
+        )
+
+
+def test_a_line_time_without_end_is_refused():
+    with pytest.raises(DomainError, match="line_s = inf must be finite: the seconds from one row"):
+        render.exposed_frames(camera(), grating(9.0), still, [0.0], 0.0, line_s=math.inf)
 
 
 # ---- adaptive times
