@@ -66,14 +66,6 @@ def real_numbers(values: Any, name: str) -> Tensor:
     return found
 
 
-def real_number(value: Any, name: str) -> Tensor:
-    """One finite real number as a float64 scalar tensor, with its gradient: DomainError for anything else."""
-    found = real_numbers(value, name)
-    if found.ndim or not bool(found.isfinite()):
-        raise DomainError(f"{name}: {value} is not one finite number; give one.")
-    return found.double()
-
-
 def one_distance(at_m: Distances) -> Distances:
     """The distance itself, where a result is that of one: ShapeError for several."""
     count = real_numbers(at_m, "object distances").shape

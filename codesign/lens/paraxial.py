@@ -15,17 +15,6 @@ from codesign.lens.glass import WAVELENGTH_UM
 D_LINE = WAVELENGTH_UM["d"]
 
 
-class IdealLens(Protocol):
-    """A focal length, a film behind it and a pupil; ThinLens is one."""
-
-    efl_mm: Tensor
-    image_distance_mm: Tensor
-    entrance_pupil_diameter_mm: float
-
-    @property
-    def dtype(self) -> torch.dtype: ...
-
-
 @dataclass(frozen=True)
 class FirstOrder:
     """Paraxial figures of a lens with the object at infinity; scalar tensors in millimetres, light along +z.
@@ -304,23 +293,3 @@ def image_scale_mm(
     _, angle = focused_image(lens, vergence_per_mm, wavelength_um)
     # Lagrange's invariant of the chief ray and of this one, whose height at the pupil is 1 / (1 - vergence z)
     return -lens.index(wavelength_um)[0] / ((1 - vergence_per_mm * pupil_z) * angle)
-
-
-def circle_of_confusion_mm(thin: IdealLens, distance_m: float | Tensor) -> Tensor:
-    """Diameter on the film of the blur of an axial object point, D |s (1/f - 1/d) - 1| for pupil D, film
-    distance s and object distance d from the lens.
-
-    Args: thin: ThinLens, or what ``GeoLens.thin`` returns. distance_m: > 0, metres; number or tensor of any
-      shape, inf is allowed.
-    Returns: mm, shape of the distance. Gradient: to focal length, film distance and object distance.
-    Raises: DomainError for a distance that is not positive.
-    """
-    distance_m = torch.as_tensor(distance_m, dtype=thin.dtype, device=thin.efl_mm.device)
-    if not bool((distance_m > 0).all()):
-        raise DomainError(
-            f"object distances must be positive (metres before the lens), got {distance_m.tolist()}."
-        )
-    return (
-        thin.entrance_pupil_diameter_mm
-        * (thin.image_distance_mm * (1 / thin.efl_mm - 1 / (distance_m * 1e3)) - 1).abs()
-    )

@@ -28,6 +28,7 @@ LINE_UM = {
     "t": 1.01398,
 }
 MOST_WAVELENGTHS = 1000
+ROUNDING = 4 * np.finfo(float).eps  # to which the ends of strata are found
 SECOND_RADIATION_UM_K = 14387.768775  # h c / k, exact in the SI of 2019
 
 # CIE standard illuminant D65, 300 to 830 nm in steps of 10 nm, linear between them by definition. Source: CIE
@@ -133,6 +134,10 @@ class Spectrum:
           1 to 1000.
         Raises: ShapeError, DomainError.
         """
+        # they take a second to import, which who traces in given lines need not wait for
+        from scipy.interpolate import PPoly
+        from scipy.optimize import brentq
+
         if isinstance(count, bool) or not isinstance(count, int) or not 0 < count <= MOST_WAVELENGTHS:
             raise DomainError(f"count {str(count)[:20]} must be a whole number from 1 to {MOST_WAVELENGTHS}.")
         (w1, v1), (w2, v2) = _curve(response, "response"), _curve(illuminant, "illuminant")
@@ -146,50 +151,32 @@ class Spectrum:
         knots = np.union1d(w1, w2)
         knots = knots[(knots >= first) & (knots <= last)]
         # values are scaled so that tiny or huge units neither vanish nor overflow in the product
-        segments = _Segments(knots, np.interp(knots, w1, v1 / v1.max()), np.interp(knots, w2, v2 / v2.max()))
-        if not segments.energy[-1] > 0:
+        (a, da), (b, db) = (_pieces(knots, w, v / v.max()) for w, v in ((w1, v1), (w2, v2)))
+        signal = np.stack([da * db, a * db + da * b, a * b])
+        none = np.zeros_like(signal[:1])
+        energy = PPoly(signal, knots).antiderivative()
+        moment = PPoly(
+            np.concatenate([signal, none]) + knots[:-1] * np.concatenate([none, signal]), knots
+        ).antiderivative()
+        whole = float(energy(last))
+        if not whole > 0:
             raise DomainError(
                 f"response times illuminant is zero everywhere from {first:g} to {last:g} um; give curves "
                 "that overlap."
             )
-        bounds = [segments.at(segments.energy[-1] * k / count) for k in range(count + 1)]
-        energy, moment = np.diff(np.array(bounds), axis=0).T
-        return Spectrum(tuple((moment / energy).tolist()), (1.0 / count,) * count)
+        inner = [
+            brentq(lambda w, k=k: energy(w) - whole * k / count, first, last, xtol=1e-300, rtol=ROUNDING)
+            for k in range(1, count)
+        ]
+        bounds = np.array([first, *inner, last])
+        means = np.diff(moment(bounds)) / np.diff(energy(bounds))
+        return Spectrum(tuple(means.tolist()), (1.0 / count,) * count)
 
 
-class _Segments:
-    """Running integrals of a product of two piecewise linear curves, and of wavelength times it: exact
-    polynomials per segment."""
-
-    def __init__(self, knots, a, b):
-        self.start = knots[:-1]
-        self.width = np.diff(knots)
-        da = np.diff(a)
-        db = np.diff(b)
-        self.terms = np.stack([a[:-1] * b[:-1], a[:-1] * db + da * b[:-1], da * db], axis=1)
-        energy, moment = zip(*(self._upto(i, 1.0) for i in range(len(da))), strict=True)
-        self.energy, self.moment = (np.concatenate([[0.0], np.cumsum(x)]) for x in (energy, moment))
-
-    def _upto(self, i, t):
-        """Energy and first moment of segment i from its start to the fraction t."""
-        p = self.terms[i]
-        h = self.width[i]
-        energy = h * (p[0] * t + p[1] * t**2 / 2 + p[2] * t**3 / 3)
-        return energy, self.start[i] * energy + h * h * (p[0] * t**2 / 2 + p[1] * t**3 / 3 + p[2] * t**4 / 4)
-
-    def at(self, energy):
-        """Energy and moment below the wavelength at which the running energy reaches ``energy``."""
-        i = min(max(int(np.searchsorted(self.energy, energy)) - 1, 0), len(self.width) - 1)
-        low = 0.0
-        high = 1.0
-        # bisection to the last bit: the energy within a segment never falls
-        for _ in range(60):
-            middle = (low + high) / 2
-            low, high = (
-                (middle, high) if self.energy[i] + self._upto(i, middle)[0] < energy else (low, middle)
-            )
-        inside = self._upto(i, high)
-        return self.energy[i] + inside[0], self.moment[i] + inside[1]
+def _pieces(knots, wavelength_um, value):
+    """Value at the start of each segment between the knots, and its slope there."""
+    at = np.interp(knots, wavelength_um, value)
+    return at[:-1], np.diff(at) / np.diff(knots)
 
 
 def _floats(values):

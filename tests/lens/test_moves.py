@@ -16,7 +16,6 @@ from codesign.lens.design import (
     neighbour_glasses,
     with_glass,
     without_element,
-    without_surface,
 )
 from codesign.lens.design.tolerance import Tolerances, errors_of
 from codesign.lens.glass import names
@@ -122,29 +121,6 @@ def test_a_cemented_component_leaves_the_cement_to_its_neighbour():
         bare = without_element(geo, element)
         assert efl(bare) == pytest.approx(efl(geo), rel=1e-12)
         assert rows(bare)[:-1] == front
-
-
-def test_a_dummy_taken_out_changes_no_ray(gauss):
-    *surfaces, last = gauss.to_surfaces()
-    ends = Surface(last.radius_mm, 10.0, None, 22.0), Surface(PLANE, last.thickness_mm - 10.0, None, 22.0)
-    geo = GeoLens([*surfaces, *ends], 33.33)
-    for at in (-1, 11):
-        bare = without_surface(geo, at)
-        torch.testing.assert_close(
-            lens.spots(bare, FIELDS)[0], lens.spots(gauss, FIELDS)[0], rtol=0, atol=1e-11
-        )
-        assert len(bare.surfaces) == 11
-    # its stop in air goes to the nearer neighbour, 13.7 mm behind and not 16.4 mm in front
-    moved = without_surface(gauss, 5)
-    assert moved.stop_index == 5
-    assert moved.to_surfaces()[4].thickness_mm == pytest.approx(16.369445 + 13.747957, rel=1e-14)
-    assert efl(moved) == pytest.approx(efl(gauss), rel=1e-12)
-
-
-def test_a_cement_taken_out_leaves_the_glass_in_front(doublet):
-    left = without_surface(doublet, 1)
-    assert rows(left)[0][1:3] == (8.0, "N-BK7")
-    assert efl(left) == pytest.approx(efl(doublet), rel=1e-13)
 
 
 def test_the_path_ends_in_a_plate_and_has_gradients(triplet, doublet):

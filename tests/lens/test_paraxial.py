@@ -1,15 +1,12 @@
 """System matrix, cardinal points, paraxial rays and defocus against closed forms."""
 
-import math
-
 import pytest
 import torch
 
 from codesign import lens
-from codesign.lens import GeoLens, Surface, ThinLens
+from codesign.lens import GeoLens, Surface
 from codesign.lens.paraxial import (
     cardinal_points,
-    circle_of_confusion_mm,
     first_order,
     paraxial_rays,
     system_matrix,
@@ -95,32 +92,13 @@ def test_pupils_of_a_stop_between_two_surfaces_by_gauss(before):
     assert float(found.exit_pupil_diameter_mm) == pytest.approx(2 * stop * size, rel=1e-13)
 
 
-def test_circle_of_confusion_is_the_spread_of_the_rays():
-    thin = ThinLens(50.0, 20.0, 50.7)
-    for distance_m in (0.4, 3.0, 50.0):
-        # rays from two film points through both rims; where they pass the object's plane is linear in the
-        # film point
-        film = torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=D).repeat(2, 1)
-        pupil = torch.tensor([[1.0, 0.0]] * 2 + [[-1.0, 0.0]] * 2, dtype=D)
-        rays = thin.camera_rays(film, pupil)
-        at = rays.origin_m[:, 0] + rays.direction[:, 0] / rays.direction[:, 2] * distance_m
-        # film points whose rays meet the axis there
-        start = [float(-a / (b - a)) for a, b in (at[:2], at[2:])]
-        assert float(circle_of_confusion_mm(thin, distance_m)) == pytest.approx(
-            abs(start[0] - start[1]), rel=1e-10
-        )
-    assert float(circle_of_confusion_mm(ThinLens(50.0, 20.0), math.inf)) == 0
-    sharp = 50.0 * 50.7 / 0.7 * 1e-3  # 1 / f = 1 / s + 1 / d
-    assert float(circle_of_confusion_mm(thin, sharp)) == pytest.approx(0, abs=1e-13)
-
-
 def test_gradients_of_paraxial_figures():
     start = thick().freeze()
 
     def figures(curvature, thickness):
         geo = start.replace(curvature_per_mm=curvature, thickness_mm=thickness)
         rays = paraxial_rays(geo, 0.2)
-        lengths = cardinal_points(geo).front_nodal_z_mm, circle_of_confusion_mm(geo.thin(), 2.0)
+        lengths = cardinal_points(geo).front_nodal_z_mm, geo.thin().image_distance_mm
         return system_matrix(geo), rays.chief_angle, rays.marginal_height_mm, *lengths
 
     leaves = [v.clone().requires_grad_() for v in (start.curvature_per_mm, start.thickness_mm)]

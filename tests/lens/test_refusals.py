@@ -22,18 +22,10 @@ from codesign.lens import (
 from codesign.lens.design import Limits, Tolerances, glass_map, moved_element
 from codesign.lens.design.constraints import rows
 from codesign.lens.design.hits import traced_semi_aperture_mm
-from codesign.lens.design.precision import Forecast, cheapest, equal_shares, fitted
+from codesign.lens.design.precision import Forecast, cheapest
 from codesign.lens.design.tolerance import Error, compare, errors_of, monte_carlo, perturbed
-from codesign.lens.diffraction import (
-    Field,
-    GridPlate,
-    ZernikePlate,
-    angular_spectrum,
-    disc,
-    fresnel,
-    rectangle,
-)
-from codesign.lens.paraxial import cardinal_points, circle_of_confusion_mm, paraxial_rays
+from codesign.lens.diffraction import GridPlate, ZernikePlate
+from codesign.lens.paraxial import cardinal_points, paraxial_rays
 from codesign.lens.seidel import seidel_sums
 from codesign.lens.solves import focus_paraxial, focus_rays, hold_efl, holding_surface
 from codesign.lens.spectrum import blackbody, silicon_response
@@ -115,7 +107,6 @@ LENS = [
     ),
     (lambda geo: cardinal_points(WINDOW), "no cardinal points"),
     (lambda geo: paraxial_rays(geo, math.pi / 2), "at 90 degrees has no slope"),
-    (lambda geo: circle_of_confusion_mm(ThinLens(50.0, 10.0), 0.0), "must be positive"),
     (lambda geo: lens.sum_over_chunks(torch.sum, rows=4), "rays hold"),
     (lambda geo: lens.sum_over_chunks(torch.sum, torch.zeros(0, 3), rows=4), "rays hold"),
     (lambda geo: lens.sum_over_chunks(torch.sum, torch.zeros(3), torch.zeros(2)), "rays hold"),
@@ -138,7 +129,6 @@ DISTANCES = [
     ),
     (lambda geo: geo.focus_at("0.5"), NO_NUMBER),
     (lambda geo: geo.variables("curvature", focus_at_m="a"), NO_NUMBER),
-    (lambda geo: diffraction.before_image(geo, 1.0, 0.001, 8, at_m=1j), NO_NUMBER),
     (lambda geo: analysis.wavefront(geo, 0.1, at_m=(0.5, 1.0)), ONE),
     (lambda geo: analysis.polychromatic_spot(geo, 0.1, 0.58, at_m=(0.5, 1.0)), ONE),
     (lambda geo: analysis.through_focus_spot_mm(geo, [0.1], [0.0], at_m=(0.5, 1.0)), ONE),
@@ -256,9 +246,6 @@ DESIGN = [
         lambda geo: design.without_element(lens.load("double-gauss"), 2),
         r"the image lies 28\.6 mm before the last surface; flatten",
     ),
-    (lambda geo: design.without_surface(geo, 7), "there is no surface 7; it has 0 to 5"),
-    (lambda geo: design.without_surface(geo, 1), "between glass and air.*without_element"),
-    (lambda geo: design.without_surface(MANGIN, 1), "surface 2 is a mirror"),
     (
         lambda geo: design.with_glass(geo, 1, "F2"),
         "no glass behind surface 1 to exchange; there is behind 0, 2, 4",
@@ -315,7 +302,7 @@ TOLERANCES = [
     (lambda geo: perturbed(geo, curvatures(6), torch.zeros(5)), "6 errors"),
     (lambda geo: errors_of(MANGIN, Tolerances(element_tilt_deg=0.1)), "holds a mirror or is passed twice"),
     (lambda geo: cheapest(TWO, curvatures(2), -0.1), "budget must be a positive increase"),
-    (lambda geo: equal_shares(TWO, curvatures(2), 0.1, share=0.4), r"share lie between 0\.5 and 1"),
+    (lambda geo: cheapest(TWO, curvatures(2), 0.1, share=0.4), r"share lie between 0\.5 and 1"),
     (lambda geo: cheapest(TWO, curvatures(3), 0.1), "of 2 errors, but 3 were given"),
     (
         lambda geo: cheapest(TWO, curvatures(2), 0.1, costs={"roughness": 2}),
@@ -331,41 +318,12 @@ TOLERANCES = [
         lambda geo: cheapest(linear(1.0, 0.0), curvatures(2), 0.2),
         "not grow with curvature of surface 2, so give",
     ),
-    (lambda geo: fitted(torch.sum, geo, []), "no errors were given"),
-    (lambda geo: fitted(torch.sum, geo, curvatures(2), steps=0.0), "steps of errors must be positive"),
-    (lambda geo: fitted(torch.sum, geo, curvatures(2), INF), "positive and finite"),
-    (lambda geo: fitted(torch.sum, geo, curvatures(2), [1.0] * 3), "3 steps were given for 2"),
-    (lambda geo: fitted(lambda g: NAN, geo, curvatures(2)), "figure of the lens: 1 of 1"),
 ]
-BEAM = Field(torch.ones(16, 16, dtype=torch.complex128), 0.01, 0.5)
 PLATE = ZernikePlate({4: 0.0}, 4.0)
 RIPPLE = torch.zeros(121, 121, dtype=D)
 # small, but with detail between cells
 RIPPLE[::2] = 0.1
 LIGHT = [
-    (lambda geo: Field(torch.ones(4, 4), 0.1, 0.5), "complex"),
-    (lambda geo: Field(BEAM.amplitude, 0.0, 0.5), "must be positive"),
-    (lambda geo: Field(BEAM.amplitude * NAN, 0.1, 0.5), "field: 256 of 256 values are NaN"),
-    (lambda geo: fresnel(BEAM, 0.0, 0.01, 8), "neither of them 0"),
-    (lambda geo: fresnel(BEAM, 10.0, 0.001, 8, focus_mm=NAN), "focus nan mm must be single numbers"),
-    (lambda geo: fresnel(BEAM, 10.0, 0.001, -3), "a grid of -3 samples"),
-    (lambda geo: fresnel(BEAM, 10.0, NAN, 8), "8 samples, nan mm apart"),
-    (lambda geo: fresnel(BEAM, 1.0, 0.01, 256), "after which it repeats .* a pitch of .* mm is needed"),
-    *((lambda geo, r=r: disc(32, 0.1, r), f"half widths of an opening .* got {r} mm") for r in (-1, NAN)),
-    (lambda geo: rectangle(32, 0.1, (0.1, -0.1)), "half widths of an opening .* got 0.1, -0.1 mm"),
-    *(
-        (lambda geo, z=z: angular_spectrum(BEAM, z), "is not one finite number")
-        for z in (NAN, -INF, torch.ones(2))
-    ),
-    *(
-        (lambda geo, p=p: angular_spectrum(BEAM, 1.0, padding=p), f"padding {p} must be a whole number")
-        for p in (0, NAN)
-    ),
-    (lambda geo: diffraction.before_image(geo, NAN, 0.001, 8), "distance in mm: nan"),
-    (
-        lambda geo: diffraction.before_image(paraboloid(), 20.0, 0.02, 64, grid=64),
-        "asks for a pitch of at most .* mm and a pupil grid of at least",
-    ),
     (lambda geo: plated(geo, GridPlate(RIPPLE, 0.07), grid=64), r"detail of 0.07 mm"),
     (lambda geo: diffraction.with_plate(geo, PLATE, 0, 1.0), "is not modelled; put it next to the stop"),
     (lambda geo: diffraction.with_plate(geo, PLATE, 7), "from surface 8 is not modelled"),
@@ -471,17 +429,3 @@ def test_the_grid_that_a_sentence_asks_for_is_enough(triplet):
     # a phase c Z11 steps by c sqrt(5) (24 - 12) / pi waves per radius at the rim; half a wave from cell to
     # cell
     assert needed == pytest.approx(60 * math.sqrt(5) * 12 / (2 * math.pi) * 2 * 2, rel=0.02)
-    x = (torch.arange(64, dtype=D) - 32) * 0.002
-    narrow = torch.exp(-(x.square() + x[:, None].square()) / 0.01**2)
-    with pytest.raises(CodesignError, match=r"light leaves the grid of 0.128 mm within 20 mm") as caught:
-        angular_spectrum(Field(narrow.to(torch.complex128), 0.002, 0.5), 20.0)
-    needed = int(str(caught.value).split("(")[1].split(" samples")[0])
-    x = (torch.arange(needed, dtype=D) - needed // 2) * 0.002
-    wide = torch.exp(-(x.square() + x[:, None].square()) / 0.01**2)
-    angular_spectrum(Field(wide.to(torch.complex128), 0.002, 0.5), 20.0)
-    turning = torch.polar(
-        torch.ones_like(narrow), -math.pi / 0.5e-3 / 5 * 25 * (x[:64].square() + x[:64, None].square())
-    )
-    steep = Field(turning, 0.01, 0.5)
-    check(lambda: angular_spectrum(steep, 1.0), r"turns by about half a wave .* give a pitch")
-    check(lambda: fresnel(steep, 1.0, 0.001, 16), "or take a sphere out")

@@ -13,7 +13,6 @@ from codesign.lens.design.moves import (
     moved_element,
     with_glass,
     without_element,
-    without_surface,
 )
 from codesign.lens.design.tolerance import Tolerances
 from codesign.lens.solves import focus_paraxial, focus_rays, hold_efl
@@ -36,7 +35,6 @@ __all__ = [
     "neighbour_glasses",
     "with_glass",
     "without_element",
-    "without_surface",
 ]
 
 explain(globals())

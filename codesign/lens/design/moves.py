@@ -19,11 +19,9 @@ from torch import Tensor
 from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.lens.distance import real_numbers
 from codesign.lens.geolens import GeoLens
-from codesign.lens.glass import WAVELENGTH_UM, Glass
+from codesign.lens.glass import Glass
 from codesign.lens.solves import focus_paraxial, hold_efl
 from codesign.lens.surface import Surface, passes_of
-
-SAME_INDEX = 1e-9
 
 
 def elements(lens: GeoLens) -> tuple[tuple[int, int], ...]:
@@ -79,36 +77,8 @@ def without_element(lens: GeoLens, element: int) -> GeoLens:
         surfaces[front] = replace(surfaces[front], medium=surfaces[back].medium)
         gone = [back] if front > 0 and filled[front - 1] else [back, front]
     for at in gone:
-        surfaces = _without(surfaces, at, keep_stop=True)
+        surfaces = _without(surfaces, at)
     return _held(lens, surfaces, f"without element {range(len(pairs))[element] + 1}")
-
-
-def without_surface(lens: GeoLens, surface: int) -> GeoLens:
-    """The lens without one surface, a dummy in air or the face between two glasses; the gap in front of it
-    grows over it, with its medium.
-
-    A stop on that surface moves to the nearer neighbour.
-    Args: surface: counted from 0; from the last when negative. Returns, Raises: as ``without_element``;
-      DomainError too for a face between glass and air, whose element would have no end.
-    """
-    count = len(lens.surfaces)
-    if not -count <= surface < count:
-        raise DomainError(f"{lens.name}: there is no surface {surface}; it has 0 to {count - 1}.")
-    at = range(count)[surface]
-    if lens.mirrors[at]:
-        raise DomainError(
-            f"{lens.name}: surface {at + 1} is a mirror, and without it the light turns no more."
-        )
-    filled = [False, *lens.glass.tolist()]
-    if filled[at] != filled[at + 1] and not _same_medium(lens, at):
-        raise DomainError(
-            f"{lens.name}: surface {at + 1} lies between glass and air, so the glass would have no face; "
-            "take its "
-            "element out with without_element."
-        )
-    if count == 1:
-        raise DomainError(f"{lens.name}: surface 1 is its only one; a lens needs at least one.")
-    return _held(lens, _without(_surfaces(lens), at, keep_stop=False), f"without surface {at + 1}")
 
 
 def flattened(lens: GeoLens, element: int, share: float) -> GeoLens:
@@ -175,31 +145,19 @@ def _element_faces(lens, pairs, element):
     return front, back
 
 
-def _same_medium(lens, surface):
-    return all(
-        abs(float(n[surface + 1] - n[surface])) <= SAME_INDEX
-        for n in (lens.index(w).detach() for w in WAVELENGTH_UM.values())
-    )
-
-
 def _surfaces(lens):
     """Today's surfaces as a list, the stop marked."""
     return [replace(s, is_stop=i == lens.stop_index) for i, s in enumerate(lens.to_surfaces())]
 
 
-def _without(surfaces, at, keep_stop):
-    """The list without a surface, the gap in front of it longer; a plane stop in its place when the stop is
-    to stay."""
+def _without(surfaces, at):
+    """The list without a surface, the gap in front of it longer; a plane stop in the place of a stop."""
     found = list(surfaces)
     gone = found.pop(at)
-    if gone.is_stop and keep_stop:
+    if gone.is_stop:
         medium = found[at - 1].medium if at else None
         found.insert(at, Surface(math.inf, gone.thickness_mm, medium, gone.semi_aperture_mm, is_stop=True))
         return found
-    if gone.is_stop:
-        ahead = at > 0 and (at == len(found) or found[at - 1].thickness_mm < gone.thickness_mm)
-        heir = at - 1 if ahead else at
-        found[heir] = replace(found[heir], is_stop=True)
     if at:
         found[at - 1] = replace(found[at - 1], thickness_mm=found[at - 1].thickness_mm + gone.thickness_mm)
     return found

@@ -23,9 +23,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
-from codesign.lens.design.tolerance import Compensator, Error, Figures, SpotForecast, compensated, perturbed
-from codesign.lens.distance import real_numbers
-from codesign.lens.geolens import GeoLens
+from codesign.lens.design.tolerance import Error, SpotForecast
 
 NODES = 2048  # of the sum over the characteristic function
 FARTHEST = (
@@ -92,53 +90,6 @@ def of_spot(forecast: SpotForecast) -> Forecast:
     return Forecast(float(forecast.nominal.mean()), forecast.linear.mean(0), forecast.square.mean(0))
 
 
-def fitted(
-    figure: Figures,
-    lens: GeoLens,
-    errors: Sequence[Error],
-    steps: Tensor | float = 1.0,
-    compensate: Compensator | None = None,
-) -> Forecast:
-    """Forecast of a figure without useful derivatives, such as a flow error: a parabola through the lens
-    itself and each error at plus and minus its step, 2 P + 1 evaluations; errors do not mix in it.
-
-    Args: figure: lens -> one number; draw the same random numbers in every call. steps: in standard
-      deviations, a number or [P]; large enough for the figure to rise above its noise.
-    """
-    figure = compensated(figure, compensate)
-    _check_some(errors)
-    sizes = real_numbers(steps, "steps").double()
-    if sizes.shape not in ((), (len(errors),)):
-        raise ShapeError(
-            f"{sizes.numel()} steps were given for {len(errors)} errors; give one, or one for each."
-        )
-    sizes = sizes.expand(len(errors))
-    if not bool(((sizes > 0) & sizes.isfinite()).all()):
-        raise DomainError(f"steps of errors must be positive and finite, got {sizes.tolist()}.")
-    with torch.no_grad():
-        nominal = float(figure(lens))
-        sides = torch.tensor(
-            [
-                [float(figure(perturbed(lens, errors, sign * row))) for sign in (1.0, -1.0)]
-                for row in torch.diag(sizes).to(lens.dtype)
-            ],
-            dtype=torch.float64,
-        )
-    check_finite(torch.tensor(nominal), "figure of the lens", "give a figure that is a number there")
-    check_finite(sides, "figures at plus and minus a step of each error", "take smaller steps")
-    plus, minus = sides.unbind(1)
-    return Forecast(
-        nominal, (plus - minus) / (2 * sizes), torch.diag((plus + minus - 2 * nominal) / (2 * sizes.square()))
-    )
-
-
-def equal_shares(
-    forecast: Forecast, errors: Sequence[Error], budget: float, share: float = 0.9, most: float = math.inf
-) -> Precision:
-    """Tolerances of which each takes the same part of the budget; see ``cheapest``."""
-    return _solved(forecast, errors, budget, share, most, _costs(errors, None), power=1.0)
-
-
 def cheapest(
     forecast: Forecast,
     errors: Sequence[Error],
@@ -160,17 +111,15 @@ def cheapest(
     Raises: DomainError for a budget or share out of range, an unknown cost, a tolerance that the figure does
       not grow with and ``most`` does not bound, and a budget that is not spent when all are at ``most``.
     """
-    return _solved(forecast, errors, budget, share, most, _costs(errors, costs), power=2 / 3)
-
-
-def _solved(forecast, errors, budget, share, most, costs, power):
-    count = len(errors)
-    _check_some(errors)
+    if not errors:
+        raise DomainError("no errors were given; give at least one, as errors_of makes them.")
     for part in (forecast.linear, forecast.square):
         check_finite(part, "forecast", "look for what makes the figure NaN or infinite")
     forecast = Forecast(forecast.nominal, forecast.linear.double(), forecast.square.double())
-    if forecast.linear.shape != (count,):
-        raise ShapeError(f"the forecast is of {forecast.linear.numel()} errors, but {count} were given.")
+    if forecast.linear.shape != (len(errors),):
+        raise ShapeError(
+            f"the forecast is of {forecast.linear.numel()} errors, but {len(errors)} were given."
+        )
     if not any(bool(part.any()) for part in (forecast.linear, forecast.square)):
         raise DomainError(
             "the figure has no slope in any error; larger steps, or another figure, may show one."
@@ -182,6 +131,7 @@ def _solved(forecast, errors, budget, share, most, costs, power):
             "figure, the share lie between 0.5 and 1, and the factor be positive."
         )
     names = list(dict.fromkeys(e.drawn for e in errors))
+    costs = _costs(names, costs or {})
     member = torch.tensor([names.index(e.drawn) for e in errors])
     z = NormalDist().inv_cdf(share)
     factors = torch.ones(len(names), dtype=forecast.linear.dtype)
@@ -211,7 +161,7 @@ def _solved(forecast, errors, budget, share, most, costs, power):
             raise DomainError(
                 f"the figure does not grow with {flat}, so give the largest factor it may have."
             )
-        aim = torch.where(w > 0, (costs / w.clamp_min(1e-300)) ** (power / 2), 1e30)
+        aim = torch.where(w > 0, (costs / w.clamp_min(1e-300)) ** (1 / 3), 1e30)
         before = factors
         factors = (_largest(aim, member, most, normal) * before).sqrt()
         if float((factors / before - 1).abs().max()) < 1e-7:
@@ -241,14 +191,8 @@ def _largest(shape, member, most, keeps):
     return (shape * math.exp(low)).clamp_max(most)
 
 
-def _check_some(errors):
-    if not errors:
-        raise DomainError("no errors were given; give at least one, as errors_of makes them.")
-
-
-def _costs(errors, given):
-    names = list(dict.fromkeys(e.drawn for e in errors))
-    given = given or {}
+def _costs(names, given):
+    """The costs [names] of tolerances."""
     if not isinstance(given, Mapping):
         raise DomainError(f"costs {given}: give a mapping from the names of tolerances to their costs.")
     known = {*names, *(name.split()[0] for name in names)}
