@@ -38,6 +38,8 @@ from codesign.lens.design.tolerance import (
 )
 from codesign.lens.solves import focus_rays
 from studies.frame.run import Run, StudyConfig, main
+from studies.frame.show import table
+from studies.frame.sweep import plain
 
 FIELDS = (0.0, 0.7, 1.0)
 LINES = tuple(WAVELENGTH_UM[line] for line in "FdC")
@@ -165,34 +167,26 @@ def report_linear(run, slopes, trials):
     quantiles = trials.quantiles(QUANTILES)
     rows = []
     for k, name in enumerate(LINEAR_FIGURES):
-        figures = {
-            "deviation_forecast": float(found.forecast[k]),
-            "deviation_simulated": float(found.simulated[k]),
-            "correlation": float(found.correlation[k]),
+        known = {
+            "deviation_forecast": found.forecast[k],
+            "deviation_simulated": found.simulated[k],
+            "correlation": found.correlation[k],
         }
-        key = name.split(" (")[0].lower().replace(" ", "_")
-        run.record(**{f"{key}_{figure}": value for figure, value in figures.items()})
-        values = trials.nominal[k], *figures.values(), found.bias[k], *quantiles[:, k]
-        rows.append([name, *(f"{float(value):.6g}" for value in values)])
+        key = plain(name.split(" (")[0].lower())
+        run.record(**{f"{key}_{figure}": value for figure, value in known.items()})
+        figures = {"nominal": trials.nominal[k], **known, "mean shift / deviation": found.bias[k]}
+        figures |= {f"{q:.0%}": value for q, value in zip(QUANTILES, quantiles[:, k], strict=True)}
+        rows.append({"figure": name, **{title: f"{float(value):.6g}" for title, value in figures.items()}})
     run.card(
         "Linear figures",
         f"{min(found.correlation.tolist()):.6f}",
         "lowest correlation of forecast and simulated change",
     )
     run.section("Linear figures")
-    columns = [
-        "figure",
-        "nominal",
-        "deviation forecast",
-        "simulated",
-        "correlation",
-        "mean shift / deviation",
-    ]
     count = trials.figures.shape[0]
     run.table(
         "Forecast and trials",
-        [*columns, *(f"{q:.0%}" for q in QUANTILES)],
-        rows,
+        *table(rows),
         f"{count} trials know a standard deviation to {(2 * count - 2) ** -0.5:.1%} (one standard error); "
         "the correlation is not limited by that.",
     )
@@ -219,35 +213,34 @@ def report_spot(run, name, forecast, amounts, squares):
     predicted = forecast.at(amounts[good])
     generator = torch.Generator().manual_seed(run.config.seed + 1)
     draws = torch.randn(DRAWS, amounts.shape[1], generator=generator, dtype=amounts.dtype)
-    drawn_um = forecast.at(draws).clamp_min(0).sqrt() * 1e3
-    truth_um = squares.sqrt() * 1e3
-    nominal_um = (forecast.nominal.sqrt() * 1e3).tolist()
+    drawn_um, truth_um, nominal_um = (
+        v.clamp_min(0).sqrt() * 1e3 for v in (forecast.at(draws), squares, forecast.nominal)
+    )
+    mean, deviation = squares.mean(0), squares.std(0)
+    added, spread = forecast.moments()
+    known = {
+        "mean_square_same_draws_ratio": predicted.mean(0) / mean,
+        "deviation_same_draws_ratio": predicted.std(0) / deviation,
+        "deviation_ratio": spread / deviation,
+        "linear_deviation_ratio": torch.linalg.vector_norm(forecast.linear, dim=1) / deviation,
+        "correlation": [
+            torch.corrcoef(torch.stack(pair))[0, 1] for pair in zip(predicted.T, squares.T, strict=True)
+        ],
+    }
+    expected = forecast.nominal + added
+    quantiles = [v.quantile(v.new_tensor(QUANTILES), 0) for v in (drawn_um, truth_um)]
     rows = []
-    worst = 0.0
     for f, share in enumerate(FIELDS):
-        mean = float(squares[:, f].mean())
-        deviation = float(squares[:, f].std())
-        figures = {
-            "mean_square_same_draws_ratio": float(predicted[:, f].mean()) / mean,
-            "deviation_same_draws_ratio": float(predicted[:, f].std()) / deviation,
-            "deviation_ratio": float(forecast.deviation[f]) / deviation,
-            "linear_deviation_ratio": float(forecast.linear_deviation[f]) / deviation,
-            "correlation": float(torch.corrcoef(torch.stack([predicted[:, f], squares[:, f]]))[0, 1]),
-        }
-        worst = max(worst, abs(figures["mean_square_same_draws_ratio"] - 1))
+        figures = {figure: float(values[f]) for figure, values in known.items()}
         key = f"spot_{name}_field{share:g}".replace(".", "_")
-        run.record(
-            **{f"{key}_mean_square_ratio": float(forecast.mean[f]) / mean},
-            **{f"{key}_{figure}": value for figure, value in figures.items()},
-        )
-        sizes = nominal_um[f], 1e3 * float(forecast.mean[f]) ** 0.5, 1e3 * mean**0.5
-        quantiles = zip(
-            *(v[:, f].quantile(v.new_tensor(QUANTILES)) for v in (drawn_um, truth_um)), strict=True
-        )
+        figures_of = {"mean_square_ratio": float(expected[f] / mean[f]), **figures}
+        run.record(**{f"{key}_{figure}": value for figure, value in figures_of.items()})
+        sizes = nominal_um[f], 1e3 * expected[f].sqrt(), 1e3 * mean[f].sqrt()
         rows.append(
-            [f"{share:g}", *(f"{size:.2f}" for size in sizes), *(f"{v:.5f}" for v in figures.values())]
-            + [f"{float(a):.2f} / {float(b):.2f}" for a, b in quantiles]
+            [f"{share:g}", *(f"{float(size):.2f}" for size in sizes), *(f"{v:.5f}" for v in figures.values())]
+            + [f"{a:.2f} / {b:.2f}" for a, b in zip(*(q[:, f].tolist() for q in quantiles), strict=True)]
         )
+    worst = float((known["mean_square_same_draws_ratio"] - 1).abs().max())
     run.card(f"Spot, {name}", f"{worst:.2%}", "largest error of the mean square spot over the same draws")
     run.section(f"Spot with the image plane {name}")
     run.table(
@@ -263,11 +256,12 @@ def report_spot(run, name, forecast, amounts, squares):
     )
     figure, axes = plt.subplots(1, len(FIELDS), figsize=(11, 3.4), layout="constrained")
     for f, axis in enumerate(axes):
-        truth = truth_um[:, f].numpy()
-        _, edges, _ = axis.hist(truth, bins=30, density=True, color="#9cc3dd", label="simulated")
+        _, edges, _ = axis.hist(
+            truth_um[:, f].numpy(), bins=30, density=True, color="#9cc3dd", label="simulated"
+        )
         shape = {"bins": edges, "density": True, "histtype": "step", "color": "#c0392b"}
         axis.hist(drawn_um[:, f].numpy(), label="forecast", **shape)
-        axis.axvline(nominal_um[f], color="k", linewidth=1, label="nominal")
+        axis.axvline(float(nominal_um[f]), color="k", linewidth=1, label="nominal")
         axis.set(xlabel="RMS spot (µm)", title=f"field {FIELDS[f]:g}")
     axes[0].legend(frameon=False, fontsize=8)
     run.figure(
@@ -309,7 +303,7 @@ def report_needed(run, geo, figure, refocus):
     )
     errors = errors_of(geo, tolerances)
     slopes = sensitivities(geo, errors, figure, compensate=refocus)
-    forecast = precision.of_spot(forecast_spot(compensated(figure, refocus)(geo), slopes, len(FIELDS)))
+    forecast = forecast_spot(compensated(figure, refocus)(geo), slopes, len(FIELDS)).averaged()
     budget = ((1 + GROWTH) ** 2 - 1) * forecast.nominal
     needed = precision.cheapest(forecast, errors, budget, SHARE, most=config.widest)
 
@@ -318,18 +312,17 @@ def report_needed(run, geo, figure, refocus):
 
     generator = torch.Generator().manual_seed(config.seed + 3)
     trials = monte_carlo(geo, needed.errors, square, JUDGED, generator, compensate=refocus)
-    grown = trials.figures[:, 0] - compensated(square, refocus)(geo)
-    kept = float((grown <= budget).double().mean())
+    kept = float((trials.figures - trials.nominal <= budget).double().mean())
     run.record(needed_share_within_budget=kept, needed_cost=needed.cost)
-    shares = {}
+    shares = dict.fromkeys((error.drawn for error in needed.errors), 0.0)
+    deviations = {error.drawn: said(geo, error) for error in reversed(needed.errors)}
     for error, share in zip(needed.errors, needed.shares.tolist(), strict=True):
-        deviation, total = shares.get(error.drawn, (said(geo, error), 0.0))
-        shares[error.drawn] = deviation, total + share
+        shares[error.drawn] += share
     run.section("What precision each part needs")
     run.table(
         f"Standard deviations for which {SHARE:.0%} of lenses keep their spot within {GROWTH:.0%}",
         ["tolerance", "deviation", "share of the budget"],
-        [[name, deviation, f"{share:.1%}"] for name, (deviation, share) in shares.items()],
+        [[name, deviations[name], f"{share:.1%}"] for name, share in shares.items()],
         "Refocused after assembly; cheapest at costs of one over each tolerance in units of the one given. "
         f"{kept:.0%} of {JUDGED} simulated lenses keep the budget.",
     )

@@ -24,6 +24,7 @@ REACHED = 1e-11  # miss at the stop, relative to the stop's radius: where roundi
 SINGULAR = 1e-12  # determinant at the stop of rays that stay where they are
 # step of the derivative that goes into the irradiance, relative to the pupil's size; its error is the square
 DIFFERENCE = 1e-3
+START_Z_MM = -5.0  # where aimed rays start, from the first vertex
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,6 @@ def aimed_rays(
     field_rad: float | Tensor,
     pupil: Tensor,
     wavelength_um: float = WAVELENGTH_UM["d"],
-    start_z_mm: float = -5.0,
 ) -> tuple[Tensor, Tensor]:
     """Parallel rays of one field angle (in +y) that meet the real stop at points of its disc.
 
@@ -132,7 +132,7 @@ def aimed_rays(
         slope = torch.cat([0 * share, tangent * share, torch.ones_like(share)], 1)
         direction = torch.nn.functional.normalize(slope, dim=1)
         at = torch.cat([points, f.entrance_pupil_z_mm.expand(points.shape[0], 1)], 1)
-        return at + slope * (start_z_mm - at[:, 2:]), direction
+        return at + slope * (START_Z_MM - at[:, 2:]), direction
 
     aim = aim_at_stop(
         rays,

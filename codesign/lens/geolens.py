@@ -427,9 +427,9 @@ class GeoLens(Replaceable):
         return trace(self.prescription(wavelength_um), origin_mm, direction)
 
     @settled
-    def thin(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> ThinLens:
+    def thin(self) -> ThinLens:
         """The paraxial level of this lens: same focal length, pupil and defocus, no aberrations."""
-        f = self.first_order(wavelength_um)
+        f = self.first_order()
         return ThinLens(
             f.efl_mm, self.entrance_pupil_diameter_mm, f.efl_mm + self.thickness_mm[-1] - f.bfl_mm
         )

@@ -230,8 +230,8 @@ class Glass:
 
     @staticmethod
     def from_dict(page: dict[str, Any]) -> "Glass":
-        """Glass from what ``to_dict`` gave, or from {"name", "F", "d", "C"}; anything else is a
-        DomainError."""
+        """Glass from what ``dataclasses.asdict`` gives of one, or from {"name", "F", "d", "C"}; anything else is
+        a DomainError."""
         if not isinstance(page, dict):
             raise DomainError(
                 f"glass {_cut(page)} must be an object with name, model, coefficients and range_um, or with "
@@ -242,30 +242,14 @@ class Glass:
             if "model" in page
             else (("F", "d", "C"), ("name",))
         )
-        for key in needed:
-            if key not in page:
-                raise DomainError(
-                    f"glass {_cut(page.get('name', 'custom'))}: the field '{key}' is missing; it needs "
-                    f"{', '.join(needed)}."
-                )
-        for key in page:
-            if key not in needed and key not in free:
-                raise DomainError(
-                    f"glass {_cut(page.get('name', 'custom'))}: the field {_cut(key)} is not known; it has "
-                    f"{', '.join((*needed, *free))}."
-                )
+        wrong = [f"'{key}' is missing" for key in needed if key not in page]
+        wrong += [f"{_cut(key)} is not known" for key in page if key not in (*needed, *free)]
+        if wrong:
+            raise DomainError(
+                f"glass {_cut(page.get('name', 'custom'))}: the field {wrong[0]}; it has "
+                f"{', '.join((*needed, *free))}."
+            )
         return Glass(**page) if "model" in page else Glass.from_indices(**page)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain JSON types that ``from_dict`` turns into an equal glass, to the last bit."""
-        return {
-            "name": self.name,
-            "model": self.model,
-            "coefficients": list(self.coefficients),
-            "range_um": list(self.range_um),
-            "source": self.source,
-            "offset": self.offset,
-        }
 
     def shifted(self, offset: float) -> "Glass":
         """The same medium with its index larger by ``offset`` at every wavelength."""

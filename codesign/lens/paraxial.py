@@ -4,7 +4,7 @@ term, mirrors and diffraction count."""
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -59,20 +59,21 @@ def bending(index: Tensor, mirrors: Sequence[bool]) -> Tensor:
 
 
 def yu_trace(
-    power: Tensor,
-    thickness_mm: Tensor,
-    index: Tensor,
-    y: Tensor,
-    nu: Tensor,
+    power: Any,
+    thickness_mm: Any,
+    index: Any,
+    y: Any,
+    nu: Any,
     first: int = 0,
     last: int | None = None,
-) -> tuple[list[Tensor], list[Tensor]]:
+) -> tuple[list[Any], list[Any]]:
     """Paraxial height and reduced angle (n u) just after each surface from ``first`` to before ``last``.
 
-    Args: power [S] per mm, thickness_mm [S], index [S + 1]; y at surface ``first`` and nu before it.
+    Args: power [S] per mm, thickness_mm [S], index [S + 1]; y at surface ``first`` and nu before it. Tensors,
+      or plain numbers and lists of them.
     Returns: lists of y and nu per surface.
     """
-    last = power.numel() if last is None else last
+    last = len(power) if last is None else last
     heights = []
     angles = []
     for i in range(first, last):

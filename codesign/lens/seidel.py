@@ -25,7 +25,7 @@ NAMES = ("spherical", "coma", "astigmatism", "petzval", "distortion")
 @dataclass(frozen=True)
 class SeidelSums:
     """Contributions per surface, [S] mm of wavefront each: S_I spherical, S_II coma, S_III astigmatism, S_IV
-    Petzval, S_V distortion, C_I axial and C_II lateral colour (between the two outer wavelengths).
+    Petzval, S_V distortion, C_I axial and C_II lateral colour (between F and C).
     ``invariant_mm``: Lagrange invariant.
     """
 
@@ -53,8 +53,6 @@ def seidel_sums(
     lens: GeoLens,
     field_rad: float,
     wavelength_um: float = WAVELENGTH_UM["d"],
-    short_um: float = WAVELENGTH_UM["F"],
-    long_um: float = WAVELENGTH_UM["C"],
     at_m: float | Tensor = PARALLEL,
 ) -> SeidelSums:
     """SeidelSums of a lens for an object plane.
@@ -62,8 +60,7 @@ def seidel_sums(
     Spheres, conics, the r^2 and r^4 asphere terms, mirrors, and the first two diffractive terms; decentres
     and tilts do not count.
 
-    Args: field_rad: half field. wavelength_um: of the monochromatic sums; short_um and long_um: ends of the
-      colour sums. at_m: metres from the entrance pupil to the object, inf for parallel light; the pupil's
+    Args: field_rad: half field. wavelength_um: of the monochromatic sums; those of colour are between F and C. at_m: metres from the entrance pupil to the object, inf for parallel light; the pupil's
       diameter is the lens's at every distance.
     Gradient: to every lens tensor and to at_m. Raises: DomainError, see ``paraxial_rays`` and
       ``distance.vergence_per_mm``.
@@ -79,7 +76,7 @@ def seidel_sums(
     figure = (1 + lens.conic) * lens.curvature_per_mm**3 / 8 + _column(lens.asphere, 1) - curvature**3 / 8
     plate = _plate(rays, 8 * figure * bending(index, lens.mirrors))
     monochromatic = {name: a + b + c for name, a, b, c in zip(NAMES, layer, sphere, plate, strict=True)}
-    axial, lateral = _colour(lens, rays, index, curvature, power, short_um, long_um)
+    axial, lateral = _colour(lens, rays, index, curvature, power)
     return SeidelSums(
         **monochromatic, axial_colour=axial, lateral_colour=lateral, invariant_mm=rays.invariant_mm
     )
@@ -169,13 +166,13 @@ def _plate(rays, strength):
     ]
 
 
-def _colour(lens, rays, index, curvature, power, short_um, long_um):
+def _colour(lens, rays, index, curvature, power):
     """C_I and C_II, [S] each: A y jump(dn / n) of the refraction, and y^2 times the spread of the diffractive
     power."""
     (A, A_bar), _ = _invariants(rays, index, curvature, power)
     y = rays.marginal_height_mm
     y_bar = rays.chief_height_mm
-    spread = (lens.index(short_um) - lens.index(long_um)) / index
-    jump = spread[1:] - spread[:-1]
-    layer = -2 * (_column(lens.path_mm(short_um), 0) - _column(lens.path_mm(long_um), 0))
+    short, long = WAVELENGTH_UM["F"], WAVELENGTH_UM["C"]
+    jump = ((lens.index(short) - lens.index(long)) / index).diff()
+    layer = -2 * _column(lens.path_mm(short) - lens.path_mm(long), 0)
     return y * (A * jump + y * layer), y * (A_bar * jump + y_bar * layer)

@@ -136,12 +136,7 @@ def _remedy(lens):
     return f"it needs more than {float(nearest.detach()) * 1e-3:.6g} m"
 
 
-def focus_paraxial(
-    lens: L,
-    wavelength_um: float = WAVELENGTH_UM["d"],
-    defocus_mm: float | Tensor = 0.0,
-    at_m: float | Tensor = PARALLEL,
-) -> L:
+def focus_paraxial(lens: L, defocus_mm: float | Tensor = 0.0, at_m: float | Tensor = PARALLEL) -> L:
     """The lens with its image plane at the paraxial image of an axial point, or ``defocus_mm`` (number or
     scalar tensor) behind it. Differentiable.
 
@@ -150,14 +145,14 @@ def focus_paraxial(
     Raises: DomainError for light that leaves the lens parallel, or a distance inside the lens. A focus
       inside the lens gives a negative last thickness, which constraints must push back.
     """
-    height, angle = focused_image(lens, vergence_per_mm(lens, one_distance(at_m)), wavelength_um)
+    height, angle = focused_image(lens, vergence_per_mm(lens, one_distance(at_m)))
     if abs(float(angle.detach())) < 1e-12:
         raise DomainError(
             f"{lens.name}: the light of a point {float(torch.as_tensor(at_m).detach()):.6g} m away leaves "
             "the lens parallel, "
             "so it has no focus; the lens is afocal for it: change a curvature or the distance."
         )
-    return _last_thickness(lens, -height * lens.index(wavelength_um)[-1] / angle + defocus_mm)
+    return _last_thickness(lens, -height * lens.index()[-1] / angle + defocus_mm)
 
 
 def focus_rays(

@@ -1,4 +1,4 @@
-"""Pictures of what passes along the chain: frames, event frames, curves, junction table."""
+"""Pictures, curves and matrices drawn into axes: what pages of runs are made of."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -6,24 +6,6 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
-
-
-def strips(
-    rows: Sequence[Sequence[np.ndarray]], titles: Sequence[str], signed: Sequence[bool], labels: Sequence[str]
-) -> Figure:
-    """Figure of image rows: rows [R][C] of [H, W] arrays; ``signed`` rows are drawn red (ON) and blue (OFF),
-    others in grey."""
-    figure, axes = plt.subplots(
-        len(rows), len(rows[0]), figsize=(2.3 * len(rows[0]), 2.35 * len(rows)), squeeze=False
-    )
-    for r, (row, sign) in enumerate(zip(rows, signed, strict=True)):
-        for c, (axis, image) in enumerate(zip(axes[r], row, strict=True)):
-            draw_image(axis, image, row, sign)
-            if r == 0:
-                axis.set_title(titles[c], fontsize=9)
-        axes[r, 0].set_ylabel(labels[r], fontsize=9)
-    figure.tight_layout()
-    return figure
 
 
 def draw_image(axis: Any, image: Any, of_scale: Sequence[Any], signed: bool = False) -> None:
@@ -45,18 +27,6 @@ def draw_image(axis: Any, image: Any, of_scale: Sequence[Any], signed: bool = Fa
         axis.imshow(np.clip(image / top, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
     axis.set_xticks([])
     axis.set_yticks([])
-
-
-def curves(
-    series: Mapping[str, tuple[Any, Any]], ylabel: str, xlabel: str = "step", logarithmic: bool = False
-) -> Figure:
-    """Figure of named curves: dict label -> (x, y)."""
-    figure, axis = plt.subplots(figsize=(7, 3.4))
-    draw_curves(axis, series, xlabel, ylabel, "y" if logarithmic else "")
-    if len(series) > 1:
-        axis.legend(fontsize=8, ncols=2)
-    figure.tight_layout()
-    return figure
 
 
 def draw_curves(

@@ -30,7 +30,6 @@ def field_errors(
     lens: GeoLens,
     half_field_rad: float,
     light: analysis.Light = VISIBLE_UM,
-    mapping: str = "f-tan",
     count: int = 21,
     at_m: float = PARALLEL,
 ) -> Figure:
@@ -44,9 +43,9 @@ def field_errors(
     axes[0].plot(shifts[:, 1], angles, color=COLOURS[0], ls="--", label="sagittal")
     axes[0].set(xlabel="focus shift (mm)", ylabel="field (degrees)", title="Field curvature")
     # on the axis it is 0 by definition
-    distortion = analysis.distortion_percent(lens, fields[1:], mapping, reference, at_m)
+    distortion = analysis.distortion_percent(lens, fields[1:], wavelength_um=reference, at_m=at_m)
     axes[1].plot(distortion.numpy(), angles[1:], color=COLOURS[2])
-    axes[1].set(xlabel=f"distortion (%), {mapping}", title="Distortion")
+    axes[1].set(xlabel="distortion (%), f-tan", title="Distortion")
     colour = analysis.lateral_colour_mm(lens, fields, others, reference, at_m) if others else ()
     for k, wavelength in enumerate(others):
         label = f"{wavelength * 1e3:.0f} nm"
@@ -70,7 +69,6 @@ def through_focus(
     frequency_per_mm: float,
     light: analysis.Light = WAVELENGTH_UM["d"],
     vignetting: bool = False,
-    method: str = "geometric",
     at_m: float = PARALLEL,
 ) -> Figure:
     """Figure over the position of the image plane: RMS spot, and MTF at one frequency."""
@@ -80,12 +78,12 @@ def through_focus(
     for field, row, colour in zip(fields_rad, sizes, COLOURS * len(fields_rad), strict=False):
         axes[0].plot(z, row.numpy(), color=colour, label=degrees(field))
         curves = analysis.through_focus_mtf(
-            lens, field, frequency_per_mm, z, light, method, vignetting=vignetting, at_m=at_m
+            lens, field, frequency_per_mm, z, light, "geometric", vignetting, at_m=at_m
         )
         for side, curve, style in zip(("tangential", "sagittal"), curves.numpy(), ("-", "--"), strict=True):
             axes[1].plot(z, curve, style, color=colour, label=f"{degrees(field)}, {side}")
     axes[0].set(ylabel="RMS spot (µm)", ylim=(0, None))
-    axes[1].set(ylabel=f"{method} MTF at {frequency_per_mm:g} / mm", ylim=(0, 1.02))
+    axes[1].set(ylabel=f"geometric MTF at {frequency_per_mm:g} / mm", ylim=(0, 1.02))
     for axis in axes:
         axis.axvline(0, color="0.5", lw=0.6)
         axis.set_xlabel("defocus (mm)")

@@ -35,7 +35,6 @@ def lens_layout(
     lens: GeoLens,
     fields_rad: Sequence[float] | None = None,
     path: str | Path | None = None,
-    rays: int = 5,
     at_m: float = PARALLEL,
 ) -> Figure:
     """Figure of a lens's cross-section with meridional rays.
@@ -43,7 +42,6 @@ def lens_layout(
     Args:
       fields_rad: angles; None takes 0, 0.7 and 1 of the lens's half field (10 degrees where none is known).
       path: where to save, .svg, .png or .pdf, or None.
-      rays: per field.
       at_m: metres from the entrance pupil to the object plane. Mirrors are drawn along the unfolded axis.
     Returns: matplotlib Figure. Raises: FileFormatError for another ending or a place that is not writable.
     """
@@ -54,7 +52,7 @@ def lens_layout(
     if fields_rad is None:
         fields_rad = [math.radians(lens.half_field_deg or 10.0) * h for h in (0.0, 0.7, 1.0)]
     figure, axis = plt.subplots(figsize=(9, 4), layout="constrained")
-    draw_layout(axis, lens, fields_rad, rays, at_m)
+    draw_layout(axis, lens, fields_rad, at_m=at_m)
     axis.set_title(lens.name, loc="left")
     if path is not None:
         with replacing(path) as temporary:

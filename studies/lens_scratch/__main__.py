@@ -8,12 +8,11 @@ Cooke triplet: success is a mean RMS spot within twice its own, over fields 0, 0
 unvignetted pupil, every ray passing and every limit held.
 """
 
-import dataclasses
 import math
 import statistics
 import sys
-import time
 from dataclasses import dataclass
+from statistics import fmean
 from typing import ClassVar
 
 import matplotlib.pyplot as plt
@@ -26,7 +25,8 @@ from codesign.report import lens_figures
 from studies.frame.compare import share
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.show import table
-from studies.lens_scratch.search import ATTEMPTS, METHODS, Outcome, Search
+from studies.frame.sweep import sweep
+from studies.lens_scratch.search import METHODS, search
 from studies.lens_scratch.task import JUDGED_FIELDS, judge, polychromatic_spots_um
 
 YARDSTICK = "cooke-triplet"
@@ -50,90 +50,36 @@ def study(run: Run[Config]):
             f"{config.seeds} seeds and methods {config.methods}: give at least one seed, and methods out of "
             f"{', '.join(METHODS)}."
         )
-    methods = config.methods
     seeds = range(config.seed, config.seed + config.seeds)
     published = lens.load(YARDSTICK).freeze()
-    published_um = mean(polychromatic_spots_um(published))
+    published_um = fmean(polychromatic_spots_um(published))
     goal_um = ALLOWED * published_um
     run.say(f"{YARDSTICK}: mean RMS spot {published_um:.2f} um in F, d, C; goal {goal_um:.2f} um")
-    outcomes = search_all(run, [(method, seed) for method in methods for seed in seeds], goal_um)
-    found = [(outcome, judge_outcome(outcome)) for outcome in outcomes]
-    for method in methods:
-        record_method(run, method, [(o, v) for o, v in found if o.method == method])
+    given = {"goal_um": goal_um, "shorten": 2 if config.quick else 1}
+    rows = sweep(run, search, "searches", given=given, method=config.methods, seed=seeds)
+    found = [(row, judge(torch.tensor(row["variables"], dtype=torch.float64))) for row in rows]
+    for method in config.methods:
+        record_method(run, method, [pair for pair in found if pair[0]["method"] == method])
     run.record(
         published_mean_spot_um=published_um,
-        published_mean_spot_d_um=mean(polychromatic_spots_um(published, ("d",))),
+        published_mean_spot_d_um=fmean(polychromatic_spots_um(published, ("d",))),
         goal_mean_spot_um=goal_um,
     )
     show(run, published, found)
 
 
-def search_all(run, jobs, goal_um):
-    """Outcome of every (method, seed), going on where an earlier session stopped."""
-    stored = run.load_state() if run.resumed else None
-    numbers = stored.numbers if stored else {"done": [], "now": None}
-    done = [Outcome(**row) for row in numbers["done"]]
-    searches: dict[str, Search | None] = {"now": None}
-
-    def save():
-        run.save_state(
-            {},
-            {
-                "done": [dataclasses.asdict(o) for o in [*done, *ended(searches["now"])]],
-                "now": search.state() if (search := searches["now"]) and not search.outcome else None,
-            },
-        )
-
-    run.on_interrupt(save)
-    for method, seed in jobs[len(done) :]:
-        search = searches["now"] = Search(method, seed, goal_um, shorten=2 if run.config.quick else 1)
-        if numbers["now"]:
-            search.resume(numbers.pop("now"))
-        numbers["now"] = None
-        with run.progress(
-            ATTEMPTS * sum(s.steps for s in search.stages), f"{method} {seed}", search.steps
-        ) as progress:
-            while search.outcome is None:
-                began = time.monotonic()
-                entry = search.step()
-                search.seconds += time.monotonic() - began
-                progress.advance(loss=entry.loss)
-        (outcome,) = ended(search)
-        done.append(outcome)
-        searches["now"] = None
-        save()
-        verdict = judge_outcome(outcome)
-        run.say(
-            f"{method} {seed}: {'success' if outcome.succeeded else 'no success'}, mean RMS spot "
-            f"{verdict.mean_um if verdict else math.nan:.2f} um, "
-            f"{outcome.steps} steps, {outcome.evaluations} evaluations, {search.seconds:.1f} s, attempt "
-            f"{outcome.attempts}"
-        )
-    return done
-
-
-def ended(search):
-    """The outcome of a search, in a list; an empty one before its last step."""
-    return [dataclasses.replace(search.outcome, seconds=search.seconds)] if search and search.outcome else []
-
-
-def judge_outcome(outcome):
-    """Verdict on an outcome's lens, None when it is no lens."""
-    return judge(torch.tensor(outcome.variables, dtype=torch.float64))
-
-
 def record_method(run, method, found):
     """Figures of one method into metrics.json, and its card."""
-    wins = [o for o, _ in found if o.succeeded]
+    wins = [row for row, _ in found if row["succeeded"]]
     succeeded = share(len(wins), len(found))
     figures = {
         "seeds": len(found),
         "seeds_succeeded": len(wins),
         "success_low": succeeded.low,
         "success_high": succeeded.high,
-        "seeds_succeeded_at_first_attempt": sum(o.attempts == 1 for o in wins),
-        "seconds_total": sum(o.seconds for o, _ in found),
-        "evaluations_total": sum(o.evaluations for o, _ in found),
+        "seeds_succeeded_at_first_attempt": sum(row["attempts"] == 1 for row in wins),
+        "seconds_total": sum(row["seconds"] for row, _ in found),
+        "evaluations_total": sum(row["evaluations"] for row, _ in found),
     }
     spots = [v.mean_um for _, v in found if v is not None and math.isfinite(v.mean_um)]
     if spots:
@@ -155,23 +101,19 @@ def show(run, published, found):
         f"{published_um:.2f} µm",
         f"mean RMS spot in F, d, C; the goal is {goal_um:.2f} µm",
     )
-    first = [(o, v) for o, v in found if o.method == run.config.methods[0]]
+    first = [pair for pair in found if pair[0]["method"] == run.config.methods[0]]
     run.figure(
         layouts(published, first),
         "layouts",
         "The published lens and the design of every seed of the first method, with the rays of fields 0, 0.7 and 1.",
     )
     rows = []
-    for o, v in found:
-        row = {name: getattr(o, name) for name in ("method", "seed", "attempts", "steps", "evaluations")}
-        row |= {"success": "yes" if o.succeeded else "no", "seconds": round(o.seconds, 1)}
+    for row, v in found:
+        shown = {name: value for name, value in row.items() if name != "variables"}
         if v is not None:
             tight = [f"{c.name} ({c.state(TIGHT)})" for c in active(v.limits, TIGHT)]
-            row |= {
-                "mean spot (µm)": round(v.mean_um, 2),
-                "limits that bind or fail": "; ".join(tight) or "none",
-            }
-        rows.append(row)
+            shown |= {"mean spot (µm)": v.mean_um, "limits that bind or fail": "; ".join(tight) or "none"}
+        rows.append(shown)
     run.table("Seeds", *table(rows))
     run.finish(
         "A lens from plane plates",
@@ -183,9 +125,7 @@ def show(run, published, found):
 def layouts(published, found):
     """Small layouts, the published lens first."""
     shown = [("published", published)]
-    shown += [
-        (f"seed {o.seed}: {v.mean_um:.1f} µm", v.geo) for o, v in found if v is not None and v.rays_pass
-    ]
+    shown += [(f"seed {row['seed']}: {v.mean_um:.1f} µm", v.geo) for row, v in found if v and v.rays_pass]
     count = math.ceil(len(shown) / 3)
     figure, axes = plt.subplots(count, 3, figsize=(13, 2.6 * count), squeeze=False, layout="constrained")
     for axis in axes.flat:
@@ -194,10 +134,6 @@ def layouts(published, found):
         lens_figures.draw_layout(axis, geo, JUDGED_FIELDS, rays=3)
         axis.set_title(title, loc="left", fontsize=9)
     return figure
-
-
-def mean(values):
-    return sum(values) / len(values)
 
 
 if __name__ == "__main__":

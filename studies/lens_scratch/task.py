@@ -53,12 +53,11 @@ class Stage:
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """What a design is worth: RMS spots in um at JUDGED_FIELDS, in F, d, C together and in d alone; its
-    limits; whether every ray passes."""
+    """What a design is worth: RMS spots in um at JUDGED_FIELDS, in F, d, C together; its limits; whether every
+    ray passes."""
 
     geo: GeoLens
     spots_um: tuple[float, ...]
-    spots_d_um: tuple[float, ...]
     limits: tuple[Constraint, ...]
     rays_pass: bool
 
@@ -67,8 +66,9 @@ class Verdict:
         return sum(self.spots_um) / len(self.spots_um)
 
     @property
-    def limits_hold(self):
-        return all(c.state() != "violated" for c in self.limits)
+    def good(self):
+        """Whether every ray passes and every limit holds."""
+        return self.rays_pass and all(c.state() != "violated" for c in self.limits)
 
 
 def _plates():
@@ -157,20 +157,11 @@ def judge(variables):
     None when it is no lens at all."""
     try:
         geo = build(variables)
-        apertures = traced_semi_aperture_mm(geo, (*JUDGED_FIELDS, -HALF_FIELD)).tolist()
-        surfaces = [
-            dataclasses.replace(s, semi_aperture_mm=a)
-            for s, a in zip(geo.to_surfaces(), apertures, strict=True)
-        ]
-        made = GeoLens(surfaces, PUPIL_MM, name=PLATES.name, half_field_deg=math.degrees(HALF_FIELD)).freeze()
+        made = geo.replace(
+            semi_aperture_mm=traced_semi_aperture_mm(geo, (*JUDGED_FIELDS, -HALF_FIELD))
+        ).scaled(1)
     except DomainError:
         return None
+    made.freeze()
     spots = polychromatic_spots_um(made)
-    spots_d = polychromatic_spots_um(made, ("d",))
-    return Verdict(
-        made,
-        spots,
-        spots_d,
-        tuple(evaluate(made, JUDGED_LIMITS)),
-        all(map(math.isfinite, (*spots, *spots_d))),
-    )
+    return Verdict(made, spots, tuple(evaluate(made, JUDGED_LIMITS)), all(map(math.isfinite, spots)))

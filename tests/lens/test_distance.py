@@ -77,7 +77,7 @@ FOCUSED = {
         4, 4
     ],
     "MTF": lambda geo, at_m: analysis.diffraction_mtf(geo, 0.0, [20.0], grid=128, at_m=at_m),
-    "depth of field": lambda geo, at_m: analysis.depth_of_field(geo, 0.02, at_m).near_m,
+    "depth of field": lambda geo, at_m: analysis.depth_of_field(geo.focus_at(at_m), 0.02).near_m,
 }
 FIGURES = {
     "spots": lambda geo, at_m: lens.rms_spot_mm(geo, FIELDS, at_m=at_m),
@@ -155,7 +155,7 @@ def test_depth_of_field_of_a_thin_lens_is_that_of_its_circle_of_confusion(focus_
     # no thickness: all at the pupil
     front = lens.Surface(50.0, 0.0, glass(1.5), 10.0, is_stop=True)
     geo = lens.GeoLens([front, lens.Surface(-50.0, 50.0, None, 10.0)], 10.0)
-    found = analysis.depth_of_field(geo, 0.05, focus_m)
+    found = analysis.depth_of_field(geo.focus_at(focus_m), 0.05)
     thin = geo.focus_at(focus_m).thin()
     for limit in filter(math.isfinite, (float(found.near_m), float(found.far_m))):
         # D |s (1 / f - 1 / d) - 1| for pupil D, film distance s and object distance d from the lens
@@ -163,7 +163,7 @@ def test_depth_of_field_of_a_thin_lens_is_that_of_its_circle_of_confusion(focus_
         assert blur == pytest.approx(0.05, rel=1e-10)
     hyperfocal = float(analysis.hyperfocal_m(geo, 0.05))
     assert hyperfocal == pytest.approx((50.0**2 / (5.0 * 0.05) + 50.0) / 1e3, rel=1e-12)
-    wide = analysis.depth_of_field(geo, 0.05 * (1 + 1e-9), hyperfocal)
+    wide = analysis.depth_of_field(geo.focus_at(hyperfocal), 0.05 * (1 + 1e-9))
     # from half of it, for a thin lens
     assert (float(wide.near_m), float(wide.far_m)) == (pytest.approx(hyperfocal / 2, rel=1e-6), math.inf)
 

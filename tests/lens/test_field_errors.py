@@ -105,9 +105,9 @@ def test_encircled_energy_of_a_defocused_point_is_that_of_a_disc():
     # rays evenly over the pupil stay even over the disc (up to (y / 2 f)^2): the share inside r is (r / a)^2
     a = 0.5 * 2.5 / 100
     radii = [0.25 * a, 0.5 * a, 0.75 * a, 1.01 * a]
-    found = analysis.encircled_energy(paraboloid(), 0.0, radii, grid=128, defocus_mm=0.5).tolist()
+    found = analysis.encircled_energy(paraboloid(defocus_mm=0.5), 0.0, radii, grid=128).tolist()
     assert found == pytest.approx([1 / 16, 1 / 4, 9 / 16, 1], abs=3e-3)
-    radius = analysis.encircled_radius_mm(paraboloid(), 0.0, 0.64, grid=128, defocus_mm=0.5).item()
+    radius = analysis.encircled_radius_mm(paraboloid(defocus_mm=0.5), 0.0, 0.64, grid=128).item()
     assert radius == pytest.approx(0.8 * a, rel=5e-3)
 
 

@@ -53,7 +53,7 @@ def test_defocus_of_half_a_wave_lowers_the_mtf_by_hopkins_integral():
     overlap = ((x + v).square() + y * y <= 1) & ((x - v).square() + y * y <= 1)
     truth = float((torch.cos(2 * math.pi * 0.5 * 4 * v * x) * overlap).sum() / (x * x + y * y <= 1).sum())
     frequency = [v / (w * (f + shift) / diameter)]
-    found = diffraction_mtf(paraboloid(), 0.0, frequency, grid=256, defocus_mm=shift)[:, 0].tolist()
+    found = diffraction_mtf(paraboloid(defocus_mm=shift), 0.0, frequency, grid=256)[:, 0].tolist()
     assert found == pytest.approx([abs(truth)] * 2, abs=1.5e-3)
 
 
@@ -95,7 +95,7 @@ def test_the_geometric_mtf_is_the_transform_of_the_spot():
     frequency = torch.linspace(0, 400, 9, dtype=D)
     x = 2 * math.pi * radius * frequency
     truth = torch.where(x == 0, 1.0, 2 * torch.special.bessel_j1(x) / torch.where(x == 0, 1, x))
-    found = geometric_mtf(paraboloid(), 0.0, frequency, grid=256, defocus_mm=0.05).detach()
+    found = geometric_mtf(paraboloid(defocus_mm=0.05), 0.0, frequency, grid=256).detach()
     torch.testing.assert_close(found, truth.abs().expand(2, -1), rtol=0, atol=2e-3)
 
 

@@ -206,7 +206,7 @@ def focus(system, at_m):
         product = product + (bundle.position * slopes).sum()
         square = square + (slopes**2).sum()
     film = ld.crossing(system, "d", at)
-    found = analysis.depth_of_field(geo, 0.02, at_m)
+    found = analysis.depth_of_field(geo.focus_at(at_m), 0.02)
 
     def blur(distance_m):
         """Diameter on the film of the paraxial light of a point."""

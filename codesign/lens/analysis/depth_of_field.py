@@ -7,13 +7,12 @@ aberrations included.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError
+from codesign.errors import DomainError
 from codesign.lens.analysis.spots import rms_spot_mm
 from codesign.lens.distance import real_numbers
 from codesign.lens.geolens import GeoLens
@@ -21,8 +20,6 @@ from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.paraxial import yu_trace
 
 RMS_OF_DISC = 1 / (2 * math.sqrt(2))  # RMS radius of an evenly filled disc over its diameter
-SAMPLES = 33  # vergences of one trace
-ROUNDS = 5  # of traces, each looking into one step of the one before
 CLOSEST_PER_MM = 1e3  # to a pupil that has no surface before it
 
 
@@ -39,23 +36,21 @@ class DepthOfField:
 def depth_of_field(
     lens: GeoLens,
     blur_mm: float | Tensor,
-    focus_m: float | Tensor | None = None,
     wavelength_um: float = WAVELENGTH_UM["d"],
 ) -> DepthOfField:
     """DepthOfField where the paraxial blur disc of an axial point is at most ``blur_mm`` across.
 
-    Args: blur_mm: diameter on the film, > 0. focus_m: distance to focus on first (``GeoLens.focus_at``), None
-      leaves the film where it is. A near limit before the lens is its first vertex.
-    Gradient: to every lens tensor that bends or moves light, to the blur and to focus_m.
+    Args: blur_mm: diameter on the film, > 0; see ``GeoLens.focus_at`` for where the film stands. A near limit
+      before the lens is its first vertex.
+    Gradient: to every lens tensor that bends or moves light, and to the blur.
     Raises: DomainError for a limit that is not positive, and when nothing before the lens is that sharp.
 
     Example:
     >>> from codesign import lens
-    >>> found = lens.analysis.depth_of_field(lens.load("cooke-triplet"), 0.02, focus_m=2.0)
+    >>> found = lens.analysis.depth_of_field(lens.load("cooke-triplet").focus_at(2.0), 0.02)
     >>> round(found.near_m.item(), 2), round(found.far_m.item(), 2)
     (1.86, 2.17)
     """
-    lens = lens if focus_m is None else lens.focus_at(focus_m, wavelength_um)
     (at_parallel, _), (per_vergence, _) = _film_heights(lens, wavelength_um)
     sharpest = -at_parallel / per_vergence
     reach = _checked(lens, blur_mm) / (
@@ -96,79 +91,64 @@ def hyperfocal_m(lens: GeoLens, blur_mm: float | Tensor, wavelength_um: float = 
 def traced_depth_of_field(
     lens: GeoLens,
     blur_mm: float,
-    focus_m: float | None = None,
-    fields_rad: Sequence[float] = (0.0,),
     wavelength_um: float = WAVELENGTH_UM["d"],
     grid: int = 16,
 ) -> DepthOfField:
-    """DepthOfField where the RMS spot over the fields is at most that of an even disc ``blur_mm`` across.
+    """DepthOfField where the RMS spot on the axis is at most that of an even disc ``blur_mm`` across.
 
     Aberrations share the blur: this range is the smaller the more of the limit they take. Args as for
-    ``depth_of_field``; fields_rad: angles whose mean square counts. Gradient: none (limits are searched, to
+    ``depth_of_field``; grid: pupil samples across. Gradient: none (limits are searched, to
     1e-6).
     Raises: DomainError for a limit that is not positive, and when aberrations alone exceed it.
     """
-    if torch.as_tensor(fields_rad).ndim != 1:
-        raise ShapeError(f"fields_rad must be a list of angles in radians, got {fields_rad}.")
-    lens = lens if focus_m is None else lens.focus_at(focus_m, wavelength_um)
     limit = float(_checked(lens, blur_mm)) * RMS_OF_DISC
     (at_parallel, _), (per_vergence, _) = _film_heights(lens, wavelength_um)
-    sharpest = float(-at_parallel / per_vergence)
-    width = 3 * float(blur_mm) / float(lens.first_order().entrance_pupil_diameter_mm * per_vergence.abs())
     nearest = _nearest(lens)
     top = 0.999 / nearest if nearest else CLOSEST_PER_MM
-    centre = min(max(sharpest, 0.0), top)
+    centre = min(max(float(-at_parallel / per_vergence), 0.0), top)
+    width = 3 * float(blur_mm) / float(lens.first_order().entrance_pupil_diameter_mm * per_vergence.abs())
 
-    def rms(vergences):
-        spots = rms_spot_mm(lens, fields_rad, wavelength_um, grid, 1e-3 / vergences)
-        return spots.square().mean(1).sqrt()
-
-    def line(low, high):
-        return torch.linspace(low, high, 8 * SAMPLES, dtype=lens.dtype, device=lens.thickness_mm.device)
+    def rms(vergence):
+        at_m = 1e-3 / torch.tensor(vergence, dtype=lens.dtype)
+        return float(rms_spot_mm(lens, [0.0], wavelength_um, grid, at_m))
 
     while True:  # aberrations, or a plate, may move the sharpest place far from the paraxial one
         low, high = max(0.0, centre - width), min(top, centre + width)
-        at = line(low, high)
-        found = rms(at)
-        best = int(found.argmin())
-        ends_low = low == 0 or (best > 0 and float(found[0]) > limit)
-        ends_high = high == top or (best < len(at) - 1 and float(found[-1]) > limit)
-        if ends_low and ends_high:
+        centre = min(low, high, _least(rms, low, high), key=rms)
+        if low < centre < high or centre in (0.0, top):
             break
         width *= 2
-    least = at[max(best - 1, 0) : best + 2]
-    for _ in range(ROUNDS):  # the range within the limit may be narrower than a step
-        least = line(float(least[0]), float(least[-1]))
-        k = int(rms(least).argmin())
-        least = least[max(k - 1, 0) : k + 2]
-    at = torch.cat([at, least]).unique()  # in order
-    found = rms(at)
-    best = int(found.argmin())
-    if not float(found[best]) <= limit:
+    if not rms(centre) <= limit:
         raise DomainError(
-            f"{lens.name}: its RMS spot is {float(found[best]):.4g} mm at best, above the {limit:.4g} mm of "
-            "a disc of "
+            f"{lens.name}: its RMS spot is {rms(centre):.4g} mm at best, above the {limit:.4g} mm of a disc of "
             f"{float(blur_mm):.4g} mm; allow more blur, or stop down."
         )
-    far, near = (_edge(rms, at, found, best, step, limit) for step in (-1, 1))
-    return DepthOfField(_metres(near), _metres(far), _metres(at[best]))
+    near, far = (_edge(lambda v: rms(v) - limit, centre, end, width) for end in (top, 0.0))
+    like = lens.thickness_mm.detach()
+    return DepthOfField(*(_metres(like.new_tensor(v)) for v in (near, far, centre)))
 
 
-def _edge(rms, at, found, best, step, limit):
-    """Vergence where the spot reaches the limit, going from the best sample in one direction."""
-    k = best
-    while 0 <= k + step < len(at) and float(found[k + step]) <= limit:
-        k += step
-    if not 0 <= k + step < len(at):
-        return at[k]
-    inside, outside = at[k], at[k + step]
-    for _ in range(ROUNDS):
-        between = inside + (outside - inside) * torch.linspace(
-            0, 1, SAMPLES, dtype=at.dtype, device=at.device
-        )
-        sharp = (rms(between) <= limit).long().cumprod(0).sum()
-        inside, outside = between[(sharp - 1).clamp_min(0)], between[sharp.clamp_max(SAMPLES - 1)]
-    return inside
+def _least(function, low, high):
+    """Where a function of one number is least between two ends."""
+    from scipy.optimize import minimize_scalar
+
+    found = minimize_scalar(
+        function, bounds=(low, high), method="bounded", options={"xatol": 1e-7 * (high - low)}
+    )
+    return float(found.x)
+
+
+def _edge(function, start, end, step):
+    """Where a function that is at most 0 at the start turns positive on the way to the end; the end if nowhere."""
+    from scipy.optimize import brentq
+
+    inside = start
+    while inside != end:
+        ahead = min(inside + step, end) if end > start else max(inside - step, end)
+        if function(ahead) > 0:
+            return brentq(function, inside, ahead, xtol=1e-9 * abs(ahead - inside))
+        inside, step = ahead, 2 * step
+    return end
 
 
 def _film_heights(lens, wavelength_um):

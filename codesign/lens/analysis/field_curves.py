@@ -56,6 +56,7 @@ def chromatic_focus_shift_mm(
     return torch.stack([place - reference for place in places], -1)
 
 
+REACH = 1e-3  # share of the pupil radius, of the rays of a thin bundle
 MAPPINGS = {"f-tan": math.tan, "f-theta": float}
 
 
@@ -104,18 +105,16 @@ def focus_shift_mm(
     lens: GeoLens,
     fields_rad: Sequence[float],
     wavelength_um: float = WAVELENGTH_UM["d"],
-    reach: float = 1e-3,
     at_m: Distances = PARALLEL,
 ) -> Tensor:
     """Tangential and sagittal focus of each field, along z from the image plane; the difference is the
     astigmatism.
 
-    Rays at +-reach and +-2 reach of the pupil radius stand for the infinitely thin bundle of Coddington's
+    Rays at +-REACH and +-2 REACH of the pupil radius stand for the infinitely thin bundle of Coddington's
     equations; four points cancel the terms of third order in the reach, so what is left is rounding (below
     1e-8 of the focal length).
 
-    Args: fields_rad: F angles. reach: share of the pupil radius. at_m: metres to the object plane, or D of
-      them.
+    Args: fields_rad: F angles. at_m: metres to the object plane, or D of them.
     Returns: [F, 2] or [D, F, 2] mm, tangential (rays displaced in y) then sagittal (in x); positive behind
       the image plane. Computed in float64, as the rays lie so close together, and given in the lens's
       precision.
@@ -123,7 +122,7 @@ def focus_shift_mm(
     """
     dtype = lens.dtype
     lens = in_float64(lens)
-    line = torch.tensor([-2.0, -1.0, 1.0, 2.0], dtype=lens.dtype, device=lens.curvature_per_mm.device) * reach
+    line = torch.tensor([-2.0, -1.0, 1.0, 2.0], dtype=lens.dtype, device=lens.curvature_per_mm.device) * REACH
     zero = torch.zeros_like(line)
     pupil = torch.cat([torch.stack([zero, line], 1), torch.stack([line, zero], 1)])
     rays = trace_field(lens, fields_rad, pupil, wavelength_um, at_m=at_m)
@@ -166,7 +165,6 @@ def ray_fan(
     count: int = 33,
     vignetting: bool = False,
     reference_mm: Tensor | None = None,
-    defocus_mm: float | Tensor = 0.0,
     at_m: float | Tensor = PARALLEL,
 ) -> RayFan:
     """RayFan of one object point and wavelength.
@@ -174,7 +172,7 @@ def ray_fan(
     Args:
       count: rays per diameter, odd to hold the chief ray. reference_mm: [2] image point to which both
         aberrations refer; None is the chief ray of this wavelength. Give that of a middle wavelength to see
-        lateral colour. vignetting, defocus_mm, at_m (one distance): see ``trace_field``.
+        lateral colour. vignetting, at_m (one distance): see ``trace_field``.
     Gradient: aberrations to every lens tensor and to at_m. Raises: DomainError when no ray, or not the chief
       ray, arrives.
     """
@@ -182,12 +180,10 @@ def ray_fan(
     line = torch.linspace(-1, 1, count, dtype=like.dtype, device=like.device)
     zero = torch.zeros(count, dtype=like.dtype, device=like.device)
     pupil = torch.cat([torch.stack([zero, line], 1), torch.stack([line, zero], 1)])
-    rays, chief = trace_with_chief(lens, field_rad, pupil, wavelength_um, vignetting, defocus_mm, at_m)
+    rays, chief = trace_with_chief(lens, field_rad, pupil, wavelength_um, vignetting, at_m)
     centre = chief.position_mm[0] if reference_mm is None else reference_mm
     away = rays.position_mm - centre
-    waves = path_difference_mm(lens, rays, chief, wavelength_um, reference_mm, defocus_mm) / (
-        wavelength_um * 1e-3
-    )
+    waves = path_difference_mm(lens, rays, chief, wavelength_um, reference_mm) / (wavelength_um * 1e-3)
     return RayFan(
         line,
         away[:count, 1],
@@ -218,11 +214,17 @@ def through_focus_spot_mm(
     one_distance(at_m)
     rays = [trace_field(lens, fields_rad, pupil, w, vignetting, at_m=at_m) for w in wavelengths]
     weight = torch.stack([r.weight * share for r, share in zip(rays, shares, strict=True)], 1)
-    columns = []
-    for z in defocus_mm:
-        positions = torch.stack([r.shifted(float(z)).position_mm for r in rays], 1)
-        columns.append(torch.stack([spot_radius_mm(p, w) for p, w in zip(positions, weight, strict=True)]))
-    return torch.stack(columns, 1)
+    place = torch.stack([r.position_mm for r in rays], 1)
+    slope = torch.stack([r.direction[..., :2] / r.direction[..., 2:] for r in rays], 1)
+    return torch.stack(
+        [
+            torch.stack(
+                [spot_radius_mm(p + float(z) * s, w) for p, s, w in zip(place, slope, weight, strict=True)]
+            )
+            for z in defocus_mm
+        ],
+        1,
+    )
 
 
 def through_focus_mtf(
@@ -232,7 +234,6 @@ def through_focus_mtf(
     defocus_mm: Values,
     light: Light = WAVELENGTH_UM["d"],
     method: str = "diffraction",
-    grid: int | None = None,
     vignetting: bool = False,
     at_m: float | Tensor = PARALLEL,
 ) -> Tensor:
@@ -240,28 +241,14 @@ def through_focus_mtf(
     "geometric"; at_m: metres to the object plane. Gradient: to every lens tensor."""
     if method not in METHODS:
         raise DomainError(f"method '{method}' is not known; known methods: {', '.join(METHODS)}.")
-    options = {} if grid is None else {"grid": grid}
-    return torch.cat(
-        [
-            METHODS[method](
-                lens,
-                field_rad,
-                [frequency_per_mm],
-                light,
-                vignetting=vignetting,
-                defocus_mm=float(z),
-                at_m=at_m,
-                **options,
-            )
-            for z in defocus_mm
-        ],
-        1,
-    )
+    behind = torch.zeros_like(lens.thickness_mm)
+    behind[-1] = 1.0
+    lenses = [lens.replace(thickness_mm=lens.thickness_mm + float(z) * behind) for z in defocus_mm]
+    options = {"light": light, "vignetting": vignetting, "at_m": at_m}
+    return torch.cat([METHODS[method](geo, field_rad, [frequency_per_mm], **options) for geo in lenses], 1)
 
 
-def relative_illumination(
-    lens: GeoLens, fields_rad: Sequence[float], wavelength_um: float = WAVELENGTH_UM["d"], grid: int = 24
-) -> Tensor:
+def relative_illumination(lens: GeoLens, fields_rad: Sequence[float], grid: int = 24) -> Tensor:
     """Irradiance of the image of a uniform world at each field, relative to the axis, vignetting included.
 
     Args: fields_rad: angles from the axis; grid: pupil points across the stop.
@@ -276,21 +263,21 @@ def relative_illumination(
     lens = in_float64(lens)
     pupil = pupil_grid(grid)
     fields = [0.0, *map(float, fields_rad)]
-    heights = [_image_height(lens, field, wavelength_um) for field in fields]
+    heights = [_image_height(lens, field) for field in fields]
     film = torch.stack([torch.zeros_like(torch.stack(heights)), torch.stack(heights)], 1).repeat_interleave(
         pupil.shape[0], 0
     )
     # camera rays take points as seen upright
-    rays = lens.camera_rays(-film, pupil.repeat(len(fields), 1), wavelength_um, aim=True)
+    rays = lens.camera_rays(-film, pupil.repeat(len(fields), 1), aim=True)
     assert rays.irradiance is not None  # GeoLens gives it
     light = (rays.weight * rays.irradiance).reshape(len(fields), -1).mean(1)
     return (light[1:] / light[0]).to(dtype)
 
 
-def _image_height(lens, field_rad, wavelength_um):
+def _image_height(lens, field_rad):
     """Where the chief ray of a field meets the image plane, mm (negative for a positive field)."""
-    origin, direction = aimed_rays(lens, field_rad, torch.zeros(1, 2, dtype=lens.dtype), wavelength_um)
-    out = lens.trace(origin, direction, wavelength_um)
+    origin, direction = aimed_rays(lens, field_rad, torch.zeros(1, 2, dtype=lens.dtype))
+    out = lens.trace(origin, direction)
     if out.status[0] != 0:
         raise DomainError(
             f"{lens.name}: the chief ray of field {field_rad * 57.29578:.4g} degrees does not pass the "

@@ -38,7 +38,6 @@ def diffraction_mtf(
     light: Light = WAVELENGTH_UM["d"],
     grid: int | None = None,
     vignetting: bool = False,
-    defocus_mm: float | Tensor = 0.0,
     at_m: float | Tensor = PARALLEL,
 ) -> Tensor:
     """MTF with diffraction of one field, from the Fourier transform of the point spread.
@@ -46,13 +45,13 @@ def diffraction_mtf(
     Several wavelengths add as complex transfer functions about one image point, so that lateral colour
     counts.
 
-    Args: frequency_per_mm: [K] line pairs per mm in the image. light, grid, vignetting, defocus_mm, at_m: see
+    Args: frequency_per_mm: [K] line pairs per mm in the image. light, grid, vignetting, at_m: see
       ``psf_on_pixels``.
     Returns: [2, K] tangential, sagittal, in [0, 1]; exactly 0 beyond the cut-off.
     Gradient: to every lens tensor. Raises: DomainError for a negative frequency, and see ``pupil_function``.
     """
     frequency = _frequencies(lens, frequency_per_mm)
-    _, pupils = pupil_functions(lens, field_rad, light, grid, vignetting, defocus_mm, at_m)
+    _, pupils = pupil_functions(lens, field_rad, light, grid, vignetting, at_m)
     transfers = (
         share * torch.stack([_transfer(pupil, axis, frequency) for axis in (1, 0)]) for share, pupil in pupils
     )
@@ -66,7 +65,6 @@ def geometric_mtf(
     light: Light = WAVELENGTH_UM["d"],
     grid: int = 64,
     vignetting: bool = False,
-    defocus_mm: float | Tensor = 0.0,
     at_m: float | Tensor = PARALLEL,
 ) -> Tensor:
     """MTF of the rays alone, |mean of exp(-2 pi i frequency x)|, [2, K] tangential, sagittal. Arguments and
@@ -75,7 +73,7 @@ def geometric_mtf(
     Multiply by ``ideal_mtf`` for the usual estimate between the two limits.
     """
     frequency = _frequencies(lens, frequency_per_mm)
-    points, weight = lit_points(lens, field_rad, light, grid, vignetting, defocus_mm, at_m)
+    points, weight = lit_points(lens, field_rad, light, grid, vignetting, at_m)
     away = points - (points * weight[:, None]).sum(0)
     found = []
     for axis in (1, 0):

@@ -37,8 +37,6 @@ def diffraction_psf(
     grid: int | None = None,
     padding: int = 4,
     vignetting: bool = False,
-    defocus_mm: float | Tensor = 0.0,
-    reference_mm: Tensor | None = None,
     at_m: float | Tensor = PARALLEL,
 ) -> Psf:
     """Psf by a Fourier transform of the pupil, zero-padded from n to n * padding cells.
@@ -47,13 +45,13 @@ def diffraction_psf(
     Airy scale wavelength times f-number per unit of padding 4. The picture repeats with n wavelength times
     f-number. Energy sums to 1.
 
-    Args: grid, vignetting, defocus_mm, reference_mm, at_m: see ``pupil_function``. padding: >= 2, so that the
+    Args: grid, vignetting, at_m: see ``pupil_function``. padding: >= 2, so that the
       energy is not aliased.
     Gradient: energy and pitch to every lens tensor. Raises: DomainError, see ``pupil_function``.
     """
     if int(padding) != padding or padding < 2:
         raise DomainError(f"padding {padding} must be a whole number of at least 2.")
-    pupil = pupil_function(lens, field_rad, wavelength_um, grid, vignetting, defocus_mm, reference_mm, at_m)
+    pupil = pupil_function(lens, field_rad, wavelength_um, grid, vignetting, at_m=at_m)
     count = pupil.field.shape[0] * int(padding)
     # signs in a chequer put the reference point into the middle; columns of padding alone need no transform
     sign = 1 - 2 * (torch.arange(pupil.field.shape[0], device=pupil.field.device) % 2)
@@ -74,7 +72,6 @@ def psf_on_pixels(
     light: Light = WAVELENGTH_UM["d"],
     grid: int | None = None,
     vignetting: bool = False,
-    defocus_mm: float | Tensor = 0.0,
     at_m: float | Tensor = PARALLEL,
 ) -> Psf:
     """Psf of one or several wavelengths by diffraction, on a pixel grid of one's own, about the chief ray of
@@ -90,7 +87,7 @@ def psf_on_pixels(
       than the sampled pupil's period.
     """
     pixel_mm, pixels = _pixels(pixel_mm, pixels)
-    reference, pupils = pupil_functions(lens, field_rad, light, grid, vignetting, defocus_mm, at_m)
+    reference, pupils = pupil_functions(lens, field_rad, light, grid, vignetting, at_m)
     at = (torch.arange(pixels, dtype=lens.dtype, device=reference.device) - pixels // 2) * pixel_mm
     total = torch.zeros(pixels, pixels, dtype=lens.dtype, device=reference.device)
     for share, pupil in pupils:
@@ -114,7 +111,6 @@ def geometric_psf(
     light: Light = WAVELENGTH_UM["d"],
     grid: int = 128,
     vignetting: bool = False,
-    defocus_mm: float | Tensor = 0.0,
     at_m: float | Tensor = PARALLEL,
 ) -> Psf:
     """Psf by rays: each ray's weight is shared bilinearly among the four pixel centres around it. About the
@@ -125,8 +121,8 @@ def geometric_psf(
     Gradient: energy to every lens tensor, piecewise linear in the ray positions.
     """
     pixel_mm, pixels = _pixels(pixel_mm, pixels)
-    points, weight = lit_points(lens, field_rad, light, grid, vignetting, defocus_mm, at_m)
-    reference = chief_ray(lens, field_rad, spectral_lines(light)[0][0], defocus_mm, at_m).position_mm[0]
+    points, weight = lit_points(lens, field_rad, light, grid, vignetting, at_m)
+    reference = chief_ray(lens, field_rad, spectral_lines(light)[0][0], at_m).position_mm[0]
     place = (points - reference) / pixel_mm + pixels // 2  # x, y in pixels
     low = place.detach().floor()
     share = place - low

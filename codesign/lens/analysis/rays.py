@@ -117,8 +117,7 @@ def field_rays(
 
 @dataclass(frozen=True)
 class ImageRays:
-    """Rays of one wavelength on a plane across the axis near the image, with leading axes [...] of distances
-    and fields.
+    """Rays of one wavelength on the image plane, with leading axes [...] of distances and fields.
 
     position_mm: [..., M, 2] (x, y). direction: [..., M, 3] unit. path_mm: [..., M] optical path to the plane
       from the wavefront of the object point through the centre of the entrance pupil. weight: [..., M] >= 0,
@@ -148,19 +147,6 @@ class ImageRays:
             self.transmission[..., rays],
         )
 
-    def shifted(self, defocus_mm: float | Tensor) -> "ImageRays":
-        """The same rays on a plane ``defocus_mm`` further along +z (scalar, may carry a gradient); rays of
-        weight 0 stay where they failed."""
-        if isinstance(defocus_mm, (int, float)) and defocus_mm == 0:
-            return self
-        arrived = self.weight > 0
-        length = torch.where(arrived, defocus_mm / torch.where(arrived, self.direction[..., 2], 1), 0)
-        return replace(
-            self,
-            position_mm=self.position_mm + self.direction[..., :2] * length[..., None],
-            path_mm=self.path_mm + self.index * length,
-        )
-
 
 def trace_field(
     lens: TracedLens,
@@ -168,22 +154,20 @@ def trace_field(
     pupil: Tensor,
     wavelength_um: float = WAVELENGTH_UM["d"],
     vignetting: bool = False,
-    defocus_mm: float | Tensor = 0.0,
     at_m: Distances = PARALLEL,
 ) -> ImageRays:
     """Trace object points through pupil points to the image plane, in one trace.
 
     Args:
       field_rad: an angle in +y, or F of them. pupil: [M, 2] on the unit disc. vignetting: weigh rays by the
-        apertures' soft edges; otherwise every ray that arrives weighs 1. defocus_mm: distance of the plane
-        behind the lens's own image plane. at_m: metres from the entrance pupil to the object plane, or D of
-        them; see ``source_rays``.
+        apertures' soft edges; otherwise every ray that arrives weighs 1. at_m: metres from the entrance pupil
+        to the object plane, or D of them; see ``source_rays``.
     Returns: ImageRays with the axes [D, F, M], D and F as far as several were given.
     Gradient: positions, directions and paths to every lens tensor and to at_m; with vignetting the weights
       too.
     Raises: DomainError when no ray of a field arrives, or for a distance inside the lens.
     """
-    rays = trace_source(lens, source_rays(lens, field_rad, pupil, at_m), wavelength_um).shifted(defocus_mm)
+    rays = trace_source(lens, source_rays(lens, field_rad, pupil, at_m), wavelength_um)
     return _lit(lens, rays.vignetted() if vignetting else rays, field_rad)
 
 
@@ -222,13 +206,12 @@ def trace_with_chief(
     pupil: Tensor,
     wavelength_um: float,
     vignetting: bool,
-    defocus_mm: float | Tensor,
     at_m: float | Tensor,
 ) -> tuple[ImageRays, ImageRays]:
     """The rays of one field as from ``trace_field``, and its ``chief_ray``, in one trace."""
     one_distance(at_m)
     points = torch.cat([pupil, torch.zeros_like(pupil[:1])])
-    both = trace_source(lens, source_rays(lens, field_rad, points, at_m), wavelength_um).shifted(defocus_mm)
+    both = trace_source(lens, source_rays(lens, field_rad, points, at_m), wavelength_um)
     rays = both.part(slice(-1))
     chief = both.part(slice(-1, None))
     return _lit(lens, rays.vignetted() if vignetting else rays, field_rad), _lit(lens, chief, field_rad)
@@ -238,19 +221,12 @@ def chief_ray(
     lens: TracedLens,
     field_rad: float | Sequence[float] | Tensor,
     wavelength_um: float = WAVELENGTH_UM["d"],
-    defocus_mm: float | Tensor = 0.0,
     at_m: Distances = PARALLEL,
 ) -> ImageRays:
     """The ray through the centre of the pupil, as ImageRays with M = 1. Raises: DomainError when it does not
     arrive."""
-    return trace_field(
-        lens,
-        field_rad,
-        torch.zeros(1, 2, dtype=lens.dtype, device=lens.curvature_per_mm.device),
-        wavelength_um,
-        defocus_mm=defocus_mm,
-        at_m=at_m,
-    )
+    centre = torch.zeros(1, 2, dtype=lens.dtype, device=lens.curvature_per_mm.device)
+    return trace_field(lens, field_rad, centre, wavelength_um, at_m=at_m)
 
 
 def spectral_lines(light: Light) -> tuple[tuple[float, ...], tuple[float, ...]]:

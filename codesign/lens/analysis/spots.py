@@ -76,12 +76,11 @@ def polychromatic_spot(
     light: Light,
     grid: int = 32,
     vignetting: bool = False,
-    defocus_mm: float | Tensor = 0.0,
     at_m: float | Tensor = PARALLEL,
 ) -> tuple[Tensor, Tensor]:
     """Spot of one object point in light of several wavelengths, lateral colour included.
 
-    Args: light: see ``spectral_lines``. grid: pupil cells across. vignetting, defocus_mm, at_m (one
+    Args: light: see ``spectral_lines``. grid: pupil cells across. vignetting, at_m (one
       distance): see ``trace_field``.
     Returns: positions [W, M, 2] mm on the image plane, and weights [W, M] that sum to 1 (rays of one
       wavelength share its weight as far as they arrive).
@@ -91,7 +90,7 @@ def polychromatic_spot(
     one_distance(at_m)
     pupil = pupil_grid(grid, lens.dtype, lens.curvature_per_mm.device)
     wavelengths, shares = spectral_lines(light)
-    rays = [trace_field(lens, field_rad, pupil, w, vignetting, defocus_mm, at_m) for w in wavelengths]
+    rays = [trace_field(lens, field_rad, pupil, w, vignetting, at_m) for w in wavelengths]
     weight = torch.stack([r.weight * share for r, share in zip(rays, shares, strict=True)])
     return torch.stack([r.position_mm for r in rays]), weight / weight.sum()
 
@@ -102,11 +101,10 @@ def lit_points(
     light: Light,
     grid: int,
     vignetting: bool,
-    defocus_mm: float | Tensor,
     at_m: float | Tensor,
 ) -> tuple[Tensor, Tensor]:
     """The rays of a ``polychromatic_spot`` that arrive: positions [N, 2] mm and weights [N]."""
-    positions, weight = polychromatic_spot(lens, field_rad, light, grid, vignetting, defocus_mm, at_m)
+    positions, weight = polychromatic_spot(lens, field_rad, light, grid, vignetting, at_m)
     lit = weight.detach() > 0
     return positions[lit], weight[lit]
 
@@ -135,7 +133,6 @@ def encircled_energy(
     light: Light = WAVELENGTH_UM["d"],
     grid: int = 64,
     vignetting: bool = False,
-    defocus_mm: float | Tensor = 0.0,
     about_chief: bool = False,
     at_m: float | Tensor = PARALLEL,
 ) -> Tensor:
@@ -144,7 +141,7 @@ def encircled_energy(
     Args: radii_mm: [K] increasing or not; the others as for ``polychromatic_spot``. Returns: [K] in [0, 1],
       geometric, without diffraction. Gradient: none (a count).
     """
-    distance, weight = _distances(lens, field_rad, light, grid, vignetting, defocus_mm, about_chief, at_m)
+    distance, weight = _distances(lens, field_rad, light, grid, vignetting, about_chief, at_m)
     radii = torch.as_tensor(radii_mm, dtype=distance.dtype, device=distance.device).reshape(-1)
     order = distance.detach().argsort()
     energy = torch.cat([torch.zeros_like(weight[:1]), weight.detach()[order].cumsum(0)])
@@ -158,7 +155,6 @@ def encircled_radius_mm(
     light: Light = WAVELENGTH_UM["d"],
     grid: int = 64,
     vignetting: bool = False,
-    defocus_mm: float | Tensor = 0.0,
     about_chief: bool = False,
     at_m: float | Tensor = PARALLEL,
 ) -> Tensor:
@@ -166,7 +162,7 @@ def encircled_radius_mm(
     DomainError for a share outside (0, 1]."""
     if not 0 < share <= 1:
         raise DomainError(f"share {share} of encircled energy must lie in (0, 1].")
-    distance, weight = _distances(lens, field_rad, light, grid, vignetting, defocus_mm, about_chief, at_m)
+    distance, weight = _distances(lens, field_rad, light, grid, vignetting, about_chief, at_m)
     order = distance.detach().argsort()
     reached = weight.detach()[order].cumsum(0)
     at = int(
@@ -177,10 +173,10 @@ def encircled_radius_mm(
     return distance[order[at]]
 
 
-def _distances(lens, field_rad, light, grid, vignetting, defocus_mm, about_chief, at_m):
-    points, weight = lit_points(lens, field_rad, light, grid, vignetting, defocus_mm, at_m)
+def _distances(lens, field_rad, light, grid, vignetting, about_chief, at_m):
+    points, weight = lit_points(lens, field_rad, light, grid, vignetting, at_m)
     if about_chief:
-        centre = chief_ray(lens, field_rad, spectral_lines(light)[0][0], defocus_mm, at_m).position_mm
+        centre = chief_ray(lens, field_rad, spectral_lines(light)[0][0], at_m).position_mm
     else:
         centre = (points * weight[:, None]).sum(0)
     return torch.linalg.vector_norm(points - centre, dim=1), weight

@@ -52,15 +52,13 @@ def path_difference_mm(
     chief: ImageRays,
     wavelength_um: float,
     reference_mm: Tensor | None = None,
-    defocus_mm: float | Tensor = 0.0,
 ) -> Tensor:
     """Optical path of the chief ray minus that of each ray, both up to the reference sphere, [M] mm.
 
-    Args: rays, chief: ImageRays of the lens on the plane ``defocus_mm`` behind its image plane. reference_mm:
-      [2] centre of the sphere.
+    Args: rays, chief: ImageRays of the lens. reference_mm: [2] centre of the sphere.
     Raises: DomainError when the exit pupil lies in the image, or a sphere is too small for the rays.
     """
-    return _on_sphere(lens, rays, chief, wavelength_um, reference_mm, defocus_mm)[0]
+    return _on_sphere(lens, rays, chief, wavelength_um, reference_mm)[0]
 
 
 def wavefront(
@@ -69,7 +67,6 @@ def wavefront(
     wavelength_um: float = WAVELENGTH_UM["d"],
     grid: int = 64,
     vignetting: bool = False,
-    defocus_mm: float | Tensor = 0.0,
     reference_mm: Tensor | None = None,
     pupil: Tensor | None = None,
     at_m: float | Tensor = PARALLEL,
@@ -79,7 +76,7 @@ def wavefront(
     Args:
       grid: pupil cells across (the points are those of ``pupil_grid``), unless ``pupil`` [M, 2] gives the
         points themselves.
-      vignetting, defocus_mm, at_m (one distance): see ``trace_field``. reference_mm: [2] centre of the
+      vignetting, at_m (one distance): see ``trace_field``. reference_mm: [2] centre of the
         reference sphere; None is the chief ray's point.
     Returns: Wavefront, in the lens's precision; paths of many wavelengths are computed in float64.
     Gradient: opd_mm to every lens tensor and to at_m. Raises: DomainError when no ray, or not the chief ray,
@@ -88,9 +85,9 @@ def wavefront(
     like = lens.curvature_per_mm
     lens = in_float64(lens)
     pupil = pupil_grid(grid, torch.float64, like.device) if pupil is None else pupil.double()
-    rays, chief = trace_with_chief(lens, field_rad, pupil, wavelength_um, vignetting, defocus_mm, at_m)
+    rays, chief = trace_with_chief(lens, field_rad, pupil, wavelength_um, vignetting, at_m)
     reference_mm = chief.position_mm[0] if reference_mm is None else torch.as_tensor(reference_mm)
-    opd, slope = _on_sphere(lens, rays, chief, wavelength_um, reference_mm, defocus_mm)
+    opd, slope = _on_sphere(lens, rays, chief, wavelength_um, reference_mm)
     opd = torch.where(rays.weight > 0, opd, 0)
     pupil, opd, weight, slope, reference_mm = (
         v.to(like.dtype) for v in (pupil, opd, rays.weight, slope, reference_mm)
@@ -139,10 +136,10 @@ def strehl_marechal(front: Wavefront) -> Tensor:
     return torch.exp(-(2 * math.pi * rms_waves(front)).square())
 
 
-def _on_sphere(lens, rays, chief, wavelength_um, reference_mm, defocus_mm):
+def _on_sphere(lens, rays, chief, wavelength_um, reference_mm):
     """Path differences [M] mm and slopes [M, 2] of a Wavefront."""
     centre = chief.position_mm[0] if reference_mm is None else reference_mm
-    bend = _sphere_curvature(lens, centre, wavelength_um, defocus_mm)
+    bend = _sphere_curvature(lens, centre, wavelength_um)
     lengths = [_to_sphere(bundle, centre, bend) for bundle in (rays, chief)]
     towards = [
         bundle.direction[:, :2] * (1 - bend * length)[:, None] - bend * (bundle.position_mm - centre)
@@ -153,11 +150,11 @@ def _on_sphere(lens, rays, chief, wavelength_um, reference_mm, defocus_mm):
     )
 
 
-def _sphere_curvature(lens, centre, wavelength_um, defocus_mm):
+def _sphere_curvature(lens, centre, wavelength_um):
     """1 / radius of the reference sphere, positive when the exit pupil lies before the image; 0 for a
     telecentric lens."""
     f = lens.first_order(wavelength_um)
-    before = lens.thickness_mm[-1] + defocus_mm - f.exit_pupil_z_mm  # mm from the exit pupil to the plane
+    before = lens.thickness_mm[-1] - f.exit_pupil_z_mm  # mm from the exit pupil to the plane
     if abs(float(before.detach())) < 1e-9:
         raise DomainError(
             f"{lens.name}: the exit pupil lies in the image plane, so there is no reference sphere; move "

@@ -141,12 +141,12 @@ def evaluate(lens: GeoLens, limits: Limits, semi_aperture_mm: Tensor | None = No
     Gradient: to every lens tensor the figure depends on. A least gap has that of its narrowest place.
     """
     apertures = lens.semi_aperture_mm if semi_aperture_mm is None else semi_aperture_mm
+    parts = _lengths(lens, limits, apertures), _rays(lens, limits), _glasses(lens, limits)
     return [
-        *_thicknesses(lens, limits, apertures),
-        *_lengths(lens, limits),
-        *_steepness(lens, limits, apertures),
-        *_rays(lens, limits),
-        *_glasses(lens, limits),
+        Constraint(name, value, bound, at_least, *scale)
+        for part in parts
+        for name, value, bound, at_least, *scale in part
+        if bound is not None
     ]
 
 
@@ -173,25 +173,14 @@ def report(constraints: Collection[Constraint], tolerance: float = 1e-3) -> str:
     """A printable table: every constraint with value, bound, slack and state, the tightest first."""
     ordered = sorted(constraints, key=lambda c: float(c.slack.detach()) / c.scale)
     lines = [("constraint", "value", "bound", "slack", "unit", "state")]
-    lines += [
-        (
-            c.name,
-            f"{float(c.value.detach()):.4f}",
-            f"{'≥' if c.at_least else '≤'} {c.bound:g}",
-            f"{float(c.slack.detach()):+.4f}",
-            c.unit,
-            c.state(tolerance),
-        )
-        for c in ordered
-    ]
-    widths = [max(len(line[k]) for line in lines) for k in range(6)]
-    return "\n".join(
-        "  ".join(
-            cell.ljust(w) if k in (0, 4, 5) else cell.rjust(w)
-            for k, (cell, w) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in lines
-    )
+    for c in ordered:
+        value, slack = float(c.value.detach()), float(c.slack.detach())
+        bound = f"{'≥' if c.at_least else '≤'} {c.bound:g}"
+        lines.append((c.name, f"{value:.4f}", bound, f"{slack:+.4f}", c.unit, c.state(tolerance)))
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    # names, units and states begin a column, numbers end it
+    form = "  ".join(f"{{:{side}{width}}}" for side, width in zip("<>>><<", widths, strict=True))
+    return "\n".join(form.format(*line).rstrip() for line in lines)
 
 
 def is_glass(lens: GeoLens) -> list[bool]:
@@ -199,88 +188,56 @@ def is_glass(lens: GeoLens) -> list[bool]:
     return [n > 1.001 for n in lens.index()[1:].tolist()]
 
 
-def _thicknesses(lens, limits, apertures):
-    glass = is_glass(lens)
-    found = []
-    between = [f"between surfaces {i + 1} and {i + 2}" for i in range(len(glass) - 1)]
-    lowest = gap_mm(
-        lens, torch.linspace(0, 1, 33, dtype=lens.dtype, device=apertures.device), apertures
-    ).amin(1)
-    edges = gap_mm(lens, torch.ones(1, dtype=lens.dtype, device=apertures.device), apertures)[:, 0]
-    for i, where in enumerate(between):
-        if glass[i]:
-            found += _least(
-                f"centre of glass {where}", lens.thickness_mm[i], limits.glass_centre_mm, limits.scale_mm
-            )
-            found += _most(
-                f"centre of glass {where}", lens.thickness_mm[i], limits.glass_centre_most_mm, limits.scale_mm
-            )
-            found += _least(f"edge of glass {where}", edges[i], limits.glass_edge_mm, limits.scale_mm)
+LEAST, MOST = True, False  # of a figure: name, value, bound or None, side, scale, unit, whether it can bind
+
+
+def _lengths(lens, limits, apertures):
+    """Thicknesses, gaps, lengths and steepness."""
+    heights = torch.linspace(0, 1, 33, dtype=lens.dtype, device=apertures.device)
+    gaps = gap_mm(lens, heights, apertures)
+    lowest, edges = gaps.amin(1), gaps[:, -1]
+    unit = limits.scale_mm, "mm"
+    for i, filled in enumerate(is_glass(lens)[:-1]):
+        where = f"between surfaces {i + 1} and {i + 2}"
+        if filled:
+            centre = lens.thickness_mm[i]
+            yield f"centre of glass {where}", centre, limits.glass_centre_mm, LEAST, *unit
+            yield f"centre of glass {where}", centre, limits.glass_centre_most_mm, MOST, *unit
+            yield f"edge of glass {where}", edges[i], limits.glass_edge_mm, LEAST, *unit
         else:
-            found += _least(f"air {where}", lowest[i], limits.air_gap_mm, limits.scale_mm)
-    return found
-
-
-def _lengths(lens, limits):
-    track = _most("total track", lens.thickness_mm.sum(), limits.track_mm, limits.scale_mm)
-    return track + _least("back focus", lens.thickness_mm[-1], limits.back_focus_mm, limits.scale_mm)
-
-
-def _steepness(lens, limits, apertures):
+            yield f"air {where}", lowest[i], limits.air_gap_mm, LEAST, *unit
+    yield "total track", lens.thickness_mm.sum(), limits.track_mm, MOST, *unit
+    yield "back focus", lens.thickness_mm[-1], limits.back_focus_mm, LEAST, *unit
     steep = (lens.curvature_per_mm * apertures).abs() * (1 + lens.conic).clamp_min(1e-12).sqrt()
-    return [
-        c
-        for i, value in enumerate(steep.unbind(0))
-        for c in _most(f"steepness of surface {i + 1}", value, limits.steepness, 0.1, "")
-    ]
+    for i, value in enumerate(steep.unbind(0)):
+        yield f"steepness of surface {i + 1}", value, limits.steepness, MOST, 0.1, ""
 
 
 def _rays(lens, limits):
     if limits.incidence_deg is None and not limits.rays:
-        return []
+        return
     origin, direction = rim_rays(lens, limits.fields_rad, at_m=limits.at_m)
-    found = []
     if limits.incidence_deg is not None:
         hits = surface_hits(lens, origin, direction)
         sine = (1 - hits.cosine.clamp_max(1).square()).clamp_min(1e-12).sqrt()
         angle = torch.rad2deg(torch.atan2(sine, hits.cosine))
         worst = torch.where(hits.passed, angle, 0.0).amax(1)  # a ray that fails is the business of ``rays``
-        found += [
-            c
-            for i, value in enumerate(worst.unbind(0))
-            for c in _most(
-                f"incidence on surface {i + 1}", value, limits.incidence_deg, limits.scale_deg, "deg"
-            )
-        ]
+        for i, value in enumerate(worst.unbind(0)):
+            yield f"incidence on surface {i + 1}", value, limits.incidence_deg, MOST, limits.scale_deg, "deg"
     if limits.rays:
-        out = lens.trace(origin, direction)
         # a radicand lacks the deficit: exactly 0 for a ray that passes
-        found.append(
-            Constraint("deficit of rays that fail", out.deficit.sum(), 0.0, False, 0.1, "", can_bind=False)
-        )
-    return found
+        deficit = lens.trace(origin, direction).deficit.sum()
+        yield "deficit of rays that fail", deficit, 0.0, MOST, 0.1, "", False
 
 
 def _glasses(lens, limits):
-    if limits.glass_polygon is None and limits.index_range is None:
-        return []
-    found = []
+    low, high = limits.index_range or (None, None)
+    if limits.glass_polygon is None and low is None:
+        return
     for i, (nd, vd) in glass_map.places(lens).items():
         name = f"glass behind surface {i + 1}"
-        if limits.index_range is not None:
-            found += _least(f"index of {name}", nd, limits.index_range[0], 0.01, "") + _most(
-                f"index of {name}", nd, limits.index_range[1], 0.01, ""
-            )
+        yield f"index of {name}", nd, low, LEAST, 0.01, ""
+        yield f"index of {name}", nd, high, MOST, 0.01, ""
         if limits.glass_polygon is not None:
-            found += _least(
-                f"{name} in the glass map", glass_map.inside(nd, vd, limits.glass_polygon), 0.0, 0.01, "nd"
-            )
-    return found
-
-
-def _least(name, value, bound, scale, unit="mm"):
-    return [] if bound is None else [Constraint(name, value, bound, True, scale, unit)]
-
-
-def _most(name, value, bound, scale, unit="mm"):
-    return [] if bound is None else [Constraint(name, value, bound, False, scale, unit)]
+            inside = glass_map.inside(nd, vd, limits.glass_polygon)
+            yield f"{name} in the glass map", inside, 0.0, LEAST, 0.01, "nd"

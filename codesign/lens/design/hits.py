@@ -95,7 +95,6 @@ def traced_semi_aperture_mm(
     lens: GeoLens,
     fields_rad: Sequence[float],
     margin: float = 0.05,
-    count: int = 16,
     at_m: Distances = PARALLEL,
 ) -> Tensor:
     """Semi-aperture that lets the full pupil of all fields and distances pass, [S] mm: the largest height of
@@ -108,7 +107,7 @@ def traced_semi_aperture_mm(
             f"{lens.name}: margin {margin} is added to semi-apertures as a share; give a finite number of "
             "at least 0."
         )
-    rays = rim_rays(lens, fields_rad, count, at_m)
+    rays = rim_rays(lens, fields_rad, at_m=at_m)
     failed = lens.trace(*rays).status != 0
     if bool(failed.any()):
         raise DomainError(

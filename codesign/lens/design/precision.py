@@ -4,18 +4,17 @@ A figure is forecast to second order in the errors, F(e) = F0 + s.e + e.Q e, wit
 deviations that the errors have so far. With factors f on these deviations its increase has the mean sum Q_ii
 f_i^2 and the variance sum s_i^2 f_i^2 + 2 sum Q_ij^2 f_i^2 f_j^2. The budget is the increase that a share of
 all lenses stays within. With v = f^2 and w the slope of mean + z deviation over v (z the normal quantile of
-the share), equal contributions mean w v alike for all, and the cheapest tolerances at costs c / f have f
-proportional to (c / w)^(1/3) (Lagrange). Where Q = 0 that is the closed form of a root sum of squares; else
+the share), the cheapest tolerances at costs 1 / f have f proportional to w^(-1/3) (Lagrange). Where Q = 0 that is the closed form of a root sum of squares; else
 w depends on v, and both are a fixed point. The scale of all factors follows from the distribution of the
 quadratic form itself, not from its normal approximation.
 
-    forecast = of_spot(forecast_spot(nominal, slopes, 3))
+    forecast = forecast_spot(nominal, slopes, 3).averaged()
     needed = cheapest(forecast, errors, 0.21 * forecast.nominal)  # the RMS spot grows by 10 % at most
     trials = monte_carlo(geo, needed.errors, figures, 400, generator)
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
 
@@ -23,7 +22,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
-from codesign.lens.design.tolerance import Error, SpotForecast
+from codesign.lens.design.tolerance import Error, Forecast
 
 NODES = 2048  # of the sum over the characteristic function
 FARTHEST = (
@@ -32,62 +31,35 @@ FARTHEST = (
 ROUNDS = 40  # of the fixed point and of a bisection
 
 
-@dataclass(frozen=True)
-class Forecast:
-    """A figure to second order in P independent errors of one standard deviation each: nominal + linear . e
-    + e . square e, with a number, [P] and [P, P] symmetric."""
+def share_within(forecast: Forecast, increase: float, factors: Tensor) -> float:
+    """Share of lenses whose figure grows by at most ``increase``, of errors with factors [P].
 
-    nominal: float
-    linear: Tensor
-    square: Tensor
-
-    def at(self, amounts: Tensor) -> Tensor:
-        """The figure at errors [N, P], [N]."""
-        return (
-            self.nominal + amounts @ self.linear + torch.einsum("np,pq,nq->n", amounts, self.square, amounts)
-        )
-
-    def moments(self, factors: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of the increase when every error has its factor [P] times the
-        deviation."""
-        v = factors.square()
-        mean = self.square.diagonal() @ v
-        return mean, (self.linear.square() @ v + 2 * v @ self.square.square() @ v).sqrt()
-
-    def share_within(self, increase: float, factors: Tensor) -> float:
-        """Share of lenses whose figure grows by at most ``increase``, of errors with factors [P].
-
-        Source: Davies, Numerical inversion of a characteristic function, Biometrika 60 (1973): a sum over the
-          characteristic function, here of a quadratic form in its principal axes.
-        """
-        mean, deviation = self.moments(factors)
-        away = float(increase - mean)
-        if abs(away) >= FARTHEST * float(deviation):
-            return float(away >= 0)
-        size, axes = torch.linalg.eigh(factors[:, None] * self.square * factors)
-        slope = axes.T @ (factors * self.linear)
-        node = torch.arange(NODES, dtype=size.dtype) + 0.5
-        t = node * (math.pi / FARTHEST) / deviation
-        bent = 1 - 2j * t[:, None] * size
-        log = (-0.5 * bent.log() - 0.5 * (t[:, None] * slope).square() / bent).sum(1) - 1j * t * increase
-        return 0.5 - float((log.exp().imag / node).sum()) / math.pi
+    Source: Davies, Numerical inversion of a characteristic function, Biometrika 60 (1973): a sum over the
+      characteristic function, here of a quadratic form in its principal axes.
+    """
+    mean, deviation = forecast.moments(factors)
+    away = float(increase - mean)
+    if abs(away) >= FARTHEST * float(deviation):
+        return float(away >= 0)
+    size, axes = torch.linalg.eigh(factors[:, None] * forecast.square * factors)
+    slope = axes.T @ (factors * forecast.linear)
+    node = torch.arange(NODES, dtype=size.dtype) + 0.5
+    t = node * (math.pi / FARTHEST) / deviation
+    bent = 1 - 2j * t[:, None] * size
+    log = (-0.5 * bent.log() - 0.5 * (t[:, None] * slope).square() / bent).sum(1) - 1j * t * increase
+    return 0.5 - float((log.exp().imag / node).sum()) / math.pi
 
 
 @dataclass(frozen=True)
 class Precision:
     """Tolerances that spend a budget. errors: with the deviations needed. factors: [P], of these over those
     given; one for both axes of a tolerance. shares: [P] of the budget that each error takes. cost: sum of
-    cost / factor."""
+    1 / factor."""
 
     errors: tuple[Error, ...]
     factors: Tensor
     shares: Tensor
     cost: float
-
-
-def of_spot(forecast: SpotForecast) -> Forecast:
-    """The squared RMS spot, mean over the fields, as one figure."""
-    return Forecast(float(forecast.nominal.mean()), forecast.linear.mean(0), forecast.square.mean(0))
 
 
 def cheapest(
@@ -96,9 +68,8 @@ def cheapest(
     budget: float,
     share: float = 0.9,
     most: float = math.inf,
-    costs: Mapping[str, float] | None = None,
 ) -> Precision:
-    """Tolerances of the least total cost, each costing c over its factor, with which a share of all lenses
+    """Tolerances of the least total cost, each costing 1 over its factor, with which a share of all lenses
     keeps the figure's increase within the budget.
 
     Args:
@@ -106,9 +77,7 @@ def cheapest(
         drawing covers (x and y) get one factor.
       budget: > 0, in the unit of the figure. share: of lenses, above a half and below 1. most: largest
         factor.
-      costs: c by name of a tolerance (``Error.drawn``) or by its first word ("tilt"); 1 where neither is
-        named.
-    Raises: DomainError for a budget or share out of range, an unknown cost, a tolerance that the figure does
+    Raises: DomainError for a budget or share out of range, a tolerance that the figure does
       not grow with and ``most`` does not bound, and a budget that is not spent when all are at ``most``.
     """
     if not errors:
@@ -131,7 +100,6 @@ def cheapest(
             "figure, the share lie between 0.5 and 1, and the factor be positive."
         )
     names = list(dict.fromkeys(e.drawn for e in errors))
-    costs = _costs(names, costs or {})
     member = torch.tensor([names.index(e.drawn) for e in errors])
     z = NormalDist().inv_cdf(share)
     factors = torch.ones(len(names), dtype=forecast.linear.dtype)
@@ -141,7 +109,7 @@ def cheapest(
         error."""
         v = factors[member].square()
         deviation = forecast.moments(factors[member])[1]
-        w = forecast.square.diagonal() + z / (2 * deviation) * (
+        w = forecast.added + z / (2 * deviation) * (
             forecast.linear.square() + 4 * forecast.square.square() @ v
         )
         return torch.zeros_like(factors).index_add(0, member, w), w
@@ -151,7 +119,7 @@ def cheapest(
         return bool(mean + z * deviation <= budget)
 
     def exact(trial):
-        return forecast.share_within(budget, trial) >= share
+        return share_within(forecast, budget, trial) >= share
 
     aim = factors
     for _ in range(ROUNDS):
@@ -161,7 +129,7 @@ def cheapest(
             raise DomainError(
                 f"the figure does not grow with {flat}, so give the largest factor it may have."
             )
-        aim = torch.where(w > 0, (costs / w.clamp_min(1e-300)) ** (1 / 3), 1e30)
+        aim = torch.where(w > 0, w.clamp_min(1e-300) ** (-1 / 3), 1e30)
         before = factors
         factors = (_largest(aim, member, most, normal) * before).sqrt()
         if float((factors / before - 1).abs().max()) < 1e-7:
@@ -171,7 +139,7 @@ def cheapest(
     found = tuple(
         replace(e, deviation=e.deviation * f) for e, f in zip(errors, factors[member].tolist(), strict=True)
     )
-    return Precision(found, factors[member], spent / spent.sum(), float((costs / factors).sum()))
+    return Precision(found, factors[member], spent / spent.sum(), float((1 / factors).sum()))
 
 
 def _largest(shape, member, most, keeps):
@@ -189,19 +157,3 @@ def _largest(shape, member, most, keeps):
         inside = keeps((shape * math.exp(middle)).clamp_max(most)[member])
         low, high = (middle, high) if inside else (low, middle)
     return (shape * math.exp(low)).clamp_max(most)
-
-
-def _costs(names, given):
-    """The costs [names] of tolerances."""
-    if not isinstance(given, Mapping):
-        raise DomainError(f"costs {given}: give a mapping from the names of tolerances to their costs.")
-    known = {*names, *(name.split()[0] for name in names)}
-    wrong = [f"{k} {v}" for k, v in given.items() if k not in known or not 0 < v < math.inf]
-    if wrong:
-        raise DomainError(
-            f"costs {', '.join(wrong)}: name tolerances out of {', '.join(sorted(known))}, with positive "
-            "numbers."
-        )
-    return torch.tensor(
-        [given.get(name, given.get(name.split()[0], 1.0)) for name in names], dtype=torch.float64
-    )

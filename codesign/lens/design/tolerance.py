@@ -182,12 +182,7 @@ Figures = Callable[[GeoLens], Tensor]
 Compensator = Callable[[GeoLens], GeoLens]
 
 
-def linear_figures(
-    half_field_rad: float,
-    wavelength_um: float = WAVELENGTH_UM["d"],
-    grid: int = 8,
-    at_m: float = PARALLEL,
-) -> Figures:
+def linear_figures(half_field_rad: float, at_m: float = PARALLEL) -> Figures:
     """Figures that errors change in proportion: the function lens -> [5] of EFL, BFL, distortion at the field
     (relative), and the x and y of the axial spot's mean point; lengths in mm. Names: LINEAR_FIGURES.
 
@@ -197,9 +192,9 @@ def linear_figures(
     one_distance(at_m)
 
     def figures(lens):
-        f = lens.first_order(wavelength_um)
-        position, arrived = spots(lens, (0.0, half_field_rad), wavelength_um, grid, at_m)
-        scale = image_scale_mm(lens, vergence_per_mm(lens, at_m), wavelength_um)
+        f = lens.first_order()
+        position, arrived = spots(lens, (0.0, half_field_rad), grid=8, at_m=at_m)
+        scale = image_scale_mm(lens, vergence_per_mm(lens, at_m))
         weight = arrived[..., None] / arrived.sum(1)[:, None, None]
         mean = (position * weight).sum(1)
         shift = mean[1, 1] - mean[0, 1]
@@ -273,13 +268,11 @@ def monte_carlo(
     figures: Figures,
     count: int,
     generator: torch.Generator,
-    progress: Callable[[], object] | None = None,
     compensate: Compensator | None = None,
 ) -> Trials:
     """Trials of ``count`` lenses with random errors.
 
-    Args: generator: torch.Generator (CPU). progress: called after every trial, or None. compensate: applied
-      to every faulty lens, and to the nominal one.
+    Args: generator: torch.Generator (CPU). compensate: applied to every faulty lens, and to the nominal one.
     A lens that raises DomainError (no ray arrives, no focal length) is a failed trial: counted, never dropped
     in silence.
     """
@@ -297,8 +290,6 @@ def monte_carlo(
             except DomainError:
                 row = torch.full_like(nominal, math.nan)
             rows.append(row if finite(row) else torch.full_like(row, math.nan))
-            if progress is not None:
-                progress()
     found = torch.stack(rows)
     return Trials(amounts, found, nominal, int((~found.isfinite().all(1)).sum()))
 
@@ -351,38 +342,33 @@ def worst_offenders(
 
 
 @dataclass(frozen=True)
-class SpotForecast:
-    """Per field: nominal [F] squared RMS spot, linear [F, P] its slope 2 A^T r, added [F, P] the diagonal of
-    A^T A (mean square that each error adds), square [F, P, P] all of A^T A. In mm^2 and per standard
-    deviation."""
+class Forecast:
+    """Figures to second order in P independent errors of one standard deviation each: nominal + linear . e
+    + e . square e. nominal [...], or a number; linear [..., P]; square [..., P, P], symmetric."""
 
-    nominal: Tensor
+    nominal: float | Tensor
     linear: Tensor
-    added: Tensor
     square: Tensor
 
     @property
-    def mean(self) -> Tensor:
-        """Expected squared RMS spot, [F] mm^2."""
-        return self.nominal + self.added.sum(1)
-
-    @property
-    def deviation(self) -> Tensor:
-        """Standard deviation of the squared RMS spot, [F] mm^2."""
-        return (self.linear.square().sum(1) + 2 * self.square.square().sum((1, 2))).sqrt()
-
-    @property
-    def linear_deviation(self) -> Tensor:
-        """The same from the slope alone; far too small near an optimum."""
-        return torch.linalg.vector_norm(self.linear, dim=1)
+    def added(self) -> Tensor:
+        """What each error adds in the mean, [..., P]."""
+        return self.square.diagonal(dim1=-2, dim2=-1)
 
     def at(self, amounts: Tensor) -> Tensor:
-        """Squared RMS spot forecast for errors of ``amounts`` [N, P] standard deviations, [N, F] mm^2."""
-        return (
-            self.nominal
-            + amounts @ self.linear.T
-            + torch.einsum("np,fpq,nq->nf", amounts, self.square, amounts)
-        )
+        """The figures at errors [N, P], [N, ...]."""
+        bent = torch.einsum("np,...pq,nq->n...", amounts, self.square, amounts)
+        return self.nominal + torch.einsum("np,...p->n...", amounts, self.linear) + bent
+
+    def moments(self, factors: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of the increase, [...], when every error has its factor [P] times the
+        deviation; 1 where None are given."""
+        v = self.linear.new_ones(self.linear.shape[-1]) if factors is None else factors.square()
+        return self.added @ v, (self.linear.square() @ v + 2 * (self.square.square() @ v) @ v).sqrt()
+
+    def averaged(self) -> "Forecast":
+        """The mean over the figures, as one."""
+        return Forecast(float(self.nominal.mean()), self.linear.mean(0), self.square.mean(0))
 
 
 def spot_errors(
@@ -419,11 +405,10 @@ def squared_spots(errors: Tensor, fields: int) -> Tensor:
     return errors.reshape(fields, -1).square().sum(1)
 
 
-def forecast_spot(nominal: Tensor, slopes: Tensor, fields: int) -> SpotForecast:
-    """SpotForecast from ray errors [F * M * 2] and their sensitivities [F * M * 2, P]."""
+def forecast_spot(nominal: Tensor, slopes: Tensor, fields: int) -> Forecast:
+    """Forecast of the squared RMS spots, [F] mm^2, from ray errors [F * M * 2] and their sensitivities
+    [F * M * 2, P]."""
     r = nominal.reshape(fields, -1)
     A = slopes.reshape(fields, -1, slopes.shape[1])
     square = torch.einsum("fmp,fmq->fpq", A, A)
-    return SpotForecast(
-        r.square().sum(1), 2 * torch.einsum("fmp,fm->fp", A, r), square.diagonal(dim1=1, dim2=2), square
-    )
+    return Forecast(r.square().sum(1), 2 * torch.einsum("fmp,fm->fp", A, r), square)

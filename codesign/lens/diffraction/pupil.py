@@ -68,7 +68,6 @@ def pupil_function(
     wavelength_um: float = WAVELENGTH_UM["d"],
     grid: int | None = None,
     vignetting: bool = False,
-    defocus_mm: float | Tensor = 0.0,
     reference_mm: Tensor | None = None,
     at_m: float | Tensor = PARALLEL,
 ) -> PupilFunction:
@@ -86,9 +85,9 @@ def pupil_function(
       than half a wave, a phase plate is finer than the cells, or no ray arrives.
     """
     if lens.plate is not None and reference_mm is None:
-        reference_mm = chief_ray(lens, field_rad, wavelength_um, defocus_mm, at_m).position_mm[0]
+        reference_mm = chief_ray(lens, field_rad, wavelength_um, at_m).position_mm[0]
     if grid is None:
-        grid = _enough_cells(lens, field_rad, wavelength_um, vignetting, defocus_mm, reference_mm, at_m)
+        grid = _enough_cells(lens, field_rad, wavelength_um, vignetting, reference_mm, at_m)
     finest = cells_for_plate(lens, wavelength_um)
     if grid < finest:
         raise DomainError(
@@ -104,7 +103,7 @@ def pupil_function(
     seen = x * x + y * y <= 1
     points = torch.stack([x, y], -1)[seen]
     bare = with_plate(lens, None)
-    front = wavefront(bare, field_rad, wavelength_um, 0, vignetting, defocus_mm, reference_mm, points, at_m)
+    front = wavefront(bare, field_rad, wavelength_um, 0, vignetting, reference_mm, points, at_m)
     scale = _cosine_radius(front)
     if lens.plate is not None:
         waves, reaches = plate_waves(lens, field_rad, points, wavelength_um, at_m)
@@ -141,14 +140,13 @@ def pupil_functions(
     light: Light,
     grid: int | None,
     vignetting: bool,
-    defocus_mm: float | Tensor,
     at_m: float | Tensor,
 ) -> tuple[Tensor, Iterator[tuple[float, PupilFunction]]]:
     """The chief ray's image point [2] of the first wavelength, and share and PupilFunction of each about it."""
     wavelengths, shares = spectral_lines(light)
-    reference = chief_ray(lens, field_rad, wavelengths[0], defocus_mm, at_m).position_mm[0]
+    reference = chief_ray(lens, field_rad, wavelengths[0], at_m).position_mm[0]
     return reference, (
-        (share, pupil_function(lens, field_rad, w, grid, vignetting, defocus_mm, reference, at_m))
+        (share, pupil_function(lens, field_rad, w, grid, vignetting, reference, at_m))
         for w, share in zip(wavelengths, shares, strict=True)
     )
 
@@ -174,7 +172,7 @@ def _largest_step(opd, lit):
     return float(torch.stack(steps).max())
 
 
-def _enough_cells(lens, field_rad, wavelength_um, vignetting, defocus_mm, reference_mm, at_m) -> int:
+def _enough_cells(lens, field_rad, wavelength_um, vignetting, reference_mm, at_m) -> int:
     """Power of two for which neighbours differ by at most a third of a wave, from a coarse look at the
     wavefront."""
     line = torch.linspace(-1, 1, 65, dtype=lens.dtype, device=lens.curvature_per_mm.device)
@@ -187,7 +185,6 @@ def _enough_cells(lens, field_rad, wavelength_um, vignetting, defocus_mm, refere
             wavelength_um,
             0,
             vignetting,
-            defocus_mm,
             reference_mm,
             torch.stack([x, y], -1)[inside],
             at_m,

@@ -3,6 +3,7 @@ computed."""
 
 import itertools
 import math
+from dataclasses import replace
 
 import torch
 
@@ -10,6 +11,7 @@ from codesign.errors import FileFormatError
 from codesign.lens.files.system import FileLens, placed, unfold
 from codesign.lens.files.text import MOST_SURFACES
 from codesign.lens.geolens import GeoLens
+from codesign.lens.paraxial import yu_trace
 from codesign.lens.surface import Surface, sag_mm
 
 # an aperture no file states: what the paraxial rays of pupil and field need, and 5 % for what they leave out
@@ -32,11 +34,11 @@ def assemble(lens: FileLens, dtype: torch.dtype = torch.float64) -> GeoLens:
             "is it a lens?"
         )
     rows = unfold(lens)
-    _check(rows)
     optics = Paraxial(_draft(rows, lens.name), lens.wavelength_um)
     if lens.focus:
         turns = sum(row.mirror for row in rows)
-        rows[-1].thickness = optics.focus() + lens.defocus * lens.unit_mm * (-1) ** turns
+        back_focus = optics.trace(1.0, 0.0)[0][-1] * optics.focal_length()
+        rows[-1].thickness = back_focus + lens.defocus * lens.unit_mm * (-1) ** turns
         if not 0 <= rows[-1].thickness < math.inf:
             raise FileFormatError(
                 f"its solve for the paraxial focus puts the image {rows[-1].thickness:.6g} mm behind the "
@@ -58,21 +60,16 @@ class Paraxial:
     """Paraxial rays through a lens at one wavelength, as plain numbers in mm."""
 
     def __init__(self, draft: GeoLens, wavelength_um: float) -> None:
-        self.power = draft.surface_power(wavelength_um).tolist()
-        self.thickness = draft.thickness_mm.tolist()
-        self.index = draft.index(wavelength_um).tolist()
+        columns = draft.surface_power(wavelength_um), draft.thickness_mm, draft.index(wavelength_um)
+        self.columns = [column.tolist() for column in columns]
+        self.index = self.columns[2][-1]
         self.stop = draft.stop_index
 
     def trace(self, y: float, u: float) -> tuple[list[float], float]:
         """Heights at the surfaces, and the angle behind the last, of a ray that meets the first at height y
         with slope u (in air)."""
-        heights = []
-        nu = u
-        for power, thickness, index in zip(self.power, self.thickness, self.index[1:], strict=True):
-            heights.append(y)
-            nu -= y * power
-            y += thickness * nu / index
-        return heights, nu / self.index[-1]
+        heights, angles = yu_trace(*self.columns, y, u)
+        return heights, angles[-1] / self.index
 
     def focal_length(self) -> float:
         _, u = self.trace(1.0, 0.0)
@@ -83,14 +80,9 @@ class Paraxial:
             )
         return -1 / u
 
-    def focus(self) -> float:
-        heights, u = self.trace(1.0, 0.0)
-        return heights[-1] * self.focal_length()
-
     def entrance_pupil_mm(self) -> float:
         """Where the entrance pupil lies, from the first vertex."""
-        parallel = self.trace(1.0, 0.0)[0][self.stop]
-        slanted = self.trace(0.0, 1.0)[0][self.stop]
+        parallel, slanted = (self.trace(*start)[0][self.stop] for start in ((1.0, 0.0), (0.0, 1.0)))
         if abs(parallel) < 1e-12:
             raise FileFormatError(
                 "its stop lies where parallel light comes to a focus, so it has no entrance pupil; move the "
@@ -99,29 +91,20 @@ class Paraxial:
         return slanted / parallel
 
 
-def _check(rows):
-    """Raise for surfaces that cannot exist whatever their aperture."""
-    if sum(row.is_stop for row in rows) > 1:
-        raise FileFormatError(
-            f"surfaces {[row.label for row in rows if row.is_stop]} are all marked as the stop; mark one."
-        )
-    for row in rows:
-        _surface(row, 1e-9, 0.0).check(f"surface {row.label}")
-
-
 def _draft(rows, name):
-    return GeoLens([_surface(row, 1e-9, 0.0) for row in rows], 1.0, name=name)
+    """The lens with apertures so small that only shapes count. Raises: DomainError for surfaces that cannot be."""
+    surfaces = [replace(_surface(row), semi_aperture_mm=1e-9, inner_semi_aperture_mm=0.0) for row in rows]
+    for row, surface in zip(rows, surfaces, strict=True):
+        surface.check(f"surface {row.label}")
+    return GeoLens(surfaces, 1.0, name=name)
 
 
-def _surface(row, semi_aperture=None, inner=None):
-    semi_aperture = row.semi_aperture if semi_aperture is None else semi_aperture
-    inner = row.inner if inner is None else inner
-    radius = 1 / row.curvature if row.curvature else math.inf
+def _surface(row):
     return Surface(
-        radius,
+        1 / row.curvature if row.curvature else math.inf,
         row.thickness,
         row.medium,
-        semi_aperture,
+        row.semi_aperture,
         row.conic,
         row.asphere,
         row.is_stop,
@@ -129,7 +112,7 @@ def _surface(row, semi_aperture=None, inner=None):
         row.phase,
         row.decentre,
         row.tilt_deg,
-        inner,
+        row.inner,
     )
 
 
@@ -162,7 +145,7 @@ def _pupil(lens, rows, optics):
         raise FileFormatError(f"its {kind} is {value:g}; it must be positive.")
     if kind == "diameter":
         return value * lens.unit_mm
-    if optics.index[-1] != 1:
+    if optics.index != 1:
         raise FileFormatError(
             f"its {kind} is counted in the image space, which is glass here; give the entrance pupil "
             "diameter."
@@ -183,19 +166,19 @@ def _pupil(lens, rows, optics):
 
 def _half_field(lens, optics):
     """Half field of view in degrees, or None where the file gives none."""
-    kind, value = lens.field if lens.field is not None else ("angle", 0.0)
-    if value == 0:
+    kind, height = lens.field or ("angle", 0.0)
+    if height == 0:
         return None
-    if kind == "image height":
-        value = math.degrees(math.atan(abs(value * lens.unit_mm / optics.focal_length())))
-    elif kind == "object height":
-        distance = lens.object_distance * lens.unit_mm + optics.entrance_pupil_mm()
-        value = (
-            math.degrees(math.atan(abs(value * lens.unit_mm / distance))) if math.isfinite(distance) else 0.0
-        )
-    if not 0 <= abs(value) < 90:
-        raise FileFormatError(f"its half field is {value:g} degrees; it must stay below 90.")
-    return abs(value) or None
+    if kind == "angle":
+        found = abs(height)
+    else:
+        lever_mm = optics.focal_length()
+        if kind == "object height":
+            lever_mm = lens.object_distance * lens.unit_mm + optics.entrance_pupil_mm()
+        found = math.degrees(math.atan(abs(height * lens.unit_mm / lever_mm)))
+    if not found < 90:
+        raise FileFormatError(f"its half field is {height:g} degrees; it must stay below 90.")
+    return found or None
 
 
 def _open(rows, optics, diameter, half_field):
@@ -204,26 +187,20 @@ def _open(rows, optics, diameter, half_field):
     slope = math.tan(math.radians(half_field or 0.0))
     marginal, _ = optics.trace(diameter / 2, 0.0)
     chief, _ = optics.trace(-slope * optics.entrance_pupil_mm() if slope else 0.0, slope)
-    unknown = [row.semi_aperture is None for row in rows]
+    free = [row for row in rows if row.semi_aperture is None]
     for row, y, y_chief in zip(rows, marginal, chief, strict=True):
-        if row.semi_aperture is None:
-            needed = max(abs(y) if row.is_stop else MARGIN * (abs(y) + abs(y_chief)), 1e-3 * diameter)
-            reach = (
-                0.98 / (abs(row.curvature) * math.sqrt(1 + row.conic))
-                if row.curvature and row.conic > -1
-                else math.inf
-            )
-            row.semi_aperture = min(needed, reach)
-    for front, back, *free in zip(rows, rows[1:], unknown, unknown[1:], strict=False):
+        if row in free:
+            needed = abs(y) if row.is_stop else MARGIN * (abs(y) + abs(y_chief))
+            square = (1 + row.conic) * row.curvature**2
+            reach = 0.98 / math.sqrt(square) if square > 0 else math.inf
+            row.semi_aperture = min(max(needed, 1e-3 * diameter), reach)
+    for front, back in itertools.pairwise(rows):
         heights, gap = _edge(front, back)
         crossed = int((gap < 0).int().argmax())  # the first height where they cross, 0 where they do not
-        if front.medium is not None and crossed and any(free):
-            for row, is_free in zip((front, back), free, strict=True):
-                row.semi_aperture = (
-                    min(row.semi_aperture, float(heights[crossed - 1]) or row.semi_aperture)
-                    if is_free
-                    else row.semi_aperture
-                )
+        most = float(heights[crossed - 1])
+        for row in (front, back) if front.medium is not None and crossed > 1 else ():
+            if row in free:
+                row.semi_aperture = min(row.semi_aperture, most)
 
 
 def _edge(front, back):

@@ -11,6 +11,7 @@ from codesign.lens.files.text import MOST_SURFACES, shown
 Page = dict[str, Any]
 
 DEEPEST = 30
+MOST_NUMBERS = 16
 
 
 def parse(text: str) -> Any:
@@ -83,13 +84,13 @@ def boolean(row: Page, key: str) -> bool:
     return bool(value)
 
 
-def numbers(row: Page, key: str, most: int = 16) -> tuple[float, ...]:
-    """The list of at most ``most`` finite numbers under a key, empty when it is missing or null."""
+def numbers(row: Page, key: str) -> tuple[float, ...]:
+    """The list of at most MOST_NUMBERS finite numbers under a key, empty when it is missing or null."""
     value = row.get(key)
     value = [] if value is None else value
-    if not isinstance(value, list) or len(value) > most:
+    if not isinstance(value, list) or len(value) > MOST_NUMBERS:
         raise FileFormatError(
-            f"{key} is {shown(value)}, a list of at most {most} numbers is needed; correct it."
+            f"{key} is {shown(value)}, a list of at most {MOST_NUMBERS} numbers is needed; correct it."
         )
     return tuple(number({key: v}, key) for v in value)
 

@@ -1,6 +1,6 @@
 """The private glasses of a .seq file."""
 
-import itertools
+import numpy as np
 
 from codesign.errors import FileFormatError
 from codesign.lens.files.text import number, shown
@@ -47,20 +47,16 @@ class PrivateGlasses:
                 f"its glass {shown(name)} has {len(table)} indices for {len(self.waves_um)} wavelengths; "
                 "give one each, for at least two positive wavelengths."
             )
-        points = sorted(zip(self.waves_um, table, strict=True))
-        return Glass.from_indices(*(_between(points, w, name) for w in WAVELENGTH_UM.values()), name)
-
-
-def _between(points, wavelength_um, name):
-    """Index at a wavelength, linear in 1 / wavelength^2 between its neighbours."""
-    for (a, n_a), (b, n_b) in itertools.pairwise(points):
-        if a <= wavelength_um <= b and a < b:
-            share = (wavelength_um**-2 - a**-2) / (b**-2 - a**-2)
-            return n_a + share * (n_b - n_a)
-    raise FileFormatError(
-        f"its glass {shown(name)} is given from {points[0][0]:g} to {points[-1][0]:g} um, without "
-        f"{wavelength_um:g} um; give more indices (PWL)."
-    )
+        waves_um, indices = zip(*sorted(zip(self.waves_um, table, strict=True)), strict=True)
+        beyond = [w for w in WAVELENGTH_UM.values() if not waves_um[0] <= w <= waves_um[-1]]
+        if beyond:
+            raise FileFormatError(
+                f"its glass {shown(name)} is given from {waves_um[0]:g} to {waves_um[-1]:g} um, without "
+                f"{beyond[0]:g} um; give more indices (PWL)."
+            )
+        # linear in 1 / wavelength^2
+        lines, knots = (-1 / np.square(list(w)) for w in (WAVELENGTH_UM.values(), waves_um))
+        return Glass.from_indices(*np.interp(lines, knots, indices).tolist(), name)
 
 
 def _plain(word):

@@ -1,8 +1,7 @@
 """Readers of DeepLens JSON and of DiffOptics text tables."""
 
 import re
-from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 from codesign.errors import FileFormatError
 from codesign.lens.files import page as p
@@ -56,49 +55,47 @@ def read_deeplens(page: Page, name: str) -> FileLens:
     stops = []
     for i, row in enumerate(p.rows(page, "surfaces"), 1):
         with at(f"surface {i}"):
-            _check_front(row, page["surfaces"][: i - 1])
+            _check_front(row, surfaces[-1].medium if surfaces else None)
             surfaces.append(_surface(row, i))
             stops += [i - 1] if row["type"] in ("Stop", "Aperture") else []
     if len(stops) > 1:
         raise FileFormatError(f"surfaces {[i + 1 for i in stops]} are all stops; keep one.")
-    at_stop = stops[0] if stops else smallest(surfaces)
-    surfaces[at_stop].is_stop = True
-    _check_places(page, surfaces)
+    _mark_stop(surfaces, stops)
+    _check_places(page)
     info = page.get("info")
     return FileLens(name if info in (None, "None") else title(info, name), surfaces, pupil=("stop", 0.0))
 
 
-def _check_front(row, before):
+def _check_front(row, medium):
     """Raise where ``mat1`` is not the medium behind the surface before."""
-    given, behind = (
-        str(name).lower()
-        for name in (row.get("mat1", "air"), before[-1].get("mat2", "air") if before else "air")
-    )
-    given, behind = ("air" if name in AIR else name for name in (given, behind))
-    if "mat1" in row and given != behind:
+    front = _named(row, "mat1") if "mat1" in row else medium
+    if front != medium:
+        given, behind = (glass.name.lower() if glass else "air" for glass in (front, medium))
         raise FileFormatError(
             f"mat1 is {shown(given)!r}, but the surface before is followed by {shown(behind)!r}; correct "
             "one of them."
         )
 
 
-def _check_places(page, surfaces):
+def _check_places(page):
     """Raise where the positions ``d`` and ``d_sensor`` contradict the distances ``d_next``."""
     first = p.number(page["surfaces"][0], "d", 0.0)
     z = 0.0
-    for row, surface in zip([*page["surfaces"], {"d": page.get("d_sensor")}], [*surfaces, None], strict=True):
+    places = [(f"surface {i}", row) for i, row in enumerate(page["surfaces"], 1)]
+    for place, row in (*places, ("the sensor", {"d": page.get("d_sensor")})):
         given = p.number(row, "d") - first if row.get("d") is not None else z
         if abs(given - z) > FITS_MM:
             raise FileFormatError(
-                f"{'the sensor' if surface is None else f'surface {surface.label}'} lies at {given:.6g} mm, "
-                f"but the distances d_next lead to {z:.6g} mm; correct one of them."
+                f"{place} lies at {given:.6g} mm, but the distances d_next lead to {z:.6g} mm; correct one of "
+                "them."
             )
-        z += surface.thickness if surface else 0.0
+        z += row.get("d_next", 0.0)
 
 
-def smallest(surfaces: Sequence[FileSurface]) -> int:
-    """Index of the surface with the smallest aperture, the first of equals."""
-    return min(range(len(surfaces)), key=lambda i: cast(float, surfaces[i].semi_aperture))
+def _mark_stop(surfaces, stops):
+    """Mark the surface of the only index in ``stops``, else the first with the smallest aperture."""
+    at_stop = surfaces[stops[0]] if stops else min(surfaces, key=lambda surface: surface.semi_aperture)
+    at_stop.is_stop = True
 
 
 def _surface(row, label):
@@ -112,19 +109,24 @@ def _surface(row, label):
     asphere = _asphere(row)
     if kind != "Aspheric" and (conic or any(asphere)):
         raise FileFormatError(f"a surface of type {kind} has a conic or asphere; make it Aspheric.")
-    medium = row.get("mat2", "air")
-    if not isinstance(medium, str):
-        raise FileFormatError(f"mat2 is {shown(medium)!r}, a name or 'nd/Vd' is needed.")
     return FileSurface(
         label,
         _curvature(row),
         p.number(row, "d_next"),
-        _medium(medium),
+        _named(row, "mat2"),
         p.number(row, "r"),
         True,
         conic,
         asphere,
     )
+
+
+def _named(row, key):
+    """The medium under a key, air when it is missing."""
+    medium = row.get(key, "air")
+    if not isinstance(medium, str):
+        raise FileFormatError(f"{key} is {shown(medium)!r}, a name or 'nd/Vd' is needed.")
+    return _medium(medium)
 
 
 def _curvature(row):
@@ -217,7 +219,7 @@ def read_diffoptics(text: str, name: str) -> FileLens:
             f"it has {len(surfaces)} surfaces, {len(stops)} stops (A) and {'an' if image else 'no'} image "
             "(I); it needs surfaces, at most one stop, and an image."
         )
-    surfaces[stops[0] if stops else smallest(surfaces)].is_stop = True
+    _mark_stop(surfaces, stops)
     return FileLens(title(" ".join(table[0][1]), name), surfaces, pupil=("stop", 0.0))
 
 
