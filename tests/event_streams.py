@@ -64,12 +64,13 @@ def packed_aedat4(data, code, packet):
     return bytes(changed)
 
 
-def in_hdf5(datasets, fill=None, **packing):
-    """Bytes of an HDF5 file of datasets, None: left out; fill: what else is done to it."""
+def in_hdf5(datasets, fill=None, userblock=0, **packing):
+    """Bytes of an HDF5 file of datasets, None: left out; fill: what else is done to it; userblock: bytes of
+    another program's at its start."""
     import h5py
 
     buffer = io.BytesIO()
-    with h5py.File(buffer, "w") as file:
+    with h5py.File(buffer, "w", userblock_size=userblock) as file:
         for name, values in datasets.items():
             if values is not None:
                 file.create_dataset(name, data=values, **(packing if np.ndim(values) else {}))

@@ -28,7 +28,7 @@ FLO_TAG = struct.pack("<f", 202021.25)
 FLO_UNKNOWN = 1e10
 FLO_LIMIT = 1e9
 PNG_START = b"\x89PNG\r\n\x1a\n"
-MOST_PIXELS = 64_000_000  # what a file may announce
+MOST_PIXELS = 32_000_000  # what a file may announce
 MOST_BYTES = 1_000_000_000
 
 
@@ -88,7 +88,8 @@ def read_flow(path: str | Path) -> tuple[torch.Tensor, torch.Tensor]:
     decode = _choose({".png": _from_png, ".flo": _from_flo}, path, "read")
     content = read_bytes(path, MOST_BYTES)
     flow, valid = decode(path, content)
-    return torch.from_numpy(np.where(valid, flow, 0).astype(np.float32)), torch.from_numpy(valid)
+    flow[:, ~valid] = 0
+    return torch.from_numpy(flow), torch.from_numpy(valid)
 
 
 def _choose(table, path, verb):
@@ -124,7 +125,8 @@ def _from_flo(path, content):
             f"{path} announces {width} x {height} pixels, which its {len(content)} bytes do not hold; it is "
             "cut off or damaged."
         )
-    flow = np.frombuffer(content, "<f4", offset=12).reshape(height, width, 2).transpose(2, 0, 1)
+    pixels = np.frombuffer(content, "<f4", offset=12).reshape(height, width, 2)
+    flow = pixels.transpose(2, 0, 1).astype(np.float32, "C")
     return flow, (np.abs(flow) <= FLO_LIMIT).all(0)  # NaN is unknown too
 
 
@@ -167,14 +169,19 @@ def _from_png(path, content):
     with reading(path, "it is cut off or damaged"):
         with Image.open(io.BytesIO(content), formats=["PNG"]) as image:
             image.verify()
-        high, low = (_bytes(content, order) for order in ("B", "L"))
-    pixels = high.astype(np.uint16) << 8 | low
+        # in place: a file of a few bytes may announce the most pixels
+        pixels = _bytes(content, "B").astype(np.uint16)
+        pixels <<= 8
+        pixels |= _bytes(content, "L")
     if pixels[..., 2].max() > 1:
         raise FileFormatError(
             f"{path} is not a flow PNG: its third channel reaches {pixels[..., 2].max()}, but holds 1 for "
             "valid pixels and 0 for others."
         )
-    return (pixels[..., :2].transpose(2, 0, 1).astype(np.float64) - OFFSET) / SCALE, pixels[..., 2] == 1
+    flow = pixels[..., :2].transpose(2, 0, 1).astype(np.float32, "C")  # exact, as all that follows
+    flow -= OFFSET
+    flow /= SCALE
+    return flow, pixels[..., 2] == 1
 
 
 def _bytes(content, order):

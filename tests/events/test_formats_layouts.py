@@ -301,8 +301,14 @@ SINCE_US = (STREAM.t_us - EPOCH_US).numpy()
 
 @pytest.mark.parametrize(
     "packing",
-    [dict(hdf5plugin.Blosc(cname="zstd", clevel=1)), {"compression": "gzip", "shuffle": True, "fletcher32": True}, {"chunks": True}, {}],
-)  # fmt: skip
+    [
+        dict(hdf5plugin.Blosc(cname="zstd", clevel=1)),
+        {"compression": "gzip", "shuffle": True, "fletcher32": True},
+        {"chunks": True},
+        {"chunks": True, "userblock": 512},
+        {},
+    ],
+)
 def test_published_hdf5_files_are_read(tmp_path, packing):
     assert same(read(dsec(tmp_path / "e.h5", SINCE_US, **packing), height_px=480, width_px=640), STREAM)
 

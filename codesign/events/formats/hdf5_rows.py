@@ -1,8 +1,9 @@
 """HDF5 on damaged files and full disks: rows of large datasets, block by block, and new files.
 
-The library trusts its filters: a block that unpacks to fewer bytes than its chunk, or a filter without its
-parameters, ends the process. So gzip blocks are unpacked and measured here, and Blosc blocks are handed on
-only when their headers say what the chunk needs; other filters are refused.
+The library trusts its filters and its index: a block that unpacks to fewer bytes than its chunk, a filter
+without its parameters, or a damaged index while a block is read ends the process. So stored bytes are read
+past it, gzip blocks are unpacked and measured here, and Blosc blocks are handed on only when their headers
+say what the chunk needs; other filters are refused.
 Source: HDF5 File Format Specification 3.0, "Data Object Header Messages: Filter Pipeline"; c-blosc,
   README_CHUNK_FORMAT.
 """
@@ -41,8 +42,8 @@ def chunk_bytes(dataset):
 
 
 def places_of(path, dataset, name, file_bytes):
-    """[(first indices, mask of filters left out, stored bytes)] of all blocks, which must cover the dataset
-    once."""
+    """[(first indices, mask of filters left out, first byte, stored bytes)] of all blocks, which must cover the
+    dataset once and lie inside the file."""
     needed = math.prod(
         -(-length // chunk) for length, chunk in zip(dataset.shape, dataset.chunks, strict=True)
     )
@@ -56,23 +57,37 @@ def places_of(path, dataset, name, file_bytes):
             f"{file_bytes} bytes; it is damaged."
         )
     places = []
-    dataset.id.chunk_iter(lambda info: places.append((tuple(info.chunk_offset), info.filter_mask, info.size)))
+    # byte_offset counts from the start of the file, its user block included
+    dataset.id.chunk_iter(
+        lambda info: places.append((tuple(info.chunk_offset), info.filter_mask, info.byte_offset, info.size))
+    )
     sides = tuple(zip(dataset.chunks, dataset.shape, strict=True))
     inside = all(
         first % chunk == 0 and 0 <= first < length
-        for at, _, _ in places
+        for at, *_ in places
         for first, (chunk, length) in zip(at, sides, strict=True)
     )
     if (
         not inside
-        or len({at for at, _, _ in places}) != needed
+        or len({at for at, *_ in places}) != needed
         or len(places) != needed
-        or any(size > file_bytes for _, _, size in places)
+        or any(start is None or start + size > file_bytes for _, _, start, size in places)
     ):
         raise FileFormatError(
             f"{path}: {name} needs {needed} blocks and lacks some; the file was cut or is damaged."
         )
     return places
+
+
+def stored_bytes(path, name, place):
+    """A block as it lies in the file."""
+    _, _, start, size = place
+    with open(path, "rb") as file:
+        file.seek(start)
+        data = file.read(size)
+    if len(data) != size:
+        raise damaged(path, name, "cut")
+    return data
 
 
 def undone(path, name, kind, options, data, limit_bytes):
@@ -107,8 +122,8 @@ def check_blosc(path, dataset, name, place, options):
     size = chunk_bytes(dataset)
     if len(options) < 4 or tuple(options[2:4]) != (width, size):
         raise damaged(path, name, "Blosc's parameters")
-    at, mask, stored = place
-    data = dataset.id.read_direct_chunk(at)[1]
+    at, mask, _, stored = place
+    data = stored_bytes(path, name, place)
     header = struct.unpack_from("<4B3I", data) if len(data) >= 16 else (0,) * 7
     version, _, _, typesize, unpacked, block, packed = header
     fits = (version, typesize, unpacked, packed) == (2, width, size, len(data)) and 0 < block <= max(size, 1)
@@ -258,13 +273,13 @@ class Rows:
 
     def _block(self, dataset, place):
         """One unpacked block, after checking that it is what it claims."""
-        at, mask, _ = place
+        at, mask, *_ = place
         if self.filters and self.filters[0][0] == BLOSC:
             check_blosc(self.path, dataset, self.name, place, self.filters[0][2])
             return np.asarray(
                 dataset[tuple(slice(a, a + n) for a, n in zip(at, self.block_shape or (), strict=True))]
             )
-        data = dataset.id.read_direct_chunk(at)[1]
+        data = stored_bytes(self.path, self.name, place)
         size = chunk_bytes(dataset)
         for k in reversed(range(len(self.filters))):
             if not mask >> k & 1:
