@@ -1,7 +1,9 @@
 """Run every command that README, docs and Makefile name, in its quick form, and print what became of each.
 
     make try-all                      from a fresh clone; ARGS="--only lens --limit 120" runs a part
+    make try-all ARGS="--resume"      after a cut: what went as it should is not run again
 
+Results are kept command by command in runs/try_all.jsonl, with the commit that they are of.
 A new command on a page is tried by itself. A study runs with --quick in a folder of its own, through its target of
 make where it has one. A command that names a file of the reader's own must end in a sentence (exit 2).
 """
@@ -10,6 +12,7 @@ import argparse
 import json
 import os
 import re
+import resource
 import shlex
 import subprocess
 import sys
@@ -31,6 +34,9 @@ INSTEAD = {"NAME_OR_FILE": "cooke-triplet", "--lens NAME": "--lens cooke-triplet
 # what else stands for something of the reader's own
 OWN = re.compile(r"\b[A-Z]{3,}\b|\w\.(mp4|npz|npy|txt|yaml|urdf)\b|frames/|runs/|--recording |--video$")
 NEEDS = re.compile(r"\b(?:give|needs?|pass|with|required:)\b.*?(--[a-z][a-z-]*)")
+# what is no study is made short by what it is given last
+SHORT = {"fuzz": ["--minutes", "1"], "kill-test": ["--count", "1"]}
+KEPT = ROOT / "runs" / "try_all.jsonl"
 ELSEWHERE = ("help", "setup", "test", "test-bits", "lint", "core-check", "clean", "try-all")
 
 
@@ -86,7 +92,8 @@ def outcome(command: str, limit_s: float) -> tuple[bool, str, str]:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
     with tempfile.TemporaryDirectory(prefix="try-all-") as folder:
         os.symlink(ROOT / "docs", f"{folder}/docs")  # pages name raw tables as from the project's folder
-        more = ["--quick", "--out", f"{folder}/out"] if name == "python" or words[0] in STUDIES else []
+        study = name == "python" or words[0] in STUDIES
+        more = ["--quick", "--out", f"{folder}/out"] if study else SHORT.get(words[0], [])
         if name == "make":
             given = " ".join(["".join(words[1:]).removeprefix("ARGS="), *more])
             words = ["make", "-C", str(ROOT), words[0], f"ARGS={given}"]
@@ -110,26 +117,46 @@ def outcome(command: str, limit_s: float) -> tuple[bool, str, str]:
     return right, code[0], "" if code[0] == "0" else lines[-1 if traced else 0][:160]
 
 
+def cpu_s() -> float:
+    """Processor time of all commands that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
 def main() -> int:
     asked = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     asked.add_argument("--only", default="", help="try the commands that hold this text")
     asked.add_argument("--metrics", type=Path, help="file for the figures commands and failed")
     asked.add_argument("--limit", type=float, default=900.0, help="seconds that a command may take")
+    asked.add_argument("--resume", action="store_true", help="leave out what went as it should before")
     options = asked.parse_args()
+    commit = subprocess.run(
+        ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
+    ).stdout.strip()
+    KEPT.parent.mkdir(exist_ok=True)
+    if not options.resume:
+        KEPT.write_text("")
+    lines = KEPT.read_text(encoding="utf-8").splitlines() if KEPT.exists() else []
+    known = {row["command"]: row for row in map(json.loads, lines) if row["right"]}
     tried = failed = 0
-    print("| command | page | exit | seconds | first line of the error |\n|---|---|---|---|---|")
+    print("| command | page | exit | seconds | CPU-s | first line of the error |\n|---|---|---|---|---|---|")
     for command, page in commands().items():
         if options.only not in command or command.split()[1] in ELSEWHERE:
             continue
-        began = time.monotonic()
-        right, code, said = outcome(command, options.limit)
-        tried, failed = tried + 1, failed + (not right)
+        row = known.get(command)
+        if row is None:
+            began, used_s = time.monotonic(), cpu_s()
+            right, code, said = outcome(command, options.limit)
+            row = {"command": command, "right": right, "exit": code, "said": said}
+            row |= {"seconds": round(time.monotonic() - began), "cpu_s": round(cpu_s() - used_s)}
+            with KEPT.open("a", encoding="utf-8") as file:
+                file.write(json.dumps({**row, "commit": commit}) + "\n")
+        tried, failed = tried + 1, failed + (not row["right"])
         if options.metrics:
             options.metrics.write_text(json.dumps({"commands": tried, "failed": failed}), encoding="utf-8")
-        mark = "" if right else " **fails**"
-        print(
-            f"| `{command}` | {page} | {code}{mark} | {time.monotonic() - began:.0f} | {said} |", flush=True
-        )
+        mark = "" if row["right"] else " **fails**"
+        times = f"{row['seconds']} | {row['cpu_s']}"
+        print(f"| `{command}` | {page} | {row['exit']}{mark} | {times} | {row['said']} |", flush=True)
     print(f"{failed} failed; {', '.join(ELSEWHERE)} are left to CI and to you")
     return min(failed, 1)
 
