@@ -3,7 +3,6 @@
 from codesign.doors import explain
 from codesign.render import sequence, truth
 from codesign.render.camera import Camera, angular_miss_rad, project
-from codesign.render.check import check_view
 from codesign.render.film import Film
 from codesign.render.moving import MovingScene
 from codesign.render.planes import TexturedPlane
@@ -11,13 +10,7 @@ from codesign.render.projection import ProjectionTable
 from codesign.render.psf_frames import psf_frames
 from codesign.render.psf_map import PsfMap, psf_map
 from codesign.render.sequence import frames
-from codesign.render.time import (
-    adaptive_times,
-    exposed_frames,
-    frame_chunks,
-    gauss_legendre,
-    midpoints,
-)
+from codesign.render.time import adaptive_times, exposed_frames, frame_chunks
 from codesign.render.truth import (
     FlowTruth,
     FramesTruth,
@@ -45,13 +38,10 @@ __all__ = [
     "adaptive_times",
     "angular_miss_rad",
     "camera_velocity",
-    "check_view",
     "exposed_frames",
     "flow_and_occlusion",
     "frame_chunks",
     "frames",
-    "gauss_legendre",
-    "midpoints",
     "project",
     "psf_frames",
     "psf_map",

@@ -1,18 +1,21 @@
 """The gradient of the light that the rims of apertures take away, sampled where it is.
 
-Within the pupil the share of light W that passes falls from one to nothing over the soft edge of an aperture, and only
-there does it change with the lens. Samples spread over the whole pupil meet that edge now and then, each with a large
-derivative: most of the noise of a gradient to the lens. Points of the edge alone, weighted by its width, have the same
-mean: d/dp of the mean of W L over the disc is the mean over angles of 2 (b - a) r dW/dp L with r uniform in [a, b], where
-b - a is the edge at that angle and field point.
+Within the pupil the share of light W that passes falls from one to nothing over the soft edge of an aperture,
+and only there does it change with the lens. Samples spread over the whole pupil meet that edge now and then,
+each with a large
+derivative: most of the noise of a gradient to the lens. Points of the edge alone, weighted by its width, have
+  the same
+mean: d/dp of the mean of W L over the disc is the mean over angles of 2 (b - a) r dW/dp L with r uniform in
+[a, b], where b - a is the edge at that angle and field point.
 """
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from codesign.render.camera import Camera, coloured_rays
+from codesign.render.camera import Camera
 from codesign.render.moving import Views
 from codesign.render.wavefront import look
 
@@ -25,8 +28,8 @@ WHOLE = 1 - 1e-9  # share of light from which nothing is taken away
 
 
 def aperture_edge_term(camera: Camera, views: Views, samples: int) -> Tensor | None:
-    """Zero-valued image [..., T, *film.shape] whose gradient is that of the light which apertures take away; None where
-    the edge cannot be found so (an obstruction in the pupil's middle).
+    """Zero-valued image [..., T, *film.shape] whose gradient is that of the light which apertures take away;
+    None where the edge cannot be found so (an obstruction in the pupil's middle).
 
     Args:
       camera: as for ``frames``.
@@ -43,21 +46,21 @@ def aperture_edge_term(camera: Camera, views: Views, samples: int) -> Tensor | N
     film_px, pupil, colour, pixel, size = found
     if not len(pixel):
         return torch.zeros(shape, dtype=dtype)
-    origin, direction, weight = coloured_rays(camera, film_px, pupil, colour)
+    rays = camera.coloured_rays(film_px, pupil, colour)
     with torch.no_grad():
         count = views.cameras.shape[1]
         frame = torch.arange(count).repeat_interleave(len(pixel))
-        origin, direction = (v.detach().repeat(count, 1) for v in (origin, direction))
+        origin, direction = (v.detach().repeat(count, 1) for v in (rays.origin_m, rays.direction))
         light, _ = look(views.scene, views.cameras, frame, origin, direction)
         light = light.reshape(count, -1) * (size / samples)
-    taken = light * (weight - weight.detach())
+    taken = light * camera.light(replace(rays, weight=rays.weight - rays.weight.detach()), colour)
     image = torch.zeros(count, math.prod(camera.film.shape), dtype=taken.dtype).index_add(1, pixel, taken)
     return image.reshape(shape).to(dtype)
 
 
 def _edge_points(camera, samples):
-    """Film positions [n, 2] px, pupil points [n, 2], colours and pixels [n], and what share of its pixel's disc each
-    point stands for [n]; None where the edge is no single one."""
+    """Film positions [n, 2] px, pupil points [n, 2], colours and pixels [n], and what share of its pixel's
+    disc each point stands for [n]; None where the edge is no single one."""
     edge = _edge(camera)
     if edge is None:
         return None
@@ -73,15 +76,16 @@ def _edge_points(camera, samples):
     rows = torch.nonzero(last > first)[:, 0]
     angle = 2 * torch.pi * at[rows, 2]
     spoke = torch.stack([angle.cos(), angle.sin()], 1)
-    colour = rows % (1 if camera.spectrum is None else len(camera.spectrum.wavelengths_um))
+    colour = rows % len(camera.colours)
 
-    # the edge lies between the largest radius at which all light passes and the smallest at which none does; both at once
+    # the edge lies between the largest radius at which all light passes and the smallest at which none does;
+    # both at once
     inner, outer = (v[rows].repeat(2, 1) for v in (first, last))
     least = torch.tensor([[WHOLE], [DARK]], dtype=torch.float64)
     for _ in range(HALVINGS):
         middle = (inner + outer) / 2
         q = (middle[..., None] * spoke).reshape(-1, 2)
-        share = coloured_rays(camera, film_px[rows].repeat(2, 1), q, colour.repeat(2), False)[2]
+        share = camera.coloured_rays(film_px[rows].repeat(2, 1), q, colour.repeat(2)).weight
         passes = share.reshape(2, -1) >= least
         inner, outer = torch.where(passes, middle, inner), torch.where(passes, outer, middle)
     begin, end = inner[0], outer[1]
@@ -90,8 +94,9 @@ def _edge_points(camera, samples):
 
 
 def _edge(camera):
-    """Least and largest radius [FIELDS, FIELDS, ANGLES] of the edge within each cell of the sensor and each sector of
-    the pupil, the cells' first corner [2] px and size [2] px; None where light falls and rises again on the way out."""
+    """Least and largest radius [FIELDS, FIELDS, ANGLES] of the edge within each cell of the sensor and each
+    sector of the pupil, the cells' first corner [2] px and size [2] px; None where light falls and rises
+    again on the way out."""
     film = camera.film
     size = torch.tensor([film.sensor_width_px, film.sensor_height_px], dtype=torch.float64)
     k = torch.arange(FIELDS + 1, dtype=torch.float64) / FIELDS
@@ -101,10 +106,9 @@ def _edge(camera):
     radius = torch.arange(RADII + 1, dtype=torch.float64) / RADII
     disc = (radius[:, None, None] * torch.stack([turn.cos(), turn.sin()], 1)).reshape(-1, 2)
     least = most = torch.ones(0)
-    colours = [None] if camera.spectrum is None else camera.spectrum.wavelengths_um
-    for wavelength in colours:
+    for line, _ in camera.colours:
         rays = camera.rays_through(
-            fields.repeat_interleave(len(disc), 0), disc.repeat(len(fields), 1), wavelength
+            fields.repeat_interleave(len(disc), 0), disc.repeat(len(fields), 1), **line
         )
         share = rays.weight.reshape(FIELDS + 1, FIELDS + 1, RADII + 1, ANGLES).double()
         if bool((share.diff(dim=2) > 1e-9).any()) or bool((share[:, :, 0] < WHOLE).any()):

@@ -1,5 +1,6 @@
-"""Triangle meshes cut into cells, parallelograms where two triangles make one, laid side by side in one texture: a
-texture for any mesh, whatever texture coordinates it has. Meshes finer than the texels get radiance at vertices.
+"""Triangle meshes cut into cells, parallelograms where two triangles make one, laid side by side in one
+texture: a texture for any mesh, whatever texture coordinates it has. Meshes finer than the texels get
+  radiance at vertices.
 """
 
 from dataclasses import dataclass
@@ -18,8 +19,8 @@ NEAR = 0.4  # of a face, from a vertex: where light counts as that of the vertex
 
 @dataclass(frozen=True)
 class Cells:
-    """Flat pieces of a mesh. origin, along_u, along_v, normal: [C, 3]; triangle: [C] bool, whether a cell is only the
-    half of its parallelogram next to its origin."""
+    """Flat pieces of a mesh. origin, along_u, along_v, normal: [C, 3]; triangle: [C] bool, whether a cell is
+    only the half of its parallelogram next to its origin."""
 
     origin: np.ndarray
     along_u: np.ndarray
@@ -64,8 +65,8 @@ def places(vertices: np.ndarray) -> np.ndarray:
 
 
 def shared_edges(place: np.ndarray) -> np.ndarray:
-    """Edges between two faces of places [F, 3]: [E, 4] of face, other face, and the corner where the edge starts in
-    each, running one way in the first and the other way in the second."""
+    """Edges between two faces of places [F, 3]: [E, 4] of face, other face, and the corner where the edge
+    starts in each, running one way in the first and the other way in the second."""
     face = np.repeat(np.arange(len(place)), 3)
     corner = np.tile(np.arange(3), len(place))
     start = place.reshape(-1)
@@ -85,8 +86,8 @@ def shared_edges(place: np.ndarray) -> np.ndarray:
 
 
 def _parallelograms(place, corners, normal):
-    """Pairs of faces that make one: [P, 4] of face, other face, corner where their common edge starts in the first,
-    corner opposite to it in the second. No face twice, longest edges first."""
+    """Pairs of faces that make one: [P, 4] of face, other face, corner where their common edge starts in the
+    first, corner opposite to it in the second. No face twice, longest edges first."""
     edges = shared_edges(place)
     face, other, k, j = edges.T
     start, end, apex = (corners[face, (k + i) % 3] for i in range(3))
@@ -105,8 +106,10 @@ def _parallelograms(place, corners, normal):
 
 @dataclass(frozen=True)
 class Atlas:
-    """Cells in one texture. left, bottom: [C] first texel of each cell behind its gap; wide, high: [C] its texels;
-    texels: (rows, columns) of the whole; cell: [rows, columns] number of the cell of each texel, -1 for none."""
+    """Cells in one texture. left, bottom: [C] first texel of each cell behind its gap; wide, high: [C] its
+    texels;
+    texels: (rows, columns) of the whole; cell: [rows, columns] number of the cell of each texel, -1 for
+      none."""
 
     cells: Cells
     left: np.ndarray
@@ -117,7 +120,8 @@ class Atlas:
     cell: np.ndarray
 
     def at(self, u, v):
-        """Points [N, 3], normals [N, 3] and whether they are on the surface [N], of texture coordinates [N]."""
+        """Points [N, 3], normals [N, 3] and whether they are on the surface [N], of texture coordinates
+        [N]."""
         rows, columns = self.texels
         x = u * columns
         y = v * rows
@@ -177,8 +181,9 @@ def atlas_of(cells: Cells, texel: float) -> Atlas:
 
 @dataclass(frozen=True)
 class Nodes:
-    """Vertices of a fine mesh, one per place and smooth surface. vertices: [N, 3]; faces: [F, 3] of them; normal:
-    [F, 3]; corner: [3 F] corners 3 face + k in order of their nodes; first: [N + 1] where each node starts there."""
+    """Vertices of a fine mesh, one per place and smooth surface. vertices: [N, 3]; faces: [F, 3] of them;
+    normal: [F, 3]; corner: [3 F] corners 3 face + k in order of their nodes; first: [N + 1] where each node
+      starts there."""
 
     vertices: np.ndarray
     faces: np.ndarray

@@ -2,9 +2,9 @@
 
 Outgoing radiance of a Lambertian surface is emission + albedo x irradiance / pi, the same from every side.
 Irradiance is smooth, so it is estimated on a coarse light map; albedo and emission are read at their own
-resolution; the product is the texture of a ``MitsubaScene``. Of surfaces that shine, whose radiance depends on where
-they are seen from, it is the mean over directions (weighted by their cosine, so that the energy is right), or the
-radiance towards one point. Surfaces that reflect on both sides have a texture for each.
+resolution; the product is the texture of a ``MitsubaScene``. Of surfaces that shine, whose radiance depends
+on where they are seen from, it is the mean over directions (weighted by their cosine, so that the energy is
+right), or the radiance towards one point. Surfaces that reflect on both sides have a texture for each.
 """
 
 import itertools
@@ -57,22 +57,24 @@ def bake(
     """A MitsubaScene whose emissive textures are the outgoing radiance of a scene.
 
     Args:
-      description: Mitsuba scene dictionary, or an mi.Scene, of rectangles, disks, spheres, cylinders and meshes, area
-        emitters where they glow, and lamps of any kind. Environment maps stay in the scene, seen and lighting.
-      texel_m: size of light-map texels, from 4 to max_texels along each side of a shape; larger on a mesh that would
+      description: Mitsuba scene dictionary, or an mi.Scene, of rectangles, disks, spheres, cylinders and
+        meshes, area emitters where they glow, and lamps of any kind. Environment maps stay in the scene, seen
+        and lighting.
+      texel_m: size of light-map texels, from 4 to max_texels along each side of a shape; larger on a mesh
+        that would
         need more than two million. samples: paths per texel; seed: of all of them.
-      max_depth: longest path. integrator: a Mitsuba SamplingIntegrator instead. fine: texels of a finished texture
-        per light-map texel along each side, unless its picture is coarser than that.
+      max_depth: longest path. integrator: a Mitsuba SamplingIntegrator instead. fine: texels of a finished
+        texture per light-map texel along each side, unless its picture is coarser than that.
       towards_m: place from which shiny surfaces look as they are; None shows the mean over directions.
       matte: whether mirrors, glass and masks are shown as if they were matte, in their mean radiance.
       lit: whether there is light at all; without it what glows shows its emission, anything else its albedo.
       placement: of the scene in the world; texel_m and towards_m are the world's.
-    Returns: MitsubaScene. Meshes have textures of their own, whatever texture coordinates they come with; those
-      finer than their texels have radiance at vertices.
+    Returns: MitsubaScene. Meshes have textures of their own, whatever texture coordinates they come with;
+      those finer than their texels have radiance at vertices.
     Error: noise of about 1 / sqrt(samples) of what arrives indirectly, light smeared over a texel at contact
       shadows, pictures read bilinearly, gloss from one direction; see light.level_error.
-    Raises: DomainError for mirrors, glass and masks unless ``matte``; media; shapes without known charts; of a
-      dictionary, shapes of which nothing can be seen from their front.
+    Raises: DomainError for mirrors, glass and masks unless ``matte``; media; shapes without known charts; of
+      a dictionary, shapes of which nothing can be seen from their front.
     """
     if not (0 < texel_m < np.inf and samples >= 1 and max_texels >= 4 and fine >= 1):
         raise DomainError(
@@ -103,8 +105,8 @@ def bake(
 def shown(
     world: MitsubaScene, surfaces: Sequence[Surface], light: Any, place: Placement, device: str
 ) -> MitsubaScene:
-    """The scene of these surfaces with their light, a list per surface of one array per side, as emission, and the
-    sky of the scene they come from."""
+    """The scene of these surfaces with their light, a list per surface of one array per side, as emission,
+    and the sky of the scene they come from."""
     mi = world.mi
     to_world = np.eye(4)
     to_world[:3, :3] = place.unit_m * place.R_world_scene.numpy()
@@ -126,8 +128,8 @@ def shown(
 
 @dataclass(frozen=True)
 class Bake:
-    """The estimates. texel, towards: in the scene's unit and axes; integrator None takes light to be 1 everywhere,
-    which leaves albedo and emission."""
+    """The estimates. texel, towards: in the scene's unit and axes; integrator None takes light to be 1
+    everywhere, which leaves albedo and emission."""
 
     mi: Any
     scene: Any
@@ -140,8 +142,8 @@ class Bake:
     towards: np.ndarray | None = None
 
     def radiance(self, surfaces: Sequence[Surface], strict: bool) -> list[list[np.ndarray]]:
-        """Outgoing radiance of every side of every surface: textures [H, W], or values [N] of nodes. strict: whether
-        a surface that nothing can be seen of from its front is an error."""
+        """Outgoing radiance of every side of every surface: textures [H, W], or values [N] of nodes. strict:
+        whether a surface that nothing can be seen of from its front is an error."""
         jobs = [(surface, side) for surface in surfaces for side in (1, -1)[: surface.sides]]
         found = {}
         for kind, estimate in ((Chart, self._textures(jobs, strict)), (Nodes, self._values(jobs))):
@@ -172,8 +174,8 @@ class Bake:
         for k, (surface, side) in enumerate(jobs):
             if strict and self.integrator and side > 0 and not there[k]:
                 raise DomainError(
-                    f"bake: nothing of shape '{surface.name}' can be seen from its front; another shape covers it, "
-                    "or its normals point inwards."
+                    f"bake: nothing of shape '{surface.name}' can be seen from its front; another shape "
+                    "covers it, or its normals point inwards."
                 )
         values = None
         for (k, texel, last), _, albedo, emission, seen in self._stream(self._fine_points(jobs, fine), False):
@@ -205,7 +207,8 @@ class Bake:
                     yield points[inside], side * normals[inside], surface.shiny, (k, texel[inside])
 
     def _fine_points(self, jobs, sizes):
-        """Centres of the texels of finished textures: points, normals, shiny, (job, texel, whether the last)."""
+        """Centres of the texels of finished textures: points, normals, shiny, (job, texel, whether the
+        last)."""
         for k, ((surface, side), (rows, columns)) in enumerate(zip(jobs, sizes, strict=True)):
             for start in range(0, rows * columns, SIZES[-1]):
                 end = min(start + SIZES[-1], rows * columns)
@@ -215,8 +218,8 @@ class Bake:
                 yield points[inside], side * normals[inside], surface.shiny, (k, texel, end == rows * columns)
 
     def _stream(self, requests, paths):
-        """Answers of ``_look`` to (points, normals, shiny, tag), as (tag, *answers) in order; small requests share a
-        launch, since setting one up costs a tenth of a second."""
+        """Answers of ``_look`` to (points, normals, shiny, tag), as (tag, *answers) in order; small requests
+        share a launch, since setting one up costs a tenth of a second."""
         waiting = []
         lanes = 0
         for request in itertools.chain(requests, [None]):
@@ -234,8 +237,8 @@ class Bake:
                 lanes += len(request[0])
 
     def _values(self, jobs):
-        """Outgoing radiance [N] of each (surface, side) with nodes: the mean near each; where nothing is seen that of
-        the others."""
+        """Outgoing radiance [N] of each (surface, side) with nodes: the mean near each; where nothing is seen
+        that of the others."""
         jobs = [job for job in jobs if isinstance(job[0].chart, Nodes)]
         total, count = ([np.zeros(len(surface.chart.vertices)) for surface, _ in jobs] for _ in range(2))
         lit = self.integrator is not None
@@ -264,8 +267,8 @@ class Bake:
         return tuple(int(n) for n in np.clip(wanted, 4, self.max_texels))
 
     def _fine(self, surface):
-        """Texels (rows, columns) of the finished texture: those of the pictures on the shape, but no more than
-        ``fine`` per light-map texel."""
+        """Texels (rows, columns) of the finished texture: those of the pictures on the shape, but no more
+        than ``fine`` per light-map texel."""
         chart = surface.chart
         coarse = np.array(self._coarse(chart))
         pictures = np.array(surface.texels_per_uv)
@@ -281,8 +284,9 @@ class Bake:
         return tuple(int(n) for n in np.maximum(coarse, wanted * min(1.0, most)))
 
     def _look(self, points, normals, shiny, paths):
-        """Light (irradiance / pi), albedo, emission and whether the surface is there, for points on a surface; numpy
-        [N]. Where it is ``shiny`` light comes towards one direction, and albedo is no less than SHINE."""
+        """Light (irradiance / pi), albedo, emission and whether the surface is there, for points on a
+        surface; numpy [N]. Where it is ``shiny`` light comes towards one direction, and albedo is no less
+        than SHINE."""
         import drjit as dr
 
         mi = self.mi
@@ -325,8 +329,8 @@ class Bake:
         return [np.concatenate(column) for column in zip(*parts, strict=True)]
 
     def _directions(self, points, normals, shiny):
-        """Where each point is looked at from: along its normal, or where it shines from ``towards``, or from anywhere
-        with the density of the cosine."""
+        """Where each point is looked at from: along its normal, or where it shines from ``towards``, or from
+        anywhere with the density of the cosine."""
         if not shiny.any():
             return normals
         cosine = np.sqrt(self.random.uniform(GRAZING**2, 1, len(points)))[:, None]

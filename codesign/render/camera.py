@@ -3,7 +3,7 @@
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, Protocol
 
 import torch
@@ -23,8 +23,8 @@ CHECKED_RAYS = 16
 
 
 class Lens(Protocol):
-    """camera_rays(film_mm [N, 2], pupil [N, 2], aim=...) -> Rays [N], as GeoLens has it; ``dtype`` where it is
-    not float64, ``film_points`` for a first guess where gradients of silhouettes are asked for,
+    """camera_rays(film_mm [N, 2], pupil [N, 2], aim=...) -> Rays [N], as GeoLens has it; ``dtype`` where it
+    is not float64, ``film_points`` for a first guess where gradients of silhouettes are asked for,
     ``entrance_pupil_diameter_mm`` where there is an aperture."""
 
     @property
@@ -35,7 +35,8 @@ class Camera:
     """A lens (GeoLens, ThinLens or Pinhole: anything with ``camera_rays``) before a film.
 
     >>> from codesign import lens, render
-    >>> camera = render.Camera(lens.load("cooke-triplet").scaled(0.2), 8, 8, pixel_pitch_mm=0.5, samples_per_pixel=4)
+    >>> camera = render.Camera(lens.load("cooke-triplet").scaled(0.2), 8, 8, pixel_pitch_mm=0.5,
+    samples_per_pixel=4)
     >>> camera.check().rays().weight.shape  # 8 x 8 pixels x 4 samples
     torch.Size([256])
 
@@ -68,7 +69,8 @@ class Camera:
             hasattr(spectrum, "wavelengths_um") and hasattr(spectrum, "weights")
         ):
             raise DomainError(
-                f"camera: a {type(spectrum).__name__} is no spectrum; give a lens.Spectrum, or None for the d line."
+                f"camera: a {type(spectrum).__name__} is no spectrum; give a lens.Spectrum, or None for the "
+                "d line."
             )
         if spectrum is not None and samples_per_pixel % len(spectrum.wavelengths_um):
             raise DomainError(
@@ -77,8 +79,8 @@ class Camera:
             )
         if not hasattr(lens, "camera_rays") or isinstance(lens, type):
             raise DomainError(
-                f"camera: a {type(lens).__name__} has no camera_rays, so it is no lens; give a GeoLens, ThinLens, "
-                "Pinhole, or an object of your own with camera_rays as GeoLens has it."
+                f"camera: a {type(lens).__name__} has no camera_rays, so it is no lens; give a GeoLens, "
+                "ThinLens, Pinhole, or an object of your own with camera_rays as GeoLens has it."
             )
         self.lens: Any = lens
         if film is not None and not isinstance(film, Film):
@@ -91,11 +93,14 @@ class Camera:
         self.falloff = falloff
         self.aim = aim
 
+    def _with(self, **changes):
+        twin = copy.copy(self)
+        vars(twin).update(changes)
+        return twin
+
     def with_lens(self, lens: Lens) -> "Camera":
         """The same film and samples behind another lens."""
-        twin = copy.copy(self)
-        twin.lens = lens
-        return twin
+        return self._with(lens=lens)
 
     def with_film(self, film: Film) -> "Camera":
         """The same lens and samples before other pixels."""
@@ -105,9 +110,43 @@ class Camera:
 
     def with_seed(self, seed: int) -> "Camera":
         """The same lens and film with other samples."""
-        twin = copy.copy(self)
-        twin.seed = check_seed(seed, "camera: seed")
-        return twin
+        return self._with(seed=check_seed(seed, "camera: seed"))
+
+    def in_one_colour(self) -> "Camera":
+        """The same camera for light of the d line, without falloff."""
+        return self._with(spectrum=None, falloff=False)
+
+    @property
+    def colours(self) -> list[tuple[dict[str, float], float]]:
+        """Of each colour what ``camera_rays`` has to be told, and how its light counts beside an equal
+        share."""
+        if self.spectrum is None:
+            return [({}, 1.0)]
+        lines = self.spectrum.wavelengths_um
+        return [
+            ({"wavelength_um": line}, weight * len(lines))
+            for line, weight in zip(lines, self.spectrum.weights, strict=True)
+        ]
+
+    @property
+    def aperture_m(self) -> float:
+        """Radius of the entrance pupil, metres; 0 without an aperture."""
+        return getattr(self.lens, "entrance_pupil_diameter_mm", 0.0) * 1e-3 / 2
+
+    def light(self, rays: Rays, colour: Tensor) -> Tensor:
+        """Light [N] that rays in the colours of their numbers [N] bring, less what falls off towards the
+        corners.
+        Raises: DomainError for a lens that does not say how it does."""
+        light = rays.weight
+        if self.spectrum is not None:
+            light = light * torch.tensor([share for _, share in self.colours], dtype=light.dtype)[colour]
+        if not self.falloff:
+            return light
+        if rays.irradiance is None:
+            raise DomainError(
+                "camera: this lens does not say how illumination falls off; leave falloff=False."
+            )
+        return light * rays.irradiance
 
     def check(self) -> "Camera":
         """Raise DomainError when some pixels of the film get no light at all through the lens; returns the
@@ -126,8 +165,9 @@ class Camera:
             radius_mm = self.film_mm(pixels).norm(dim=1)
             lit_mm = float(radius_mm[~dark].max()) if not bool(dark.all()) else 0.0
             raise DomainError(
-                f"camera: about {float(dark.double().mean()):.0%} of the film's pixels get no light: it comes as "
-                f"far as {lit_mm:.3g} mm from the axis, the film reaches {float(radius_mm.max()):.3g} mm; make "
+                f"camera: about {float(dark.double().mean()):.0%} of the film's pixels get no light: it "
+                f"comes as far as {lit_mm:.3g} mm from the axis, the film reaches "
+                f"{float(radius_mm.max()):.3g} mm; make "
                 "the film or its pixels smaller, or give a lens with a larger image circle."
             )
         return self
@@ -157,51 +197,29 @@ class Camera:
         """All rays of one frame, pixel after pixel, samples_per_pixel each: Rays with N = pixels x samples,
         in the lens's dtype. Gradient: to the lens."""
         offset, pupil = film_pupil_pattern(self.samples_per_pixel, self.seed)
-        if self.spectrum is None:
-            rays = self._rays(offset, pupil)
-            light = None
-        else:
-            colours = len(self.spectrum.wavelengths_um)
-            parts = [
-                self._rays(o, p, wavelength_um=w)
-                for w, o, p in zip(
-                    self.spectrum.wavelengths_um, offset.chunk(colours), pupil.chunk(colours), strict=True
-                )
-            ]
-            rays = Rays(*(self._joined([getattr(part, f.name) for part in parts]) for f in fields(Rays)))
-            light = (
-                torch.tensor(self.spectrum.weights)
-                .repeat_interleave(self.samples_per_pixel // colours)
-                .to(rays.weight)
-                .repeat(self.film.pixels().shape[0])
-                * colours
-            )
-        weight = rays.weight if light is None else rays.weight * light
-        if self.falloff:
-            if rays.irradiance is None:
-                raise DomainError(
-                    "camera: this lens does not say how illumination falls off; leave falloff=False."
-                )
-            weight = weight * rays.irradiance
-        return replace(rays, weight=weight)
-
-    def _rays(self, offset, pupil, **wavelength):
         pixels = self.film.pixels()
-        dtype = getattr(self.lens, "dtype", torch.float64)
         points = (pixels[:, None] + offset).reshape(-1, 2)
-        return self.lens.camera_rays(
-            self.film_mm(points).to(dtype),
-            pupil.repeat(pixels.shape[0], 1).to(dtype),
-            aim=self.aim,
-            **wavelength,
-        )
+        each = torch.arange(len(self.colours)).repeat_interleave(self.samples_per_pixel // len(self.colours))
+        colour = each.repeat(len(pixels))
+        rays = self._coloured(self._rays, points, pupil.repeat(len(pixels), 1), colour)
+        return replace(rays, weight=self.light(rays, colour))
 
-    def _joined(self, parts):
-        """What rays of several colours have, pixel after pixel; None where they do not say."""
-        if any(part is None for part in parts):
-            return None
-        pixels = self.film.pixels().shape[0]
-        return torch.cat([part.reshape(pixels, -1, *part.shape[1:]) for part in parts], 1).flatten(0, 1)
+    def _rays(self, pixels, pupil, **colour):
+        dtype = getattr(self.lens, "dtype", torch.float64)
+        return self.lens.camera_rays(self.film_mm(pixels).to(dtype), pupil.to(dtype), aim=self.aim, **colour)
+
+    def _coloured(self, trace, pixels, pupil, colour):
+        if self.spectrum is None:
+            return trace(pixels, pupil)
+        rows = [torch.nonzero(colour == number)[:, 0] for number in range(len(self.colours))]
+        parts = [trace(pixels[k], pupil[k], **line) for k, (line, _) in zip(rows, self.colours, strict=True)]
+        back = torch.cat(rows).argsort()
+        return _columns(lambda *column: torch.cat(column)[back], *parts)
+
+    def coloured_rays(self, pixels: Tensor, pupil: Tensor, colour: Tensor) -> Rays:
+        """As ``rays_through``, each in the colour of its number [N]."""
+        rays = self._coloured(self.rays_through, pixels, pupil, colour)
+        return _columns(lambda column: column.double(), rays)
 
     def chief_rays(self, pixels: Tensor) -> Rays:
         """Rays through the pupil's centre for pixel coordinates [N, 2]: Rays, float64."""
@@ -218,28 +236,36 @@ class Camera:
         )
 
     def rays_through(self, pixels: Tensor, pupil: Tensor, wavelength_um: float | None = None) -> Rays:
-        """Rays of pixel coordinates [N, 2] through points [N, 2] of the pupil, of one colour (the d line when none is
-        given): Rays, float64. The axial ray goes along: only a lens that passes nothing at all is an error."""
-        colour = {} if wavelength_um is None else {"wavelength_um": wavelength_um}
+        """Rays of pixel coordinates [N, 2] through points [N, 2] of the pupil, of one colour (the d line when
+        none is
+        given): Rays, float64. The axial ray goes along: only a lens that passes nothing at all is an
+        error."""
+        line = {} if wavelength_um is None else {"wavelength_um": wavelength_um}
         at = torch.cat([self.film.middle_px[None].to(pixels), pixels])
         through = torch.cat([pupil.new_zeros(1, 2), pupil])
-        rays = self.lens.camera_rays(self.film_mm(at), through, aim=self.aim, **colour)
-        irradiance = None if rays.irradiance is None else rays.irradiance[1:]
-        return Rays(rays.origin_m[1:], rays.direction[1:], rays.weight[1:], irradiance)
+        rays = self.lens.camera_rays(self.film_mm(at), through, aim=self.aim, **line)
+        return _columns(lambda column: column[1:], rays)
+
+
+def _columns(of, *rays):
+    """Rays of which every column is ``of`` those of the given ones; None where one of them does not say."""
+    columns = zip(*((r.origin_m, r.direction, r.weight, r.irradiance) for r in rays), strict=True)
+    return Rays(*(None if any(v is None for v in column) else of(*column) for column in columns))
 
 
 def project(camera: Camera, points_cam_m: Tensor, pupil: Tensor | None = None) -> Tensor:
     """Pixel coordinates whose ray through a point of the pupil (the centre when none is given) passes through
     points of space.
 
-    Args: points_cam_m [..., N, 3], camera axes, metres, in front of the camera. pupil: [..., N, 2] on the unit
-      disc, or None for chief rays.
+    Args: points_cam_m [..., N, 3], camera axes, metres, in front of the camera. pupil: [..., N, 2] on the
+      unit disc, or None for chief rays.
     Returns: [..., N, 2] px (the centre of the first pixel is 0, 0), float64; NaN for points that no such ray
       reaches (outside the lens's field).
 
     >>> from codesign import lens, render
     >>> camera = render.Camera(lens.Pinhole(8.0), 8, 8, pixel_pitch_mm=0.5)
-    >>> points = torch.tensor([[0.0, 0.0, 2.0], [0.125, 0.0, 2.0]])  # metres; 8 / 2000 / 0.5 px per millimetre
+    >>> points = torch.tensor([[0.0, 0.0, 2.0], [0.125, 0.0, 2.0]])  # metres; 8 / 2000 / 0.5 px per
+    millimetre
     >>> render.project(camera, points).tolist()
     [[3.5, 3.5], [4.5, 3.5]]
 
@@ -314,35 +340,3 @@ def angular_miss_rad(camera: Camera, pixels: Tensor, points_cam_m: Tensor) -> Te
     rays = camera.chief_rays(pixels)
     towards = torch.nn.functional.normalize(points_cam_m - rays.origin_m, dim=1)
     return ((towards - rays.direction).square().sum(1) + 1e-12).sqrt()
-
-
-__all__ = ["Camera", "Film", "Rays", "angular_miss_rad", "project"]
-
-
-def coloured_rays(
-    camera: Camera, film_px: Tensor, pupil: Tensor, colour: Tensor, whole: bool = True
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Origins and directions [n, 3] in camera axes of rays through film positions and pupil points, and the share of
-    a sample's light [n] that they carry, each in its own colour; without ``whole`` the share that passes the apertures."""
-    if camera.spectrum is None:
-        return _of_rays(camera, camera.rays_through(film_px, pupil), 1.0, whole)
-    count = len(camera.spectrum.wavelengths_um)
-    found = []
-    order = []
-    for number, (wavelength, weight) in enumerate(
-        zip(camera.spectrum.wavelengths_um, camera.spectrum.weights, strict=True)
-    ):
-        rows = torch.nonzero(colour == number)[:, 0]
-        order.append(rows)
-        rays = camera.rays_through(film_px[rows], pupil[rows], wavelength)
-        found.append(_of_rays(camera, rays, weight * count, whole))
-    back = torch.cat(order).argsort()
-    origin, direction, light = (torch.cat(column)[back] for column in zip(*found, strict=True))
-    return origin, direction, light
-
-
-def _of_rays(camera, rays, share, whole):
-    light = rays.weight * share if whole else rays.weight
-    if whole and camera.falloff:
-        light = light * rays.irradiance.detach()
-    return rays.origin_m.double(), rays.direction.double(), light.double()

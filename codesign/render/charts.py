@@ -1,5 +1,5 @@
-"""Surfaces whose light is baked: where their texels lie (charts from texture coordinates to points and normals), their
-sides, whether they shine, their pictures; and meshes that glow."""
+"""Surfaces whose light is baked: where their texels lie (charts from texture coordinates to points and
+normals), their sides, whether they shine, their pictures; and meshes that glow."""
 
 import itertools
 from collections.abc import Callable
@@ -25,9 +25,9 @@ LAMBERTIAN = ("DiffuseReflection", "FrontSide", "BackSide", "SpatiallyVarying")
 @dataclass(frozen=True)
 class Chart:
     """A map from the unit square to a surface: ``at`` takes u, v [N] (v up) and gives points [N, 3], normals
-    [N, 3], on the surface [N]. size: its extent along u and v, in the scene's unit. matrix, kind, flip: of the
-    Mitsuba shape that it is; atlas: the layout of a mesh, whose texture coordinates are its own; uv_per_unit:
-    lengths of that mesh's former ones on its surface."""
+    [N, 3], on the surface [N]. size: its extent along u and v, in the scene's unit. matrix, kind, flip: of
+    the Mitsuba shape that it is; atlas: the layout of a mesh, whose texture coordinates are its own;
+    uv_per_unit: lengths of that mesh's former ones on its surface."""
 
     size: tuple[float, float]
     at: Callable[[Any, Any], tuple[Any, Any, Any]]
@@ -41,8 +41,8 @@ class Chart:
 def chart_of(mi: Any, shape: Any, texel: float, detail: float | None) -> Chart | Nodes:
     """The chart of a Mitsuba shape, or nodes for a mesh that is finer than its texels.
 
-    Args: texel: of light; detail: of the pictures on it, None where there are none. Raises: DomainError for a shape
-      that has no chart here.
+    Args: texel: of light; detail: of the pictures on it, None where there are none. Raises: DomainError for a
+      shape that has no chart here.
     """
     kind = shape.shape_type()
     parameters = mi.traverse(shape)
@@ -54,8 +54,8 @@ def chart_of(mi: Any, shape: Any, texel: float, detail: float | None) -> Chart |
             return chart(*_unmirrored(mi, shape, _matrix(parameters)))
     if not shape.is_mesh() or "faces" not in parameters:
         raise DomainError(
-            f"bake: shape '{shape.id()}', a {shape.class_name()}, has no texture chart here; use meshes, rectangles, "
-            "cubes, spheres, disks and cylinders (copies instead of instances), or PathScene."
+            f"bake: shape '{shape.id()}', a {shape.class_name()}, has no texture chart here; use meshes, "
+            "rectangles, cubes, spheres, disks and cylinders (copies instead of instances), or PathScene."
         )
     vertices, _, uv = mesh_arrays(parameters)
     faces = front_faces(shape, parameters)
@@ -77,9 +77,9 @@ def _areas(corners):
 
 
 def placed(mi: Any, chart: Chart | Nodes, to_world: np.ndarray, light: list[np.ndarray]) -> tuple[Any, Any]:
-    """The shape moved by a similarity [4, 4], with its light as emission: textures [H, W] of a Chart, values [N] of
-    Nodes, of its front and, where there are two, of its back. Returns the shape and the emitter of its back or
-    None."""
+    """The shape moved by a similarity [4, 4], with its light as emission: textures [H, W] of a Chart, values
+    [N] of Nodes, of its front and, where there are two, of its back. Returns the shape and the emitter of its
+    back or None."""
     if isinstance(chart, Nodes):
         back = {"type": "area", "radiance": {"type": "mesh_attribute", "name": "vertex_back"}}
         shape = emissive_mesh(
@@ -116,9 +116,9 @@ def emitter(mi, texture):
 
 @exclusive
 def emissive_mesh(mi, vertices, faces, light, uv=None, bsdf=None, attribute="face_radiance"):
-    """A Mitsuba mesh of flat faces: ``light`` is an emitter dictionary, an array of radiance, [F] per face or, for an
-    ``attribute`` that begins with vertex_, [V] per vertex, or None; ``bsdf`` a dictionary or None. Raises: DomainError
-    and ShapeError for a mesh that cannot be."""
+    """A Mitsuba mesh of flat faces: ``light`` is an emitter dictionary, an array of radiance, [F] per face
+    or, for an ``attribute`` that begins with vertex_, [V] per vertex, or None; ``bsdf`` a dictionary or None.
+    Raises: DomainError and ShapeError for a mesh that cannot be."""
     vertices, faces = checked_mesh("mesh", vertices, faces)
     per = "vertex" if attribute.startswith("vertex_") else "face"
     for label, values, count in (
@@ -154,7 +154,8 @@ def emissive_mesh(mi, vertices, faces, light, uv=None, bsdf=None, attribute="fac
 
 
 def mesh_arrays(parameters):
-    """Vertices [V, 3] float64, faces [F, 3] and texture coordinates [V, 2] of a mesh, None where it has none."""
+    """Vertices [V, 3] float64, faces [F, 3] and texture coordinates [V, 2] of a mesh, None where it has
+    none."""
     vertices = np.array(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
     uv = (
         np.array(parameters["vertex_texcoords"], dtype=np.float64)
@@ -172,7 +173,8 @@ def _matrix(parameters):
 
 
 def _unmirrored(mi, shape, matrix):
-    """A to_world [4, 4] of the same surface that does not mirror, and whether its normals are then flipped (-1)."""
+    """A to_world [4, 4] of the same surface that does not mirror, and whether its normals are then flipped
+    (-1)."""
     flip = -1.0 if shape.has_flipped_normals() else 1.0
     if is_mirrored(matrix):
         matrix = matrix @ np.diag([1.0, -1, 1, 1])
@@ -244,9 +246,11 @@ def _cylinder(matrix, flip):
 
 @dataclass(frozen=True)
 class Surface:
-    """name, shape: of the Mitsuba scene. chart: of its points. sides: 1, or 2 where it reflects from behind too.
-    shiny: whether its radiance depends on the direction. texels_per_uv: rows and columns of its finest picture per
-    unit of its texture coordinates, (0, 0) without pictures, infinite where patterns have no resolution."""
+    """name, shape: of the Mitsuba scene. chart: of its points. sides: 1, or 2 where it reflects from behind
+    too.
+    shiny: whether its radiance depends on the direction. texels_per_uv: rows and columns of its finest
+    picture per unit of its texture coordinates, (0, 0) without pictures, infinite where patterns have no
+    resolution."""
 
     name: str
     shape: Any
@@ -259,8 +263,8 @@ class Surface:
 def surfaces_of(mi: Any, scene: Any, texel: float, fine: int, matte: bool) -> list[Surface]:
     """The surfaces of a Mitsuba scene whose light is kept in texels of this size, and pictures in finer ones.
 
-    Raises: DomainError for surfaces that no texture can stand for: mirrors, glass and masks unless ``matte``, media,
-      shapes without charts.
+    Raises: DomainError for surfaces that no texture can stand for: mirrors, glass and masks unless ``matte``,
+      media, shapes without charts.
     """
     found = {}
     for shape in scene.shapes():
@@ -286,8 +290,9 @@ def _surface(mi, name, shape, texel, fine, matte):
     mirror = has("DeltaReflection") and not has("DiffuseReflection")
     if (through or mirror) and not matte:
         raise DomainError(
-            f"bake: what one sees on shape '{name}', a {bsdf.class_name()}, lies behind it or before it and moves as "
-            "one moves; use the level 'path', or matte=True to show it as a matte surface of its mean radiance."
+            f"bake: what one sees on shape '{name}', a {bsdf.class_name()}, lies behind it or before it and "
+            "moves as one moves; use the level 'path', or matte=True to show it as a matte surface of its "
+            "mean radiance."
         )
     shiny = bool(flags & ~sum(int(getattr(mi.BSDFFlags, kind)) for kind in LAMBERTIAN))
     pictures = _pictures(mi.traverse(shape))
@@ -312,8 +317,8 @@ def _pictures(parameters):
 
 
 def glowing(triangles_m: Tensor) -> MitsubaScene:
-    """Scene of triangles [F, 3, 3] with radiance 1 on both sides, and 0 elsewhere. Raises: DomainError for a mesh that
-    cannot be."""
+    """Scene of triangles [F, 3, 3] with radiance 1 on both sides, and 0 elsewhere. Raises: DomainError for a
+    mesh that cannot be."""
     corners = triangles_m.detach().cpu().reshape(-1, 3).numpy()
     faces = np.arange(len(corners)).reshape(-1, 3)
     mesh = emissive_mesh(backend.mitsuba("cpu"), corners, faces, np.ones(len(faces)))

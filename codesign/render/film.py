@@ -1,5 +1,5 @@
-"""Pixels of a sensor, windows on it, and the one low-discrepancy pattern over film and pupil that all pixels, all frames
-and both sides of a difference share."""
+"""Pixels of a sensor, windows on it, and the one low-discrepancy pattern over film and pupil that all pixels,
+all frames and both sides of a difference share."""
 
 import math
 from dataclasses import dataclass
@@ -92,8 +92,9 @@ def check_memory(film: Film, samples_per_pixel: int) -> None:
     needed = count * BYTES_PER_RAY
     if needed > memory_bytes():
         raise DomainError(
-            f"camera: {math.prod(film.shape):.3g} pixels of {samples_per_pixel} samples are {count:.3g} rays per "
-            f"frame, at least {needed / 2**30:.3g} GiB; this machine has {memory_bytes() / 2**30:.3g} GiB: make "
+            f"camera: {math.prod(film.shape):.3g} pixels of {samples_per_pixel} samples are {count:.3g} rays "
+            f"per frame, at least {needed / 2**30:.3g} GiB; this machine has {memory_bytes() / 2**30:.3g} "
+            "GiB: make "
             "the film smaller, look at windows of it (render.Film), or take fewer samples."
         )
 

@@ -25,8 +25,8 @@ def first_hits(origin_cam_m: Tensor, direction_cam: Tensor, lit: Tensor, scene: 
     """The nearest surface of all parts of a scene along rays given in camera space.
 
     Args: origin_cam_m, direction_cam: [P, 3], the same rays in every frame, or [F, P, 3]. lit: [P] or [F, P]
-      bool; rays that carry no light meet nothing. cameras: [parts, F, 4, 4], poses of the camera in the axes of
-      every part.
+      bool; rays that carry no light meet nothing. cameras: [parts, F, 4, 4], poses of the camera in the axes
+      of every part.
     Gradient: to rays and poses, surfaces taken as their tangent planes.
     A frame's values do not depend on the frames beside it: every product is written out by element.
     """
@@ -63,8 +63,8 @@ def carried(hits: Hits, transforms: Tensor) -> Tensor:
 
 
 def of_part(hits: Hits, transforms: Tensor) -> Tensor:
-    """Of transforms [parts, F, 4, 4] those of the part that each ray meets: [F, P, 4, 4], or [F, 1, 4, 4] where
-    there is one part only."""
+    """Of transforms [parts, F, 4, 4] those of the part that each ray meets: [F, P, 4, 4], or [F, 1, 4, 4]
+    where there is one part only."""
     if len(transforms) == 1:
         return transforms[0][:, None]
     return transforms[hits.part.clamp_min(0), torch.arange(len(hits.part))[:, None]]

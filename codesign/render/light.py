@@ -244,5 +244,8 @@ def choose(
             f" (RMS errors: {others}; {noise})." if others else "."
         )
     else:
-        reason = f"{name}: the cheapest level within {tolerance:g} of {last}, with an RMS error of {worst[name]:.2g} ({noise}) for {cpu_s[name]:.2g} CPU-s instead of {cpu_s[last]:.2g}."
+        reason = (
+            f"{name}: the cheapest level within {tolerance:g} of {last}, with an RMS error of "
+            f"{worst[name]:.2g} ({noise}) for {cpu_s[name]:.2g} CPU-s instead of {cpu_s[last]:.2g}."
+        )
     return Choice(name, levels[name], reason, errors, cpu_s)

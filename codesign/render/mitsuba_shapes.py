@@ -1,9 +1,9 @@
-"""What the shapes of Mitsuba do not tell by themselves: which side is the front, radiance between vertices, numbers, and
-the box around them.
+"""What the shapes of Mitsuba do not tell by themselves: which side is the front, radiance between vertices,
+numbers, and the box around them.
 
-Mitsuba takes the front from the normals that a shape stores, and a mirrored ``to_world`` turns its faces inside out, but
-not those normals. At vertices it weighs corners in float32 by the square of a face's area, which is noise on faces more
-than a thousand times as long as wide; here that is float64.
+Mitsuba takes the front from the normals that a shape stores, and a mirrored ``to_world`` turns its faces
+inside out, but not those normals. At vertices it weighs corners in float32 by the square of a face's area,
+which is noise on faces more than a thousand times as long as wide; here that is float64.
 """
 
 import re
@@ -50,14 +50,15 @@ def _against_normals(shape, parameters, faces):
 
 
 def vertex_attribute(surface: Any) -> str | None:
-    """Name of the attribute at vertices that an emitter or material of Mitsuba shows, None where it shows none."""
+    """Name of the attribute at vertices that an emitter or material of Mitsuba shows, None where it shows
+    none."""
     found = re.search(r'MeshAttribute\[\s*name = "(vertex_\w+)"', str(surface))
     return found[1] if found else None
 
 
 def interpolated(mi: Any, shape: Any, name: str, si: Any) -> Any:
-    """An attribute at vertices of a mesh where it is met (drjit arrays), between the values of the corners. Gradient: to
-    the place."""
+    """An attribute at vertices of a mesh where it is met (drjit arrays), between the values of the corners.
+    Gradient: to the place."""
     import drjit as dr
 
     parameters = mi.traverse(shape)
@@ -76,7 +77,8 @@ def interpolated(mi: Any, shape: Any, name: str, si: Any) -> Any:
 
 
 def shape_numbers(mi: Any, scene: Any) -> Any:
-    """Numbers of the shapes of a Mitsuba scene in its own list, behind what their pointers hold (drjit array)."""
+    """Numbers of the shapes of a Mitsuba scene in its own list, behind what their pointers hold (drjit
+    array)."""
     import drjit as dr
 
     held = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in scene.shapes()]
@@ -87,8 +89,8 @@ def shape_numbers(mi: Any, scene: Any) -> Any:
 
 
 def box_around(mi: Any, scene: Any) -> Any:
-    """Box (drjit arrays) with room for rounding around all shapes of a Mitsuba scene; None under a sky, where rays
-    start inside."""
+    """Box (drjit arrays) with room for rounding around all shapes of a Mitsuba scene; None under a sky, where
+    rays start inside."""
     import drjit as dr
 
     box = scene.bbox()

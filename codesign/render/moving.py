@@ -59,8 +59,8 @@ class MovingScene:
             isinstance(pair, tuple | list) and len(pair) == 2 for pair in objects.values()
         ):
             raise DomainError(
-                "moving scene: objects are a dictionary {name: (scene, T_world_object [T, 4, 4])}; give a scene "
-                "and poses for each name."
+                "moving scene: objects are a dictionary {name: (scene, T_world_object [T, 4, 4])}; give a "
+                "scene and poses for each name."
             )
         for part in (static, *(scene for scene, _ in objects.values())):
             check_kind(part.static if isinstance(part, MovingScene) else part)
@@ -150,7 +150,8 @@ def scenes_and_poses(scene: Any, T_world_cam: Poses) -> list[tuple[Any, Tensor]]
 class Views:
     """A scene as all frames of all trajectories see it, N frames one after the other.
 
-    scene: with the poses of its objects in these frames. T_world_part: [parts, N, 4, 4], the identity for the static
+    scene: with the poses of its objects in these frames. T_world_part: [parts, N, 4, 4], the identity for the
+      static
     part. cameras: [parts, N, 4, 4], poses of the camera in the axes of every part. batch: (..., T). float64.
     """
 
@@ -170,10 +171,12 @@ class Views:
 
 
 def views_of(scene: Any, T_world_cam: Poses, rays: Rays | None = None) -> Views:
-    """Views of a scene from trajectories [..., T, 4, 4]: the one place where poses are checked and brought into the
+    """Views of a scene from trajectories [..., T, 4, 4]: the one place where poses are checked and brought
+    into the
     axes of every part. rays: of the camera, which must be on one device with them.
 
-    Raises: DomainError for what is no scene or no poses; ShapeError unless every object has a pose for every frame.
+    Raises: DomainError for what is no scene or no poses; ShapeError unless every object has a pose for every
+      frame.
     """
     for part in parts(scene):
         check_kind(part)
@@ -196,8 +199,8 @@ def check_device(rays: Rays, poses: Tensor) -> None:
     """Raise DomainError unless the rays of a camera are on one device with its poses."""
     if rays.weight.device != poses.device:
         raise DomainError(
-            f"poses are on {poses.device}, the rays of the camera on {rays.weight.device}; move one to the other "
-            "with .to(device)."
+            f"poses are on {poses.device}, the rays of the camera on {rays.weight.device}; move one to the "
+            "other with .to(device)."
         )
 
 

@@ -1,5 +1,5 @@
-"""Pixel means of a wavefront in torch's graph: forward one launch, a lane per ray and frame, backward the sums of
-``slopes``."""
+"""Pixel means of a wavefront in torch's graph: forward one launch, a lane per ray and frame, backward the
+sums of ``slopes``."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -26,8 +26,8 @@ class Wavefront:
     dtype: torch.dtype
 
     def image(self, arr: Any, rays: Sequence[Any], poses: Sequence[Any]) -> Any:
-        """Pixel means [F x pixels] of rays: origin (3), direction (3) and weight [N], from poses [F x 12] in each
-        part (drjit arrays)."""
+        """Pixel means [F x pixels] of rays: origin (3), direction (3) and weight [N], from poses [F x 12] in
+        each part (drjit arrays)."""
         import drjit as dr
 
         *line, weight = rays
@@ -70,8 +70,8 @@ class Wavefront:
 def pixel_means(
     wavefront: Wavefront, origin: Tensor, direction: Tensor, weight: Tensor, poses: Tensor
 ) -> Tensor:
-    """Pixel means [F, pixels] of rays given in camera space, origin and direction [3, N], weight [N], seen from poses
-    [parts, F, 3, 4] of the camera; all of the wavefront's dtype.
+    """Pixel means [F, pixels] of rays given in camera space, origin and direction [3, N], weight [N], seen
+    from poses [parts, F, 3, 4] of the camera; all of the wavefront's dtype.
 
     Gradient: to all four, silhouettes at rest.
     """
@@ -159,9 +159,10 @@ def _gradients(ctx, grad, origin, direction, weight, poses):
 def lanes(arr: Any, line: Sequence[Any], poses: Sequence[Any]) -> tuple[Any, Any, Any, list[Any]]:
     """Every ray in every frame, frame after frame (drjit arrays).
 
-    Args: line: origin (3) and direction (3) before the camera, [N] each. poses: of the camera in every part, rows
-      [F x 12] each.
-    Returns: number of the ray of every lane, its origin and direction before the camera, and those in each part.
+    Args: line: origin (3) and direction (3) before the camera, [N] each. poses: of the camera in every part,
+      rows [F x 12] each.
+    Returns: number of the ray of every lane, its origin and direction before the camera, and those in each
+      part.
     """
     import drjit as dr
 
@@ -185,7 +186,8 @@ def placed(arr: Any, o: Any, d: Any, pose: Any, frame: Any) -> tuple[Any, Any]:
 
 
 def nearest(arr: Any, scenes: Sequence[Any], placed: Sequence[Any]) -> tuple[Any, Any, Any]:
-    """Radiance of the part met first, its distance and its number; where nothing is met, what the first part says."""
+    """Radiance of the part met first, its distance and its number; where nothing is met, what the first part
+    says."""
     import drjit as dr
 
     light, least = scenes[0].radiance_and_distance(arr, *placed[0])

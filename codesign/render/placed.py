@@ -1,5 +1,5 @@
-"""Scenes in axes and a unit of their own, placed in the world: the rays go to the scene; and emissive scenes that are
-placed already, whose surfaces may show one radiance from their front and another from behind."""
+"""Scenes in axes and a unit of their own, placed in the world: the rays go to the scene; and emissive scenes
+that are placed already, whose surfaces may show one radiance from their front and another from behind."""
 
 import copy
 from collections.abc import Mapping
@@ -15,8 +15,8 @@ from codesign.render.world import MitsubaScene
 
 @dataclass(frozen=True)
 class Placement:
-    """How a scene of its own axes and unit stands in the world. R_world_scene: [3, 3] rotation from its axes to the
-    world's; unit_m: metres per unit of its lengths; gain: factor on its radiance.
+    """How a scene of its own axes and unit stands in the world. R_world_scene: [3, 3] rotation from its axes
+    to the world's; unit_m: metres per unit of its lengths; gain: factor on its radiance.
 
     Raises: DomainError for a matrix that is no rotation, or a unit or gain that is not positive.
     """
@@ -46,8 +46,9 @@ class Placement:
 class PlacedScene:
     """A scene in axes and units of its own, seen by cameras in the world's metres.
 
-    Args: scene: with ``radiance``, ``radiance_and_distance`` and ``hit``, such as a PathScene. placement: of it.
-    Nothing of the scene is changed, so what depends on its size (media, bumps, point lamps) looks as in itself.
+    Args: scene: with ``radiance``, ``radiance_and_distance`` and ``hit``, such as a PathScene. placement: of
+    it. Nothing of the scene is changed, so what depends on its size (media, bumps, point lamps) looks as in
+    itself.
     Gradient: that of the scene.
     """
 
@@ -91,16 +92,18 @@ class PlacedScene:
     def outline(self) -> Any:
         """Raises GradientError: curves are known of scenes in the world's own axes."""
         raise GradientError(
-            "a placed scene has no outline and no gradient of silhouettes; choose a baked or emissive level, or "
-            "gradient 'difference'."
+            "a placed scene has no outline and no gradient of silhouettes; choose a baked or emissive level, "
+            "or gradient 'difference'."
         )
 
 
 class SidedScene(MitsubaScene):
     """A MitsubaScene of which some shapes show light from behind too.
 
-    Args: description: as for MitsubaScene. backs: area emitter of the back of each shape that has one, by its name.
-      placement: turn of the scene's sky and factor on all its radiance; its shapes stand in the world already.
+    Args: description: as for MitsubaScene. backs: area emitter of the back of each shape that has one, by its
+      name.
+      placement: turn of the scene's sky and factor on all its radiance; its shapes stand in the world
+        already.
     """
 
     both_sides = True

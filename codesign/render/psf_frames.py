@@ -1,9 +1,9 @@
 """Frames by their point spread functions: one sharp picture with depth, convolved layer by layer.
 
-The fidelity level between the thin and the traced lens. A picture of the chief rays (distortion in it, no blur)
-is split into layers of depth, by hats over 1 / distance that sum to 1; each is convolved with the point spread
-functions of its depth, interpolated over the film; layers are put on each other front to back. What a nearer
-layer hides of a farther one is filled in from around it.
+The fidelity level between the thin and the traced lens. A picture of the chief rays (distortion in it, no
+blur) is split into layers of depth, by hats over 1 / distance that sum to 1; each is convolved with the point
+spread functions of its depth, interpolated over the film; layers are put on each other front to back. What a
+nearer layer hides of a farther one is filled in from around it.
 """
 
 import itertools
@@ -43,22 +43,22 @@ def psf_frames(
     >>> near.shape, bool((near - traced).abs().max() < 1e-3 * traced.std())
     (torch.Size([3, 16, 16]), True)
 
-    Args: camera, scene, T_world_cam: as for ``render.frames``; the camera's samples and seed do not count. psf:
-      ``psf_map(camera)``, made once for many calls while the lens stays as it is; None makes one.
+    Args: camera, scene, T_world_cam: as for ``render.frames``; the camera's samples and seed do not count.
+      psf: ``psf_map(camera)``, made once for many calls while the lens stays as it is; None makes one.
     Returns: [..., T, *film.shape].
     Gradient: to lens, poses and poses of objects, through the sharp picture, its depth and the point spread
       functions; "interior" as in ``render.frames``: the motion of silhouettes is left out.
-    Raises: DomainError for surfaces nearer than the map is made for, and scenes without distances; ShapeError for
-      a map of another film.
-    True where blur changes slowly; not within a blur's radius of depth edges, where light that a chief ray does
-    not see is guessed (docs/worlds.md has figures).
+    Raises: DomainError for surfaces nearer than the map is made for, and scenes without distances; ShapeError
+      for a map of another film.
+    True where blur changes slowly; not within a blur's radius of depth edges, where light that a chief ray
+    does not see is guessed (docs/worlds.md has figures).
     """
     if psf is None:
         psf = psf_map(camera)
     if psf.camera.film != camera.film:
         raise ShapeError(
-            f"psf frames: the map is of the film {psf.camera.film}, the camera has {camera.film}; make the map of "
-            "this camera, psf_map(camera)."
+            f"psf frames: the map is of the film {psf.camera.film}, the camera has {camera.film}; make the "
+            "map of this camera, psf_map(camera)."
         )
     if pairs := scenes_and_poses(scene, T_world_cam):
         return torch.stack([psf_frames(camera, one, poses, psf) for one, poses in pairs])
@@ -71,7 +71,8 @@ def psf_frames(
 
 
 def _layers(psf, per_m, lit):
-    """Layers of depth for what is seen, as numbers (near to far) of a step in 1 / distance: the map's, halved while
+    """Layers of depth for what is seen, as numbers (near to far) of a step in 1 / distance: the map's, halved
+    while
     there are few. Raises: DomainError for surfaces nearer than the map's, or a film without chief rays."""
     if not bool(lit.any()):
         raise DomainError(
@@ -81,8 +82,8 @@ def _layers(psf, per_m, lit):
     farthest = float(torch.where(lit > 0, per_m, torch.inf).min())
     if nearest > (1 + 1e-5) / psf.nearest_m:
         raise DomainError(
-            f"psf frames: a surface is {1 / nearest:.4g} m away, nearer than the {psf.nearest_m:g} m of the map; "
-            f"make it with psf_map(camera, nearest_m={0.9 / nearest:.2g})."
+            f"psf frames: a surface is {1 / nearest:.4g} m away, nearer than the {psf.nearest_m:g} m of the "
+            f"map; make it with psf_map(camera, nearest_m={0.9 / nearest:.2g})."
         )
     for halvings in range(FINEST, -1, -1):
         step = psf.step_per_m / 2**halvings
@@ -132,8 +133,8 @@ def _filled(layers, width):
 def _convolved(psf, layers, depths_per_m):
     """Layers [J, 2, S, W, H + 2 R, W + 2 R] at these 1 / distance convolved: [J, 2, W, H, W].
 
-    Cell after cell, by Fourier transforms: with the weights of its four corners, which are then interpolated (so a
-    constant stays constant).
+    Cell after cell, by Fourier transforms: with the weights of its four corners, which are then interpolated
+    (so a constant stays constant).
     """
     film = psf.camera.film
     rows, columns = (n - 1 for n in psf.grid[1:])

@@ -2,9 +2,9 @@
 
 The rays of a pixel through the pupil do not depend on what they meet. So one trace, of pupil points for the
 nodes of a grid over the film, says for every distance which places of the sharp picture (that of the chief
-rays) the pixel gathers light from: where the ray meets the plane at that distance, in pixels of the chief rays
-around it. That is the point spread function mirrored, exact for a plane across the axis, whatever the lens
-(vignetting, decentred elements, colour).
+rays) the pixel gathers light from: where the ray meets the plane at that distance, in pixels of the chief
+rays around it. That is the point spread function mirrored, exact for a plane across the axis, whatever the
+lens (vignetting, decentred elements, colour).
 """
 
 import math
@@ -27,8 +27,8 @@ PUPIL_PX = 1.0  # spacing of the pupil's points in the widest blur, about
 ACROSS = 32  # film points across the sensor whose light is traced
 APART_PX = 0.5  # of the chief rays that give the scale of the picture, on either side
 SIDE = 2  # values of the sharp picture per side of a pixel
-# a pixel's weights reach beyond the blur by the quartic splines and, until it has fallen below 0.5 %, the ringing
-# of the interpolation, in spacings of the sharp picture
+# a pixel's weights reach beyond the blur by the quartic splines and, until it has fallen below 0.5 %, the
+# ringing of the interpolation, in spacings of the sharp picture
 TAIL_PX = math.ceil((2.5 + (SIDE - 1) / 2 + 4) / SIDE)
 
 
@@ -37,15 +37,17 @@ class PsfMap:
     """Rays of a camera from which its point spread functions follow, made by ``psf_map``.
 
     camera: Camera. nearest_m: least distance it is made for. nodes_px: [N, 2] film points, pixel coordinates;
-      ``grid`` = (windows, rows, columns) of them, N in all, cells of ``cell_px`` (rows, columns) pixels between.
-    transmission: [windows, H, W] share of the light that passes, as in the traced frames. radius_px: how far the
-      light of a pixel comes from. step_per_m: of 1 / distance, over which blur grows by LAYER_PX at most. sharp:
-      chief rays of the film's pixels and a margin of radius_px around them, window after window, SIDE x SIDE values a
-      pixel of ``fine`` x ``fine`` rays each.
+      ``grid`` = (windows, rows, columns) of them, N in all, cells of ``cell_px`` (rows, columns) pixels
+      between.
+    transmission: [windows, H, W] share of the light that passes, as in the traced frames. radius_px: how far
+      the
+      light of a pixel comes from. step_per_m: of 1 / distance, over which blur grows by LAYER_PX at most.
+      sharp: chief rays of the film's pixels and a margin of radius_px around them, window after window, SIDE
+      x SIDE values a pixel of ``fine`` x ``fine`` rays each.
       transfers: what ``psf_frames`` keeps for its next call.
-    base_m, slope: [N, M, 2] where rays through pupil points meet the entrance pupil's plane, and their slopes,
-      both relative to the chief ray; share: [N, M] of the light, sum 1. base_m_per_px, slope_per_px: [N, 2, 2] the
-      same of neighbouring chief rays, per pixel.
+    base_m, slope: [N, M, 2] where rays through pupil points meet the entrance pupil's plane, and their
+      slopes, both relative to the chief ray; share: [N, M] of the light, sum 1. base_m_per_px, slope_per_px:
+      [N, 2, 2] the same of neighbouring chief rays, per pixel.
     """
 
     camera: Camera
@@ -66,7 +68,8 @@ class PsfMap:
     transfers: dict[tuple[Any, ...], Tensor] = field(default_factory=dict, repr=False, compare=False)
 
     def offsets_px(self, per_m: Tensor) -> Tensor:
-        """Where the light of a point ends up, relative to its chief ray: [D, N, M, 2] px, for 1 / distance [D].
+        """Where the light of a point ends up, relative to its chief ray: [D, N, M, 2] px, for 1 / distance
+        [D].
 
         Gradient: to the lens and to per_m. Raises: DomainError for distances nearer than ``nearest_m``.
         """
@@ -75,8 +78,9 @@ class PsfMap:
             raise ShapeError(f"psf map: distances must be a list [D], got shape {tuple(per_m.shape)}.")
         if not bool(((per_m.detach() >= 0) & (per_m.detach() <= (1 + ROUNDING) / self.nearest_m)).all()):
             raise DomainError(
-                f"psf map: 1 / distance {per_m.tolist()} must lie between 0 and {1 / self.nearest_m:g} per metre, as the "
-                f"map is made for {self.nearest_m:g} m and beyond; give psf_map a smaller nearest_m."
+                f"psf map: 1 / distance {per_m.tolist()} must lie between 0 and {1 / self.nearest_m:g} per "
+                f"metre, as the map is made for {self.nearest_m:g} m and beyond; give psf_map a smaller "
+                "nearest_m."
             )
         return self._offsets_px(per_m)
 
@@ -98,7 +102,8 @@ class PsfMap:
         [0.02, 1.0, 0.02]
 
         Args: distance_m: [D] along the camera's axis from the entrance pupil, inf allowed. size_px: rows and
-          columns, odd; None is as many as the widest blur needs. A ray is shared bilinearly among four pixels.
+          columns, odd; None is as many as the widest blur needs. A ray is shared bilinearly among four
+          pixels.
         Gradient: to every tensor of the lens and to the distances, piecewise linear in the rays' positions.
         Raises: DomainError for distances nearer than ``nearest_m``, or a size that does not hold the blur.
         """
@@ -107,15 +112,15 @@ class PsfMap:
             raise ShapeError(f"psf map: distances must be a list [D], got shape {tuple(distance_m.shape)}.")
         if not bool((distance_m.detach() >= self.nearest_m * (1 - ROUNDING)).all()):
             raise DomainError(
-                f"psf map: distance {float(distance_m.detach().min()):.4g} m is nearer than the {self.nearest_m:g} m "
-                "that the map is made for; give psf_map a smaller nearest_m."
+                f"psf map: distance {float(distance_m.detach().min()):.4g} m is nearer than the "
+                f"{self.nearest_m:g} m that the map is made for; give psf_map a smaller nearest_m."
             )
         needed = 2 * (self.radius_px - TAIL_PX) + 3
         size = needed if size_px is None else size_px
         if not size >= needed or size % 2 != 1:
             raise DomainError(
-                f"psf map: {size} x {size} pixels do not hold the blur about a middle pixel; give an odd number of "
-                f"at least {needed}."
+                f"psf map: {size} x {size} pixels do not hold the blur about a middle pixel; give an odd "
+                f"number of at least {needed}."
             )
         at = self.offsets_px(1 / distance_m)[..., None] - (torch.arange(size).to(self.base_m) - size // 2)
         return _shared((1 - at.abs()).clamp_min(0), self.share)
@@ -124,8 +129,9 @@ class PsfMap:
         """What pixels gather from the sharp picture at 1 / distance [J]: [J, N, S, S, K, K], by which the
         picture of each of a pixel's S x S values is convolved; K = 2 radius_px + 1, all of a node sum to 1.
 
-        The sharp picture is taken as the cubic spline through its values. Values of one ray each are integrated
-        over the pixel in closed form (quartic splines); those of several are means over their part of it already.
+        The sharp picture is taken as the cubic spline through its values. Values of one ray each are
+        integrated over the pixel in closed form (quartic splines); those of several are means over their part
+        of it already.
         Source: Unser, IEEE Signal Processing Magazine 16, 1999.
         """
         dtype = per_m.dtype
@@ -146,9 +152,11 @@ class PsfMap:
 def psf_map(camera: Camera, nearest_m: float = 0.3, cell_px: int = 64, rays_per_px: int = 4) -> PsfMap:
     """Trace what the point spread functions of a camera at all distances from ``nearest_m`` on follow from.
 
-    Args: camera: before any lens with ``camera_rays``; its spectrum, falloff and aim count, its samples do not.
+    Args: camera: before any lens with ``camera_rays``; its spectrum, falloff and aim count, its samples do
+      not.
       nearest_m: metres from the entrance pupil. cell_px: largest spacing of the film points between which
-      point spread functions are interpolated. rays_per_px: 4, or for scenes full of hard edges 16, 36, 64, ...
+      point spread functions are interpolated. rays_per_px: 4, or for scenes full of hard edges 16, 36, 64,
+      ...
     Gradient: to the lens. To be made anew for every state of the lens.
     Raises: DomainError when the blur is wider than LARGEST_PX, or no light reaches the film.
     """
@@ -172,8 +180,9 @@ def psf_map(camera: Camera, nearest_m: float = 0.3, cell_px: int = 64, rays_per_
     reach = _reach(*found[:2], scale, 1 / nearest_m)
     if reach > LARGEST_PX:
         raise DomainError(
-            f"psf map: between {nearest_m:g} m and infinity the blur reaches {reach:.0f} pixels from its chief ray, "
-            f"more than {LARGEST_PX}; focus the lens, give a larger nearest_m, or render traced frames."
+            f"psf map: between {nearest_m:g} m and infinity the blur reaches {reach:.0f} pixels from its "
+            f"chief ray, more than {LARGEST_PX}; focus the lens, give a larger nearest_m, or render traced "
+            "frames."
         )
     across = 2 ** math.ceil(math.log2(max(16.0, 2 * reach / PUPIL_PX)))
     if across > 16:
@@ -201,7 +210,8 @@ def psf_map(camera: Camera, nearest_m: float = 0.3, cell_px: int = 64, rays_per_
 
 
 def _nodes(camera, cell_px):
-    """Film points at the corners of equal cells over every window: [N, 2] px, how many, and pixels of a cell."""
+    """Film points at the corners of equal cells over every window: [N, 2] px, how many, and pixels of a
+    cell."""
     film = camera.film
     corners = torch.tensor(film.windows_px or ((0, 0),), dtype=torch.float64)
     lines = []
@@ -229,33 +239,20 @@ def _lines(rays: Rays) -> tuple[Tensor, Tensor]:
 
 
 def _through_pupil(camera, places, across):
-    """Rays of film points [P, 2] px through ``across`` x ``across`` equal parts of the pupil, colour after colour:
-    at the entrance pupil's plane and slopes [P, M, 2], and their light [P, M], 1 in all where nothing stops it."""
+    """Rays of film points [P, 2] px through ``across`` x ``across`` equal parts of the pupil, colour after
+    colour: at the entrance pupil's plane and slopes [P, M, 2], and their light [P, M], 1 in all where nothing
+      stops it."""
     line = (torch.arange(across, dtype=torch.float64) + 0.5) / across
-    pupil = concentric_disc(torch.cartesian_prod(line, line))
-    film = camera.film_mm(places).repeat_interleave(len(pupil), 0)
-    lines = camera.spectrum
-    colours = [({}, 1.0)]
-    if lines is not None:
-        colours = [
-            ({"wavelength_um": w}, s) for w, s in zip(lines.wavelengths_um, lines.weights, strict=True)
-        ]
-    parts = []
-    for colour, weight in colours:
-        rays = camera.lens.camera_rays(film, pupil.repeat(len(places), 1), aim=camera.aim, **colour)
-        light = weight / len(pupil) * rays.weight
-        if camera.falloff:
-            if rays.irradiance is None:
-                raise DomainError(
-                    "psf map: this lens does not say how illumination falls off; leave falloff=False."
-                )
-            light = light * rays.irradiance
-        parts.append([v.double().unflatten(0, (len(places), -1)) for v in (*_lines(rays), light)])
-    return [torch.cat(column, 1) for column in zip(*parts, strict=True)]
+    pupil = concentric_disc(torch.cartesian_prod(line, line)).repeat(len(camera.colours), 1)
+    colour = torch.arange(len(camera.colours)).repeat_interleave(across**2).repeat(len(places))
+    rays = camera.coloured_rays(places.repeat_interleave(len(pupil), 0), pupil.repeat(len(places), 1), colour)
+    light = camera.light(rays, colour) / len(pupil)
+    return [v.unflatten(0, (len(places), -1)) for v in (*_lines(rays), light)]
 
 
 def _gathered(camera, nodes, across, base, slope, scale):
-    """Rays through the pupil relative to the chief rays: base and slope [N, M, 2], and shares of the light [N, M]."""
+    """Rays through the pupil relative to the chief rays: base and slope [N, M, 2], and shares of the light
+    [N, M]."""
     meets, leans, light = _through_pupil(camera, nodes, across)
     total = light.sum(1, keepdim=True)
     if not bool((total.detach() > 0).any()):
@@ -297,8 +294,8 @@ def _solved(matrix, vectors):
 
 
 def _places(film, margin, fine):
-    """Pixel coordinates of ``fine`` x ``fine`` points in each of SIDE x SIDE equal parts of every pixel of the windows
-    and a margin around them."""
+    """Pixel coordinates of ``fine`` x ``fine`` points in each of SIDE x SIDE equal parts of every pixel of
+    the windows and a margin around them."""
     lines = [torch.arange(-margin, n + margin, dtype=torch.float64) for n in (film.height_px, film.width_px)]
     corners = torch.tensor(film.windows_px or ((0, 0),), dtype=torch.float64)
     count = SIDE * fine

@@ -1,5 +1,5 @@
-"""Scenes that cannot be: refused where they are built, before Mitsuba renders them wrong or black, or ends the
-process."""
+"""Scenes that cannot be: refused where they are built, before Mitsuba renders them wrong or black, or ends
+the process."""
 
 import re
 from collections.abc import Mapping
@@ -23,8 +23,8 @@ NAMED = 3  # shapes that a sentence names
 
 
 def checked_mesh(name: str, vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] and faces [F, 3] of a mesh as arrays; ShapeError and DomainError, by its name, for a mesh
-    without faces, vertices that are not finite and faces of vertices that are not there."""
+    """Vertices [V, 3] and faces [F, 3] of a mesh as arrays; ShapeError and DomainError, by its name, for a
+    mesh without faces, vertices that are not finite and faces of vertices that are not there."""
     vertices = np.asarray(vertices)
     faces = np.asarray(faces)
     for label, array in (("vertices", vertices), ("faces", faces)):
@@ -33,25 +33,25 @@ def checked_mesh(name: str, vertices: Any, faces: Any) -> tuple[np.ndarray, np.n
     finite = np.isfinite(vertices).all(1)
     if not finite.all():
         raise DomainError(
-            f"mesh '{name}': {int((~finite).sum())} of {len(finite)} vertices are NaN or infinite (first number "
-            f"{int(np.argmin(finite))}); repair or remove them."
+            f"mesh '{name}': {int((~finite).sum())} of {len(finite)} vertices are NaN or infinite (first "
+            f"number {int(np.argmin(finite))}); repair or remove them."
         )
     low, high = int(faces.min()), int(faces.max())
     if low < 0 or high >= len(vertices):
         raise DomainError(
-            f"mesh '{name}': its faces name vertices {low} to {high}, but it has {len(vertices)}, counted from 0; "
-            "repair the faces."
+            f"mesh '{name}': its faces name vertices {low} to {high}, but it has {len(vertices)}, counted "
+            "from 0; repair the faces."
         )
     return vertices, faces
 
 
 def check_description(mi: Any, description: Any) -> None:
-    """Raise DomainError or ShapeError for a description that is none, or that holds a mesh which would end the
-    process when Mitsuba builds the scene."""
+    """Raise DomainError or ShapeError for a description that is none, or that holds a mesh which would end
+    the process when Mitsuba builds the scene."""
     if not isinstance(description, Mapping):
         raise DomainError(
-            f"a scene is described by a dictionary of shapes as Mitsuba has it, got a {type(description).__name__}; "
-            "give one, or ask worlds.from_mitsuba for a file."
+            "a scene is described by a dictionary of shapes as Mitsuba has it, got a "
+            f"{type(description).__name__}; give one, or ask worlds.from_mitsuba for a file."
         )
     for name, entry in description.items():
         if isinstance(entry, Mapping) and entry.get("type") in FILES_UNCHECKED:
@@ -69,8 +69,8 @@ def check_description(mi: Any, description: Any) -> None:
 
 
 def check_scene(mi: Any, scene: Any, emissive: bool) -> None:
-    """Raise DomainError or ShapeError when a shape of a built scene is not finite, has no faces, or, where it must be
-    ``emissive``, has no emitter; or when an emitter's radiance is negative or not finite."""
+    """Raise DomainError or ShapeError when a shape of a built scene is not finite, has no faces, or, where it
+    must be ``emissive``, has no emitter; or when an emitter's radiance is negative or not finite."""
     black = []
     for number, shape in enumerate(scene.shapes()):
         name = shape.id() or f"number {number}"
@@ -80,8 +80,9 @@ def check_scene(mi: Any, scene: Any, emissive: bool) -> None:
     if emissive and black:
         more = f" and {len(black) - NAMED} more" if len(black) > NAMED else ""
         raise DomainError(
-            f"shape {', '.join(map(repr, black[:NAMED]))}{more} has no emitter, so it would be black: give it one "
-            "of type 'area' (of radiance 0 where black is meant), or let light.bake or light.PathScene work out "
+            f"shape {', '.join(map(repr, black[:NAMED]))}{more} has no emitter, so it would be black: give "
+            "it one of type 'area' (of radiance 0 where black is meant), or let light.bake or "
+            "light.PathScene work out "
             "its light."
         )
     for emitter in scene.emitters():
@@ -97,8 +98,8 @@ def _check_attributes(shape, emitter):
     for name in re.findall(r'MeshAttribute\[\s*name = "(\w+)"', str(emitter)):
         if not bool(shape.has_attribute(name)[0]):
             raise DomainError(
-                f"radiance of '{shape.id()}': the mesh has no attribute '{name}', so it would be black; add it "
-                "(mesh.add_attribute), or name one that is there."
+                f"radiance of '{shape.id()}': the mesh has no attribute '{name}', so it would be black; add "
+                "it (mesh.add_attribute), or name one that is there."
             )
 
 
@@ -135,8 +136,9 @@ def _check_lookup(name, parameters):
         reach = float(np.abs(uv).max(initial=0)) * scale * size
         if not reach <= MOST_TEXELS:
             raise DomainError(
-                f"shape '{name}': its texture coordinates reach {reach:.3g} texels away from 0, where float32 no longer "
-                f"tells texels apart (at most {MOST_TEXELS:.0f}); repeat the picture less often, or make its texels larger."
+                f"shape '{name}': its texture coordinates reach {reach:.3g} texels away from 0, where "
+                f"float32 no longer tells texels apart (at most {MOST_TEXELS:.0f}); repeat the picture less "
+                "often, or make its texels larger."
             )
 
 
@@ -147,8 +149,9 @@ def _check_thick(name, corners):
     thin = int(((area > 0) & (area < THINNEST * uu * vv)).sum())
     if thin:
         raise DomainError(
-            f"mesh '{name}': {thin} of its faces are more than {THINNEST**-0.5:.0f} times as long as wide, on which Mitsuba "
-            "cannot tell albedo at vertices; remove them, or show the mesh at the level 'emissive'."
+            f"mesh '{name}': {thin} of its faces are more than {THINNEST**-0.5:.0f} times as long as wide, "
+            "on which Mitsuba cannot tell albedo at vertices; remove them, or show the mesh at the level "
+            "'emissive'."
         )
 
 
@@ -158,6 +161,6 @@ def _check_radiance(name, values):
         if array.size and not (array.min() >= 0 and array.max() < np.inf):
             wrong = array[~(np.isfinite(array) & (array >= 0))]
             raise DomainError(
-                f"radiance of '{name}': {key} holds {wrong.size} values that are negative, NaN or infinite (first "
-                f"{wrong.flat[0]:.3g}); make every one finite and at least 0."
+                f"radiance of '{name}': {key} holds {wrong.size} values that are negative, NaN or infinite "
+                f"(first {wrong.flat[0]:.3g}); make every one finite and at least 0."
             )

@@ -2,7 +2,8 @@
 
 interior: what moves inside surfaces (plain automatic differentiation).
 boundary: with the motion of silhouettes and edges.
-difference: central differences with common random numbers, twelve renders for the poses and two per lens number.
+difference: central differences with common random numbers, twelve renders for the poses and two per lens
+  number.
 auto: the cheapest of the three that is right for the frames at hand.
 """
 
@@ -60,15 +61,16 @@ def frames(
 
     Args:
       camera: Camera, before any lens with ``camera_rays``.
-      scene: anything with ``radiance`` and ``dtype`` (MitsubaScene, TexturedPlane, MovingScene), or a list of scenes,
-        one for each entry of the first axis of T_world_cam.
+      scene: anything with ``radiance`` and ``dtype`` (MitsubaScene, TexturedPlane, MovingScene), or a list of
+        scenes, one for each entry of the first axis of T_world_cam.
       T_world_cam: [..., T, 4, 4], several trajectories in one batch as if each were rendered by itself.
-      gradient: "interior", "boundary", "difference" or "auto", see the top of this file; the frames are the same.
+      gradient: "interior", "boundary", "difference" or "auto", see the top of this file; the frames are the
+        same.
       per_px: samples per pixel length of silhouettes and edges for "boundary".
-      rays: ``camera.rays()`` where they are traced already (one trace for many calls) or recorded, for "interior" and
-        "boundary"; the boundary term traces its own points through the camera's lens.
-    Returns: [..., T, H, W] (or [..., T, windows, H, W] behind a Film with windows) linear irradiance in the scene's
-      units, box-filtered over each pixel.
+      rays: ``camera.rays()`` where they are traced already (one trace for many calls) or recorded, for
+        "interior" and "boundary"; the boundary term traces its own points through the camera's lens.
+    Returns: [..., T, H, W] (or [..., T, windows, H, W] behind a Film with windows) linear irradiance in the
+      scene's units, box-filtered over each pixel.
     Gradient: lens and poses; "interior" leaves out the motion of silhouettes.
     Raises: DomainError for an unknown way, rays that it cannot use, or a scene whose silhouettes are not
       known; ShapeError for rays of another camera, or numbers of scenes and poses that differ.
@@ -77,12 +79,13 @@ def frames(
         raise DomainError(f"gradient = {gradient!r} is not known; choose one of {', '.join(WAYS)}.")
     if rays is not None and gradient not in PROVEN:
         raise DomainError(
-            f"gradient {gradient!r} traces the lens at other values than the given rays have; leave rays out, "
-            "or choose 'interior' or 'boundary'."
+            f"gradient {gradient!r} traces the lens at other values than the given rays have; leave rays "
+            "out, or choose 'interior' or 'boundary'."
         )
     if not 0 < as_number(per_px, "per_px") < math.inf:
         raise DomainError(
-            f"per_px = {per_px} samples per pixel length of silhouettes must be positive and finite, such as 2.5."
+            f"per_px = {per_px} samples per pixel length of silhouettes must be positive and finite, such as "
+            "2.5."
         )
     if not isinstance(camera, Camera):
         raise DomainError(
@@ -162,8 +165,8 @@ def _twist(T_world_cam):
 
 
 def pose_steps(camera: Camera, views: Views) -> list[float]:
-    """Steps of differences to the six components of a twist, metres and radians: at most STEP_PX of motion on the film,
-    for translations at the median distance of what the first frame shows."""
+    """Steps of differences to the six components of a twist, metres and radians: at most STEP_PX of motion on
+    the film, for translations at the median distance of what the first frame shows."""
     with torch.no_grad():
         turn = STEP_PX * abs(camera.slope_per_px())
         move = turn * reach_m(camera, views.scene, views.cameras[:, :1])
@@ -231,8 +234,8 @@ def lens_difference(camera: Camera, views: Views, name: str, i: int) -> Tensor:
 
 
 def cheapest(camera: Camera, views: Views) -> Way:
-    """The cheapest way that is right for these very frames: "interior" where no edge or outline in them parts two
-    radiances, "boundary" where one does, "difference" where the scene does not list them."""
+    """The cheapest way that is right for these very frames: "interior" where no edge or outline in them parts
+    two radiances, "boundary" where one does, "difference" where the scene does not list them."""
     middle = camera.film.middle_px[None]
     ray = camera.rays_through(middle, torch.zeros_like(middle))
     asked = [views.cameras, ray.origin_m, ray.direction, ray.weight, *lens_tensors(camera.lens).values()]

@@ -1,8 +1,9 @@
-"""Slopes of light to the ray that carries it, worked out where the light is, and gradients of pixel means from them.
+"""Slopes of light to the ray that carries it, worked out where the light is, and gradients of pixel means
+from them.
 
-The light of a ray depends on six numbers, its origin and direction in the axes of the part that it meets. Their
-slopes are known when the light is, at little more cost; with them, gradients to poses, lens and weights are sums over
-rays, for which nothing is traced again.
+The light of a ray depends on six numbers, its origin and direction in the axes of the part that it meets.
+Their slopes are known when the light is, at little more cost; with them, gradients to poses, lens and weights
+are sums over rays, for which nothing is traced again.
 """
 
 import weakref
@@ -17,8 +18,8 @@ KEPT = 1 / 8  # of the machine's memory, for slopes that wait for a backward pas
 
 
 def with_slopes(shown: Callable[..., Any]) -> Callable[..., Any]:
-    """A function (origin, direction, *others) -> (light, normal) of drjit arrays as one that returns light, normal,
-    and the slopes of light to origin and direction, all without a graph.
+    """A function (origin, direction, *others) -> (light, normal) of drjit arrays as one that returns light,
+    normal, and the slopes of light to origin and direction, all without a graph.
 
     Differentiating through a call would visit the surface once more; here that ends inside the call.
     """
@@ -34,7 +35,8 @@ def with_slopes(shown: Callable[..., Any]) -> Callable[..., Any]:
             if dr.grad_enabled(light):
                 dr.backward(light)
             slopes = dr.grad(origin), dr.grad(direction)
-            # a ray that touches a round shape, or meets a pole of its picture, has no slope: one in some millions
+            # a ray that touches a round shape, or meets a pole of its picture, has no slope: one in some
+            # millions
             told = dr.all(dr.isfinite(slopes[0])) & dr.all(dr.isfinite(slopes[1])) | ~dr.isfinite(light)
             return dr.detach(light), dr.detach(normal), *(dr.select(told, slope, 0) for slope in slopes)
 
@@ -43,8 +45,9 @@ def with_slopes(shown: Callable[..., Any]) -> Callable[..., Any]:
 
 @dataclass(frozen=True, eq=False)
 class Slopes:
-    """Of F x N rays, one frame after the other (drjit arrays): slopes [6] to origin and direction in the axes of the
-    part that is met, number of that part (None: there is one only), light (None where nobody asks for weights)."""
+    """Of F x N rays, one frame after the other (drjit arrays): slopes [6] to origin and direction in the axes
+    of the part that is met, number of that part (None: there is one only), light (None where nobody asks for
+    weights)."""
 
     slopes: Sequence[Any]
     part: Any
@@ -79,7 +82,8 @@ def ray_gradients(
 ) -> tuple[Any, ...]:
     """Gradients of origin (3), direction (3) and weight of N rays before the camera: drjit arrays [N].
 
-    Args: arr: drjit types. kept: slopes of ``frames`` frames. seed: gradient of the pixel means, [F x pixels]. weight:
+    Args: arr: drjit types. kept: slopes of ``frames`` frames. seed: gradient of the pixel means, [F x
+      pixels]. weight:
       [N]. poses: [parts x F x 12], rows of the camera's poses in the parts. samples: rays per pixel.
     """
     import drjit as dr

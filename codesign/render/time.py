@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -36,21 +35,6 @@ COARSE = 8  # times the spacing of pixels, for the search of a step; the step fo
 SMALLEST_STEP = 1e-9  # of the interval
 
 
-def midpoints(samples: int) -> tuple[Tensor, Tensor]:
-    """Times in -1/2..1/2 and weights of equal shares of an exposure, two float64 tensors [samples]: edges
-    blur to equal steps."""
-    return (torch.arange(samples, dtype=torch.float64) + 0.5) / samples - 0.5, torch.full(
-        (samples,), 1 / samples, dtype=torch.float64
-    )
-
-
-def gauss_legendre(samples: int) -> tuple[Tensor, Tensor]:
-    """As ``midpoints``, by Gauss-Legendre quadrature: exact for what changes as a polynomial of degree 2
-    samples - 1 over the exposure."""
-    nodes, weights = np.polynomial.legendre.leggauss(samples)
-    return torch.from_numpy(nodes) / 2, torch.from_numpy(weights) / 2
-
-
 def exposed_frames(
     camera: Camera,
     scene: Scene | MovingScene | Callable[[Tensor], MovingScene],
@@ -58,7 +42,6 @@ def exposed_frames(
     t_s: Tensor | Sequence[float],
     exposure_s: float,
     samples: int = 8,
-    rule: Callable[[int], tuple[Tensor, Tensor]] = midpoints,
     gradient: Way = "interior",
     per_px: float = 2.5,
     *,
@@ -79,16 +62,16 @@ def exposed_frames(
       scene, trajectory: see the top of this file.
       t_s: [T], middles of the exposures.
       exposure_s: length of the exposure, >= 0.
-      samples: time samples per frame.
-      rule: ``midpoints`` (error of a moving edge: at most its jump / (2 samples)) or ``gauss_legendre`` (for smooth
-        textures).
-      gradient, per_px: as ``frames`` takes them, for every time sample; "boundary" has the motion of silhouettes in it.
-      line_s: rolling shutter: row r of the sensor is exposed r * line_s later than row 0, whose middle is t_s; each
-        row is a launch of its own.
+      samples: time samples per frame, in the middle of equal shares of the exposure: a moving edge is wrong by
+        at most its jump / (2 samples).
+      gradient, per_px: as ``frames`` takes them, for every time sample; "boundary" has the motion of
+        silhouettes in it.
+      line_s: rolling shutter: row r of the sensor is exposed r * line_s later than row 0, whose middle is t_s;
+        each row is a launch of its own.
     Returns: [..., T, *film.shape], the mean of the irradiance over the exposure, in the scene's units.
     Gradient: lens, and whatever the trajectory's poses depend on; what it holds says ``gradient``.
-    Raises: DomainError on a negative exposure, a line time that is not finite, fewer than one sample, poses that are not
-      rigid, or a gradient that ``frames`` refuses.
+    Raises: DomainError on a negative exposure, a line time that is not finite, fewer than one sample, poses
+      that are not rigid, or a gradient that ``frames`` refuses.
     """
     t_s = check_finite(torch.as_tensor(t_s, dtype=torch.float64).reshape(-1), "times of the frames")
     if not 0 <= as_number(exposure_s, "exposure_s") < math.inf:
@@ -98,9 +81,9 @@ def exposed_frames(
             f"line_s = {line_s} must be finite: the seconds from one row of the sensor to the next."
         )
     samples = check_whole(samples, "time samples of an exposure")
-    times = [pair.tolist() for pair in rule(samples)]
+    nodes_s = [((k + 0.5) / samples - 0.5) * exposure_s for k in range(samples)]
     if not line_s:
-        return _exposed(camera, scene, trajectory, t_s, exposure_s, times, gradient, per_px)
+        return _exposed(camera, scene, trajectory, t_s, nodes_s, gradient, per_px)
     film = camera.film
     corners = film.windows_px or ((0, 0),)
     shown = [(left, top + row) for left, top in corners for row in range(film.height_px)]
@@ -108,19 +91,20 @@ def exposed_frames(
     for top in sorted({top for _, top in shown}):
         here = [number for number, place in enumerate(shown) if place[1] == top]
         row = camera.with_film(replace(film, height_px=1, windows_px=tuple(shown[number] for number in here)))
-        lines = _exposed(row, scene, trajectory, t_s + top * line_s, exposure_s, times, gradient, per_px)
+        lines = _exposed(row, scene, trajectory, t_s + top * line_s, nodes_s, gradient, per_px)
         found.update(zip(here, lines.squeeze(-2).unbind(-2), strict=True))
     lines = torch.stack([found[number] for number in range(len(shown))], -2)
     return lines.reshape(*lines.shape[:-2], *film.shape)
 
 
-def _exposed(camera, scene, trajectory, t_s, exposure_s, times, gradient, per_px):
-    """Weighted sum of the frames at (node, weight) of ``times``; the lens is traced once where ``gradient`` allows it."""
+def _exposed(camera, scene, trajectory, t_s, nodes_s, gradient, per_px):
+    """Mean of the frames at all ``nodes_s`` from t_s; the lens is traced once where ``gradient`` allows it."""
     rays = camera.rays() if gradient in PROVEN else None
     total = 0.0
-    for node, weight in zip(*times, strict=True):
-        at = t_s + node * exposure_s
-        total = total + weight * frames(camera, _at(scene, at), trajectory(at), gradient, per_px, rays=rays)
+    for node_s in nodes_s:
+        at = t_s + node_s
+        seen = frames(camera, _at(scene, at), trajectory(at), gradient, per_px, rays=rays)
+        total = total + seen / len(nodes_s)
     return total
 
 
@@ -178,8 +162,9 @@ def adaptive_times(
     the points seen at its end. Steps grow at
     most twofold and are judged at their middle too (on a coarser grid), so that a motion that comes back
     within a step is met by its parts.
-    Linear interpolation between the frames then times a crossing of a pattern of wave number k to within k largest_px^2 / (8 s)
-    pixels of motion, s the slope there as a share of the largest: a chord misses by h^2 max|L''| / 8 at most.
+    Linear interpolation between the frames then times a crossing of a pattern of wave number k to within k
+    largest_px^2 / (8 s) pixels of motion, s the slope there as a share of the largest: a chord misses by h^2
+    max|L''| / 8 at most.
     Raises: DomainError when the interval is empty, largest_px is not positive, or a displacement does not
       shrink with the step (a jump).
     Source: Rebecq, Gehrig and Scaramuzza, ESIM: an open event camera simulator, CoRL 2018 (adaptive sampling
@@ -245,15 +230,10 @@ def _lost_px(camera, found, rays, lost):
     camera."""
     if not bool(found.in_front[lost].all()):
         return math.inf
-    axis = camera.chief_rays(
-        camera.film.middle_px + torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64)
-    ).direction
-    slope_per_px = float(axis[1, 0] / axis[1, 2] - axis[0, 0] / axis[0, 2])
     before = rays.direction.double().expand(*lost.shape, 3)[lost]
     after = found.points_cam_m[lost]
-    return (
-        float((after[:, :2] / after[:, 2:] - before[:, :2] / before[:, 2:]).norm(dim=1).max()) / slope_per_px
-    )
+    moved = after[:, :2] / after[:, 2:] - before[:, :2] / before[:, 2:]
+    return float(moved.norm(dim=1).max()) / camera.slope_per_px()
 
 
 def _at(scene, t_s):

@@ -33,8 +33,8 @@ class View:
     """What lies under the pixel centres of one frame; zero (object_id -1) where not valid.
 
     points_world_m, normal: [..., *film.shape, 3] in world axes, the normal of unit length and as the surface
-      has it. depth_m: [..., *film.shape] along the camera's z axis. object_id: [..., *film.shape] int64, 0 for
-      the static scene, then the moving objects in order. valid: [..., *film.shape] bool.
+      has it. depth_m: [..., *film.shape] along the camera's z axis. object_id: [..., *film.shape] int64, 0
+      for the static scene, then the moving objects in order. valid: [..., *film.shape] bool.
     """
 
     points_world_m: Tensor
@@ -180,8 +180,8 @@ def truth_of_frames(
     of the camera's lens (to 1e-6 px) instead of traced.
 
     Args: table: ProjectionTable of the camera. scene: as for ``true_flow``. T_world_cam: [T >= count, 4, 4];
-      flow where there is a frame behind (of ``count`` - 1 frames where T = count). rays: the camera's chief rays
-      through all pixel centres, where they are traced already.
+      flow where there is a frame behind (of ``count`` - 1 frames where T = count). rays: the camera's chief
+      rays through all pixel centres, where they are traced already.
     """
     camera = table.camera
     shape = camera.film.shape
@@ -212,9 +212,9 @@ class Track:
     """Points under pixels [P] of F frames, and where they are at a later frame each: hits of the first,
     points_cam_m [F, P, 3] and to_px [F, P, 2] of the later (the pixel itself where not valid).
 
-    in_front: [F, P] bool, the point lies before the later camera (points_cam_m is (0, 0, 1) elsewhere). valid:
-      [F, P] bool, it is in the field of the lens too. chief: the later chief rays to the points, base and slope
-      [F, P, 2], where a table gave them.
+    in_front: [F, P] bool, the point lies before the later camera (points_cam_m is (0, 0, 1) elsewhere).
+      valid: [F, P] bool, it is in the field of the lens too. chief: the later chief rays to the points, base
+      and slope [F, P, 2], where a table gave them.
     """
 
     hits: Hits
@@ -227,8 +227,8 @@ class Track:
 
 
 def track(camera: Camera, views: Views, now: Tensor, later: Tensor, pixels: Tensor, rays: Rays) -> Track:
-    """Track of the pixel coordinates [P, 2] and their chief rays from frames ``now`` to frames ``later`` (numbers
-    [F]) of a sequence."""
+    """Track of the pixel coordinates [P, 2] and their chief rays from frames ``now`` to frames ``later``
+    (numbers [F]) of a sequence."""
     hits = hits_of(rays, views.scene, views.cameras[:, now])
     return follow(camera, hits, views.cameras[:, later], pixels)
 
@@ -251,10 +251,10 @@ def follow(optics: Camera | ProjectionTable, hits: Hits, later: Tensor, pixels: 
 def later_points(rays: Rays, scene: Any, T_world_cam: Poses) -> tuple[Tensor, Tensor]:
     """Points under rays at the first pose of each trajectory, as they lie before the camera at its last.
 
-    Args: rays: Rays [P] (chief rays). scene: as for ``true_flow``; points move with their object. T_world_cam:
-      [..., T, 4, 4].
-    Returns: points [B, P, 3] metres in the axes of the last camera, B trajectories; seen [B, P] bool: it met a
-      surface, and lies before the last camera (the point is (0, 0, 1) elsewhere).
+    Args: rays: Rays [P] (chief rays). scene: as for ``true_flow``; points move with their object.
+      T_world_cam: [..., T, 4, 4].
+    Returns: points [B, P, 3] metres in the axes of the last camera, B trajectories; seen [B, P] bool: it met
+      a surface, and lies before the last camera (the point is (0, 0, 1) elsewhere).
     Gradient: to rays, camera and object poses, the surface taken as its tangent plane at the hit.
     """
     views = views_of(scene, T_world_cam, rays)
@@ -264,7 +264,8 @@ def later_points(rays: Rays, scene: Any, T_world_cam: Poses) -> tuple[Tensor, Te
 
 
 def _before(hits, later):
-    """Points that were hit in the axes of cameras ``later`` [parts, F, 4, 4], and whether they lie before them."""
+    """Points that were hit in the axes of cameras ``later`` [parts, F, 4, 4], and whether they lie before
+    them."""
     points = carried(hits, inverse(later))
     in_front = (hits.part >= 0) & (points.detach()[..., 2] > NEAREST_M)
     return torch.where(
@@ -274,7 +275,8 @@ def _before(hits, later):
 
 @torch.no_grad()
 def _hidden(camera, scene, later, found):
-    """Whether something is nearer than the tracked points at the later frames [parts, F, 4, 4]: [F, P] bool."""
+    """Whether something is nearer than the tracked points at the later frames [parts, F, 4, 4]: [F, P]
+    bool."""
     if found.chief is None:
         at = torch.where(found.valid[..., None], found.to_px, camera.film.middle_px)
         rays = camera.chief_rays(at.reshape(-1, 2))

@@ -17,8 +17,8 @@ def camera_velocity(T_world_cam: Poses, t_s: Tensor | Sequence[float]) -> tuple[
     """Mean velocity of a camera between its poses: the constant twist that leads from each pose to the next.
 
     Args: T_world_cam: [..., T >= 2, 4, 4]. t_s: [T] times, increasing, the same for all trajectories.
-    Returns: two twists [..., T - 1, 6], translation of the camera's origin (m/s) then rotation (rad/s): in the
-      camera's own axes, where it is the same all
+    Returns: two twists [..., T - 1, 6], translation of the camera's origin (m/s) then rotation (rad/s): in
+      the camera's own axes, where it is the same all
       through the interval, and in world axes, as it is at the middle of the interval.
     Gradient: to the poses.
     Raises: DomainError when times do not increase or the camera turns by more than 3 rad from one pose to the

@@ -44,15 +44,15 @@ def shaded(rays: Rays, views: Views, samples_per_pixel: int) -> Tensor:
     for part in parts(scene):
         if not hasattr(part, "radiance") or not hasattr(part, "dtype"):
             raise DomainError(
-                f"a {type(part).__name__} lacks ``radiance`` or ``dtype``, so it cannot be rendered; write them "
-                "as TexturedPlane has them."
+                f"a {type(part).__name__} lacks ``radiance`` or ``dtype``, so it cannot be rendered; write "
+                "them as TexturedPlane has them."
             )
     dtype = scene.dtype
     if (needed := count * poses * dtype.itemsize) > memory_bytes():
         raise DomainError(
-            f"{count * poses:.3g} rays ({count} for each of {poses} frames) bring {needed / 2**30:.3g} GiB of light "
-            f"at once, this machine has {memory_bytes() / 2**30:.3g} GiB; render fewer frames at a time "
-            "(frame_chunks)."
+            f"{count * poses:.3g} rays ({count} for each of {poses} frames) bring {needed / 2**30:.3g} GiB "
+            f"of light at once, this machine has {memory_bytes() / 2**30:.3g} GiB; render fewer frames at a "
+            "time (frame_chunks)."
         )
     lines = [rays.origin_m.mT.to(dtype), rays.direction.mT.to(dtype), rays.weight.to(dtype)]
     cameras = views.cameras[:, :, :3].to(dtype)
@@ -61,8 +61,9 @@ def shaded(rays: Rays, views: Views, samples_per_pixel: int) -> Tensor:
 
 
 def light_and_nearness(rays: Rays, views: Views) -> tuple[Tensor, Tensor]:
-    """Radiance [T, N] along rays [N] given in camera space, seen in views of T frames, and 1 / depth [T, N] per
-    metre of what they meet, along the camera's axis; 0 where they meet nothing. The rays' weights do not count.
+    """Radiance [T, N] along rays [N] given in camera space, seen in views of T frames, and 1 / depth [T, N]
+    per metre of what they meet, along the camera's axis; 0 where they meet nothing. The rays' weights do not
+    count.
 
     Gradient: of both to the rays, the poses and the poses of moving objects, as ``shade``; depth through the
     tangent plane of what is met.

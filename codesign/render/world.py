@@ -71,8 +71,8 @@ class MitsubaScene:
             return self.mi.load_dict({"type": "scene", **description}, optimize=merge)
 
     def two_sided(self) -> "MitsubaScene":
-        """The same scene with surfaces that show from behind what they show from in front, as sheets and meshes
-        of unknown winding need; otherwise they are black there."""
+        """The same scene with surfaces that show from behind what they show from in front, as sheets and
+        meshes of unknown winding need; otherwise they are black there."""
         twin = copy.copy(self)
         twin.both_sides = True
         twin._outline = None
@@ -84,8 +84,8 @@ class MitsubaScene:
         return self.radiance_and_distance(arr, origin, direction)[0]
 
     def radiance_and_distance(self, arr: Any, origin: Any, direction: Any) -> Any:
-        """Radiance as above, and the distance to what is hit (infinite where nothing is). Gradient: to the rays,
-        the surface taken as its tangent plane."""
+        """Radiance as above, and the distance to what is hit (infinite where nothing is). Gradient: to the
+        rays, the surface taken as its tangent plane."""
         import drjit as dr
 
         mi = self.mi
@@ -156,7 +156,8 @@ class MitsubaScene:
         return self.emitted(shape, emitter, si, dr.abs(facing) if self.both_sides else facing)
 
     def emitted(self, shape: Any, emitter: Any, si: Any, facing: Any) -> Any:
-        """Radiance that an emitter shows on a shape where it is met (drjit arrays); 0 where ``facing`` is negative."""
+        """Radiance that an emitter shows on a shape where it is met (drjit arrays); 0 where ``facing`` is
+        negative."""
         import drjit as dr
 
         si.wi = self.mi.Vector3f(0, 0, facing)
@@ -187,7 +188,8 @@ class MitsubaScene:
         return self._outline
 
     def nearest_m(self, eye_m: Tensor) -> float:
-        """Distance from a point [3] in world axes below which there is no surface; infinite without shapes."""
+        """Distance from a point [3] in world axes below which there is no surface; infinite without
+        shapes."""
         if self._bodies is None:
             self._bodies = Bodies.of(self._read())
         return self._bodies.nearest_m(eye_m.detach().numpy())
@@ -238,8 +240,8 @@ class MitsubaScene:
 
 
 def _never_black(curve):
-    """Curves of surfaces that show on both sides: an edge that counts from every side counts also from that which its
-    faces turn away from."""
+    """Curves of surfaces that show on both sides: an edge that counts from every side counts also from that
+    which its faces turn away from."""
     if not isinstance(curve, Segments):
         return curve
     return replace(curve, normals=torch.where(curve.always[:, None, None], 0.0, curve.normals))

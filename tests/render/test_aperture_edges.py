@@ -1,5 +1,5 @@
-"""Light that apertures take away, sampled at their edges: its gradient against plain samples of the whole pupil, many
-of them, and how much less it scatters with few."""
+"""Light that apertures take away, sampled at their edges: its gradient against plain samples of the whole
+pupil, many of them, and how much less it scatters with few."""
 
 import pytest
 import torch

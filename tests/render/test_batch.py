@@ -88,7 +88,8 @@ def by_time(function):
     ],
 )
 def test_what_a_batch_gives_is_what_each_trajectory_gives(of_poses):
-    # products of 4 x 4 matrices may round differently in another batch; float32 scenes have every bit or a phase apart
+    # products of 4 x 4 matrices may round differently in another batch; float32 scenes have every bit or a
+    # phase apart
     found = of_poses(paths())
     torch.testing.assert_close(found, one_by_one(of_poses, paths()), rtol=1e-10, atol=1e-10)
     assert not torch.equal(found[0, 0], found[0, 1])
@@ -109,7 +110,8 @@ def gradients(cam, scene, poses, way, weights, separate):
 
 @pytest.mark.parametrize("way", ["interior", "boundary", "auto", "difference"])
 def test_gradients_of_a_batch_are_those_of_each_trajectory(way, generator):
-    # float32 frames, whose adjoints are sums over 8 x 8 pixels x 4 samples in any order; "auto" finds edges in all
+    # float32 frames, whose adjoints are sums over 8 x 8 pixels x 4 samples in any order; "auto" finds edges
+    # in all
     scene = silhouettes.build("cubes")
     cam = Camera(lens.load("cooke-triplet").scaled(0.11).freeze(), 8, 8, 1.0, 4)
     poses = paths(2, (2, 2), look_at((0.05, -1.2, 1.0), (0.0, 1.0, 0.7)))

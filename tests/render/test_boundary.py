@@ -101,8 +101,8 @@ def test_auto_takes_the_cheapest_way_that_agrees():
     "lengths_px", [(0.3, 0.05, 1e-4, 0.39), (5.0, 0.01, 0.19, 0.7, 0.3), (2.0, 3.3), (0.01,)]
 )
 def test_points_on_curves_stand_for_their_whole_length(lengths_px, generator):
-    """Shares times lengths add up to the length of all pieces, however short, since what is constant along them is
-    to be summed exactly; points on the short ones lie evenly along their total length."""
+    """Shares times lengths add up to the length of all pieces, however short, since what is constant along
+    them is to be summed exactly; points on the short ones lie evenly along their total length."""
     length = torch.tensor(lengths_px, dtype=F64).repeat(30)
     piece, inside, share = _places(length, 2.5, generator)
     assert bool(((inside >= 0) & (inside <= 1)).all())
@@ -123,8 +123,8 @@ def test_points_on_curves_stand_for_their_whole_length(lengths_px, generator):
 
 @pytest.mark.parametrize("scale", [1.0, 1e-3])
 def test_differences_step_by_a_share_of_a_pixel_in_small_scenes(scale):
-    """A cube before a wall, in metres and in millimetres: the same picture, so gradients to translations are as one
-    over the scale, and turns alike."""
+    """A cube before a wall, in metres and in millimetres: the same picture, so gradients to translations are
+    as one over the scale, and turns alike."""
     mi = backend.mitsuba()
     T = mi.ScalarTransform4f().scale(scale)
 

@@ -1,6 +1,6 @@
-"""The boundary term where the chain needs it: objects that move, the robot's own body before its camera, cameras with
-aimed pupils, spectrum and falloff, windows on the film and batches of trajectories. Differences with common random
-numbers are the judge."""
+"""The boundary term where the chain needs it: objects that move, the robot's own body before its camera,
+cameras with aimed pupils, spectrum and falloff, windows on the film and batches of trajectories. Differences
+with common random numbers are the judge."""
 
 import pytest
 import torch
@@ -26,8 +26,8 @@ def triplet():
 
 
 def judged(loss, many=512, seeds=(11, 12), per_px=12.0):
-    """Relative L2 error of the boundary and the interior gradient of loss(twist [6], samples, seed, way, per_px)
-    against differences, and the noise of these."""
+    """Relative L2 error of the boundary and the interior gradient of loss(twist [6], samples, seed, way,
+    per_px) against differences, and the noise of these."""
     truths = []
     for seed in seeds:
         with torch.no_grad():
@@ -89,8 +89,8 @@ def test_windows_on_the_film_each_have_their_own_edges():
 
 @pytest.mark.parametrize("optics", [lens.Pinhole(11.0), triplet()], ids=["pinhole", "traced"])
 def test_the_mount_of_a_camera_that_sees_its_robot(optics):
-    """The robot stands in the world with the camera on it; what is asked for is the pose of the mount, under which
-    the world moves and the robot's own body too."""
+    """The robot stands in the world with the camera on it; what is asked for is the pose of the mount, under
+    which the world moves and the robot's own body too."""
     scene, robot = silhouette_scenes.build("cubes"), silhouette_scenes.robot()
     T_world_robot = pose.se3_exp(torch.tensor([[0.05, -1.2, 1.0, 0.0, 0.0, 0.1]], dtype=F64))
     T_robot_cam = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, -0.15))
@@ -125,8 +125,8 @@ def test_the_pose_of_an_object_that_moves():
 
 
 def test_every_frame_is_looked_at_and_again_through_a_wider_lens():
-    """A ball that sinks into the wall in the second of three frames; a picture with hard texels that only the wider of
-    two lenses sees."""
+    """A ball that sinks into the wall in the second of three frames; a picture with hard texels that only the
+    wider of two lenses sees."""
     mi = backend.mitsuba()
     wall, ball = silhouette_scenes.build("wall"), silhouette_scenes.ball()
     camera = render.Camera(lens.Pinhole(11.0), 32, 32, 0.25, 4)
@@ -149,8 +149,8 @@ def test_every_frame_is_looked_at_and_again_through_a_wider_lens():
 
 
 def test_auto_sees_faint_edges_and_asks_the_rays_of_any_lens():
-    """A card of one per cent more radiance than what is behind it; a lens that is no module and holds its focal length
-    under a name of its own; a scene that cannot be a key."""
+    """A card of one per cent more radiance than what is behind it; a lens that is no module and holds its
+    focal length under a name of its own; a scene that cannot be a key."""
 
     class Plain:
         dtype = F64

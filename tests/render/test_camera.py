@@ -78,10 +78,10 @@ def test_points_outside_the_field_are_nan_and_leave_the_others_alone():
 
 @pytest.mark.parametrize("semi_aperture_mm", [0.02, 0.2])
 def test_points_behind_the_edge_of_an_aperture_are_nan(semi_aperture_mm):
-    """The stop is seen through a plane 3 mm behind it, in glass of 1.5: the exit pupil lies 2 mm before the plane.
-    So the chief ray of a film point at height h crosses the plane, 95 mm before the film, at 2 h / 97; what passes
-    its aperture is hidden, however little or far it is beyond the edge (the solver comes back into the field by
-    another number of steps for each of these)."""
+    """The stop is seen through a plane 3 mm behind it, in glass of 1.5: the exit pupil lies 2 mm before the
+    plane. So the chief ray of a film point at height h crosses the plane, 95 mm before the film, at 2 h / 97;
+    what passes its aperture is hidden, however little or far it is beyond the edge (the solver comes back
+    into the field by another number of steps for each of these)."""
     glass = lens.Glass.from_indices(1.5, 1.5, 1.5)
 
     def camera(semi_aperture_mm):
@@ -151,7 +151,8 @@ def test_defocus_takes_contrast_away_as_a_blur_disc_does(kind, tolerance):
 
 
 def test_the_blur_disc_of_a_thin_lens_has_the_diameter_of_the_defocus_formula():
-    """Focused at s: 1/s = 1/f - 1/s'. An object at z has a blur disc of diameter A s' |1/s - 1/z| on the film."""
+    """Focused at s: 1/s = 1/f - 1/s'. An object at z has a blur disc of diameter A s' |1/s - 1/z| on the
+    film."""
     f, aperture, image, z = 8.0, 2.5, 8.05, 0.6
     angle = torch.linspace(0, 2 * math.pi, 13, dtype=D)[:-1]
     rim = torch.stack([angle.cos(), angle.sin()], 1)

@@ -56,8 +56,8 @@ def test_frames_of_the_analytic_plane_in_double_precision(generator):
     def loss(*parameters):
         return (frames(*parameters) * weights).sum()
 
-    # exp of cosines is smooth: steps of 1e-6 m move phases by 1e-4, so differences bend by 1e-9; rounding 1e-13 of the
-    # loss over 1e-6
+    # exp of cosines is smooth: steps of 1e-6 m move phases by 1e-4, so differences bend by 1e-9; rounding
+    # 1e-13 of the loss over 1e-6
     assert_gradients(loss, [torch.zeros(6, dtype=D)] * 3, [1e-6] * 3, 1e-7)
 
 

@@ -168,8 +168,9 @@ def test_baked_light_is_path_traced_light_on_every_kind_of_shape(still_life, bak
         ours, theirs = (
             radiance_at(scene, points[there], normals[there], 5e-4) for scene in (baked_still_life, reference)
         )
-        # 131,072 paths per face, 16 to 6000 texels of 256 paths: below 0.5 %; 50 texels of a mesh's face: below 1 %, and
-        # light that falls off within a texel towards the floor is smeared. Over the floor there is next to no light
+        # 131,072 paths per face, 16 to 6000 texels of 256 paths: below 0.5 %; 50 texels of a mesh's face:
+        # below 1 %, and light that falls off within a texel towards the floor is smeared. Over the floor
+        # there is next to no light
         least, share = (5.0, 0.01) if made else (0.5 / 0.03, 0.03)
         assert abs(float((ours - theirs).mean())) < share * max(float(theirs.mean()), least)
 

@@ -1,5 +1,5 @@
-"""Moving objects: the same world seen from the object's own axes, what is nearest by hand, and gradients to object
-poses."""
+"""Moving objects: the same world seen from the object's own axes, what is nearest by hand, and gradients to
+object poses."""
 
 import pytest
 import torch
@@ -41,8 +41,8 @@ def even(radiance, z_m=0.0):
 
 @pytest.mark.parametrize("optics", [lens.Pinhole(8.0), TRIPLET])
 def test_an_object_is_seen_as_from_its_own_axes(optics):
-    """Only relative motion is seen: the card before the wall through the moving camera is the still card through the
-    camera in the card's axes."""
+    """Only relative motion is seen: the card before the wall through the moving camera is the still card
+    through the camera in the card's axes."""
     cam = camera(12, 8, 4, optics)
     found = render.frames(cam, MovingScene(plane(2, -3.0), {"card": (plane(1), OBJECTS)}), POSES)
     # the poses are multiplied in another order: rounding times the phase gradient
@@ -52,7 +52,8 @@ def test_an_object_is_seen_as_from_its_own_axes(optics):
 
 
 def test_nearest_of_several_objects_and_the_background_where_nothing_is_met():
-    """The near ball is 8.04 px wide each way, 0.2 / sqrt(4 - 0.04) under 8 mm, and its middle 4 px to one side."""
+    """The near ball is 8.04 px wide each way, 0.2 / sqrt(4 - 0.04) under 8 mm, and its middle 4 px to one
+    side."""
 
     def ball(radiance, *place):
         glow = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}

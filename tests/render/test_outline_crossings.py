@@ -54,7 +54,8 @@ def test_a_box_through_a_floor_and_through_a_box():
     }
     assert total_length(curves(box=box, floor=floor)) == pytest.approx(24 + 8 * 1.5 + 4 * 1.0, abs=1e-4)
     other = {"type": "cube", "to_world": place().translate([0.9, 0.8, 0.7])}
-    # cubes of side 2 whose corners overlap by 1.1 x 1.2 x 1.3 m: three pairs of faces cross along each of these
+    # cubes of side 2 whose corners overlap by 1.1 x 1.2 x 1.3 m: three pairs of faces cross along each of
+    # these
     assert total_length(curves(a={"type": "cube"}, b=other)) == pytest.approx(
         48 + 2 * (1.1 + 1.2 + 1.3), abs=1e-4
     )
@@ -62,8 +63,8 @@ def test_a_box_through_a_floor_and_through_a_box():
 
 @pytest.mark.parametrize("sunk_m", [0.0, 1e-7, -1e-7, 5e-5])
 def test_what_stands_on_a_floor_has_its_edges_once(sunk_m):
-    """A box and a pole that touch the floor, to rounding or to a hair: no curve beside the box's edges and the rim,
-    which are read from beyond the hair."""
+    """A box and a pole that touch the floor, to rounding or to a hair: no curve beside the box's edges and
+    the rim, which are read from beyond the hair."""
     floor = {"type": "rectangle", "to_world": place().scale(3)}
     box = {"type": "cube", "to_world": place().translate([0.5, 0.1, 0.5 - sunk_m]).scale([0.2, 0.3, 0.5])}
     pole = {"type": "cylinder", "p0": [-0.5, 0.0, -sunk_m], "p1": [-0.5, 0.0, 1.0], "radius": 0.1}
@@ -75,7 +76,8 @@ def test_what_stands_on_a_floor_has_its_edges_once(sunk_m):
 
 
 def test_half_a_ball_of_triangles_sunk_to_its_very_equator_has_it_as_an_edge():
-    """A smooth mesh with a ring of vertices in the floor's plane: its edges there are no creases, and count."""
+    """A smooth mesh with a ring of vertices in the floor's plane: its edges there are no creases, and
+    count."""
     n = 24
     turn = 2 * np.pi * np.arange(n) / n
     rings = [
@@ -102,8 +104,8 @@ def test_meshes_that_do_not_cross_themselves_have_no_crossing():
 
 @pytest.mark.parametrize("shift", [0.0, 1e-7])
 def test_faces_in_one_plane_are_refused_where_they_are_seen(shift):
-    """A picture hung into the plane of its wall; not where both show one radiance, or are tiles side by side, or seen
-    from behind, or out of view."""
+    """A picture hung into the plane of its wall; not where both show one radiance, or are tiles side by side,
+    or seen from behind, or out of view."""
     T = place()
 
     def tile(x, value, half=0.5, height=0.0):
@@ -219,7 +221,8 @@ MEET = (0.6**2 + 0.5**2 - 0.4**2) / (2 * 0.6)  # of two spheres, from the first 
             ellipse(0.2 / math.cos(LEAN), 0.2),
             1e-4,
         ),
-        # two ellipses in the planes x = +z and x = -z, half axes r and r sqrt(2); they cross where surfaces touch
+        # two ellipses in the planes x = +z and x = -z, half axes r and r sqrt(2); they cross where surfaces
+        # touch
         (
             cylinder((1.0, 0, 0), 0.3),
             cylinder((0, 0, 1.0), 0.3),

@@ -1,5 +1,5 @@
-"""Curves as seen from a point: tangency, both lines of a cylinder from end to end, and how far beside the true
-outline Mitsuba's float32 rays find it."""
+"""Curves as seen from a point: tangency, both lines of a cylinder from end to end, and how far beside the
+true outline Mitsuba's float32 rays find it."""
 
 import numpy as np
 import pytest
@@ -77,7 +77,8 @@ def hits(scene, origin, direction):
 
 
 def last_hits(scene, eyes, along, aside, low, high):
-    """Angles [n] at which rays turned aside by them meet the scene no more, by bisection between low and high [n]."""
+    """Angles [n] at which rays turned aside by them meet the scene no more, by bisection between low and high
+    [n]."""
     for _ in range(26):
         middle = (low + high) / 2
         hit = hits(scene, eyes, np.cos(middle)[:, None] * along + np.sin(middle)[:, None] * aside)
@@ -171,8 +172,8 @@ def test_float32_rays_find_straight_edges_within_the_reading_angle(offset_m, dis
 
 @pytest.mark.parametrize("eye", [(0.3, 0.4, 0.9), (3.0, 0.4, 1e-3), (0.5, 0.2, 1e-4), (0.0, 0.0, 2.0)])
 def test_no_piece_of_a_rim_turns_back(eye):
-    """A piece that went out and came back would look short: seen from the viewpoint, no piece bends by more than a
-    quarter turn, however nearly edge-on, and together they are the whole rim."""
+    """A piece that went out and came back would look short: seen from the viewpoint, no piece bends by more
+    than a quarter turn, however nearly edge-on, and together they are the whole rim."""
     rim = Circles(row(0.1, 0, 0), row(0.2, 0.1, 0), row(-0.15, 0.3, 0), row(0, 0, 0), torch.zeros(1))
     eye = torch.tensor(eye, dtype=F64)
     index, bounds = rim.pieces(eye, 0.01)
@@ -186,7 +187,8 @@ def test_no_piece_of_a_rim_turns_back(eye):
 
 @pytest.mark.parametrize("towards", [(0.2, 1.5, 0.2), (0.0, 1.0, 0.0), (1.0, 1.0, 1.0), (-2.0, 0.3, 0.3)])
 def test_a_place_on_a_sphere_has_one_name_from_all_points_of_a_pupil(towards, generator):
-    """A pupil of 2 mm before a ball of 0.3 m: the same parameters are the same places, to some millimetres."""
+    """A pupil of 2 mm before a ball of 0.3 m: the same parameters are the same places, to some
+    millimetres."""
     eye = torch.tensor([0.3, -0.2, 0.1], dtype=F64)
     curve = ball((eye + torch.tensor(towards, dtype=F64)).tolist(), 0.3)
     index, s = curve.pieces(eye, 0.1)

@@ -44,7 +44,8 @@ def test_flat_diagonals_are_no_edges_and_inner_edges_count_at_silhouettes_only()
 
 
 def test_faces_wound_against_their_neighbour_part_light_from_black():
-    """Light leaves a face on one side, so a flat diagonal counts where its two triangles are wound differently."""
+    """Light leaves a face on one side, so a flat diagonal counts where its two triangles are wound
+    differently."""
     some = np.random.default_rng(3).random(len(CUBE)) < 0.5
     edges = mesh_edges(CORNERS, np.where(some[:, None], CUBE[:, ::-1], CUBE))
     assert len(edges) == 12 + int((some[::2] != some[1::2]).sum())
@@ -101,7 +102,8 @@ def test_an_edge_of_three_faces_counts_from_every_side():
 
 
 def test_edges_between_faces_of_unequal_radiance_count_even_where_flat():
-    """A flat grid of n x n squares in rows of one radiance: n - 1 lines of n edges between rows, and the rim."""
+    """A flat grid of n x n squares in rows of one radiance: n - 1 lines of n edges between rows, and the
+    rim."""
     n = 7
     vertices = np.stack([*np.mgrid[: n + 1, : n + 1], np.zeros((n + 1, n + 1))], 2).reshape(-1, 3)
     faces = solids.squares(n + 1, n + 1)
@@ -125,7 +127,8 @@ def lines(*ends):
 
 @pytest.mark.parametrize("shift", [0.0, 3e-5, 0.49999e-4, 0.5e-4])
 def test_where_edges_overlap_does_not_hang_on_rounding(shift):
-    """Stretches of a slanted line from many intervals, moved about by less than the tolerance: their union, once."""
+    """Stretches of a slanted line from many intervals, moved about by less than the tolerance: their union,
+    once."""
     rng = np.random.default_rng(5)
     along = np.array([0.36, 0.48, 0.8])
     begin = rng.uniform(0, 3, 12)
@@ -152,7 +155,8 @@ def test_edges_that_count_as_one_are_read_from_beyond_both():
 
 
 def test_boxes_of_different_sizes_that_touch_share_their_edges():
-    """Two boxes side by side, fronts and floors flush: along the lower's edges every stretch once. Total length by
+    """Two boxes side by side, fronts and floors flush: along the lower's edges every stretch once. Total
+    length by
     hand: two boxes' edges less what both have."""
     mi = backend.mitsuba()
     T = mi.ScalarTransform4f
@@ -169,7 +173,8 @@ def test_boxes_of_different_sizes_that_touch_share_their_edges():
     curves = MitsubaScene({"low": low, "tall": tall}, merge=False).outline()
     (edges,) = [curve for curve in curves if isinstance(curve, Segments)]
     length = (edges.end - edges.start).norm(dim=1)
-    # edges of 1 x 1 x 0.5 and of 1 x 0.5 x 1 m; at x = 1 they share 0.5 m of the floor's and 0.5 m of the front's
+    # edges of 1 x 1 x 0.5 and of 1 x 0.5 x 1 m; at x = 1 they share 0.5 m of the floor's and 0.5 m of the
+    # front's
     assert float(length.sum()) == pytest.approx(4 * 2.5 + 4 * 2.5 - 0.5 - 0.5, abs=1e-5)
 
 

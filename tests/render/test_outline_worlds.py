@@ -1,5 +1,6 @@
-"""Worlds whose gradient was once wrong without a word: thin poles near and far, a mesh with one radiance per face,
-an edge of a floor against two walls. Against closed forms and differences with common random numbers."""
+"""Worlds whose gradient was once wrong without a word: thin poles near and far, a mesh with one radiance per
+face, an edge of a floor against two walls. Against closed forms and differences with common random
+numbers."""
 
 import math
 
@@ -49,8 +50,9 @@ def judged(turn_rad, pitch_mm, nearest_m, **shapes):
 
 
 def loss_of_a_pole(task, start, end, radius, radiance, twist):
-    """The task's loss for a bright pole that crosses the picture from top to bottom, before black: along every line
-    across the picture the pole lies between two planes through the eye; the weights are constant within a pixel."""
+    """The task's loss for a bright pole that crosses the picture from top to bottom, before black: along
+    every line across the picture the pole lies between two planes through the eye; the weights are constant
+    within a pixel."""
     T = (task.pose @ pose.se3_exp(torch.tensor(twist, dtype=F64)[None]))[0].numpy()
     eye = T[:3, 3]
     axis = (end - start) / np.linalg.norm(end - start)
@@ -122,8 +124,8 @@ def five_poles():
 
 
 def test_poles_with_their_ends_in_view():
-    """With points up to their very ends: an estimate of 2.5 points a pixel is off by no more than its usual noise,
-    whichever the seed."""
+    """With points up to their very ends: an estimate of 2.5 points a pixel is off by no more than its usual
+    noise, whichever the seed."""
     task = Task(MitsubaScene({**five_poles(), "wall": wall()}), "pinhole")
     truth = torch.stack([task.differences("pose", 256, seed) for seed in (11, 12)]).mean(0) * SCALE
     whole = task.gradient("pose", 256, 13, "boundary", 32.0) * SCALE
@@ -156,9 +158,9 @@ def test_lines_without_width_between_faces_are_no_jumps():
 
 @pytest.mark.parametrize("ratio", [5, 100])
 def test_a_dark_ball_through_a_mesh_however_far(ratio):
-    """A mesh of 320 faces with a black ball of half its radius before its centre, the film narrower the further it is. The
-    ball's outline lies just within the mesh and the curve along which the two meet just behind the ball, both nearer to
-    what is seen than rays pass beside them."""
+    """A mesh of 320 faces with a black ball of half its radius before its centre, the film narrower the
+    further it is. The ball's outline lies just within the mesh and the curve along which the two meet just
+    behind the ball, both nearer to what is seen than rays pass beside them."""
     radius, distance = 0.3, 0.3 * ratio
     vertices, faces = icosphere(2)
     ball = {"type": "sphere", "center": [0.06, distance - 0.24, 0.03], "radius": 0.15, "emitter": light(0)}
@@ -174,8 +176,8 @@ def test_a_dark_ball_through_a_mesh_however_far(ratio):
     ids=["6 m aside", "13 degrees of turning", "0.3 m aside of what is near"],
 )
 def test_a_view_is_looked_at_though_another_was_right(twist, nearer, monkeypatch):
-    """A wall at 100 m that alone is seen at first, and a ball that moves through a cube 10 m ahead, aside, or as much
-    smaller and nearer. A camera that moves by a thousandth of that is not looked through again."""
+    """A wall at 100 m that alone is seen at first, and a ball that moves through a cube 10 m ahead, aside, or
+    as much smaller and nearer. A camera that moves by a thousandth of that is not looked through again."""
     T = backend.mitsuba().ScalarTransform4f
     far = T().translate([0, 0, 100.0]).rotate([1, 0, 0], 180).scale(80.0)
     aside = T().scale(1 / nearer).translate([-7.2, 0, 10.0]).rotate([1, 1, 0], 40).scale(0.8)

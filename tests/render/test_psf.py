@@ -1,4 +1,5 @@
-"""Point spread functions of a camera, and frames by them, against closed forms, forward traces and traced frames."""
+"""Point spread functions of a camera, and frames by them, against closed forms, forward traces and traced
+frames."""
 
 import math
 
@@ -113,7 +114,8 @@ def test_vignetting_is_that_of_traced_frames():
     traced = render.frames(cam, even, FRONT[None]).detach()
     assert float(traced.min()) < 0.7 * float(traced.max())
     found = render.psf_frames(cam, even, FRONT[None]).detach()
-    # an aperture's hard edge passes over the 16 x 16 points of the pupil up to a row at a time, 1/16 of the light
+    # an aperture's hard edge passes over the 16 x 16 points of the pupil up to a row at a time, 1/16 of the
+    # light
     away = (found - traced).abs() / traced.max()
     assert float(away.max()) < 1 / 16
     assert float(away.square().mean().sqrt()) < 0.01

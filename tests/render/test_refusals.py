@@ -63,18 +63,6 @@ def flat(level):
     return worlds.wall(np.full((8, 8), level, dtype=np.float32))
 
 
-class Shining(TexturedPlane):
-    """A plane of one radiance, whatever it is: a scene of a user's own is not looked at where it is built."""
-
-    def __init__(self, level):
-        super().__init__([], [], [])
-        self.level = level
-
-    def radiance_and_distance(self, arr, origin, direction):
-        found, distance = super().radiance_and_distance(arr, origin, direction)
-        return 0 * found + self.level, distance
-
-
 class Brighter(MitsubaScene):
     """Twice the radiance, whose distances would tell of the plain scene."""
 
@@ -293,7 +281,7 @@ def test_scenes_and_poses_that_do_not_fit(call, scene, poses, sentence):
         (loaded(), r"the scene is a Scene, .* worlds.from_mitsuba\(scene\)"),
     ],
 )
-@pytest.mark.parametrize("call", [render.frames, render.true_flow, render.check_view])
+@pytest.mark.parametrize("call", [render.frames, render.true_flow])
 def test_what_is_no_scene(call, scene, sentence):
     with pytest.raises(DomainError, match=sentence):
         call(CAMERA, scene, POSES)
@@ -378,48 +366,6 @@ def test_more_frames_than_memory_holds_are_refused(monkeypatch):
         render.frames(CAMERA, PLANE, POSES[:1].expand(100, 4, 4))
     window = Film(200_000, 200_000, 8, 8, 0.001, ((99_996, 99_996),))
     assert Camera(PINHOLE, 8, 8, 0.001, 1, film=window).rays().weight.numel() == 64
-
-
-# ---- views
-
-
-def nearing():
-    """A ball that comes nearer to a camera 2 m above."""
-    ball = MitsubaScene({"ball": {"type": "sphere", "radius": 0.2, "emitter": area(9.0)}})
-    poses = STILL[:2].clone()
-    poses[:, 2, 3] = torch.tensor([0.5, 1.9])
-    return MovingScene(PLANE, {"ball": (ball, poses)})
-
-
-def towards(*views, down=(0, 0, -1)):
-    return torch.stack([look_at(*view, down=down) for view in views])
-
-
-DOWN = towards(*[((0, 0, 2.0), (0, 0, 0))] * 2, down=(0, 1, 0))
-UP = towards(((0, 0, 2.0), (0, 0, 4.0)), down=(0, 1, 0))
-LOW = towards(((0.5, -1.2, 1.4), (0, 1, 0.8)), ((0.1, 0.5, 0.25), (0, 1, 0.3)))
-
-
-@pytest.mark.parametrize(
-    ("scene", "poses", "sentence"),
-    [
-        (lambda: PLANE, 1.01 * POSES, "not rigid"),
-        (worlds.room, LOW, "frame 1: 100% .* meet surfaces from behind"),
-        (lambda: worlds.room(objects=False), towards(((0, -4.0, 1.3), (0, 0, 1.3))), "behind a wall"),
-        (lambda: flat(50.0), towards(((0, -2.0, 0), (0, -3.0, 0))), "frame 0 is empty"),
-        (lambda: PLANE, torch.cat([DOWN, DOWN[:1], UP]).unflatten(0, (2, 2)), "frame 3 is empty"),
-        (
-            lambda: PLANE,
-            towards(((0, 0, 2e-4), (0, 0, 0)), down=(0, 1, 0)),
-            "0.201 mm before the camera, which is less than the radius",
-        ),
-        (nearing, DOWN, "frame 1: 100%"),
-        (lambda: Shining(-3.0), POSES, "frame 0 has a radiance of -3"),
-    ],
-)
-def test_views_no_camera_could_have(scene, poses, sentence):
-    with pytest.raises(DomainError, match=sentence):
-        render.check_view(NARROW, scene(), poses)
 
 
 # ---- time
@@ -514,7 +460,9 @@ def psf():
     (lambda psf: psf.energy(2.0), ShapeError, r"distances must be a list \[D\]"),
     (lambda psf: psf.offsets_px([1.1]), DomainError, "must lie between 0 and 1 per metre"),
     (
-        lambda psf: render.psf_frames(THIN, PLANE, towards(((0, 0, 0.5), (0, 0, 0)), down=(0, 1, 0)), psf),
+        lambda psf: render.psf_frames(
+            THIN, PLANE, look_at((0, 0, 0.5), (0, 0, 0), down=(0, 1, 0))[None], psf
+        ),
         DomainError,
         "0.5 m away, nearer than the 1 m of the map",
     ),

@@ -1,4 +1,5 @@
-"""Gradients of frames from the slopes of every ray's light: kept, or worked out again; and which rays visit what."""
+"""Gradients of frames from the slopes of every ray's light: kept, or worked out again; and which rays visit
+what."""
 
 import pytest
 import torch
@@ -36,8 +37,8 @@ def motion(generator):
 
 
 def pictures(origin, direction, weight, camera, thing):
-    """Two pixels of a camera three metres before a plane; another plane moves before it in the second frame, and
-    behind it in the others."""
+    """Two pixels of a camera three metres before a plane; another plane moves before it in the second frame,
+    and behind it in the others."""
     behind = torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1)
     behind[:, 2, 3] = torch.tensor([0.8, -0.8, 0.8])
     scene = render.MovingScene(plane(), {"thing": (plane(), behind @ pose.se3_exp(thing))})

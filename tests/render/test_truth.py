@@ -74,9 +74,9 @@ def test_what_leaves_the_field_or_meets_nothing_is_invalid_zero_and_without_grad
 
 
 def test_points_of_one_flat_ground_never_hide_each_other():
-    """Seen from 2 cm above it, out to cosines of incidence of a few thousandths, where single precision moves the
-    point that a ray meets along the ground by its rounding over that cosine; the ground lies askew, so that all its
-    coordinates round."""
+    """Seen from 2 cm above it, out to cosines of incidence of a few thousandths, where single precision moves
+    the point that a ray meets along the ground by its rounding over that cosine; the ground lies askew, so
+    that all its coordinates round."""
     mi = backend.mitsuba()
     T_world_ground = se3_exp(torch.tensor([3.0, -2.0, 1.5, 0.5, 0.3, -0.4], dtype=D))
     to_world = mi.ScalarTransform4f(T_world_ground.numpy()).scale([200, 200, 1])

@@ -1,5 +1,5 @@
-"""Curves in a scene where radiance may jump: edges of meshes, rims, the outlines of spheres and cylinders as seen
-from a point, and where shapes pass through each other."""
+"""Curves in a scene where radiance may jump: edges of meshes, rims, the outlines of spheres and cylinders as
+seen from a point, and where shapes pass through each other."""
 
 from typing import Any
 
@@ -14,8 +14,8 @@ from codesign.render.silhouettes.shapes import Ball, Disk, Mesh, Shape, Tube
 
 
 def outlines(shapes: list[Shape]) -> list[Any]:
-    """All curves of the shapes of a scene: a list of Segments, Circles, Spheres, Cylinders, Meridians, Intersections, and of
-    Overlaps that refuse to be seen."""
+    """All curves of the shapes of a scene: a list of Segments, Circles, Spheres, Cylinders, Meridians,
+    Intersections, and of Overlaps that refuse to be seen."""
     if not shapes:
         return []
     apart_m = tolerance(np.concatenate([shape.corners() for shape in shapes]))
@@ -57,7 +57,8 @@ def outlines(shapes: list[Shape]) -> list[Any]:
 
 
 def _seams(shapes):
-    """Straight lines on which pictures of cylinders and disks begin: their last column need not go on in the first."""
+    """Straight lines on which pictures of cylinders and disks begin: their last column need not go on in the
+    first."""
     lines = [(s.start + s.u, s.end + s.u) for s in shapes if isinstance(s, Tube) and s.light is None]
     lines += [(s.centre, s.centre + s.u) for s in shapes if isinstance(s, Disk) and s.light is None]
     return segments(*(_columns(lines) if lines else (np.zeros((0, 3)), np.zeros((0, 3)))))

@@ -4,9 +4,9 @@ across the film.
 With pupil point q fixed, the film is cut by curves where radiance jumps. When such a curve moves by v along
 its normal n, a pixel gains (L- - L+) v per length of curve, L- and L+ the radiances before and behind it
 along n. The term is estimated by points on the curves, and enters as w (x(y, q) . n), whose value is taken
-out again and whose gradient is that of the film position x of the world point y: through the lens, the pose of
-the camera and that of the object, whatever they depend on. Sources: Li et al., Differentiable Monte Carlo ray
-tracing through edge sampling, SIGGRAPH Asia 2018 (the term); Reynolds' transport theorem.
+out again and whose gradient is that of the film position x of the world point y: through the lens, the pose
+of the camera and that of the object, whatever they depend on. Sources: Li et al., Differentiable Monte Carlo
+ray tracing through edge sampling, SIGGRAPH Asia 2018 (the term); Reynolds' transport theorem.
 """
 
 import math
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.pose import apply, inverse
-from codesign.render.camera import Camera, coloured_rays
+from codesign.render.camera import Camera
 from codesign.render.moving import Views, parts
 from codesign.render.silhouettes.curve_points import FieldOfView, curve_points
 from codesign.render.silhouettes.jumps import jumps
@@ -44,10 +44,10 @@ def boundary_term(camera: Camera, views: Views, per_px: float = 2.5) -> Tensor:
         return torch.zeros(shape, dtype=dtype)
     back = inverse(views.cameras)[found.part, found.frame]
     y = apply(back, found.world_m[:, None])[:, 0]
-    origin, direction, _ = coloured_rays(camera, found.film_px, found.pupil, found.colour)
-    ahead = (y[:, 2:] - origin[:, 2:]) / direction[:, 2:]
+    rays = camera.coloured_rays(found.film_px, found.pupil, found.colour)
+    ahead = (y[:, 2:] - rays.origin_m[:, 2:]) / rays.direction[:, 2:]
     # zero; how it changes tells how the film position must
-    miss = origin[:, :2] + direction[:, :2] * ahead - y[:, :2]
+    miss = rays.origin_m[:, :2] + rays.direction[:, :2] * ahead - y[:, :2]
     along = -(miss * found.per_miss).sum(1)
     image = torch.zeros(math.prod(shape), dtype=torch.float64).index_add(
         0, found.pixel, found.weight * (along - along.detach())
@@ -56,7 +56,8 @@ def boundary_term(camera: Camera, views: Views, per_px: float = 2.5) -> Tensor:
 
 
 def radiance_jumps(camera: Camera, views: Views) -> bool:
-    """Whether any frame shows an edge or outline at which radiance jumps by more than CONTRAST of what is seen there;
+    """Whether any frame shows an edge or outline at which radiance jumps by more than CONTRAST of what is
+    seen there;
     looked at by few points. Raises: as ``boundary_term``."""
     found = _seen(camera, views.detach(), GLANCE_PER_PX)
     return found is not None and bool((found.contrast > CONTRAST).any())
@@ -78,7 +79,7 @@ def _curves(scene):
     if not hasattr(scene, "outline"):
         raise DomainError(
             f"gradient 'boundary' needs a scene that lists the curves where its radiance jumps, but a "
-            f"{type(scene).__name__} has no outline(); give it one as MitsubaScene has it (an empty list where nothing "
-            "jumps), or use 'difference'."
+            f"{type(scene).__name__} has no outline(); give it one as MitsubaScene has it (an empty list "
+            "where nothing jumps), or use 'difference'."
         )
     return list(scene.outline())

@@ -1,5 +1,5 @@
-"""FieldOfView of a scene that were looked at, and which other views need no look of their own: those that show nothing which
-lies more than WITHIN_PX from what was seen, wherever it is, in view or beside it."""
+"""FieldOfView of a scene that were looked at, and which other views need no look of their own: those that
+show nothing which lies more than WITHIN_PX from what was seen, wherever it is, in view or beside it."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,8 +17,8 @@ MOST = 256  # views that are kept of a scene
 
 @dataclass(frozen=True)
 class Looked:
-    """A view that was found right: the camera [parts, 4, 4] in the axes of every part, the distance [parts] of the nearest
-    surface of each, and what of space falls on the film."""
+    """A view that was found right: the camera [parts, 4, 4] in the axes of every part, the distance [parts]
+    of the nearest surface of each, and what of space falls on the film."""
 
     cameras: Tensor
     nearest_m: Tensor
@@ -43,7 +43,8 @@ def _rad(motion, near_m):
 
 
 def nearest_m(parts: tuple[Any, ...], cameras: Tensor) -> Tensor:
-    """Distance [parts] from cameras [parts, 4, 4] of the nearest surface of every part, 0 for those that do not say."""
+    """Distance [parts] from cameras [parts, 4, 4] of the nearest surface of every part, 0 for those that do
+    not say."""
     eyes = cameras[:, :3, 3].cpu()
     return torch.tensor(
         [

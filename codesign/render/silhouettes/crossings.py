@@ -1,7 +1,8 @@
 """Where shapes pass through each other, and a mesh through itself: segments along which two triangles cross.
 
-Round shapes stand as fine triangles here; their segments are carried onto the true curve in ``intersections``. Where faces
-of different radiance lie in one plane, one over the other, rounding decides which is met: such views are refused.
+Round shapes stand as fine triangles here; their segments are carried onto the true curve in
+``intersections``. Where faces of different radiance lie in one plane, one over the other, rounding decides
+which is met: such views are refused.
 """
 
 from dataclasses import dataclass
@@ -22,7 +23,8 @@ BLOCK = 1_000_000  # pairs at a time
 
 @dataclass(frozen=True)
 class Triangles(Rows):
-    """corners: [N, 3, 3]; place: [N, 3], equal for corners of one shape at one place; shape, face: [N], numbers."""
+    """corners: [N, 3, 3]; place: [N, 3], equal for corners of one shape at one place; shape, face: [N],
+    numbers."""
 
     corners: np.ndarray
     place: np.ndarray
@@ -32,8 +34,8 @@ class Triangles(Rows):
 
 @dataclass(frozen=True)
 class Crossings(Rows):
-    """Segments start, end [n, 3] along which two triangles cross; normals: [n, 2, 3] of these; shapes: [n, 2],
-    their numbers."""
+    """Segments start, end [n, 3] along which two triangles cross; normals: [n, 2, 3] of these; shapes: [n,
+    2], their numbers."""
 
     start: np.ndarray
     end: np.ndarray
@@ -43,7 +45,8 @@ class Crossings(Rows):
 
 @dataclass(frozen=True)
 class Overlaps(Curve):
-    """A line start, end [n, 3] across every overlap; normal: [n, 3] of both faces; names: of their shapes [n]. No
+    """A line start, end [n, 3] across every overlap; normal: [n, 3] of both faces; names: of their shapes
+    [n]. No
     radiance can be read there: where it is asked how, the scene is refused."""
 
     start: Tensor
@@ -67,14 +70,14 @@ class Overlaps(Curve):
         first, second = self.names[int(index[0])]
         at = ", ".join(f"{v:.3g}" for v in self.start[index[0]].tolist())
         raise DomainError(
-            f"faces of shapes '{first}' and '{second}' lie in one plane near ({at}) m, one over the other, and rounding "
-            "decides which is seen; move one of them by a millimetre."
+            f"faces of shapes '{first}' and '{second}' lie in one plane near ({at}) m, one over the other, "
+            "and rounding decides which is seen; move one of them by a millimetre."
         )
 
 
 def find_crossings(shapes: list[Shape], apart_m: float = 0.0) -> tuple[Crossings, Overlaps | None]:
-    """All segments along which the shapes cross each other, and meshes themselves; and where faces of different
-    radiance lie in one plane and overlap by more than ``apart_m``."""
+    """All segments along which the shapes cross each other, and meshes themselves; and where faces of
+    different radiance lie in one plane and overlap by more than ``apart_m``."""
     triangles = _near_others(shapes)
     noise = ROUNDING * float(np.abs(triangles.corners).max(initial=0))
     pairs = touching(triangles.corners, noise)
@@ -119,8 +122,8 @@ def _neighbours(place, pairs):
 
 
 def _near_others(shapes):
-    """Triangles of all shapes: of meshes all, since they may cross themselves; of others those within the box of
-    another shape."""
+    """Triangles of all shapes: of meshes all, since they may cross themselves; of others those within the box
+    of another shape."""
     lows, highs = (np.stack([of(s.corners(), 0) for s in shapes]) for of in (np.min, np.max))
     parts = []
     for number, shape in enumerate(shapes):
@@ -144,7 +147,8 @@ def _near_others(shapes):
 
 
 def tessellated(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] and faces [F, 3] of a shape; round ones lie half within and half beyond their triangles."""
+    """Vertices [V, 3] and faces [F, 3] of a shape; round ones lie half within and half beyond their
+    triangles."""
     if isinstance(shape, Mesh):
         return shape.vertices, shape.faces
     turn = 2 * np.pi * np.arange(AROUND) / AROUND
@@ -171,8 +175,9 @@ def tessellated(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _crossing(triangles, pairs, noise):
-    """Crossings of pairs [n, 2] of triangles, and the pairs [m, 2] that lie in one plane and face one way. A corner on
-    the other's plane counts as above it, so that an edge that lies in a face is found from one of its sides at most."""
+    """Crossings of pairs [n, 2] of triangles, and the pairs [m, 2] that lie in one plane and face one way. A
+    corner on the other's plane counts as above it, so that an edge that lies in a face is found from one of
+    its sides at most."""
     pair = [triangles[pairs[:, side]] for side in (0, 1)]
     normals = [_normals(side.corners) for side in pair]
     height = [
@@ -213,7 +218,8 @@ def _normals(corners):
 
 
 def _on_plane(corners, height):
-    """The two points [n, 2, 3] where sides of triangles [n, 3, 3] meet a plane over which corners are ``height``
+    """The two points [n, 2, 3] where sides of triangles [n, 3, 3] meet a plane over which corners are
+    ``height``
     [n, 3]: one corner lies on one side, the two others on the other."""
     above = height >= 0
     lone = np.where(above.sum(1) == 1, above.argmax(1), (~above).argmax(1))
@@ -231,8 +237,8 @@ def _on_plane(corners, height):
 def overlaps(
     first: np.ndarray, second: np.ndarray, normal: np.ndarray, apart_m: float
 ) -> tuple[np.ndarray, ...]:
-    """Of triangles [n, 3, 3] in one plane each, with normals [n, 3]: the rows of those that overlap by more than
-    ``apart_m``, and the middle [m, 3] and a far end [m, 3] of what they share."""
+    """Of triangles [n, 3, 3] in one plane each, with normals [n, 3]: the rows of those that overlap by more
+    than ``apart_m``, and the middle [m, 3] and a far end [m, 3] of what they share."""
     origin = first[:, :1]
     u = first[:, 1] - first[:, 0]
     u /= np.linalg.norm(u, axis=1, keepdims=True)

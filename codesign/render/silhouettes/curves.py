@@ -2,17 +2,17 @@
 and cylinders.
 
 A curve is cut into pieces [s0, s1] of its parameter; a piece becomes a point of the world once a parameter
-and a viewpoint are given. ``aside_rad`` says how far to either side of the true curve the radiances before and
-behind it are read, ``counts`` whether the curve is one from a place of the pupil, and ``face_slope`` how steeply the
-faces on both its sides are seen.
+and a viewpoint are given. ``aside_rad`` says how far to either side of the true curve the radiances before
+and behind it are read, ``counts`` whether the curve is one from a place of the pupil, and ``face_slope`` how
+steeply the faces on both its sides are seen.
 
 Rays are cast in float32. Mitsuba finds a sphere or cylinder of radius r at distance d by the sign of
 b^2 - 4 a c, of size (r / d)^2 of its terms; an error of one part in 2^23 of these moves the edge by
 2^-23 d / r rad. Measured by bisection at d / r from 1.2 to 5000, coordinates up to 100 m from the origin: at
 most 1.05 times that for both, and 2^-23 times coordinate over distance where that is larger (cylinders, whose
-matrix is inverted in float32). A straight edge moves by 2^-23 times 2 or less times the distance of its furthest
-end over that of the ray's point. Readings lie at twice that, never deeper in the shape than half its radius;
-where the edge itself may lie there (beyond some 2,000 radii) the curve is refused.
+matrix is inverted in float32). A straight edge moves by 2^-23 times 2 or less times the distance of its
+furthest end over that of the ray's point. Readings lie at twice that, never deeper in the shape than half its
+radius; where the edge itself may lie there (beyond some 2,000 radii) the curve is refused.
 """
 
 from dataclasses import dataclass, fields
@@ -40,26 +40,30 @@ class Curve:
     """A curve that counts from everywhere, with nothing known of the surfaces beside it."""
 
     def counts(self, index: Tensor, y: Tensor, viewpoint: Tensor) -> Tensor:
-        """Whether [n] the curves ``index`` [n] are any at their points y [n, 3] from the viewpoint [n, 3] itself: next
-        to an outline lie edges that are one from elsewhere in the pupil, and would be counted with it."""
+        """Whether [n] the curves ``index`` [n] are any at their points y [n, 3] from the viewpoint [n, 3]
+        itself: next to an outline lie edges that are one from elsewhere in the pupil, and would be counted
+          with it."""
         return torch.ones_like(index, dtype=torch.bool)
 
     def face_slope(self, index: Tensor, y: Tensor, viewpoint: Tensor) -> Tensor:
-        """Tangent [n] of the angle between view and normal of the steeper of the faces on both sides of points y [n, 3],
+        """Tangent [n] of the angle between view and normal of the steeper of the faces on both sides of
+        points y [n, 3],
         where both are seen: a reading from farther away than they lie has missed them. Infinite elsewhere."""
         return torch.full(index.shape, torch.inf, dtype=torch.float64)
 
     def apex_m(self, index: Tensor) -> Tensor:
-        """Third corners [n, 2, 3] of the triangles on both sides of the curves ``index`` [n], NaN where there are none."""
+        """Third corners [n, 2, 3] of the triangles on both sides of the curves ``index`` [n], NaN where there
+        are none."""
         return torch.full((*index.shape, 2, 3), torch.nan, dtype=torch.float64)
 
 
 @dataclass(frozen=True)
 class Segments(Curve):
-    """Straight edges. start, end: [E, 3]. normals: [E, 2, 3] of the two faces, on the side that shines, 0 where
-    none is known; always: [E] bool, True where it counts from every side but that from which both faces are black
-    (rims, seams, sharp creases). width_m: [E], how far apart edges lie that count as this one. apexes: [E, 2, 3], third
-    corners of the two faces, NaN for none."""
+    """Straight edges. start, end: [E, 3]. normals: [E, 2, 3] of the two faces, on the side that shines, 0
+    where none is known; always: [E] bool, True where it counts from every side but that from which both faces
+    are black
+    (rims, seams, sharp creases). width_m: [E], how far apart edges lie that count as this one. apexes: [E, 2,
+    3], third corners of the two faces, NaN for none."""
 
     start: Tensor
     end: Tensor
@@ -97,7 +101,8 @@ class Segments(Curve):
         return on_line(self, index, s)
 
     def aside_rad(self, index, viewpoint):
-        """Angle [n] from the viewpoint [3] or [n, 3] at which radiances beside the curves ``index`` [n] are read."""
+        """Angle [n] from the viewpoint [3] or [n, 3] at which radiances beside the curves ``index`` [n] are
+        read."""
         start = self.start[index]
         end = self.end[index]
         a = start - viewpoint
@@ -120,8 +125,9 @@ class Segments(Curve):
 
 @dataclass(frozen=True)
 class Circles(Curve):
-    """Rims of disks and cylinders: centre + cos u + sin v, with u and v of the rim's radius; axis: from there to the
-    cylinder's other end, 0 for disks; [C, 3] each. width_m: [C], how far apart rims lie that count as this one."""
+    """Rims of disks and cylinders: centre + cos u + sin v, with u and v of the rim's radius; axis: from there
+    to the cylinder's other end, 0 for disks; [C, 3] each. width_m: [C], how far apart rims lie that count as
+    this one."""
 
     centre: Tensor
     u: Tensor
@@ -130,8 +136,8 @@ class Circles(Curve):
     width_m: Tensor
 
     def pieces(self, viewpoint, angle, within_m=0.0):
-        """As for Segments; all of every rim, cut where it turns back as seen from the viewpoint: a piece that went
-        out and came back would look short and be long."""
+        """As for Segments; all of every rim, cut where it turns back as seen from the viewpoint: a piece that
+        went out and came back would look short and be long."""
         first, share = self._facing(viewpoint)
         arcs = torch.stack([share, 1 - share], 1).reshape(-1)
         index, s = cut(torch.arange(arcs.numel()), (arcs * ROUND).ceil().clamp_min(1).long())
@@ -139,8 +145,8 @@ class Circles(Curve):
         return index // 2, begin[index, None] + arcs[index, None] * s
 
     def _facing(self, viewpoint):
-        """Where the arc that faces the viewpoint begins, and its share of the rim: it ends where lines from the
-        viewpoint's foot in the rim's plane are tangent. Half the rim where there are none."""
+        """Where the arc that faces the viewpoint begins, and its share of the rim: it ends where lines from
+        the viewpoint's foot in the rim's plane are tangent. Half the rim where there are none."""
         towards = viewpoint - self.centre
         across = torch.linalg.cross(self.u, self.v)
         size = across.square().sum(1)
@@ -176,8 +182,9 @@ class Circles(Curve):
 @dataclass(frozen=True)
 class Spheres(Curve):
     """Outlines of spheres: the circle where rays from the viewpoint are tangent. centre: [C, 3]; radius:
-    [C]. Parameters run over 0..1, 2..3 or 4..5: where on the circle they begin is told from the first, second or third
-    axis, the one farthest from the view, so that they name the same place from all points of a pupil."""
+    [C]. Parameters run over 0..1, 2..3 or 4..5: where on the circle they begin is told from the first, second
+    or third axis, the one farthest from the view, so that they name the same place from all points of a
+    pupil."""
 
     centre: Tensor
     radius: Tensor
@@ -283,16 +290,17 @@ def _beside_round(kind, place, radius, across, distance, viewpoint):
         k = int(lost[0])
         at = ", ".join(f"{v:.3g}" for v in place[k].tolist())
         raise DomainError(
-            f"a {kind} of radius {float(radius[k]):.3g} m near ({at}) m is seen from {float(distance[k]):.3g} m, "
-            "too far for float32 rays to find its edge; make it thicker or a mesh, or ask for gradient "
-            "'difference'."
+            f"a {kind} of radius {float(radius[k]):.3g} m near ({at}) m is seen from "
+            f"{float(distance[k]):.3g} m, too far for float32 rays to find its edge; make it thicker or a "
+            "mesh, or ask for gradient 'difference'."
         )
     return torch.minimum(ASIDE_RAD + SAFETY * error + coordinates, deepest)
 
 
 def behind_itself(away: Tensor, towards: Tensor, axis: Tensor) -> Tensor:
-    """Whether points [..., 3] of a round shape, ``away`` from its centre and with ``towards`` left to the viewpoint, lie
-    behind the shape's own near side; ``axis`` of a cylinder from its centre to its other end, 0 for a sphere."""
+    """Whether points [..., 3] of a round shape, ``away`` from its centre and with ``towards`` left to the
+    viewpoint, lie behind the shape's own near side; ``axis`` of a cylinder from its centre to its other end,
+    0 for a sphere."""
     square = axis.square().sum(-1).clamp_min(1e-300)
     across, sight = (v - ((v * axis).sum(-1) / square)[..., None] * axis for v in (away, towards))
     outward = (across * sight).sum(-1)
@@ -325,7 +333,8 @@ def pieces_of(a, b, angle):
 
 
 def cut_line(lines, index, viewpoint, angle):
-    """Pieces, as ``cut`` has them, of lines start to end [n, 3] that subtend at most ``angle`` from the viewpoint."""
+    """Pieces, as ``cut`` has them, of lines start to end [n, 3] that subtend at most ``angle`` from the
+    viewpoint."""
     return cut(index, pieces_of(lines.start[index] - viewpoint, lines.end[index] - viewpoint, angle))
 
 
@@ -343,7 +352,8 @@ def cut(index, count):
 
 
 def _across(axis, beside):
-    """Two unit vectors [n, 3] across unit vectors [n, 3], the first across the coordinate axis ``beside`` [n] too."""
+    """Two unit vectors [n, 3] across unit vectors [n, 3], the first across the coordinate axis ``beside`` [n]
+    too."""
     helper = torch.eye(3, dtype=axis.dtype)[beside]
     u = torch.nn.functional.normalize(torch.linalg.cross(axis, helper), dim=1)
     return u, torch.linalg.cross(axis, u)
@@ -351,7 +361,8 @@ def _across(axis, beside):
 
 @dataclass(frozen=True)
 class Meridians(Curve):
-    """Half circles centre + sin u + cos v for angles 0 to pi. centre, u, v: [C, 3], u and v of the sphere's radius."""
+    """Half circles centre + sin u + cos v for angles 0 to pi. centre, u, v: [C, 3], u and v of the sphere's
+    radius."""
 
     centre: Tensor
     u: Tensor
@@ -371,7 +382,8 @@ class Meridians(Curve):
         return self.centre[index] + turn.sin() * self.u[index] + turn.cos() * self.v[index]
 
     def aside_rad(self, index: Tensor, viewpoint: Tensor) -> Tensor:
-        """As for Segments: texture coordinates follow the point that is met, good to float32 of its distance."""
+        """As for Segments: texture coordinates follow the point that is met, good to float32 of its
+        distance."""
         distance = (self.centre[index] - viewpoint).norm(dim=1)
         return 1e-5 + 1e-6 * distance / self.u[index].norm(dim=1)
 

@@ -1,5 +1,5 @@
-"""Straight edges of triangle meshes that may part two radiances; and what coincides counts once: seams of walls, edges
-that overlap in part, a tube's end and its lid."""
+"""Straight edges of triangle meshes that may part two radiances; and what coincides counts once: seams of
+walls, edges that overlap in part, a tube's end and its lid."""
 
 from dataclasses import dataclass, replace
 
@@ -24,9 +24,10 @@ BITS = 10  # of each coordinate in the order along a space-filling curve
 
 @dataclass(frozen=True)
 class Edges(Rows):
-    """start, end: [E, 3]. normals: [E, 2, 3] of the two faces, the side that shines. always: [E], True where an
-    edge counts from every side. free: [E], True where not just two faces of one mesh meet. width_m: [E], how far
-    apart edges lie that count as this one. apexes: [E, 2, 3], third corners of the two faces, NaN for
+    """start, end: [E, 3]. normals: [E, 2, 3] of the two faces, the side that shines. always: [E], True where
+    an
+    edge counts from every side. free: [E], True where not just two faces of one mesh meet. width_m: [E], how
+    far apart edges lie that count as this one. apexes: [E, 2, 3], third corners of the two faces, NaN for
     none and where more than two meet."""
 
     start: np.ndarray
@@ -58,11 +59,11 @@ def segments(start: np.ndarray, end: np.ndarray) -> Edges:
 def mesh_edges(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray | None = None) -> Edges:
     """Edges of a mesh of vertices [V, 3] and faces [F, 3] that may part two radiances.
 
-    Args: values: [F, 3, k] by which radiance is looked up at the corners of every face; None for one radiance.
-    Vertices at one place are one. An edge of two faces counts from every side where they are creased sharply
-    or their values differ along it, as a silhouette where they are creased at all; an edge of one face, or of
-    three and more, counts always, and so does one between faces wound against each other, of which one is black.
-    Faces without area are left out.
+    Args: values: [F, 3, k] by which radiance is looked up at the corners of every face; None for one
+    radiance. Vertices at one place are one. An edge of two faces counts from every side where they are
+    creased sharply or their values differ along it, as a silhouette where they are creased at all; an edge of
+    one face, or of three and more, counts always, and so does one between faces wound against each other, of
+    which one is black. Faces without area are left out.
     """
     place = welded(vertices, np.ptp(vertices, axis=0).max(initial=0) * SAME_POINT)
     at = place[faces]
@@ -132,9 +133,9 @@ def welded(points: np.ndarray, apart_m: float) -> np.ndarray:
 
 
 def _equal(points):
-    """An order of points [N, 3] with equal ones side by side, and their numbers [N] in it: sorted by a mixture of
-    their coordinates, since sorting rows takes ten times as long. Should two places have one mixture, equal points
-    may get several numbers."""
+    """An order of points [N, 3] with equal ones side by side, and their numbers [N] in it: sorted by a
+    mixture of their coordinates, since sorting rows takes ten times as long. Should two places have one
+    mixture, equal points may get several numbers."""
     mixed = points[:, 0] + np.pi * points[:, 1] + np.e * points[:, 2]
     order = np.argsort(mixed)
     ordered = points[order]
@@ -142,8 +143,8 @@ def _equal(points):
 
 
 def tolerance(points: np.ndarray) -> float:
-    """Distance, metres, below which curves of a scene with points [N, 3] are one: SAME_PLACE_M, less where the
-    scene is smaller than a metre, more where its coordinates are rounded so coarsely."""
+    """Distance, metres, below which curves of a scene with points [N, 3] are one: SAME_PLACE_M, less where
+    the scene is smaller than a metre, more where its coordinates are rounded so coarsely."""
     size = float(np.ptp(points, axis=0).max(initial=0))
     return max(SAME_PLACE_M * min(size, 1.0), ROUNDING * float(np.abs(points).max(initial=0)))
 
@@ -239,8 +240,9 @@ def _from_line(points, edges):
 def rims_once(
     centre: np.ndarray, u: np.ndarray, v: np.ndarray, axis: np.ndarray, width_m: np.ndarray, apart_m: float
 ) -> tuple[np.ndarray, ...]:
-    """Rims centre + cos u + sin v with the ``axis`` of their cylinders, [C, 3] each, that are not one curve with an earlier
-    one, whose axis is then that of either; and ``width_m`` [C], grown by how far apart those lie that are."""
+    """Rims centre + cos u + sin v with the ``axis`` of their cylinders, [C, 3] each, that are not one curve
+    with an earlier one, whose axis is then that of either; and ``width_m`` [C], grown by how far apart those
+    lie that are."""
     # the same however u and v are turned
     shape = np.einsum("ni,nj->nij", u, u) + np.einsum("ni,nj->nij", v, v)
     radius = np.sqrt(np.trace(shape, axis1=1, axis2=2) / 2)
@@ -258,7 +260,8 @@ def rims_once(
 
 
 def touching(corners: np.ndarray, margin_m: float) -> np.ndarray:
-    """Pairs [n, 2], first below second, of triangles or edges, by their corners [N, k, 3], whose boxes come nearer than ``margin_m``."""
+    """Pairs [n, 2], first below second, of triangles or edges, by their corners [N, k, 3], whose boxes come
+    nearer than ``margin_m``."""
     count = len(corners)
     if count < 2:
         return np.zeros((0, 2), dtype=np.int64)

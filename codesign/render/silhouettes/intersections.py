@@ -27,9 +27,11 @@ FOUND = 1e-9  # share of the radius by which a point may miss the surfaces
 
 @dataclass(frozen=True)
 class Intersections(Curve, Rows):
-    """Pieces start, end [n, 3] of curves on two surfaces each, f(x) = (x - c) A (x - c) + b (x - c) + k = 0 with
-    gradients of length one: c, b, axis [n, 2, 3], A [n, 2, 3, 3], k [n, 2], axis that of a tube from c to its other
-    end, 0 for others; curve: [n], which pieces are one curve; radius: [n], the lesser one of the two surfaces."""
+    """Pieces start, end [n, 3] of curves on two surfaces each, f(x) = (x - c) A (x - c) + b (x - c) + k = 0
+    with
+    gradients of length one: c, b, axis [n, 2, 3], A [n, 2, 3, 3], k [n, 2], axis that of a tube from c to its
+    other end, 0 for others; curve: [n], which pieces are one curve; radius: [n], the lesser one of the two
+    surfaces."""
 
     start: Tensor
     end: Tensor
@@ -55,7 +57,8 @@ class Intersections(Curve, Rows):
         return ~((self.k[index] < 0) & behind_itself(away, towards, self.axis[index])).any(1)
 
     def onto(self, piece, x):
-        """Points x [n, 3] near pieces [n] carried onto both surfaces, and how far [n] they still are from these."""
+        """Points x [n, 3] near pieces [n] carried onto both surfaces, and how far [n] they still are from
+        these."""
         c, A, b, k = (v[piece] for v in (self.c, self.A, self.b, self.k))
         for _ in range(TURNS):
             away = x[:, None] - c
@@ -90,8 +93,8 @@ class Intersections(Curve, Rows):
 def on_surfaces(
     found: Crossings, shapes: list[Shape], apart_m: float
 ) -> tuple[Intersections | None, np.ndarray]:
-    """The crossings of which one surface is round, on these surfaces, less those that run along the rim of a tube
-    or disk; and for every shape how far [S, 2] such a crossing lies from its two rims."""
+    """The crossings of which one surface is round, on these surfaces, less those that run along the rim of a
+    tube or disk; and for every shape how far [S, 2] such a crossing lies from its two rims."""
     width = np.zeros((len(shapes), 2))
     if not len(found.start):
         return None, width
@@ -120,8 +123,8 @@ def on_surfaces(
 
 
 def _surfaces(found, shapes, side):
-    """c, b [n, 3], A [n, 3, 3], k [n], axis [n, 3] and radius [n] of one side of all crossings, infinite where
-    it is flat."""
+    """c, b [n, 3], A [n, 3, 3], k [n], axis [n, 3] and radius [n] of one side of all crossings, infinite
+    where it is flat."""
     count = len(found.start)
     c = found.start.copy()
     A = np.zeros((count, 3, 3))

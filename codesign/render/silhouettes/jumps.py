@@ -1,10 +1,11 @@
-"""Radiances on both sides of points on curves, where the camera's own rays see these, and whether they are seen.
+"""Radiances on both sides of points on curves, where the camera's own rays see these, and whether they are
+seen.
 
-A point is hidden when the rays that pass it on either side meet something before it. They pass aside, where a slanting
-surface lies nearer than at the curve itself: where that is in doubt a second pair of rays, twice as far aside, tells
-how the surface goes on, and it is taken back to the curve along a straight line. What is left is rounding of float32.
-Faces narrower than radiance is read beside their edges (slivers) are read along their normal: rays from the camera would
-pass over them, and both their edges would tell of one jump.
+A point is hidden when the rays that pass it on either side meet something before it. They pass aside, where a
+slanting surface lies nearer than at the curve itself: where that is in doubt a second pair of rays, twice as
+far aside, tells how the surface goes on, and it is taken back to the curve along a straight line. What is
+left is rounding of float32. Faces narrower than radiance is read beside their edges (slivers) are read along
+their normal: rays from the camera would pass over them, and both their edges would tell of one jump.
 """
 
 import math
@@ -16,20 +17,21 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from codesign.pose import apply, inverse
-from codesign.render.camera import Camera, coloured_rays
+from codesign.render.camera import Camera
 from codesign.render.rows import Rows
 from codesign.render.silhouettes.curve_points import IN_FRONT_M, NEARBY, CurvePoints
 from codesign.render.wavefront import look
 
-# px, of the film position for the derivative of a ray; the change up to which its root is taken as found, since the
-# next would be of its square
+# px, of the film position for the derivative of a ray; the change up to which its root is taken as found,
+# since the next would be of its square
 STEP_PX = 1e-3
 FOUND_PX = 1e-4
 TURNS = 6
 DOUBTFUL = 0.05  # share of the distance by which a slanting surface may come nearer beside its edge
 ROUNDING = 2.0**-21  # of float32 distances, four units in the last place
 SAFETY = 2.0
-SAME = 0.05  # share of the contrast of a sliver by which what is seen beyond it may differ from what is before it
+# share of the contrast of a sliver by which what is seen beyond it may differ from what is before it
+SAME = 0.05
 NARROW = 4.0  # times as wide as radiance is read to the side: wider faces are met
 WITHIN = 0.1  # share of the way from an edge to the corner beyond it at which a face is read
 FLOAT32 = 2.0**-20  # of coordinates, by which a reading keeps clear of edge and face
@@ -38,10 +40,11 @@ THIN = 1e-9
 
 @dataclass(frozen=True)
 class Jumps(Rows):
-    """Points of curves on the film. row: [n], number of the given point. world [n, 3], frame and part [n], in the axes
-    of the part; film position [n, 2] px, pupil [n, 2], colour [n], pixel [n] of the sequence; normal [n, 2] of the curve
-    on the film; before, behind [n]: radiances along it; seen [n] bool; weight [n] of the jump; per_miss: the motion along
-    the normal per miss of the ray in space, [n, 2] px/m; aside_px [n]: how far to the sides radiances are read."""
+    """Points of curves on the film. row: [n], number of the given point. world [n, 3], frame and part [n], in
+    the axes of the part; film position [n, 2] px, pupil [n, 2], colour [n], pixel [n] of the sequence; normal
+    [n, 2] of the curve on the film; before, behind [n]: radiances along it; seen [n] bool; weight [n] of the
+    jump; per_miss: the motion along the normal per miss of the ray in space, [n, 2] px/m; aside_px [n]: how
+    far to the sides radiances are read."""
 
     row: Tensor
     world_m: Tensor
@@ -66,7 +69,8 @@ class Jumps(Rows):
 
 
 def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> Jumps | None:
-    """The points that fall on the film, with their jumps of radiance, of weight 0 where they are hidden; None for none.
+    """The points that fall on the film, with their jumps of radiance, of weight 0 where they are hidden; None
+    for none.
     cameras: [parts, F, 4, 4]."""
     back = inverse(cameras)[points.part, points.frame]
     y, on = apply(back, torch.stack([points.world_m, points.ahead_m], 1)).unbind(1)
@@ -111,11 +115,12 @@ def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> J
 
 
 def _sides(camera, scene, cameras, points, y, on, x, aside):
-    """Radiances [n] before and behind points y [n, 3] of curves, which go on to ``on`` [n, 3], at film positions x [n, 2],
-    ``aside`` [n, 2] px to either side, and whether the points are seen [n]."""
+    """Radiances [n] before and behind points y [n, 3] of curves, which go on to ``on`` [n, 3], at film
+    positions x [n, 2], ``aside`` [n, 2] px to either side, and whether the points are seen [n]."""
     q, colour = (v.repeat(2, *[1] * (v.ndim - 1)) for v in (points.pupil, points.colour))
-    origin, direction, weight = coloured_rays(camera, torch.cat([x - aside, x + aside]), q, colour)
-    origin, direction, weight = (v.unflatten(0, (2, -1)) for v in (origin, direction, weight.detach()))
+    rays = camera.coloured_rays(torch.cat([x - aside, x + aside]), q, colour)
+    light = camera.light(rays, colour).detach()
+    origin, direction, weight = (v.unflatten(0, (2, -1)) for v in (rays.origin_m, rays.direction, light))
     reach = (y - origin[0]).norm(dim=1)
 
     def read(rows, share, start=0.0):
@@ -162,9 +167,10 @@ def _rad_per_px(y, per_px, slope, normal):
 
 
 def _on_film(camera, y, points):
-    """Where points y [n, 3] in camera axes are seen through points of the pupil: film position [n, 2] px, change of
-    the place at that depth per pixel of it [n, 2, 2] m/px, slope of the ray there [n, 2], and whether light passes
-    [n]. Newton's method on the rays of the camera, from where the lens says light of the point goes."""
+    """Where points y [n, 3] in camera axes are seen through points of the pupil: film position [n, 2] px,
+    change of the place at that depth per pixel of it [n, 2, 2] m/px, slope of the ray there [n, 2], and
+    whether light passes [n]. Newton's method on the rays of the camera, from where the lens says light of the
+    point goes."""
     steps = STEP_PX * torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], dtype=y.dtype)
     x = _first_guess(camera, y, points)
     per_px = torch.eye(2, dtype=y.dtype).repeat(len(y), 1, 1)
@@ -174,9 +180,9 @@ def _on_film(camera, y, points):
     for _ in range(TURNS):
         at = (x[rows] + steps[:, None]).reshape(-1, 2)
         q, colour = points.pupil[rows].repeat(3, 1), points.colour[rows].repeat(3)
-        origin, direction, light = coloured_rays(camera, at, q, colour)
-        origin, direction = (v.reshape(3, -1, 3) for v in (origin, direction))
-        passes = ((light.reshape(3, -1) > 0) & (direction[..., 2] > 1e-6)).all(0)
+        rays = camera.coloured_rays(at, q, colour)
+        origin, direction = (v.reshape(3, -1, 3) for v in (rays.origin_m, rays.direction))
+        passes = ((rays.weight.reshape(3, -1) > 0) & (direction[..., 2] > 1e-6)).all(0)
         slopes = direction[..., :2] / torch.where(passes[:, None], direction[..., 2:], 1.0)
         here = origin[..., :2] + slopes * (y[rows, 2:] - origin[..., 2:])
         change_per_px = torch.stack([here[1] - here[0], here[2] - here[0]], -1) / STEP_PX
@@ -195,18 +201,15 @@ def _on_film(camera, y, points):
 
 
 def _first_guess(camera, y, points):
-    """Film position [n, 2] px of points y [n, 3]: as the lens sends light there, or else along the chief ray of the
-    axis's scale."""
+    """Film position [n, 2] px of points y [n, 3]: as the lens sends light there, or else along the chief ray
+    of the axis's scale."""
     film = camera.film
     if not hasattr(camera.lens, "film_points"):
         return film.middle_px + y[:, :2] / y[:, 2:] / camera.slope_per_px()
-    if camera.spectrum is None:
-        x, _, _ = camera.lens.film_points(1e3 * y, points.pupil)
-        return x / film.pixel_pitch_mm + film.middle_px
     x = torch.zeros_like(y[:, :2])
-    for number, wavelength in enumerate(camera.spectrum.wavelengths_um):
+    for number, (line, _) in enumerate(camera.colours):
         rows = points.colour == number
-        x[rows] = camera.lens.film_points(1e3 * y[rows], points.pupil[rows], wavelength)[0].to(x)
+        x[rows] = camera.lens.film_points(1e3 * y[rows], points.pupil[rows], **line)[0].to(x)
     return x / film.pixel_pitch_mm + film.middle_px
 
 
@@ -222,11 +225,13 @@ def _pixels(film, x, window):
 def sliver_radiance(
     scene: object, cameras: Tensor, points: CurvePoints, y: Tensor, on: Tensor, origin: Tensor, sides: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(side [k], row [k], radiance [k]) where the face that is seen beside a straight edge is a sliver: read along its
-    normal, since radiance is the same in all directions.
+    """(side [k], row [k], radiance [k]) where the face that is seen beside a straight edge is a sliver: read
+    along its normal, since radiance is the same in all directions.
 
-    Args: cameras: [parts, F, 4, 4]. y, on: [n, 3], the points and the same curves a little further on, in camera axes.
-      origin: [n, 3] of the rays to the points; sides: [2, n, 3], directions of the rays before and behind them.
+    Args: cameras: [parts, F, 4, 4]. y, on: [n, 3], the points and the same curves a little further on, in
+      camera axes.
+      origin: [n, 3] of the rays to the points; sides: [2, n, 3], directions of the rays before and behind
+        them.
     """
     known = torch.nonzero(points.apex_m.isfinite().all(2).any(1))[:, 0]
     points, y, on, origin, sides = points[known], y[known], on[known], origin[known], sides[:, known]

@@ -1,12 +1,12 @@
-"""Does a scene list every curve where radiance jumps, and each once? Asked of the picture, not of the geometry.
+"""Does a scene list every curve where radiance jumps, and each once? Asked of the picture, not of the
+geometry.
 
-Lines are laid across the film, each through one point of the pupil; where radiance differs between neighbouring rays
-the larger difference is halved again and again, until what is left is a jump or a slope. The listed curves that cross
-the line there are read as the boundary term reads them, and their jumps together must be the one that was found. What
-differs makes the gradient of that term wrong, and is refused.
+Lines are laid across the film, each through one point of the pupil; where radiance differs between
+neighbouring rays the larger difference is halved again and again, until what is left is a jump or a slope.
+The listed curves that cross the line there are read as the boundary term reads them, and their jumps together
+must be the one that was found. What differs makes the gradient of that term wrong, and is refused.
 """
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.pose import apply
-from codesign.render.camera import Camera, coloured_rays
+from codesign.render.camera import Camera
 from codesign.render.film import coarse_pixels, film_pupil_pattern
 from codesign.render.moving import parts, says_distance
 from codesign.render.rows import Rows
@@ -47,9 +47,9 @@ DOUBTFUL = 0.005  # from which on a first look, of a few lines, is followed by a
 
 @dataclass(frozen=True)
 class Listing:
-    """Of the jumps in a view, weighted by their size: the share that is on no listed curve, the share that curves have
-    beyond what is seen, and the place where most is amiss in world axes (or the axes of the static part); crossings: how
-    many jumps were found."""
+    """Of the jumps in a view, weighted by their size: the share that is on no listed curve, the share that
+    curves have beyond what is seen, and the place where most is amiss in world axes (or the axes of the
+    static part); crossings: how many jumps were found."""
 
     unlisted: float
     doubled: float
@@ -59,9 +59,9 @@ class Listing:
 
 @dataclass(frozen=True)
 class _Crossings(Rows):
-    """Jumps along lines: frame [n]; film position, direction of the line on the film and point of the pupil [n, 2];
-    change [n] of radiance along the line; origin and direction [n, 3] of the ray in camera axes, and distance [n] m of the
-    nearer side."""
+    """Jumps along lines: frame [n]; film position, direction of the line on the film and point of the pupil
+    [n, 2]; change [n] of radiance along the line; origin and direction [n, 3] of the ray in camera axes, and
+    distance [n] m of the nearer side."""
 
     frame: Tensor
     film_px: Tensor
@@ -77,10 +77,10 @@ class _Crossings(Rows):
 def listings(
     camera: Camera, scene: Any, curves: Sequence[Sequence[Any]], cameras: Tensor, lines: int = LINES
 ) -> list[Listing]:
-    """Whether the jumps of views lie on the listed curves, one by one. cameras: [parts, F, 4, 4], the camera in the axes
-    of every part; curves: of every part; lines: each way across the film, at most, in each of the views."""
-    camera = copy.copy(camera)
-    camera.spectrum, camera.falloff = None, False
+    """Whether the jumps of views lie on the listed curves, one by one. cameras: [parts, F, 4, 4], the camera
+    in the axes of every part; curves: of every part; lines: each way across the film, at most, in each of the
+    views."""
+    camera = camera.in_one_colour()
     with torch.no_grad():
         found = _crossings(camera, scene, cameras, lines)
         if len(found.frame):
@@ -107,9 +107,9 @@ def listings(
 def check_listed(
     camera: Camera, view: FieldOfView, scene: Any, curves: Sequence[Sequence[Any]], cameras: Tensor
 ) -> None:
-    """Raise DomainError when a frame of a sequence shows jumps of radiance that the scene does not list, or lists
-    twice. Looked at are frames that may show what was not looked at yet, by fewer lines where there are many. field: of
-    the camera; cameras: [parts, F, 4, 4]."""
+    """Raise DomainError when a frame of a sequence shows jumps of radiance that the scene does not list, or
+    lists twice. Looked at are frames that may show what was not looked at yet, by fewer lines where there are
+    many. field: of the camera; cameras: [parts, F, 4, 4]."""
     known = looked_at(parts(scene), camera.film)
     for start in range(0, cameras.shape[1], FRAMES):
         views = cameras[:, start : start + FRAMES]
@@ -142,15 +142,16 @@ def _check_frames(camera, scene, curves, cameras, rows, start):
         )
         at = ", ".join(f"{v:.3g}" for v in found.place_m or ())
         raise DomainError(
-            f"gradient 'boundary': {share:.0%} of the jumps of radiance in frame {start + row} {what}, the largest near "
-            f"({at}) m: parts of a moving scene that touch, textures with hard texels, or shapes that are not "
+            f"gradient 'boundary': {share:.0%} of the jumps of radiance in frame {start + row} {what}, the "
+            f"largest near ({at}) m: parts of a moving scene that touch, textures with hard texels, or "
+            "shapes that are not "
             "known; move them apart, smooth the texture, or use 'difference'."
         )
 
 
 def reach_m(camera: Camera, scene: Any, cameras: Tensor) -> float:
-    """Median distance of what a view shows, 1 where it shows nothing or a scene that does not say. cameras: the camera
-    [parts, 1, 4, 4] in the axes of every part."""
+    """Median distance of what a view shows, 1 where it shows nothing or a scene that does not say. cameras:
+    the camera [parts, 1, 4, 4] in the axes of every part."""
     if not all(says_distance(type(part)) for part in parts(scene)):
         return 1.0
     pixels = coarse_pixels(camera.film, 8)
@@ -162,8 +163,8 @@ def reach_m(camera: Camera, scene: Any, cameras: Tensor) -> float:
 
 
 def _lines(film, most):
-    """Points of lines across every window: film position [lines, points, 2] px for either way, with direction [2], pupil
-    [lines, 2] and window [lines]."""
+    """Points of lines across every window: film position [lines, points, 2] px for either way, with direction
+    [2], pupil [lines, 2] and window [lines]."""
     generator = torch.Generator().manual_seed(most)
     _, pupils = film_pupil_pattern(64, most)
     for window, (left, top) in enumerate(film.windows_px or ((0, 0),)):
@@ -181,8 +182,8 @@ def _lines(film, most):
 
 @dataclass(frozen=True)
 class _Steps(Rows):
-    """Neighbouring rays between which light changes: frame [n]; film position, light and distance of both [n, 2, 4];
-    direction of their line on the film and point of the pupil [n, 2]; window [n]."""
+    """Neighbouring rays between which light changes: frame [n]; film position, light and distance of both [n,
+    2, 4]; direction of their line on the film and point of the pupil [n, 2]; window [n]."""
 
     frame: Tensor
     ends: Tensor
@@ -197,17 +198,14 @@ class _Steps(Rows):
 
 
 def _crossings(camera, scene, cameras, most):
-    aperture = getattr(camera.lens, "entrance_pupil_diameter_mm", 0.0) > 0
+    aperture = camera.aperture_m > 0
     frames = torch.arange(cameras.shape[1])
-
-    def rays(at, pupil):
-        return coloured_rays(camera, at, pupil, torch.zeros(len(at), dtype=torch.long))
 
     def seen(frame, at, pupil):
         """Film position, light and distance [n, 4]."""
-        origin, direction, weight = rays(at, pupil)
-        light, distance = look(scene, cameras, frame, origin, direction)
-        return torch.cat([at, (weight * light)[:, None], distance[:, None]], 1)
+        rays = camera.rays_through(at, pupil)
+        light, distance = look(scene, cameras, frame, rays.origin_m, rays.direction)
+        return torch.cat([at, (rays.weight * light)[:, None], distance[:, None]], 1)
 
     found = []
     lit = []
@@ -215,13 +213,14 @@ def _crossings(camera, scene, cameras, most):
         pupil = pupil * aperture
         lines, points = at.shape[:2]
         at = at.reshape(-1, 2)
-        origin, direction, weight = rays(at, pupil.repeat_interleave(points, 0))
+        rays = camera.rays_through(at, pupil.repeat_interleave(points, 0))
         every, same = frames.repeat_interleave(len(at)), len(frames)
-        light, distance = look(scene, cameras, every, origin.repeat(same, 1), direction.repeat(same, 1))
-        light = weight.repeat(same) * light
+        origin, direction = (v.repeat(same, 1) for v in (rays.origin_m, rays.direction))
+        light, distance = look(scene, cameras, every, origin, direction)
+        light = rays.weight.repeat(same) * light
         told = torch.cat([at.repeat(same, 1), light[:, None], distance[:, None]], 1)
         told = told.reshape(same, lines, points, 4)
-        passes = (weight > 0).reshape(lines, points)
+        passes = (rays.weight > 0).reshape(lines, points)
         lit.append(told[..., 2].flatten(1))
         frame, line, cell = torch.nonzero(
             passes[:, 1:] & passes[:, :-1] & (told[..., 2].diff(dim=2) != 0)
@@ -249,7 +248,8 @@ def _crossings(camera, scene, cameras, most):
         change = found.change
     near = found.ends[..., 3].amin(1)
     if len(at):
-        origin, direction, _ = rays(at, found.pupil)
+        rays = camera.rays_through(at, found.pupil)
+        origin, direction = rays.origin_m, rays.direction
     else:
         origin = direction = torch.zeros(0, 3, dtype=torch.float64)
     return _Crossings(
@@ -258,11 +258,11 @@ def _crossings(camera, scene, cameras, most):
 
 
 def _listed(camera, scene, curves, cameras, found):
-    """The crossings that can be judged, and the change of radiance [n] along their lines that the listed curves have there,
-    as the boundary term reads them. A line along a curve tells little of it: there is one across."""
+    """The crossings that can be judged, and the change of radiance [n] along their lines that the listed
+    curves have there, as the boundary term reads them. A line along a curve tells little of it: there is one
+    across."""
     angle = piece_rad(camera.slope_per_px())
     near_rad = NEAR_PX * abs(camera.slope_per_px())
-    aperture_m = getattr(camera.lens, "entrance_pupil_diameter_mm", 0.0) * 1e-3 / 2
     rays = []
     points = []
     for part, of_part in enumerate(curves):
@@ -273,7 +273,7 @@ def _listed(camera, scene, curves, cameras, found):
             rows = torch.nonzero((found.frame == frame) & found.distance.isfinite())[:, 0]
             eye = cameras[part, frame, :3, 3]
             for curve in of_part:
-                index, bounds = curve.pieces(eye, angle, aperture_m)
+                index, bounds = curve.pieces(eye, angle, camera.aperture_m)
                 near = curve, index, bounds, eye, o[rows], d[rows], found.distance[rows], near_rad
                 ray, piece = _near(*near)
                 if not ray.numel():
@@ -304,7 +304,8 @@ def _listed(camera, scene, curves, cameras, found):
     away = ((read.film_px - found.film_px[ray]) * read.normal).sum(1)
     met = torch.nonzero((away.abs() < SAFETY * read.aside_px + FOUND_PX) & (turned.abs() > 0))[:, 0]
     ray, turned, away, read = ray[met], turned[met], away[met], read[met]
-    # rounding leaves slivers at edges: the change that counts is that around the nearest curve, as far aside as it is read
+    # rounding leaves slivers at edges: the change that counts is that around the nearest curve, as far aside
+    # as it is read
     least = torch.full_like(total, torch.inf).scatter_reduce(0, ray, away.abs(), "amin")
     first = torch.nonzero(away.abs() == least[ray])[:, 0]
     nearest = torch.full_like(found.frame, -1).scatter_reduce(0, ray[first], first, "amax")
@@ -327,13 +328,13 @@ def _listed(camera, scene, curves, cameras, found):
 def _light(camera, scene, cameras, found, rows, along_px):
     """Light [n] of crossings ``rows`` [n], so far [n] px along their lines."""
     at = found.film_px[rows] + along_px[:, None] * found.along[rows]
-    origin, direction, weight = coloured_rays(camera, at, found.pupil[rows], torch.zeros_like(rows))
-    return weight * look(scene, cameras, found.frame[rows], origin, direction)[0]
+    rays = camera.rays_through(at, found.pupil[rows])
+    return rays.weight * look(scene, cameras, found.frame[rows], rays.origin_m, rays.direction)[0]
 
 
 def _near(curve, index, bounds, eye, origin, direction, distance, near_rad):
-    """Pairs (ray, piece) of which the chord of the piece passes near where the ray [n, 3] meets something at a distance
-    [n]."""
+    """Pairs (ray, piece) of which the chord of the piece passes near where the ray [n, 3] meets something at
+    a distance [n]."""
     if not index.numel():
         return index, index
     a, b = (curve.points(index, s, eye) for s in bounds.unbind(1))
@@ -354,8 +355,8 @@ def _near(curve, index, bounds, eye, origin, direction, distance, near_rad):
 
 
 def _place(curve, index, bounds, origin, direction):
-    """Whether the point of a curve that is nearest to a ray lies on its piece [n], that point and one a little further on
-    [n, 3]; by Newton's method along the piece and a little beyond it."""
+    """Whether the point of a curve that is nearest to a ray lies on its piece [n], that point and one a
+    little further on [n, 3]; by Newton's method along the piece and a little beyond it."""
     low, high = bounds.unbind(1)
     step = STEP * (high - low)
     s = (low + high) / 2

@@ -1,5 +1,6 @@
-"""What a Mitsuba scene is made of, as its outline needs it: triangles with what their radiance is looked up by,
-spheres, disks and cylinders; and how near the nearest of it is. World axes, metres, float64 out of Mitsuba's float32."""
+"""What a Mitsuba scene is made of, as its outline needs it: triangles with what their radiance is looked up
+by, spheres, disks and cylinders; and how near the nearest of it is. World axes, metres, float64 out of
+Mitsuba's float32."""
 
 import re
 from dataclasses import dataclass
@@ -15,9 +16,9 @@ EVEN = 1e-4  # axes of a sphere or cylinder may differ in length and angle by th
 
 @dataclass(frozen=True)
 class Mesh:
-    """vertices: [V, 3]; faces: [F, 3], normals on the side that shines; values: [F, 3, k] by which radiance is
-    looked up at every corner (texture coordinates, colours, radiance of a face), None where it is one for all; light:
-    that one radiance, None where it changes or is not known."""
+    """vertices: [V, 3]; faces: [F, 3], normals on the side that shines; values: [F, 3, k] by which radiance
+    is looked up at every corner (texture coordinates, colours, radiance of a face), None where it is one for
+    all; light: that one radiance, None where it changes or is not known."""
 
     name: str
     vertices: np.ndarray
@@ -185,7 +186,8 @@ def _check_even(name, kind, *axes):
 
 @dataclass(frozen=True)
 class Bodies:
-    """Triangles corners [N, 3, 3] and distances [N] from them to the surface: 0, or the radius about a point or line."""
+    """Triangles corners [N, 3, 3] and distances [N] from them to the surface: 0, or the radius about a point
+    or line."""
 
     corners: np.ndarray
     radius: np.ndarray
