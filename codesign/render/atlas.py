@@ -9,6 +9,8 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from codesign.render.triangles import edge_pairs, normals_of
+
 SAME_POINT = 1e-5  # vertices nearer than this share of the mesh's size are one
 STRAIGHT = 1e-3  # of an edge: how far a parallelogram may be from one
 SMOOTH = 0.8  # cosine of the angle of two faces up to which they share the light of their vertices
@@ -37,8 +39,7 @@ class Cells:
 def cells_of(vertices: np.ndarray, faces: np.ndarray) -> Cells:
     """Cells of a mesh of vertices [V, 3] and faces [F, 3] that have an area."""
     corners = vertices[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
+    normal = normals_of(corners)
     pairs = _parallelograms(places(vertices)[faces], corners, normal)
     alone = np.setdiff1d(np.arange(len(faces)), pairs[:, :2].reshape(-1))
     sides = corners[alone] - np.roll(corners[alone], -1, axis=1)
@@ -65,24 +66,13 @@ def places(vertices: np.ndarray) -> np.ndarray:
 
 
 def shared_edges(place: np.ndarray) -> np.ndarray:
-    """Edges between two faces of places [F, 3]: [E, 4] of face, other face, and the corner where the edge
-    starts in each, running one way in the first and the other way in the second."""
-    face = np.repeat(np.arange(len(place)), 3)
-    corner = np.tile(np.arange(3), len(place))
-    start = place.reshape(-1)
-    end = np.roll(place, -1, axis=1).reshape(-1)
-    low = np.minimum(start, end)
-    high = np.maximum(start, end)
-    order = np.lexsort((start, high, low))
-    key = np.stack([low, high], 1)[order]
-    changes = np.flatnonzero(np.r_[True, (key[1:] != key[:-1]).any(1), True])
-    first = changes[:-1][np.diff(changes) == 2]
-    a = order[first]
-    b = order[first + 1]
-    turned = (start[a] == end[b]) & (start[a] != end[a]) & (face[a] != face[b])
-    a = a[turned]
-    b = b[turned]
-    return np.stack([face[a], face[b], corner[a], corner[b]], 1)
+    """Edges between two faces of places [F, 3]: [E, 4] of face, other face, and the corner where the edge starts
+    in each, running one way in the first and the other way in the second."""
+    one, other, count, rises = edge_pairs(place)
+    apart = (one // 3 != other // 3) & (count == 2) & (rises[one] != rises[other])
+    one, other = one[apart], other[apart]
+    one, other = np.where(rises[one], (one, other), (other, one))
+    return np.stack([one // 3, other // 3, one % 3, other % 3], 1)
 
 
 def _parallelograms(place, corners, normal):
@@ -205,8 +195,7 @@ class Nodes:
 def nodes_of(vertices: np.ndarray, faces: np.ndarray) -> Nodes:
     """Nodes of a mesh of vertices [V, 3] and faces [F, 3]: where faces meet at a crease each has its own."""
     corners = vertices[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
+    normal = normals_of(corners)
     face, other, k, j = shared_edges(places(vertices)[faces]).T
     smooth = (normal[face] * normal[other]).sum(1) > SMOOTH
     face, other, k, j = (part[smooth] for part in (face, other, k, j))

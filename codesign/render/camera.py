@@ -3,7 +3,7 @@
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
@@ -15,9 +15,7 @@ from codesign.types import Rays
 
 _NEWTON_STEPS = 8
 _STEP_MM = 1e-4
-# a first guess beyond the lens's field is drawn towards the axis this often, by this factor
-_SHRINK_STEPS = 3
-_SHRINK = 0.85
+_SHRINK = 0.85  # by which a first guess beyond the lens's field is drawn towards the axis
 CHECKED_ACROSS = 32
 CHECKED_RAYS = 16
 
@@ -228,12 +226,9 @@ class Camera:
     def slope_per_px(self) -> float:
         """Slope of a chief ray per pixel, near the axis; no gradient."""
         with torch.no_grad():
-            rays = self.chief_rays(
-                self.film.middle_px + torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64)
-            )
-        return float(
-            rays.direction[1, 0] / rays.direction[1, 2] - rays.direction[0, 0] / rays.direction[0, 2]
-        )
+            beside = torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64)
+            _, slope = lines(self.chief_rays(self.film.middle_px + beside))
+        return float(slope[1, 0] - slope[0, 0])
 
     def rays_through(self, pixels: Tensor, pupil: Tensor, wavelength_um: float | None = None) -> Rays:
         """Rays of pixel coordinates [N, 2] through points [N, 2] of the pupil, of one colour (the d line when
@@ -251,6 +246,14 @@ def _columns(of, *rays):
     """Rays of which every column is ``of`` those of the given ones; None where one of them does not say."""
     columns = zip(*((r.origin_m, r.direction, r.weight, r.irradiance) for r in rays), strict=True)
     return Rays(*(None if any(v is None for v in column) else of(*column) for column in columns))
+
+
+def lines(rays: Rays) -> tuple[Tensor, Tensor]:
+    """Rays as places on the entrance pupil's plane [N, 2] metres and slopes [N, 2]; those that run aside have slopes
+    of the length of their directions."""
+    ahead = rays.direction[:, 2:]
+    slope = rays.direction[:, :2] / torch.where(ahead.detach() > 1e-6, ahead, 1)
+    return rays.origin_m[:, :2] - rays.origin_m[:, 2:] * slope, slope
 
 
 def project(camera: Camera, points_cam_m: Tensor, pupil: Tensor | None = None) -> Tensor:
@@ -287,45 +290,83 @@ def project(camera: Camera, points_cam_m: Tensor, pupil: Tensor | None = None) -
         else pupil.reshape(-1, 2).to(points_cam_m)
     )
     with torch.no_grad():
-        at = camera.film.middle_px + points_cam_m[:, :2] / points_cam_m[:, 2:] / camera.slope_per_px()
-        step = _STEP_MM / camera.film.pixel_pitch_mm
-        shifts = torch.tensor([[0.0, 0.0], [step, 0.0], [0.0, step]], dtype=at.dtype)
-        for turn in range(_NEWTON_STEPS):
-            miss, passes = _miss(
-                camera,
-                (at[None] + shifts[:, None]).reshape(-1, 2),
-                points_cam_m.repeat(3, 1),
-                pupil.repeat(3, 1),
-            )
-            miss, ahead_x, ahead_y = miss.reshape(3, -1, 2)
-            jacobian = torch.stack([ahead_x - miss, ahead_y - miss], -1) / step
-            found = passes.reshape(3, -1).all(0) & (
-                torch.linalg.det(jacobian).abs() > 1e-12 * jacobian.square().sum((1, 2))
-            )
-            jacobian = torch.where(found[:, None, None], jacobian, torch.eye(2, dtype=at.dtype))
-            change = torch.linalg.solve(jacobian, miss)
-            at = torch.where(
-                found[:, None], at - change, camera.film.middle_px + _SHRINK * (at - camera.film.middle_px)
-            )
-            if bool(
-                (change[found].abs() < 1e-6).all() & (found.all() | (turn >= _SHRINK_STEPS))
-            ):  # the next step would be its square
-                break
-    miss, passes = _miss(camera, at, points_cam_m, pupil)
-    change = torch.linalg.solve(jacobian, torch.where(found[:, None], miss, 0))
-    found = found & passes & (change.detach().abs() < 1e-3).all(1)
-    return torch.where(found[:, None], at - change, torch.nan).reshape(shape)
+        straight = points_cam_m[:, :2] / points_cam_m[:, 2:] / camera.slope_per_px()
+        colour = torch.zeros(len(pupil), dtype=torch.long)
+        guess = camera.film.middle_px + straight
+        apart_px = _STEP_MM / camera.film.pixel_pitch_mm
+        one = camera.in_one_colour()
+        rough = images(one, points_cam_m, pupil, colour, guess, apart_px, 1e-6, _SHRINK)
+    rays = camera.rays_through(rough.at_px, pupil)
+    base, slope = lines(rays)
+    miss = base + slope * points_cam_m[:, 2:] - points_cam_m[:, :2]
+    found = rough.step_px.isfinite()
+    change = torch.linalg.solve(rough.m_per_px, torch.where(found[:, None], miss, 0))
+    found = (
+        found
+        & (rays.weight.detach() > 0)
+        & (rays.direction.detach()[:, 2] > 1e-6)
+        & (change.detach().abs() < 1e-3).all(1)
+    )
+    return torch.where(found[:, None], rough.at_px - change, torch.nan).reshape(shape)
 
 
-def _miss(camera, pixels, points_cam_m, pupil):
-    """Where rays pass the depth of the points, minus the points: [N, 2] metres; and whether light takes them:
-    [N]."""
-    rays = camera.rays_through(pixels, pupil)
-    origin = rays.origin_m
-    direction = rays.direction
-    passes = (rays.weight.detach() > 0) & (direction.detach()[:, 2] > 1e-6)
-    ahead = (points_cam_m[:, 2:] - origin[:, 2:]) / torch.where(passes[:, None], direction[:, 2:], 1)
-    return origin[:, :2] + direction[:, :2] * ahead - points_cam_m[:, :2], passes
+@dataclass(frozen=True)
+class Images:
+    """Where N points are seen: at_px [N, 2]; m_per_px [N, 2, 2], change of the place at that depth per pixel; slope
+    [N, 2] of the ray there; step_px [N], the last step of Newton's method, infinite where no light passes."""
+
+    at_px: Tensor
+    m_per_px: Tensor
+    slope: Tensor
+    step_px: Tensor
+
+
+def images(
+    camera: Camera,
+    points_cam_m: Tensor,
+    pupil: Tensor,
+    colour: Tensor,
+    guess_px: Tensor,
+    apart_px: float,
+    within_px: float,
+    shrink: float = 0.0,
+) -> Images:
+    """Images of points [N, 3] in camera axes through points [N, 2] of the pupil, in the colours of their numbers [N].
+
+    By Newton's method from a guess [N, 2] on the rays of the camera, their derivatives by differences over
+    ``apart_px``, until a step is below ``within_px``. What gets no light is drawn towards the axis by ``shrink``
+    and tried again; 0 gives it up.
+    """
+    at = guess_px.clone()
+    m_per_px = torch.eye(2, dtype=at.dtype).repeat(len(at), 1, 1)
+    slope = torch.zeros_like(at)
+    step_px = torch.full_like(at[:, 0], torch.inf)
+    middle = camera.film.middle_px
+    shifts = apart_px * torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], dtype=at.dtype)
+    rows = torch.arange(len(at))
+    for _ in range(_NEWTON_STEPS):
+        film_px = (at[rows] + shifts[:, None]).reshape(-1, 2)
+        rays = camera.coloured_rays(film_px, pupil[rows].repeat(3, 1), colour[rows].repeat(3))
+        origin, direction = (v.reshape(3, -1, 3) for v in (rays.origin_m, rays.direction))
+        passes = ((rays.weight.reshape(3, -1) > 0) & (direction[..., 2] > 1e-6)).all(0)
+        slopes = direction[..., :2] / torch.where(passes[:, None], direction[..., 2:], 1.0)
+        meets = origin[..., :2] + slopes * (points_cam_m[rows, 2:] - origin[..., 2:])
+        per_px = torch.stack([meets[1] - meets[0], meets[2] - meets[0]], -1) / apart_px
+        passes &= torch.linalg.det(per_px).abs() > 1e-12 * per_px.square().sum((1, 2))
+        lost, rows, per_px = rows[~passes], rows[passes], per_px[passes]
+        change = torch.linalg.solve(per_px, meets[0, passes] - points_cam_m[rows, :2])
+        at[rows] -= change
+        m_per_px[rows] = per_px
+        slope[rows] = slopes[0, passes]
+        step_px[rows] = change.abs().amax(1)
+        step_px[lost] = torch.inf
+        rows = rows[step_px[rows] >= within_px]
+        if shrink:
+            at[lost] = middle + shrink * (at[lost] - middle)
+            rows = torch.cat([rows, lost])
+        if not rows.numel():
+            break
+    return Images(at, m_per_px, slope, step_px)
 
 
 def angular_miss_rad(camera: Camera, pixels: Tensor, points_cam_m: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from codesign.exclusive import exclusive
 from codesign.render.atlas import Atlas, Nodes, atlas_of, cells_of, nodes_of
 from codesign.render.mitsuba_shapes import front_faces, is_mirrored
 from codesign.render.scene_checks import checked_mesh
+from codesign.render.triangles import across
 from codesign.render.world import MitsubaScene
 
 FINE_MESH = 0.5  # of a texel: meshes whose pieces are smaller on the average have their light at vertices
@@ -73,7 +74,7 @@ def chart_of(mi: Any, shape: Any, texel: float, detail: float | None) -> Chart |
 
 
 def _areas(corners):
-    return np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    return np.linalg.norm(across(corners), axis=1) / 2
 
 
 def placed(mi: Any, chart: Chart | Nodes, to_world: np.ndarray, light: list[np.ndarray]) -> tuple[Any, Any]:

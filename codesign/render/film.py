@@ -76,14 +76,17 @@ class Film:
 
     def pixels(self) -> Tensor:
         """Coordinates (x, y) of all pixel centres on the full sensor, [P, 2] float64, in image order."""
-        y, x = torch.meshgrid(
-            torch.arange(self.height_px, dtype=torch.float64),
-            torch.arange(self.width_px, dtype=torch.float64),
-            indexing="ij",
-        )
-        base = torch.stack([x.reshape(-1), y.reshape(-1)], 1)
-        corners = torch.tensor(self.windows_px or ((0, 0),), dtype=torch.float64)
-        return (corners[:, None] + base).reshape(-1, 2)
+        rows, columns = (torch.arange(n, dtype=torch.float64) for n in (self.height_px, self.width_px))
+        return self.in_windows(rows, columns)
+
+    @property
+    def corners_px(self) -> Tensor:
+        """First pixel (x, y) of every window, [W, 2] float64; that of the sensor without windows."""
+        return torch.tensor(self.windows_px or ((0, 0),), dtype=torch.float64)
+
+    def in_windows(self, rows: Tensor, columns: Tensor) -> Tensor:
+        """Coordinates (x, y) of these rows and columns of every window, [W x rows x columns, 2], in image order."""
+        return (self.corners_px[:, None] + torch.cartesian_prod(rows, columns).flip(1)).reshape(-1, 2)
 
 
 def check_memory(film: Film, samples_per_pixel: int) -> None:
@@ -108,9 +111,7 @@ def coarse_pixels(film: Film, every_px: int) -> Tensor:
         else torch.zeros(1, dtype=torch.float64)
         for n in (film.height_px, film.width_px)
     )
-    y, x = torch.meshgrid(rows, columns, indexing="ij")
-    corners = torch.tensor(film.windows_px or ((0, 0),), dtype=torch.float64)
-    return (corners[:, None] + torch.stack([x.reshape(-1), y.reshape(-1)], 1)).reshape(-1, 2)
+    return film.in_windows(rows, columns)
 
 
 def film_pupil_pattern(samples, seed):

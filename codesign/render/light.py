@@ -146,16 +146,19 @@ def level_error(
     """
     with torch.no_grad():
         first = _flat(camera, scene_reference, T_world_cam)
-        second = (
-            _flat(camera, scene_reference.with_seed(scene_reference.seed + 1), T_world_cam)
-            if hasattr(scene_reference, "with_seed")
-            else first
-        )
+        second = _again(camera, scene_reference, T_world_cam, first)
         return _compare(_flat(camera, scene_cheap, T_world_cam), first, second)
 
 
 def _flat(camera, scene, T_world_cam):
     return frames(camera, scene, T_world_cam).double().flatten(1)
+
+
+def _again(camera, scene, T_world_cam, first):
+    """Frames with other random numbers, where a scene draws any."""
+    if not hasattr(scene, "with_seed"):
+        return first
+    return _flat(camera, scene.with_seed(scene.seed + 1), T_world_cam)
 
 
 def _compare(cheap, first, second):
@@ -215,8 +218,6 @@ def choose(
             f"light.choose: tolerance = {tolerance} must be positive and finite, such as 0.05 for 5 %."
         )
     *_, last = levels
-    reference = levels[last]
-    errors = {}
     cpu_s = {}
     with torch.no_grad():
         pictures = {}
@@ -225,13 +226,8 @@ def choose(
             start = time.process_time()
             pictures[name] = _flat(camera, scene, T_world_cam)
             cpu_s[name] = time.process_time() - start
-        other = (
-            _flat(camera, reference.with_seed(reference.seed + 1), T_world_cam)
-            if hasattr(reference, "with_seed")
-            else pictures[last]
-        )
-    for name, picture in pictures.items():
-        errors[name] = _compare(picture, pictures[last], other)
+        other = _again(camera, levels[last], T_world_cam, pictures[last])
+    errors = {name: _compare(picture, pictures[last], other) for name, picture in pictures.items()}
     worst = {
         name: 0.0 if name == last else float((e.rms_after_gain if after_gain else e.rms).max())
         for name, e in errors.items()

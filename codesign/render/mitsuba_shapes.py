@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from codesign.render.triangles import across
+
 ROOM = 1e-3  # of the diagonal
 
 
@@ -45,8 +47,7 @@ def _against_normals(shape, parameters, faces):
         np.array(parameters[key], dtype=np.float64).reshape(-1, 3)[faces]
         for key in ("vertex_positions", "vertex_normals")
     )
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return (across * normals.sum(1)).sum(1) < 0
+    return (across(corners) * normals.sum(1)).sum(1) < 0
 
 
 def vertex_attribute(surface: Any) -> str | None:

@@ -1,6 +1,7 @@
 """A world with objects that move: every object is a scene in its own frame, with a pose per frame of the
 sequence."""
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
@@ -88,13 +89,12 @@ class MovingScene:
 
     def during(self, frames: slice | Sequence[int]) -> "MovingScene":
         """The same scene for some of the frames only: a slice or a list of frame numbers."""
-        return MovingScene(
-            self.static,
-            {
-                name: (scene, poses[..., frames, :, :])
-                for name, scene, poses in zip(self.names, self.scenes[1:], self.T_world_object, strict=True)
-            },
-        )
+        return self._with(poses[..., frames, :, :] for poses in self.T_world_object)
+
+    def _with(self, poses):
+        twin = copy.copy(self)
+        twin.T_world_object = tuple(poses)
+        return twin
 
     def check_length(self, count: int) -> None:
         """Raise ShapeError unless every object has ``count`` poses."""
@@ -118,13 +118,7 @@ class MovingScene:
                     f"moving scene: object '{name}' has poses for a batch {tuple(own)} of trajectories, the "
                     f"camera for {tuple(batch[:-1])}; give one trajectory for all, or one for each."
                 )
-        return MovingScene(
-            self.static,
-            {
-                name: (scene, poses.expand(*batch, 4, 4).reshape(-1, 4, 4))
-                for name, scene, poses in zip(self.names, self.scenes[1:], self.T_world_object, strict=True)
-            },
-        )
+        return self._with(poses.expand(*batch, 4, 4).reshape(-1, 4, 4) for poses in self.T_world_object)
 
 
 def parts(scene: Any) -> tuple[Any, ...]:

@@ -10,7 +10,7 @@ both components of s, interpolated at their nodes and checked against traced ray
 import torch
 from torch import Tensor
 
-from codesign.render.camera import Camera, project
+from codesign.render.camera import Camera, lines, project
 
 FAR_M = 1e9  # at which a point is its direction
 DEGREES = (8, 12, 16, 20)
@@ -33,7 +33,7 @@ class ProjectionTable:
         self.camera = camera
         self.series = None
         rays = camera.chief_rays(_border(camera.film))
-        slope = (rays.direction[:, :2] / rays.direction[:, 2:]).detach().double()
+        slope = lines(rays)[1].double()
         if not bool(slope.isfinite().all() & (rays.weight > 0).all()):
             return  # the film is larger than the field of the lens
         middle = (slope.amax(0) + slope.amin(0)) / 2
@@ -62,9 +62,7 @@ class ProjectionTable:
             pixels[rest] = project(self.camera, points_cam_m[rest])
             found = rest & pixels.isfinite().all(1)
             if bool(found.any()):
-                rays = self.camera.chief_rays(pixels[found])
-                slope[found] = rays.direction[:, :2] / rays.direction[:, 2:]
-                base[found] = rays.origin_m[:, :2] - slope[found] * rays.origin_m[:, 2:]
+                base[found], slope[found] = lines(self.camera.chief_rays(pixels[found]))
         return pixels, base, slope
 
     def _from_series(self, points_cam_m):
@@ -109,9 +107,8 @@ class ProjectionTable:
         pixels = project(self.camera, torch.cat([slope, torch.ones_like(slope[:, :1])], 1) * FAR_M)
         if not bool(pixels.isfinite().all()):
             return None
-        rays = self.camera.chief_rays(pixels)
-        base = rays.origin_m[:, :2] - rays.direction[:, :2] / rays.direction[:, 2:] * rays.origin_m[:, 2:]
-        values = torch.cat([pixels, base], 1).detach().double().reshape(count, count, 4)
+        base, _ = lines(self.camera.chief_rays(pixels))
+        values = torch.cat([pixels, base], 1).double().reshape(count, count, 4)
         basis = _chebyshev(nodes[None], count)[0].T * (
             2 / count
         )  # interpolation at the nodes: discrete orthogonality

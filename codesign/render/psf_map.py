@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from codesign.errors import DomainError, ShapeError
-from codesign.render.camera import Camera
+from codesign.render.camera import Camera, lines
 from codesign.render.film import coarse_pixels, concentric_disc
 from codesign.types import Rays
 
@@ -170,7 +170,7 @@ def psf_map(camera: Camera, nearest_m: float = 0.3, cell_px: int = 64, rays_per_
             f"psf map: rays_per_px = {rays_per_px} must be 4, 16, 36 or another square of an even number."
         )
     nodes, grid, cell = _nodes(camera, cell_px)
-    chief = _lines(camera.chief_rays(_around(nodes)))
+    chief = lines(camera.chief_rays(_around(nodes)))
     base, slope = (part.reshape(-1, 5, 2) for part in chief)
     scale = [
         torch.stack([part[:, 1] - part[:, 2], part[:, 3] - part[:, 4]], -1) / (2 * APART_PX)
@@ -213,29 +213,19 @@ def _nodes(camera, cell_px):
     """Film points at the corners of equal cells over every window: [N, 2] px, how many, and pixels of a
     cell."""
     film = camera.film
-    corners = torch.tensor(film.windows_px or ((0, 0),), dtype=torch.float64)
-    lines = []
+    nodes = []
     cell = []
     for length in (film.height_px, film.width_px):
         count = math.ceil(length / cell_px)
         cell.append(math.ceil(length / count))
-        lines.append((torch.arange(count + 1.0, dtype=torch.float64) * cell[-1]).clamp_max(length - 1))
-    y, x = torch.meshgrid(*lines, indexing="ij")
-    nodes = corners[:, None] + torch.stack([x.reshape(-1), y.reshape(-1)], 1)
-    return nodes.reshape(-1, 2), (len(corners), len(lines[0]), len(lines[1])), tuple(cell)
+        nodes.append((torch.arange(count + 1.0, dtype=torch.float64) * cell[-1]).clamp_max(length - 1))
+    return film.in_windows(*nodes), (len(film.corners_px), len(nodes[0]), len(nodes[1])), tuple(cell)
 
 
 def _around(nodes):
     """Every node and its neighbours in +x, -x, +y, -y: [5 N, 2] px."""
     steps = torch.tensor([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=nodes.dtype)
     return (nodes[:, None] + APART_PX * steps).reshape(-1, 2)
-
-
-def _lines(rays: Rays) -> tuple[Tensor, Tensor]:
-    """Rays as x, y at the entrance pupil's plane [N, 2] metres and slopes [N, 2]."""
-    ahead = rays.direction[:, 2:]
-    slope = rays.direction[:, :2] / torch.where(ahead.detach() > 1e-6, ahead, 1)
-    return rays.origin_m[:, :2] - rays.origin_m[:, 2:] * slope, slope
 
 
 def _through_pupil(camera, places, across):
@@ -247,7 +237,7 @@ def _through_pupil(camera, places, across):
     colour = torch.arange(len(camera.colours)).repeat_interleave(across**2).repeat(len(places))
     rays = camera.coloured_rays(places.repeat_interleave(len(pupil), 0), pupil.repeat(len(places), 1), colour)
     light = camera.light(rays, colour) / len(pupil)
-    return [v.unflatten(0, (len(places), -1)) for v in (*_lines(rays), light)]
+    return [v.unflatten(0, (len(places), -1)) for v in (*lines(rays), light)]
 
 
 def _gathered(camera, nodes, across, base, slope, scale):
@@ -296,13 +286,12 @@ def _solved(matrix, vectors):
 def _places(film, margin, fine):
     """Pixel coordinates of ``fine`` x ``fine`` points in each of SIDE x SIDE equal parts of every pixel of
     the windows and a margin around them."""
-    lines = [torch.arange(-margin, n + margin, dtype=torch.float64) for n in (film.height_px, film.width_px)]
-    corners = torch.tensor(film.windows_px or ((0, 0),), dtype=torch.float64)
+    around = [torch.arange(-margin, n + margin, dtype=torch.float64) for n in (film.height_px, film.width_px)]
     count = SIDE * fine
     inside = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5).reshape(SIDE, fine)
     y, x = torch.broadcast_tensors(inside[:, None, :, None], inside[None, :, None, :])
-    at = corners[:, None] + torch.cartesian_prod(*lines).flip(1)
-    return (at[:, :, None] + torch.stack([x.reshape(-1), y.reshape(-1)], 1)).reshape(-1, 2)
+    at = film.in_windows(*around)
+    return (at[:, None] + torch.stack([x.reshape(-1), y.reshape(-1)], 1)).reshape(-1, 2)
 
 
 def _shared(at, share):

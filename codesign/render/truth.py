@@ -133,9 +133,6 @@ def true_flow(
     Gradient: to lens, camera and object poses. Occlusion at the later time is left to ``flow_and_occlusion``.
     Raises: ShapeError when there are not more poses than ``stride``.
     """
-    if pairs := scenes_and_poses(scene, T_world_cam):
-        found = [true_flow(camera, each, poses, stride) for each, poses in pairs]
-        return torch.stack([flow for flow, _ in found]), torch.stack([valid for _, valid in found])
     found = _flow_truth(camera, scene, T_world_cam, stride, occlusion=False)
     return found.flow_px, found.valid
 
@@ -162,9 +159,6 @@ def flow_and_occlusion(
     geometry, divided by the cosine at which the ray meets the point's own surface, since a ray aside by as
     much meets it earlier or later by that.
     """
-    if pairs := scenes_and_poses(scene, T_world_cam):
-        found = [flow_and_occlusion(camera, each, poses, stride) for each, poses in pairs]
-        return FlowTruth(*(torch.stack([getattr(f, n.name) for f in found]) for n in fields(FlowTruth)))
     return _flow_truth(camera, scene, T_world_cam, stride, occlusion=True)
 
 
@@ -296,6 +290,9 @@ def _hidden(camera, scene, later, found):
 
 
 def _flow_truth(camera, scene, T_world_cam, stride, occlusion):
+    if pairs := scenes_and_poses(scene, T_world_cam):
+        found = [_flow_truth(camera, each, poses, stride, occlusion) for each, poses in pairs]
+        return FlowTruth(*(torch.stack([getattr(f, n.name) for f in found]) for n in fields(FlowTruth)))
     pixels = camera.film.pixels()
     rays = camera.chief_rays(pixels)
     views = views_of(scene, T_world_cam, rays)

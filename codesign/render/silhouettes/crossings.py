@@ -16,6 +16,7 @@ from codesign.render.rows import Rows
 from codesign.render.silhouettes.curves import Curve, cut_line, on_line
 from codesign.render.silhouettes.edges import ROUNDING, touching, welded
 from codesign.render.silhouettes.shapes import Ball, Disk, Mesh, Shape
+from codesign.render.triangles import across, normals_of
 
 AROUND = 96  # triangles around a round shape
 BLOCK = 1_000_000  # pairs at a time
@@ -94,7 +95,7 @@ def find_crossings(shapes: list[Shape], apart_m: float = 0.0) -> tuple[Crossings
 def _overlaps(shapes, triangles, pairs, apart_m):
     """Overlaps of pairs [n, 2] of triangles in one plane that face one way, or None."""
     one, other = (triangles[pairs[:, side]] for side in (0, 1))
-    normal = _normals(one.corners)
+    normal = normals_of(one.corners)
     rows, middle, end = overlaps(one.corners, other.corners, normal, apart_m)
     light = [
         [shapes[k].light_of(f) for k, f in zip(side.shape[rows], side.face[rows], strict=True)]
@@ -137,8 +138,7 @@ def _near_others(shapes):
             beside[number] = False
             for other in np.nonzero(beside)[0]:
                 kept |= ((low <= highs[other]) & (high >= lows[other])).all(1)
-        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        kept &= np.linalg.norm(across, axis=1) > 0
+        kept &= across(corners).any(1)
         place = welded(vertices, 0.0)[faces] if kept.any() else faces
         parts.append(
             Triangles(corners[kept], place[kept], np.full(int(kept.sum()), number), np.nonzero(kept)[0])
@@ -179,7 +179,7 @@ def _crossing(triangles, pairs, noise):
     corner on the other's plane counts as above it, so that an edge that lies in a face is found from one of
     its sides at most."""
     pair = [triangles[pairs[:, side]] for side in (0, 1)]
-    normals = [_normals(side.corners) for side in pair]
+    normals = [normals_of(side.corners) for side in pair]
     height = [
         ((this.corners - other.corners[:, :1]) * n[:, None]).sum(2)
         for this, other, n in ((pair[0], pair[1], normals[1]), (pair[1], pair[0], normals[0]))
@@ -210,11 +210,6 @@ def _crossing(triangles, pairs, noise):
     start, end = (origin[real, 0] + v[real, None] * along[real] for v in (first, last))
     numbers = np.stack([side.shape[rows][real] for side in pair], 1)
     return Crossings(start, end, np.stack([n[real] for n in normals], 1), numbers), pairs[level]
-
-
-def _normals(corners):
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return across / np.linalg.norm(across, axis=1, keepdims=True)
 
 
 def _on_plane(corners, height):

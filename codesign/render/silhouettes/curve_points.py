@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from codesign.pose import apply, inverse
-from codesign.render.camera import Camera
+from codesign.render.camera import Camera, lines
 from codesign.render.film import film_pupil_pattern
 from codesign.render.rows import Rows
 
@@ -186,9 +186,8 @@ class FieldOfView:
         )
         size = torch.tensor([film.width_px, film.height_px], dtype=torch.float64)
         boxes = []
-        for corner in film.windows_px or ((0, 0),):
-            middle = torch.tensor(corner, dtype=torch.float64) + (size - 1) / 2
-            boxes.append(self._box(camera, middle + border * size))
+        for corner in film.corners_px:
+            boxes.append(self._box(camera, corner + (size - 1) / 2 + border * size))
         self.low, self.high = (torch.stack(side) for side in zip(*boxes, strict=True))
         self.spread, self.shift = self._blur(camera)
 
@@ -220,7 +219,7 @@ class FieldOfView:
         """Lowest and highest rough pixel of film positions; the axis scale where no chief ray reaches the
         film."""
         rays = camera.rays_through(pixels, torch.zeros_like(pixels))
-        at = rays.direction[:, :2] / rays.direction[:, 2:] * self.px_per_slope
+        at = lines(rays)[1] * self.px_per_slope
         straight = pixels - camera.film.middle_px
         at = torch.where(((rays.weight > 0) & at.isfinite().all(1))[:, None], at, 1.15 * straight)
         middle = (at.amin(0) + at.amax(0)) / 2
@@ -230,8 +229,9 @@ class FieldOfView:
     def _blur(self, camera):
         """Differences of slope [k, 2] and of place at the pupil [k, 2] m between rays of a film point through
         the pupil's rim and the straight line from its middle to where its chief ray points."""
+        none = torch.zeros(1, 2, dtype=torch.float64)
         if not self.aperture_m:
-            return torch.zeros(1, 2, dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64)
+            return none, none
         angle = torch.arange(8, dtype=torch.float64) * (math.pi / 4)
         rim = torch.stack([angle.cos(), angle.sin()], 1)
         size = torch.tensor([camera.film.sensor_width_px, camera.film.sensor_height_px], dtype=torch.float64)
@@ -241,12 +241,9 @@ class FieldOfView:
         chief = camera.rays_through(fields, torch.zeros_like(fields))
         rays = camera.rays_through(fields.repeat_interleave(8, 0), rim.repeat(5, 1))
         passes = (rays.weight > 0) & (chief.weight > 0).repeat_interleave(8)
-        straight = (chief.direction[:, :2] / chief.direction[:, 2:]).repeat_interleave(8, 0)
-        slope = rays.direction[:, :2] / rays.direction[:, 2:]
-        base = rays.origin_m[:, :2] - slope * rays.origin_m[:, 2:]
-        if not bool(passes.any()):
-            return torch.zeros(1, 2, dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64)
-        return (slope - straight)[passes], base[passes]
+        straight = lines(chief)[1].repeat_interleave(8, 0)
+        base, slope = lines(rays)
+        return ((slope - straight)[passes], base[passes]) if bool(passes.any()) else (none, none)
 
     def _blur_px(self, depth_m):
         """Radius [n] px of the blur of points at depths [n]; the larger of two ends bounds all between

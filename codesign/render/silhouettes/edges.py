@@ -9,6 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from codesign.render.rows import Rows
+from codesign.render.triangles import across, edge_pairs
 
 SAME_POINT = 1e-6  # vertices of a mesh nearer than this share of its size, or than rounding, are one
 ROUNDING = 2.0**-21  # of float32 coordinates, four units in the last place
@@ -68,8 +69,8 @@ def mesh_edges(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray | Non
     place = welded(vertices, np.ptp(vertices, axis=0).max(initial=0) * SAME_POINT)
     at = place[faces]
     corners = vertices[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(across, axis=1)
+    normals = across(corners)
+    area = np.linalg.norm(normals, axis=1)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1, initial=0)
     flat = np.abs(vertices).max(initial=0) * ROUNDING
     whole = np.nonzero(
@@ -78,17 +79,8 @@ def mesh_edges(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray | Non
         & (at[:, 2] != at[:, 0])
         & (area > longest * min(flat, 1e-3 * longest.max(initial=0)))
     )[0]
-    normals = across[whole] / area[whole, None]
-    at = at[whole]
-    first = at.reshape(-1)
-    second = np.roll(at, -1, axis=1).reshape(-1)
-    forward = first < second
-    key = np.minimum(first, second) * (place.max(initial=0) + 1) + np.maximum(first, second)
-    order = np.argsort(key, kind="stable")
-    begins = np.nonzero(np.diff(key[order], prepend=-1))[0]
-    count = np.diff(begins, append=len(order))
-    one = order[begins]
-    other = np.where(count == 2, order[np.minimum(begins + 1, len(order) - 1)], one)
+    normals = normals[whole] / area[whole, None]
+    one, other, count, forward = edge_pairs(at[whole])
     free = count != 2
     n = np.stack([normals[one // 3], normals[other // 3]], 1)
     cosine = (n[:, 0] * n[:, 1]).sum(1)

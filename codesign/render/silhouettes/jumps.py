@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from codesign.pose import apply, inverse
-from codesign.render.camera import Camera
+from codesign.render.camera import Camera, images
 from codesign.render.rows import Rows
 from codesign.render.silhouettes.curve_points import IN_FRONT_M, NEARBY, CurvePoints
 from codesign.render.wavefront import look
@@ -26,7 +26,6 @@ from codesign.render.wavefront import look
 # since the next would be of its square
 STEP_PX = 1e-3
 FOUND_PX = 1e-4
-TURNS = 6
 DOUBTFUL = 0.05  # share of the distance by which a slanting surface may come nearer beside its edge
 ROUNDING = 2.0**-21  # of float32 distances, four units in the last place
 SAFETY = 2.0
@@ -78,10 +77,12 @@ def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> J
     if not row.numel():
         return None
     points, y, on = points[row], y[row], on[row]
-    x, per_px, slope, passes = _on_film(camera, y, points)
+    guess = _first_guess(camera, y, points)
+    seen_at = images(camera, y, points.pupil, points.colour, guess, STEP_PX, FOUND_PX)
+    x, per_px, slope = seen_at.at_px, seen_at.m_per_px, seen_at.slope
     pixel = _pixels(camera.film, x, points.window)
     moved = (on - y)[:, :2] - slope * (on - y)[:, 2:]
-    fine = passes & (pixel >= 0)
+    fine = (seen_at.step_px < FOUND_PX) & (pixel >= 0)
     per_m = torch.linalg.inv(torch.where(fine[:, None, None], per_px, torch.eye(2, dtype=y.dtype)))
     tangent = (per_m @ moved[..., None])[..., 0]
     length = tangent.norm(dim=1)
@@ -166,40 +167,6 @@ def _rad_per_px(y, per_px, slope, normal):
     return torch.linalg.cross(moved, ray).norm(dim=1) / (y[:, 2] * ray.square().sum(1))
 
 
-def _on_film(camera, y, points):
-    """Where points y [n, 3] in camera axes are seen through points of the pupil: film position [n, 2] px,
-    change of the place at that depth per pixel of it [n, 2, 2] m/px, slope of the ray there [n, 2], and
-    whether light passes [n]. Newton's method on the rays of the camera, from where the lens says light of the
-    point goes."""
-    steps = STEP_PX * torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], dtype=y.dtype)
-    x = _first_guess(camera, y, points)
-    per_px = torch.eye(2, dtype=y.dtype).repeat(len(y), 1, 1)
-    slope = torch.zeros_like(x)
-    found = torch.zeros(len(y), dtype=torch.bool)
-    rows = torch.arange(len(y))
-    for _ in range(TURNS):
-        at = (x[rows] + steps[:, None]).reshape(-1, 2)
-        q, colour = points.pupil[rows].repeat(3, 1), points.colour[rows].repeat(3)
-        rays = camera.coloured_rays(at, q, colour)
-        origin, direction = (v.reshape(3, -1, 3) for v in (rays.origin_m, rays.direction))
-        passes = ((rays.weight.reshape(3, -1) > 0) & (direction[..., 2] > 1e-6)).all(0)
-        slopes = direction[..., :2] / torch.where(passes[:, None], direction[..., 2:], 1.0)
-        here = origin[..., :2] + slopes * (y[rows, 2:] - origin[..., 2:])
-        change_per_px = torch.stack([here[1] - here[0], here[2] - here[0]], -1) / STEP_PX
-        passes &= torch.linalg.det(change_per_px).abs() > 1e-12 * change_per_px.square().sum((1, 2))
-        rows, change_per_px = rows[passes], change_per_px[passes]
-        change = torch.linalg.solve(change_per_px, here[0, passes] - y[rows, :2])
-        x[rows] -= change
-        per_px[rows] = change_per_px
-        slope[rows] = slopes[0, passes]
-        near = change.abs().amax(1) < FOUND_PX
-        found[rows] = near
-        rows = rows[~near]
-        if not rows.numel():
-            break
-    return x, per_px, slope, found
-
-
 def _first_guess(camera, y, points):
     """Film position [n, 2] px of points y [n, 3]: as the lens sends light there, or else along the chief ray
     of the axis's scale."""
@@ -215,8 +182,7 @@ def _first_guess(camera, y, points):
 
 def _pixels(film, x, window):
     """Flat number of the pixel of the given windows [n] that holds each position [n, 2], -1 outside."""
-    corner = torch.tensor(film.windows_px or ((0, 0),), dtype=x.dtype)[window]
-    column, row = (x - corner + 0.5).floor().unbind(1)
+    column, row = (x - film.corners_px[window] + 0.5).floor().unbind(1)
     inside = (column >= 0) & (column < film.width_px) & (row >= 0) & (row < film.height_px)
     number = window * (film.width_px * film.height_px) + row * film.width_px + column
     return torch.where(inside, number, -1.0).long()

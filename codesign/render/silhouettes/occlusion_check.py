@@ -9,6 +9,7 @@ must be the one that was found. What differs makes the gradient of that term wro
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -57,23 +58,6 @@ class Listing:
     crossings: int
 
 
-@dataclass(frozen=True)
-class _Crossings(Rows):
-    """Jumps along lines: frame [n]; film position, direction of the line on the film and point of the pupil
-    [n, 2]; change [n] of radiance along the line; origin and direction [n, 3] of the ray in camera axes, and
-    distance [n] m of the nearer side."""
-
-    frame: Tensor
-    film_px: Tensor
-    along: Tensor
-    pupil: Tensor
-    window: Tensor
-    change: Tensor
-    origin: Tensor
-    direction: Tensor
-    distance: Tensor
-
-
 def listings(
     camera: Camera, scene: Any, curves: Sequence[Sequence[Any]], cameras: Tensor, lines: int = LINES
 ) -> list[Listing]:
@@ -83,21 +67,17 @@ def listings(
     camera = camera.in_one_colour()
     with torch.no_grad():
         found = _crossings(camera, scene, cameras, lines)
-        if len(found.frame):
-            found, listed = _listed(camera, scene, curves, cameras, found)
-        else:
-            listed = found.change
-    amiss = (found.change - listed).abs()
-    missing = torch.minimum(amiss, found.change.abs()) * (listed.abs() < found.change.abs())
+        frame, change, listed, at = _listed(camera, scene, curves, cameras, found)
+    amiss = (change - listed).abs()
+    missing = torch.minimum(amiss, change.abs()) * (listed.abs() < change.abs())
     told = []
-    for frame in range(cameras.shape[1]):
-        rows = torch.nonzero(found.frame == frame)[:, 0]
-        total = float(found.change[rows].abs().sum()) or 1.0
+    for number, pose in enumerate(cameras[0]):
+        rows = torch.nonzero(frame == number)[:, 0]
+        total = float(change[rows].abs().sum()) or 1.0
         place = None
         if rows.numel() and float(amiss[rows].max()) > 0:
             worst = rows[amiss[rows].argmax()]
-            at = found.origin[worst] + found.direction[worst] * found.distance[worst].clamp_max(1e6)
-            x, y, z = apply(cameras[0, frame], at[None])[0].tolist()
+            x, y, z = apply(pose, at[worst][None])[0].tolist()
             place = (x, y, z)
         lacks, both = float(missing[rows].sum()), float(amiss[rows].sum())
         told.append(Listing(lacks / total, (both - lacks) / total, place, len(rows)))
@@ -167,7 +147,7 @@ def _lines(film, most):
     [2], pupil [lines, 2] and window [lines]."""
     generator = torch.Generator().manual_seed(most)
     _, pupils = film_pupil_pattern(64, most)
-    for window, (left, top) in enumerate(film.windows_px or ((0, 0),)):
+    for window, corner in enumerate(film.corners_px):
         for axis in (0, 1):
             along, across = (film.width_px, film.height_px)[:: 1 - 2 * axis]
             lines = min(most, 4 * across)
@@ -175,7 +155,7 @@ def _lines(film, most):
             level = (torch.arange(lines) + shift) / lines * across - 0.5
             edges = torch.arange(along * RAYS_PER_PX + 1, dtype=torch.float64) / RAYS_PER_PX - 0.5
             at = torch.stack([edges.expand(lines, -1), level[:, None].expand(-1, len(edges))], -1)
-            at = (at if axis == 0 else at.flip(-1)) + torch.tensor([left, top], dtype=torch.float64)
+            at = (at if axis == 0 else at.flip(-1)) + corner
             turn = torch.randint(64, (lines,), generator=generator)
             yield at, torch.eye(2, dtype=torch.float64)[axis], pupils[turn], torch.full((lines,), window)
 
@@ -196,17 +176,21 @@ class _Steps(Rows):
         """Of light [n] from the first to the second."""
         return self.ends[:, 1, 2] - self.ends[:, 0, 2]
 
+    @property
+    def film_px(self):
+        """Film position [n, 2] between them."""
+        return self.ends[..., :2].mean(1)
+
+    @property
+    def distance(self):
+        """Of the nearer side [n], metres."""
+        return self.ends[..., 3].amin(1)
+
 
 def _crossings(camera, scene, cameras, most):
     aperture = camera.aperture_m > 0
     frames = torch.arange(cameras.shape[1])
-
-    def seen(frame, at, pupil):
-        """Film position, light and distance [n, 4]."""
-        rays = camera.rays_through(at, pupil)
-        light, distance = look(scene, cameras, frame, rays.origin_m, rays.direction)
-        return torch.cat([at, (rays.weight * light)[:, None], distance[:, None]], 1)
-
+    seen = partial(_look, camera, scene, cameras)
     found = []
     lit = []
     for at, along, pupil, window in _lines(camera.film, most):
@@ -232,50 +216,44 @@ def _crossings(camera, scene, cameras, most):
     least = CONTRAST * (lit.amax(1) - lit.amin(1))
     found = found[found.change.abs() > least[found.frame]]
     for _ in range(HALVINGS if len(found.frame) else 0):
-        between = seen(found.frame, found.ends[..., :2].mean(1), found.pupil)
+        between = seen(found.frame, found.film_px, found.pupil)
         first, second = found.ends[..., 2].unbind(1)
         left = (between[:, 2] - first).abs() > (second - between[:, 2]).abs()
         kept = torch.stack([left, ~left], 1)[..., None]
         found = replace(found, ends=torch.where(kept, found.ends, between[:, None]))
     found = found[found.change.abs() > least[found.frame]]
-    at = found.ends[..., :2].mean(1)
-    if len(at):  # between faces that meet rays slip through a line without width
-        sides = [seen(found.frame, at + side * FOUND_PX * found.along, found.pupil)[:, 2] for side in (-1, 1)]
-        change = sides[1] - sides[0]
-        rows = change.abs() > least[found.frame]
-        found, at, change = found[rows], at[rows], change[rows]
-    else:
-        change = found.change
-    near = found.ends[..., 3].amin(1)
-    if len(at):
-        rays = camera.rays_through(at, found.pupil)
-        origin, direction = rays.origin_m, rays.direction
-    else:
-        origin = direction = torch.zeros(0, 3, dtype=torch.float64)
-    return _Crossings(
-        found.frame, at, found.along, found.pupil, found.window, change, origin, direction, near
-    )
+    if not len(found.frame):
+        return found
+    # between faces that meet rays slip through a line without width
+    aside = FOUND_PX * found.along
+    sides = [seen(found.frame, found.film_px + sign * aside, found.pupil)[:, 2:3] for sign in (-1, 1)]
+    at, _, distance = found.ends.split([2, 1, 1], 2)
+    found = replace(found, ends=torch.cat([at, torch.stack(sides, 1), distance], 2))
+    return found[found.change.abs() > least[found.frame]]
 
 
 def _listed(camera, scene, curves, cameras, found):
-    """The crossings that can be judged, and the change of radiance [n] along their lines that the listed
-    curves have there, as the boundary term reads them. A line along a curve tells little of it: there is one
-    across."""
+    """Of the steps that can be judged their frames [n] and changes of light [n]; the changes [n] along their lines that
+    the listed curves have there, as the boundary term reads them; and their places [n, 3] in camera axes. A line
+    along a curve tells little of it: there is one across."""
+    seen = camera.rays_through(found.film_px, found.pupil)
+    place_cam_m = seen.origin_m + seen.direction * found.distance.clamp_max(1e6)[:, None]
     angle = piece_rad(camera.slope_per_px())
     near_rad = NEAR_PX * abs(camera.slope_per_px())
     rays = []
     points = []
     for part, of_part in enumerate(curves):
         pose = cameras[part][found.frame]
-        o = apply(pose, found.origin[:, None])[:, 0]
-        d = (pose[:, :3, :3] @ found.direction[..., None])[..., 0]
+        o = apply(pose, seen.origin_m[:, None])[:, 0]
+        d = (pose[:, :3, :3] @ seen.direction[..., None])[..., 0]
         for frame in torch.unique(found.frame).tolist():
             rows = torch.nonzero((found.frame == frame) & found.distance.isfinite())[:, 0]
             eye = cameras[part, frame, :3, 3]
             for curve in of_part:
                 index, bounds = curve.pieces(eye, angle, camera.aperture_m)
-                near = curve, index, bounds, eye, o[rows], d[rows], found.distance[rows], near_rad
-                ray, piece = _near(*near)
+                ray, piece = _near(
+                    curve, index, bounds, eye, o[rows], d[rows], found.distance[rows], near_rad
+                )
                 if not ray.numel():
                     continue
                 ray = rows[ray]
@@ -285,11 +263,8 @@ def _listed(camera, scene, curves, cameras, found):
                 ray, index, y, ahead = (v[count] for v in (ray, index, y, ahead))
                 beside = known_beside(curve, index, y, o[ray])
                 of_ray = found.pupil[ray], torch.zeros_like(ray), found.window[ray], found.frame[ray]
-                points.append(
-                    CurvePoints(
-                        y, ahead, torch.ones_like(y[:, 0]), *beside, *of_ray, torch.full_like(ray, part)
-                    )
-                )
+                each = torch.ones_like(y[:, 0])
+                points.append(CurvePoints(y, ahead, each, *beside, *of_ray, torch.full_like(ray, part)))
                 rays.append(ray)
     total = torch.zeros_like(found.change)
     read = None
@@ -297,7 +272,7 @@ def _listed(camera, scene, curves, cameras, found):
         ray, points = torch.cat(rays), CurvePoints.joined(points)
         read = jumps(camera, scene, cameras, points)
     if read is None:
-        return found, total
+        return found.frame, found.change, total, place_cam_m
     read = read[torch.nonzero(read.seen)[:, 0]]
     ray = ray[read.row]
     turned = (read.normal * found.along[ray]).sum(1)
@@ -317,26 +292,26 @@ def _listed(camera, scene, curves, cameras, found):
     change = (read.behind - read.before) * turned.sign() * within
     total = total.index_add(0, ray, change)
     rows = torch.nonzero((nearest >= 0) & (slant > GRAZING))[:, 0]
-    before, behind = (
-        _light(camera, scene, cameras, found, rows, (place + sign * half)[rows]) for sign in (-1, 1)
-    )
-    change = found.change.index_put((rows,), behind - before)
+    beside = found[rows]
+    before, behind = (beside.film_px + (place + sign * half)[rows, None] * beside.along for sign in (-1, 1))
+    light = [_look(camera, scene, cameras, beside.frame, at, beside.pupil)[:, 2] for at in (before, behind)]
+    change = found.change.index_put((rows,), light[1] - light[0])
     kept = torch.nonzero((nearest < 0) | (slant > GRAZING))[:, 0]
-    return replace(found, change=change)[kept], total[kept]
+    return found.frame[kept], change[kept], total[kept], place_cam_m[kept]
 
 
-def _light(camera, scene, cameras, found, rows, along_px):
-    """Light [n] of crossings ``rows`` [n], so far [n] px along their lines."""
-    at = found.film_px[rows] + along_px[:, None] * found.along[rows]
-    rays = camera.rays_through(at, found.pupil[rows])
-    return rays.weight * look(scene, cameras, found.frame[rows], rays.origin_m, rays.direction)[0]
+def _look(camera, scene, cameras, frame, at, pupil):
+    """Film position, light and distance [n, 4] of rays."""
+    rays = camera.rays_through(at, pupil)
+    light, distance = look(scene, cameras, frame, rays.origin_m, rays.direction)
+    return torch.cat([at, (rays.weight * light)[:, None], distance[:, None]], 1)
 
 
 def _near(curve, index, bounds, eye, origin, direction, distance, near_rad):
     """Pairs (ray, piece) of which the chord of the piece passes near where the ray [n, 3] meets something at
     a distance [n]."""
-    if not index.numel():
-        return index, index
+    if not (index.numel() and len(origin)):
+        return index[:0], index[:0]
     a, b = (curve.points(index, s, eye) for s in bounds.unbind(1))
     middle = (a + b) / 2
     half = (b - a).norm(dim=1) / 2

@@ -10,6 +10,7 @@ import numpy as np
 
 from codesign.errors import DomainError
 from codesign.render.mitsuba_shapes import front_faces, is_mirrored
+from codesign.render.triangles import across
 
 EVEN = 1e-4  # axes of a sphere or cylinder may differ in length and angle by this share
 
@@ -38,8 +39,18 @@ class Mesh:
         return float(own[0, 0]) if own.shape[1] == 1 and (own == own[0]).all() else None
 
 
+class Whole:
+    """What is one surface of one radiance, or of one picture."""
+
+    light: float | None
+
+    def light_of(self, face):
+        """The one radiance of the shape, None where it changes over it."""
+        return self.light
+
+
 @dataclass(frozen=True)
-class Ball:
+class Ball(Whole):
     """A sphere: centre [3], radius; seam: half axes [2, 3] of the circle on
     which its picture begins."""
 
@@ -49,17 +60,13 @@ class Ball:
     light: float | None = None
     seam: np.ndarray | None = None
 
-    def light_of(self, face):
-        """The one radiance of the shape, None where it changes over it."""
-        return self.light
-
     def corners(self):
         """Points [N, 3] whose box holds the shape."""
         return self.centre + self.radius * np.array([[-1.0], [1.0]])
 
 
 @dataclass(frozen=True)
-class Disk:
+class Disk(Whole):
     """A disk: centre [3] and half axes u, v [3] at right angles."""
 
     name: str
@@ -68,10 +75,6 @@ class Disk:
     v: np.ndarray
     light: float | None = None
 
-    def light_of(self, face):
-        """The one radiance of the shape, None where it changes over it."""
-        return self.light
-
     def corners(self):
         """Points [N, 3] whose box holds the shape."""
         reach = np.hypot(self.u, self.v)
@@ -79,7 +82,7 @@ class Disk:
 
 
 @dataclass(frozen=True)
-class Tube:
+class Tube(Whole):
     """A cylinder without caps: ends of its axis [3], half axes u, v [3] of one length at right angles."""
 
     name: str
@@ -93,10 +96,6 @@ class Tube:
     def radius(self):
         """Radius, metres."""
         return float(np.linalg.norm(self.u))
-
-    def light_of(self, face):
-        """The one radiance of the shape, None where it changes over it."""
-        return self.light
 
     def corners(self):
         """Points [N, 3] whose box holds the shape."""
@@ -227,7 +226,7 @@ def _body(shape):
 
 def _distance(corners):
     """Distance [n] of triangles [n, 3, 3], which may be lines or points, from the origin."""
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = across(corners)
     size = np.linalg.norm(normal, axis=1)
     above = np.abs((corners[:, 0] * normal).sum(1)) / np.maximum(size, 1e-300)
     within = size > 0
