@@ -66,8 +66,8 @@ def places(vertices: np.ndarray) -> np.ndarray:
 
 
 def shared_edges(place: np.ndarray) -> np.ndarray:
-    """Edges between two faces of places [F, 3]: [E, 4] of face, other face, and the corner where the edge starts
-    in each, running one way in the first and the other way in the second."""
+    """Edges between two faces of places [F, 3]: [E, 4] of face, other face, and the corner where the edge
+    starts in each, running one way in the first and the other way in the second."""
     one, other, count, rises = edge_pairs(place)
     apart = (one // 3 != other // 3) & (count == 2) & (rises[one] != rises[other])
     one, other = one[apart], other[apart]

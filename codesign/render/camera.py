@@ -249,8 +249,8 @@ def _columns(of, *rays):
 
 
 def lines(rays: Rays) -> tuple[Tensor, Tensor]:
-    """Rays as places on the entrance pupil's plane [N, 2] metres and slopes [N, 2]; those that run aside have slopes
-    of the length of their directions."""
+    """Rays as places on the entrance pupil's plane [N, 2] metres and slopes [N, 2]; those that run aside have
+    slopes of the length of their directions."""
     ahead = rays.direction[:, 2:]
     slope = rays.direction[:, :2] / torch.where(ahead.detach() > 1e-6, ahead, 1)
     return rays.origin_m[:, :2] - rays.origin_m[:, 2:] * slope, slope
@@ -312,8 +312,9 @@ def project(camera: Camera, points_cam_m: Tensor, pupil: Tensor | None = None) -
 
 @dataclass(frozen=True)
 class Images:
-    """Where N points are seen: at_px [N, 2]; m_per_px [N, 2, 2], change of the place at that depth per pixel; slope
-    [N, 2] of the ray there; step_px [N], the last step of Newton's method, infinite where no light passes."""
+    """Where N points are seen: at_px [N, 2]; m_per_px [N, 2, 2], change of the place at that depth per pixel;
+    slope [N, 2] of the ray there; step_px [N], the last step of Newton's method, infinite where no light
+    passes."""
 
     at_px: Tensor
     m_per_px: Tensor
@@ -331,11 +332,12 @@ def images(
     within_px: float,
     shrink: float = 0.0,
 ) -> Images:
-    """Images of points [N, 3] in camera axes through points [N, 2] of the pupil, in the colours of their numbers [N].
+    """Images of points [N, 3] in camera axes through points [N, 2] of the pupil, in the colours of their
+    numbers [N].
 
     By Newton's method from a guess [N, 2] on the rays of the camera, their derivatives by differences over
-    ``apart_px``, until a step is below ``within_px``. What gets no light is drawn towards the axis by ``shrink``
-    and tried again; 0 gives it up.
+    ``apart_px``, until a step is below ``within_px``. What gets no light is drawn towards the axis by
+    ``shrink`` and tried again; 0 gives it up.
     """
     at = guess_px.clone()
     m_per_px = torch.eye(2, dtype=at.dtype).repeat(len(at), 1, 1)

@@ -13,7 +13,7 @@ from codesign import backend
 from codesign.errors import DomainError, ShapeError
 from codesign.exclusive import exclusive
 from codesign.render.atlas import Atlas, Nodes, atlas_of, cells_of, nodes_of
-from codesign.render.mitsuba_shapes import front_faces, is_mirrored
+from codesign.render.mitsuba_shapes import front_faces, is_mirrored, matrix_of
 from codesign.render.scene_checks import checked_mesh
 from codesign.render.triangles import across
 from codesign.render.world import MitsubaScene
@@ -45,14 +45,10 @@ def chart_of(mi: Any, shape: Any, texel: float, detail: float | None) -> Chart |
     Args: texel: of light; detail: of the pictures on it, None where there are none. Raises: DomainError for a
       shape that has no chart here.
     """
-    kind = shape.shape_type()
     parameters = mi.traverse(shape)
-    for known, chart in ((mi.ShapeType.Rectangle, _rectangle), (mi.ShapeType.Disk, _disk)) + (
-        (mi.ShapeType.Sphere, _sphere),
-        (mi.ShapeType.Cylinder, _cylinder),
-    ):
-        if kind == int(known):
-            return chart(*_unmirrored(mi, shape, _matrix(parameters)))
+    for kind in ("Rectangle", "Disk", "Sphere", "Cylinder"):
+        if shape.shape_type() == int(getattr(mi.ShapeType, kind)):
+            return _chart(kind, *_unmirrored(mi, shape, matrix_of(parameters)))
     if not shape.is_mesh() or "faces" not in parameters:
         raise DomainError(
             f"bake: shape '{shape.id()}', a {shape.class_name()}, has no texture chart here; use meshes, "
@@ -166,11 +162,8 @@ def mesh_arrays(parameters):
     return vertices, np.array(parameters["faces"]).reshape(-1, 3), uv.reshape(-1, 2) if uv.size else None
 
 
-# ---- the map of each shape; texture coordinates as Mitsuba has them
-
-
-def _matrix(parameters):
-    return np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+def _to_world(matrix, local):
+    return local @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def _unmirrored(mi, shape, matrix):
@@ -184,65 +177,51 @@ def _unmirrored(mi, shape, matrix):
     return matrix, flip
 
 
-def _to_world(matrix, local):
-    return local @ matrix[:3, :3].T + matrix[:3, 3]
-
-
-def _rectangle(matrix, flip):
-    axes = matrix[:3, :3]
-    normal = np.cross(axes[:, 0], axes[:, 1])
-    normal *= flip / np.linalg.norm(normal)
-
-    def at(u, v):
-        points = _to_world(matrix, np.stack([2 * u - 1, 2 * v - 1, 0 * u], -1))
-        return points, np.broadcast_to(normal, points.shape), np.ones(len(points), dtype=bool)
-
-    size = (2 * float(np.linalg.norm(axes[:, 0])), 2 * float(np.linalg.norm(axes[:, 1])))
-    return Chart(size, at, "rectangle", matrix, flip)
-
-
-def _disk(matrix, flip):
-    flat = _rectangle(matrix, flip)
-    radius = float(np.linalg.norm(matrix[:3, 0]))
+def _chart(kind, matrix, flip):
+    """Chart of a shape of Mitsuba with its texture coordinates, from that of one of unit size."""
+    x, y, z = (float(length) for length in np.linalg.norm(matrix[:3, :3], axis=0))
+    local_of, size = {
+        "Rectangle": (_rectangle, (2 * x, 2 * y)),
+        "Disk": (_disk, (x, 2 * np.pi * x)),
+        "Sphere": (_sphere, (2 * np.pi * x, np.pi * x)),
+        "Cylinder": (_cylinder, (2 * np.pi * x, z)),
+    }[kind]
+    up = np.cross(matrix[:3, 0], matrix[:3, 1])
+    up *= flip / np.linalg.norm(up)
 
     def at(u, v):
-        x = u * np.cos(2 * np.pi * v)
-        y = u * np.sin(2 * np.pi * v)
-        return flat.at((x + 1) / 2, (y + 1) / 2)
+        local, out = local_of(u, v)
+        points = _to_world(matrix, local)
+        normals = np.broadcast_to(up, points.shape) if out is None else flip * out @ matrix[:3, :3].T / x
+        return points, normals, np.ones(len(points), dtype=bool)
 
-    return Chart((radius, 2 * np.pi * radius), at, "disk", matrix, flip)
-
-
-def _sphere(matrix, flip):
-    radius = float(np.linalg.norm(matrix[:3, 0]))
-
-    def at(u, v):
-        phi = 2 * np.pi * u
-        theta = np.pi * v
-        local = np.stack([np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta)], -1)
-        return (
-            _to_world(matrix, local),
-            flip * local @ matrix[:3, :3].T / radius,
-            np.ones(len(local), dtype=bool),
-        )
-
-    return Chart((2 * np.pi * radius, np.pi * radius), at, "sphere", matrix, flip)
+    return Chart(size, at, kind.lower(), matrix, flip)
 
 
-def _cylinder(matrix, flip):
-    radius = float(np.linalg.norm(matrix[:3, 0]))
-    length = float(np.linalg.norm(matrix[:3, 2]))
+# points [N, 3] of shapes of unit size at texture coordinates [N] as Mitsuba has them, and normals, None where
+# they are +z
 
-    def at(u, v):
-        phi = 2 * np.pi * u
-        around = np.stack([np.cos(phi), np.sin(phi), 0 * phi], -1)
-        return (
-            _to_world(matrix, around + np.stack([0 * v, 0 * v, v], -1)),
-            flip * around @ matrix[:3, :3].T / radius,
-            np.ones(len(around), dtype=bool),
-        )
 
-    return Chart((2 * np.pi * radius, length), at, "cylinder", matrix, flip)
+def _rectangle(u, v):
+    return np.stack([2 * u - 1, 2 * v - 1, 0 * u], -1), None
+
+
+def _disk(u, v):
+    turn = 2 * np.pi * v
+    return np.stack([u * np.cos(turn), u * np.sin(turn), 0 * u], -1), None
+
+
+def _sphere(u, v):
+    phi = 2 * np.pi * u
+    theta = np.pi * v
+    out = np.stack([np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta)], -1)
+    return out, out
+
+
+def _cylinder(u, v):
+    phi = 2 * np.pi * u
+    out = np.stack([np.cos(phi), np.sin(phi), 0 * phi], -1)
+    return out + np.stack([0 * v, 0 * v, v], -1), out
 
 
 @dataclass(frozen=True)

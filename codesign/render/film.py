@@ -85,7 +85,8 @@ class Film:
         return torch.tensor(self.windows_px or ((0, 0),), dtype=torch.float64)
 
     def in_windows(self, rows: Tensor, columns: Tensor) -> Tensor:
-        """Coordinates (x, y) of these rows and columns of every window, [W x rows x columns, 2], in image order."""
+        """Coordinates (x, y) of these rows and columns of every window, [W x rows x columns, 2], in image
+        order."""
         return (self.corners_px[:, None] + torch.cartesian_prod(rows, columns).flip(1)).reshape(-1, 2)
 
 

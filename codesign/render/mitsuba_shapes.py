@@ -21,6 +21,11 @@ def is_mirrored(matrix: Any) -> bool:
     return bool(np.linalg.det(np.asarray(matrix)[:3, :3]) < 0)
 
 
+def matrix_of(parameters: Any) -> np.ndarray:
+    """The to_world [4, 4] of a Mitsuba shape."""
+    return np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+
+
 def front_faces(shape: Any, parameters: Any) -> np.ndarray:
     """Faces [F, 3] of a Mitsuba mesh, wound so that their normals point to the side that shines."""
     faces = np.array(parameters["faces"], dtype=np.int64).reshape(-1, 3)
@@ -32,7 +37,7 @@ def are_geometric(mi: Any, shape: Any) -> bool:
     """Whether the geometric normal of a Mitsuba shape points to the side that shines, everywhere."""
     parameters = mi.traverse(shape)
     if shape.shape_type() == int(mi.ShapeType.Rectangle):
-        return not is_mirrored(np.array(parameters["to_world"].matrix, dtype=float).reshape(4, 4))
+        return not is_mirrored(matrix_of(parameters))
     if not shape.is_mesh() or "faces" not in parameters:
         return True
     faces = np.array(parameters["faces"], dtype=np.int64).reshape(-1, 3)

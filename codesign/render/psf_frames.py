@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 
 import torch
+from scipy.fft import next_fast_len
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
@@ -140,7 +141,7 @@ def _convolved(psf, layers, depths_per_m):
     rows, columns = (n - 1 for n in psf.grid[1:])
     high, wide = psf.cell_px
     margin = 2 * psf.radius_px
-    size = (_smooth(high + margin), _smooth(wide + margin))
+    size = tuple(next_fast_len(n + margin, real=True) for n in psf.cell_px)
     transfer = torch.stack([_transfer(psf, v, layers, size) for v in depths_per_m])[:, None]
     padded = pad(layers, (0, columns * wide - film.width_px, 0, rows * high - film.height_px))
     cells = padded.unfold(-2, high + margin, high).unfold(-2, wide + margin, wide)
@@ -176,15 +177,3 @@ def _between(length, cell, count):
     at = (torch.arange(count * cell, dtype=node.dtype)).reshape(count, cell)
     share = ((at - node[:-1, None]) / (node[1:] - node[:-1]).clamp_min(1)[:, None]).clamp(0, 1)
     return torch.stack([1 - share, share])
-
-
-def _smooth(length):
-    """The next length without prime factors above 5, which Fourier transforms take fast."""
-    while True:
-        rest = length
-        for prime in (2, 3, 5):
-            while rest % prime == 0:
-                rest //= prime
-        if rest == 1:
-            return length
-        length += 1

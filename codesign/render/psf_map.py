@@ -107,14 +107,7 @@ class PsfMap:
         Gradient: to every tensor of the lens and to the distances, piecewise linear in the rays' positions.
         Raises: DomainError for distances nearer than ``nearest_m``, or a size that does not hold the blur.
         """
-        distance_m = torch.as_tensor(distance_m, dtype=torch.float64)
-        if distance_m.ndim != 1:
-            raise ShapeError(f"psf map: distances must be a list [D], got shape {tuple(distance_m.shape)}.")
-        if not bool((distance_m.detach() >= self.nearest_m * (1 - ROUNDING)).all()):
-            raise DomainError(
-                f"psf map: distance {float(distance_m.detach().min()):.4g} m is nearer than the "
-                f"{self.nearest_m:g} m that the map is made for; give psf_map a smaller nearest_m."
-            )
+        offsets_px = self.offsets_px(1 / torch.as_tensor(distance_m, dtype=torch.float64))
         needed = 2 * (self.radius_px - TAIL_PX) + 3
         size = needed if size_px is None else size_px
         if not size >= needed or size % 2 != 1:
@@ -122,7 +115,7 @@ class PsfMap:
                 f"psf map: {size} x {size} pixels do not hold the blur about a middle pixel; give an odd "
                 f"number of at least {needed}."
             )
-        at = self.offsets_px(1 / distance_m)[..., None] - (torch.arange(size).to(self.base_m) - size // 2)
+        at = offsets_px[..., None] - (torch.arange(size).to(self.base_m) - size // 2)
         return _shared((1 - at.abs()).clamp_min(0), self.share)
 
     def weights(self, per_m: Tensor) -> Tensor:

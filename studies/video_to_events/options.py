@@ -19,8 +19,6 @@ POSITIVE = (
     "slow_motion",
     "white_level",
     "preview_slowdown",
-    "decay_tau_s",
-    "preview_full_scale",
     "upsample",
 )
 
@@ -64,18 +62,9 @@ class Options(StudyConfig):
     0.05 GB of memory per million events."""
     preview: bool = True
     """Make the two videos, of events and of fading traces."""
-    preview_fps: float = 30.0
-    """Pictures per second of the videos."""
     preview_slowdown: float | None = None
     """How many times slower than the scene the videos play; left out: at life's speed, or slower until they
     last 10 s or show four pictures per frame."""
-    preview_full_scale: float = 2.0
-    """Events per pixel and picture that give full colour."""
-    decay_tau_s: float | None = None
-    """Time in which traces fade to 1/e, seconds of the scene; left out: three pictures of the video, and at
-    least 1.5 frames of the input."""
-    points: int = 20_000
-    """Events drawn in the 3-D figure."""
 
 
 def with_sensor_options(kind):
@@ -123,14 +112,8 @@ def checked(config):
         value = getattr(config, name)
         if value is not None and not 0 < value < math.inf:
             raise DomainError(f"--{name.replace('_', '-')} is {value:g}; a finite number above 0 is needed.")
-    if not 1 <= config.preview_fps <= 240:
-        raise DomainError(
-            f"--preview-fps is {config.preview_fps:g}; 1 to 240 pictures per second are possible."
-        )
     if config.sensor_size is not None and not all(1 <= side <= 65535 for side in config.sensor_size):
         raise DomainError(
             f"--sensor-size is {config.sensor_size}; width and height of 1 to 65535 pixels are possible."
         )
-    if config.points < 1:
-        raise DomainError(f"--points is {config.points}; at least 1 is needed.")
     return config

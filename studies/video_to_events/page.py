@@ -18,9 +18,13 @@ from studies.video_to_events.state import LARGE, WORRYING, EventLog
 
 SHARE_OF_DURATION = 0.2  # a sensor whose reactions take more of the input hides what happens in it
 MOST_ON_PAGE_MB = 25.0  # larger videos lie beside the page
+PREVIEW_FPS = 30.0  # pictures per second of the videos
+FULL_SCALE = 2.0  # events per pixel and picture that give full colour
+POINTS = 20_000  # events drawn in space and time
 SHORTEST_S = 10.0  # of the videos, unless their slow-down is given
 # at most; between two frames events are interpolated, and more pictures would only be paler
 PICTURES_PER_FRAME = 4.0
+# traces fade to 1/e in so many pictures of the video, and at least in so many frames of the input
 TAU_PICTURES = 3.0
 TAU_FRAMES = 1.5
 RATE_BINS = 200
@@ -47,19 +51,18 @@ class View:
     @property
     def slowdown(self):
         """How many times slower than the scene the videos play."""
-        most = PICTURES_PER_FRAME * len(self.t_s) / (self.config.preview_fps * self.duration_s)
+        most = PICTURES_PER_FRAME * len(self.t_s) / (PREVIEW_FPS * self.duration_s)
         return self.config.preview_slowdown or max(1.0, min(SHORTEST_S / self.duration_s, most))
 
     @property
     def exposure_s(self):
         """Time of the scene that one picture of the videos covers."""
-        return 1 / (self.config.preview_fps * self.slowdown)
+        return 1 / (PREVIEW_FPS * self.slowdown)
 
     @property
     def tau_s(self):
         """Fading time of the traces, seconds of the scene."""
-        frames_s = TAU_FRAMES * float(self.t_s.diff().median())
-        return self.config.decay_tau_s or max(TAU_PICTURES * self.exposure_s, frames_s)
+        return max(TAU_PICTURES * self.exposure_s, TAU_FRAMES * float(self.t_s.diff().median()))
 
     def slices(self, count):
         """Equal parts of the time: first and last event of each, and its start and end in whole
@@ -208,14 +211,14 @@ def pictures(view):
     window_s = max(view.exposure_s, float(view.t_s.diff().median()))
     caption = (
         f"Frames, and the events of {seconds(window_s)} around them: red brighter, blue darker; full "
-        f"colour at {config.preview_full_scale:g} events."
+        f"colour at {FULL_SCALE:g} events."
     )
     run.figure(first_pictures(view, window_s), "pictures", caption)
     middle_s, rate_hz = rates_over_time(view)
     caption = f"Events per second of the whole picture, in {len(middle_s)} equal parts of the time."
     run.figure(rate_figure(middle_s, rate_hz), "rates", caption)
-    few = view.log.pick(sample(view.log.count, config.points, torch.Generator().manual_seed(config.seed)))
-    figure = space_time_figure(few, points=config.points, total=view.log.count)
+    few = view.log.pick(sample(view.log.count, POINTS, torch.Generator().manual_seed(config.seed)))
+    figure = space_time_figure(few, points=POINTS, total=view.log.count)
     caption = (
         f"Events in space and time: {len(few):,} of {view.log.count:,}, drawn at random. Orange brighter, "
         "blue darker."
@@ -234,7 +237,7 @@ def pictures(view):
 def video(view, name, made, caption):
     """Write a video, and show it where it is small enough."""
     path = view.run.path(f"{name}.mp4")
-    write_video(path, made, view.config.preview_fps)
+    write_video(path, made, PREVIEW_FPS)
     size_mb = path.stat().st_size / 1e6
     if size_mb <= MOST_ON_PAGE_MB:
         view.run.video(path.name, caption)
@@ -246,7 +249,7 @@ def video(view, name, made, caption):
 def event_pictures(view):
     """Pictures of the video of events, one by one."""
     for stream, start_us, end_us in view.streams():
-        yield picture(to_counts(stream, [start_us / 1e6, end_us / 1e6])[0], view.config.preview_full_scale)
+        yield picture(to_counts(stream, [start_us / 1e6, end_us / 1e6])[0], FULL_SCALE)
 
 
 def trace_pictures(view):
@@ -255,7 +258,7 @@ def trace_pictures(view):
     for stream, _, end_us in view.streams():
         trace = decay_from_stream(stream, [end_us], view.tau_s, start=start, dtype=torch.float64)[0]
         start = (trace, end_us)
-        yield picture(trace, view.config.preview_full_scale)
+        yield picture(trace, FULL_SCALE)
 
 
 def rates_over_time(view):
@@ -282,7 +285,7 @@ def first_pictures(view, window_s):
         end_us = max(round((time_s + window_s / 2) * 1e6), start_us + 1)
         stream = view.log.read(*view.log.positions([start_us, end_us]))
         counts = to_counts(stream, [start_us / 1e6, end_us / 1e6])[0]
-        rows["events"][title] = picture(counts, view.config.preview_full_scale).numpy()
+        rows["events"][title] = picture(counts, FULL_SCALE).numpy()
     return show.pictures(rows, side=3)
 
 

@@ -11,7 +11,6 @@ from codesign import lens, render
 from codesign.pose import look_at
 from codesign.render import Camera, Film, TexturedPlane, angular_miss_rad, project
 from scenes import worlds
-from tests.render.differences import assert_gradients
 from tests.render.fitted_lenses import OPTICS as FITTED
 from tests.render.fitted_lenses import PITCH_MM, SENSOR_PX, fitted
 
@@ -150,19 +149,6 @@ def test_defocus_takes_contrast_away_as_a_blur_disc_does(kind, tolerance):
     assert math.hypot(cosine, sine) / mean / 1e-3 == pytest.approx(truth, rel=tolerance)
 
 
-def test_the_blur_disc_of_a_thin_lens_has_the_diameter_of_the_defocus_formula():
-    """Focused at s: 1/s = 1/f - 1/s'. An object at z has a blur disc of diameter A s' |1/s - 1/z| on the
-    film."""
-    f, aperture, image, z = 8.0, 2.5, 8.05, 0.6
-    angle = torch.linspace(0, 2 * math.pi, 13, dtype=D)[:-1]
-    rim = torch.stack([angle.cos(), angle.sin()], 1)
-    rays = lens.ThinLens(f, aperture, image).camera_rays(torch.zeros(12, 2, dtype=D), rim)
-    at = rays.origin_m + rays.direction * ((z - rays.origin_m[:, 2:]) / rays.direction[:, 2:])
-    found = 2 * (at[:, :2] / z * image).norm(dim=1)  # on the film by the central ray, millimetres
-    truth = torch.full_like(found, aperture * image * abs((1 / f - 1 / image) - 1 / (z * 1e3)))
-    torch.testing.assert_close(found, truth, rtol=1e-12, atol=0)
-
-
 # ---- films
 
 
@@ -204,18 +190,3 @@ def test_single_precision_lenses_make_single_precision_rays_and_double_truth():
     point = torch.tensor([[0.1, 0.05, 1.0]], dtype=D)
     # curvatures rounded to float32 (6e-8) move the image of a 50 mm lens by 6e-8 * 50 pixels or so
     torch.testing.assert_close(project(single, point), project(double, point), rtol=0, atol=2e-5)
-
-
-def test_gradients_of_projection_to_points_and_lens(generator):
-    geo = fitted("cooke-triplet")
-    aside = 0.15 * torch.randn(5, 2, generator=generator, dtype=D)
-    points = torch.cat([aside, 1 + torch.rand(5, 1, generator=generator, dtype=D)], 1)
-    weights = torch.randn(5, 2, generator=generator, dtype=D)
-
-    def loss(points, curvature, thickness):
-        optics = geo.replace(curvature_per_mm=curvature, thickness_mm=thickness)
-        return (project(Camera(optics, *SENSOR_PX, PITCH_MM, 1), points) * weights).sum()
-
-    # differences bend by 1e-7; the solver's own Jacobian (forward step of 1e-4 mm) is as good
-    at = (points, geo.curvature_per_mm.detach(), geo.thickness_mm.detach())
-    assert_gradients(loss, at, (1e-4, 1e-6, 1e-4), 1e-6)

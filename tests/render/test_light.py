@@ -175,26 +175,6 @@ def test_baked_light_is_path_traced_light_on_every_kind_of_shape(still_life, bak
         assert abs(float((ours - theirs).mean())) < share * max(float(theirs.mean()), least)
 
 
-def test_frames_of_baked_light_are_frames_of_path_tracing_within_its_noise(still_life, baked_still_life):
-    error = light.level_error(baked_still_life, light.PathScene(still_life, samples=64), wide(4), VIEW)
-    # 256 paths per texel leave 1 to 2 % of light's own noise in the texture; what is beyond it are shadow
-    # edges within a texel of 4 cm
-    assert float(error.rms) < 0.03
-    assert float(error.noise) < 0.06
-
-
-def test_a_cube_is_baked_face_by_face_where_its_faces_share_texture_coordinates():
-    """Under a sun overhead, which has one direction: no noise."""
-    place = backend.mitsuba().ScalarTransform4f().scale([0.3, 0.2, 0.1])
-    scene = {"cube": {"type": "cube", "to_world": place, **grey(0.5)}, "sun": sun(100.0, 0, 0, -1)}
-    baked = light.bake(scene, samples=1)
-    points = [[0, 0, 0.1], [0, 0, -0.1], [0.3, 0, 0], [0.29, 0.19, 0.1]]
-    found = radiance_at(baked, points, [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0, 0, 1]])
-    np.testing.assert_allclose(found, [50 / math.pi, 0, 0, 50 / math.pi], rtol=1e-4, atol=1e-4)
-    (edges,) = baked.outline()  # still one mesh of twelve edges
-    assert len(edges.start) == 12
-
-
 def test_the_sky_is_the_same_at_every_level():
     scene = {"sky": sky(backend.mitsuba(), textures.sky(3, 64))}
     camera = Camera(lens.Pinhole(3.0), 24, 18, 0.2, 4)

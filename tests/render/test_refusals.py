@@ -454,11 +454,10 @@ def psf():
     (
         lambda psf: psf.energy(torch.tensor([0.5])),
         DomainError,
-        "0.5 m is nearer than the 1 m.*smaller nearest_m",
+        "between 0 and 1 per metre, .* smaller nearest_m",
     ),
     (lambda psf: psf.energy(torch.tensor([2.0]), size_px=3), DomainError, "3 x 3 pixels .* odd number"),
     (lambda psf: psf.energy(2.0), ShapeError, r"distances must be a list \[D\]"),
-    (lambda psf: psf.offsets_px([1.1]), DomainError, "must lie between 0 and 1 per metre"),
     (
         lambda psf: render.psf_frames(
             THIN, PLANE, look_at((0, 0, 0.5), (0, 0, 0), down=(0, 1, 0))[None], psf

@@ -167,7 +167,7 @@ def test_an_interrupted_run_goes_on_with_the_same_events(tmp_path, monkeypatch, 
 
 
 def test_everything_is_drawn_and_shown(tmp_path):
-    looks = ["--preview-fps", 10, "--preview-slowdown", 100, "--sensor-size", 20, 10, "--linear"]
+    looks = ["--preview-slowdown", 100, "--sensor-size", 20, 10, "--linear"]
     folder = write_folder(tmp_path / "in", waves(12))
     assert call(tmp_path / "run", "--input", folder, "--fps", 1000, *looks) == 0
     stream = events.read(tmp_path / "run" / "events.h5")
@@ -177,8 +177,8 @@ def test_everything_is_drawn_and_shown(tmp_path):
     assert page.count("data:video/mp4") == 2
     assert "sRGB gamma is undone" in page
     assert "stretched to 20 x 10" in page
-    # 11 ms at 100 times slower and 10 pictures a second
-    assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "run" / "events.mp4"))[0] == 11
+    # 11 ms at 100 times slower and 30 pictures a second
+    assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "run" / "events.mp4"))[0] == 33
     metrics = metrics_of(tmp_path / "run")
     assert metrics["events_on"] + metrics["events_off"] == len(stream)
     assert metrics["mpixel_per_s"] == pytest.approx(12 * 200 / metrics["seconds"] / 1e6)

@@ -24,16 +24,15 @@ def outlines(shapes: list[Shape]) -> list[Any]:
     curved, width_m = on_surfaces(crossed[~flat], shapes, apart_m)
     edges = [mesh_edges(s.vertices, s.faces, s.values) for s in shapes if isinstance(s, Mesh)]
     edges.append(segments(crossed.start[flat], crossed.end[flat]))
-    edges.append(_seams(shapes))
+    seams = [seam for s in shapes if s.light is None for seam in s.seams()]
+    edges.append(segments(*np.array(seams).reshape(-1, 2, 3).swapaxes(0, 1)))
     balls = [(s.centre, s.radius) for s in shapes if isinstance(s, Ball)]
     tubes = [(s.start, s.end, s.radius) for s in shapes if isinstance(s, Tube)]
-    rims = []
-    for s, both in zip(shapes, width_m, strict=True):
-        if isinstance(s, Disk):
-            rims.append((s.centre, s.u, s.v, np.zeros(3), both[0]))
-        if isinstance(s, Tube):
-            rims.append((s.start, s.u, s.v, s.end - s.start, both[0]))
-            rims.append((s.end, s.u, s.v, s.start - s.end, both[1]))
+    rims = [
+        (*rim, far)
+        for s, both in zip(shapes, width_m, strict=True)
+        for rim, far in zip(s.rims(), both, strict=False)
+    ]
     meridians = [
         (s.centre, *s.seam) for s in shapes if isinstance(s, Ball) and s.light is None and s.seam is not None
     ]
@@ -54,14 +53,6 @@ def outlines(shapes: list[Shape]) -> list[Any]:
     if over is not None:
         found.append(over)
     return found
-
-
-def _seams(shapes):
-    """Straight lines on which pictures of cylinders and disks begin: their last column need not go on in the
-    first."""
-    lines = [(s.start + s.u, s.end + s.u) for s in shapes if isinstance(s, Tube) and s.light is None]
-    lines += [(s.centre, s.centre + s.u) for s in shapes if isinstance(s, Disk) and s.light is None]
-    return segments(*(_columns(lines) if lines else (np.zeros((0, 3)), np.zeros((0, 3)))))
 
 
 def _columns(rows):

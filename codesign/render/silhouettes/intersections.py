@@ -19,7 +19,7 @@ from codesign.render.silhouettes.curves import (
     on_line,
     rounding_rad,
 )
-from codesign.render.silhouettes.shapes import Ball, Disk, Mesh, Shape, Tube
+from codesign.render.silhouettes.shapes import Shape
 
 TURNS = 6  # of Newton's method, from chords of a hundredth of a circle
 FOUND = 1e-9  # share of the radius by which a point may miss the surfaces
@@ -112,7 +112,8 @@ def on_surfaces(
         moved < length + 4 * least * (np.pi / AROUND)
     )
     for number in np.unique(found.shapes):
-        for rim, distance in enumerate(_from_rims(shapes[number], start.numpy(), end.numpy())):
+        for rim, curve_of_rim in enumerate(shapes[number].rims()):
+            distance = np.maximum(*(_from_rim(curve_of_rim, x.numpy()) for x in (start, end)))
             near = (distance < apart_m) & (found.shapes == number).any(1) & good.numpy()
             width[number, rim] = distance[near].max(initial=0)
             good &= torch.tensor(~near)
@@ -134,39 +135,20 @@ def _surfaces(found, shapes, side):
     radius = np.full(count, np.inf)
     for number in np.unique(found.shapes[:, side]):
         rows = found.shapes[:, side] == number
-        shape = shapes[number]
-        if isinstance(shape, Ball):
-            c[rows] = shape.centre
-            across = np.eye(3)
-        elif isinstance(shape, Tube):
-            c[rows] = shape.start
-            axes[rows] = shape.end - shape.start
-            axis = (shape.end - shape.start) / np.linalg.norm(shape.end - shape.start)
-            across = np.eye(3) - np.outer(axis, axis)
-        else:
-            continue
-        A[rows] = across / (2 * shape.radius)
-        b[rows] = 0
-        k[rows] = -shape.radius / 2
-        radius[rows] = shape.radius
+        if (of := shapes[number].round()) is not None:
+            c[rows], axes[rows], radius[rows] = of
+            along = of[1] / max(np.linalg.norm(of[1]), 1e-300)
+            A[rows] = (np.eye(3) - np.outer(along, along)) / (2 * of[2])
+            b[rows] = 0
+            k[rows] = -of[2] / 2
     return c, A, b, k, axes, radius
 
 
-def _from_rims(shape, start, end):
-    """For every rim of a shape, how far [n] pieces from start to end [n, 3] on its surface run from it."""
-    if isinstance(shape, Mesh | Ball):
-        return []
-    if isinstance(shape, Tube):
-        axis = (shape.end - shape.start) / np.linalg.norm(shape.end - shape.start)
-        return [
-            np.maximum(np.abs((start - centre) @ axis), np.abs((end - centre) @ axis))
-            for centre in (shape.start, shape.end)
-        ]
-    return [np.maximum(_from_rim(shape, start), _from_rim(shape, end))]
-
-
-def _from_rim(disk: Disk, points):
-    lengths = [float(np.linalg.norm(half)) for half in (disk.u, disk.v)]
-    away = points - disk.centre
-    share = np.hypot(away @ disk.u / lengths[0] ** 2, away @ disk.v / lengths[1] ** 2)
-    return np.abs(share - 1) * min(lengths)
+def _from_rim(rim, points):
+    """How far [n] points [n, 3] on the surface of a shape lie from one of its rims."""
+    centre, u, v, _ = rim
+    lengths = [float(np.linalg.norm(half)) for half in (u, v)]
+    away = points - centre
+    share = np.hypot(away @ u / lengths[0] ** 2, away @ v / lengths[1] ** 2)
+    height = away @ np.cross(u, v) / (lengths[0] * lengths[1])
+    return np.hypot((share - 1) * min(lengths), height)

@@ -233,8 +233,9 @@ def _crossings(camera, scene, cameras, most):
 
 
 def _listed(camera, scene, curves, cameras, found):
-    """Of the steps that can be judged their frames [n] and changes of light [n]; the changes [n] along their lines that
-    the listed curves have there, as the boundary term reads them; and their places [n, 3] in camera axes. A line
+    """Of the steps that can be judged their frames [n] and changes of light [n]; the changes [n] along their
+    lines that the listed curves have there, as the boundary term reads them; and their places [n, 3] in
+    camera axes. A line
     along a curve tells little of it: there is one across."""
     seen = camera.rays_through(found.film_px, found.pupil)
     place_cam_m = seen.origin_m + seen.direction * found.distance.clamp_max(1e6)[:, None]

@@ -9,14 +9,38 @@ from typing import Any
 import numpy as np
 
 from codesign.errors import DomainError
-from codesign.render.mitsuba_shapes import front_faces, is_mirrored
+from codesign.render.mitsuba_shapes import front_faces, is_mirrored, matrix_of
 from codesign.render.triangles import across
 
 EVEN = 1e-4  # axes of a sphere or cylinder may differ in length and angle by this share
 
 
+class Surface:
+    """What is one surface of one radiance, or of one picture."""
+
+    light: float | None
+
+    def light_of(self, face):
+        """The one radiance of the shape, None where it changes over it."""
+        return self.light
+
+    def round(self):
+        """Centre [3], axis [3] from there to a tube's other end or 0, and radius of a round one; None of a
+        flat one."""
+        return None
+
+    def rims(self):
+        """Rims centre + cos u + sin v, each (centre, u, v, axis as above), [3] each."""
+        return []
+
+    def seams(self):
+        """Start and end [3] of straight lines on which a picture begins: its last column need not go on in
+        the first."""
+        return []
+
+
 @dataclass(frozen=True)
-class Mesh:
+class Mesh(Surface):
     """vertices: [V, 3]; faces: [F, 3], normals on the side that shines; values: [F, 3, k] by which radiance
     is looked up at every corner (texture coordinates, colours, radiance of a face), None where it is one for
     all; light: that one radiance, None where it changes or is not known."""
@@ -39,20 +63,9 @@ class Mesh:
         return float(own[0, 0]) if own.shape[1] == 1 and (own == own[0]).all() else None
 
 
-class Whole:
-    """What is one surface of one radiance, or of one picture."""
-
-    light: float | None
-
-    def light_of(self, face):
-        """The one radiance of the shape, None where it changes over it."""
-        return self.light
-
-
 @dataclass(frozen=True)
-class Ball(Whole):
-    """A sphere: centre [3], radius; seam: half axes [2, 3] of the circle on
-    which its picture begins."""
+class Ball(Surface):
+    """A sphere: centre [3], radius; seam: half axes [2, 3] of the circle on which its picture begins."""
 
     name: str
     centre: np.ndarray
@@ -60,13 +73,17 @@ class Ball(Whole):
     light: float | None = None
     seam: np.ndarray | None = None
 
+    def round(self):
+        """As for Surface."""
+        return self.centre, np.zeros(3), self.radius
+
     def corners(self):
         """Points [N, 3] whose box holds the shape."""
         return self.centre + self.radius * np.array([[-1.0], [1.0]])
 
 
 @dataclass(frozen=True)
-class Disk(Whole):
+class Disk(Surface):
     """A disk: centre [3] and half axes u, v [3] at right angles."""
 
     name: str
@@ -80,9 +97,17 @@ class Disk(Whole):
         reach = np.hypot(self.u, self.v)
         return np.stack([self.centre - reach, self.centre + reach])
 
+    def rims(self):
+        """As for Surface."""
+        return [(self.centre, self.u, self.v, np.zeros(3))]
+
+    def seams(self):
+        """As for Surface."""
+        return [(self.centre, self.centre + self.u)]
+
 
 @dataclass(frozen=True)
-class Tube(Whole):
+class Tube(Surface):
     """A cylinder without caps: ends of its axis [3], half axes u, v [3] of one length at right angles."""
 
     name: str
@@ -97,10 +122,22 @@ class Tube(Whole):
         """Radius, metres."""
         return float(np.linalg.norm(self.u))
 
+    def round(self):
+        """As for Surface."""
+        return self.start, self.end - self.start, self.radius
+
     def corners(self):
         """Points [N, 3] whose box holds the shape."""
         reach = np.hypot(self.u, self.v)
         return np.stack([p + k * reach for p in (self.start, self.end) for k in (-1, 1)])
+
+    def rims(self):
+        """As for Surface."""
+        return [(a, self.u, self.v, b - a) for a, b in ((self.start, self.end), (self.end, self.start))]
+
+    def seams(self):
+        """As for Surface."""
+        return [(self.start + self.u, self.end + self.u)]
 
 
 Shape = Mesh | Ball | Disk | Tube
@@ -116,7 +153,7 @@ def read(mi: Any, shape: Any) -> Shape:
     if kind == int(mi.ShapeType.Rectangle):
         corners = _place(parameters, [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
         faces = np.array([[0, 1, 2], [0, 2, 3]])
-        turned = shape.has_flipped_normals() != is_mirrored(_matrix(parameters))
+        turned = shape.has_flipped_normals() != is_mirrored(matrix_of(parameters))
         return Mesh(name, corners, faces[:, ::-1] if turned else faces, None, light)
     if kind == int(mi.ShapeType.Sphere):
         centre, *ends = _place(parameters, [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
@@ -161,12 +198,8 @@ def _values(shape, parameters, faces, count):
     return None
 
 
-def _matrix(parameters):
-    return np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)
-
-
 def _place(parameters, points):
-    matrix = _matrix(parameters)
+    matrix = matrix_of(parameters)
     return np.array(points, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
 
 
