@@ -1,4 +1,4 @@
-"""Gradients beside central differences, for losses in double precision."""
+"""Gradients beside central differences, for losses in double precision; what frames are weighed and moved by."""
 
 import torch
 
@@ -22,3 +22,15 @@ def assert_gradients(loss, at, steps, within, seed=0):
             error = float((gradient * way).sum()) - (ahead - behind) / (2 * step)
             # relative to the gradient's own length, as a direction may lie across it
             assert abs(error) <= within * float(gradient.norm()), (slot, error / float(gradient.norm()))
+
+
+def to_twist(loss):
+    """Gradient [6] of loss(twist [1, 6]) about no motion."""
+    twist = torch.zeros(1, 6, dtype=torch.float64, requires_grad=True)
+    return torch.autograd.grad(loss(twist), twist)[0][0]
+
+
+def smooth_weights(size_px):
+    """Weights [size_px, size_px] of pixels, from a picture of 5 x 5."""
+    coarse = torch.randn(1, 1, 5, 5, generator=torch.Generator().manual_seed(3))
+    return torch.nn.functional.interpolate(coarse, size=(size_px, size_px), mode="bicubic")[0, 0]

@@ -1,4 +1,4 @@
-"""Triangles that several tests are made of."""
+"""Triangles and lights that several tests are made of."""
 
 import numpy as np
 
@@ -14,3 +14,8 @@ def squares(n, m, around=False):
     row, column = (v.reshape(-1) for v in np.mgrid[: n - 1, : m - (not around)])
     a, b = row * m + column, row * m + (column + 1) % m
     return np.stack([a, b, b + m, a, b + m, a + m], 1).reshape(-1, 3)
+
+
+def area(value):
+    """Area emitter of one radiance."""
+    return {"type": "area", "radiance": {"type": "rgb", "value": float(value)}}

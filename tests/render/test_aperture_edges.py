@@ -8,11 +8,10 @@ from codesign import lens, pose, render
 from codesign.render.aperture_edges import aperture_edge_term
 from codesign.render.moving import views_of
 from scenes import silhouettes as silhouette_scenes
+from tests.render.differences import smooth_weights
 
 START = pose.look_at((0.05, -1.2, 1.0), (0.0, 1.0, 0.7))[None]
-WEIGHT = torch.nn.functional.interpolate(
-    torch.randn(1, 1, 5, 5, generator=torch.Generator().manual_seed(3)), size=(32, 32), mode="bicubic"
-)[0, 0]
+WEIGHT = smooth_weights(32)
 
 
 def gradient(way, samples, seed, **options):

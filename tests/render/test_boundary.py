@@ -14,6 +14,8 @@ from codesign.render.sequence import cheapest
 from codesign.render.silhouettes.curve_points import places as _places
 from scenes import silhouettes as silhouette_scenes
 from studies.gradient_flow.silhouettes.frames import STEPS, Task
+from tests.render.differences import smooth_weights, to_twist
+from tests.render.solids import area
 
 F64 = torch.float64
 
@@ -54,13 +56,15 @@ def test_a_bright_square_moves_by_its_closed_form():
     """A square of radiance 100 alone before a pinhole: sideways the sum of all pixels stays, a weighted one
     gains radiance times length times motion on both sides."""
     place = backend.mitsuba().ScalarTransform4f().translate([0.013, 0.021, 2.0]).rotate([0, 1, 0], 180)
-    emitter = {"type": "area", "radiance": {"type": "rgb", "value": 100.0}}
+    emitter = area(100.0)
     scene = MitsubaScene({"square": {"type": "rectangle", "to_world": place.scale(0.2), "emitter": emitter}})
     camera = render.Camera(Pinhole(11.0), 32, 32, 0.25, 16)
-    twist = torch.zeros(6, dtype=F64, requires_grad=True)
-    image = render.frames(camera, scene, pose.se3_exp(twist[None]), gradient="boundary")[0].double()
-    (total,) = torch.autograd.grad(image.sum(), twist, retain_graph=True)
-    (first,) = torch.autograd.grad((image * torch.arange(32.0)).sum(), twist)
+    total, first = (
+        to_twist(
+            lambda t, w=w: (render.frames(camera, scene, pose.se3_exp(t), "boundary").double() * w).sum()
+        )
+        for w in (torch.ones(32), torch.arange(32.0))
+    )
     px_per_m = 11.0 / 0.25 / 2.0
     side = 0.4 * px_per_m  # 8.8 px
     assert abs(float(total[0])) < 1e-6 * 100 * side * px_per_m  # the two sides cancel
@@ -128,14 +132,12 @@ def test_differences_step_by_a_share_of_a_pixel_in_small_scenes(scale):
     cube = shape("cube", T.translate([0.1, 0.2, 2]).rotate([1, 2, 0.5], 40).scale(0.3), 2)
     scene = MitsubaScene({"wall": wall, "cube": cube})
     camera = render.Camera(Pinhole(11.0), 24, 24, 0.33, 256)
-    coarse = torch.randn(1, 1, 5, 5, generator=torch.Generator().manual_seed(3))
-    weight = torch.nn.functional.interpolate(coarse, size=(24, 24), mode="bicubic")[0, 0].double()
+    weight = smooth_weights(24).double()
     unit = torch.tensor([scale] * 3 + [1.0] * 3, dtype=F64)
 
-    def gradient(way):
-        twist = torch.zeros(6, dtype=F64, requires_grad=True)
-        frames = render.frames(camera, scene, pose.se3_exp(twist[None]), way)
-        return torch.autograd.grad((frames[0].double() * weight).sum(), twist)[0] * unit
-
-    found, truth = gradient("difference"), gradient("boundary")
+    found, truth = (
+        unit
+        * to_twist(lambda t, way=way: (render.frames(camera, scene, pose.se3_exp(t), way) * weight).sum())
+        for way in ("difference", "boundary")
+    )
     assert float((found - truth).norm() / truth.norm()) < 0.1

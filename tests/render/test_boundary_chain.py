@@ -9,15 +9,13 @@ from codesign import backend, lens, pose, render
 from codesign.errors import DomainError
 from codesign.render import MitsubaScene
 from scenes import silhouettes as silhouette_scenes
+from tests.render.differences import smooth_weights, to_twist
+from tests.render.solids import area
 
 F64 = torch.float64
 SIZE_PX = 24
 STEP = 2e-3
-WEIGHT = torch.nn.functional.interpolate(
-    torch.randn(1, 1, 5, 5, generator=torch.Generator().manual_seed(3)),
-    size=(SIZE_PX, SIZE_PX),
-    mode="bicubic",
-)[0, 0]
+WEIGHT = smooth_weights(SIZE_PX)
 START = pose.look_at((0.05, -1.2, 1.0), (0.0, 1.0, 0.7))
 
 
@@ -40,10 +38,7 @@ def judged(loss, many=512, seeds=(11, 12), per_px=12.0):
     noise = float(torch.stack(truths).std(0).norm() / len(seeds) ** 0.5 / truth.norm())
 
     def error(way):
-        found = []
-        for seed in seeds:
-            twist = torch.zeros(6, dtype=F64, requires_grad=True)
-            found.append(torch.autograd.grad(loss(twist, many, seed + 10, way, per_px), twist)[0])
+        found = [to_twist(lambda t, seed=seed: loss(t[0], many, seed + 10, way, per_px)) for seed in seeds]
         return float((torch.stack(found).mean(0) - truth).norm() / truth.norm())
 
     return error("boundary"), error("interior"), noise
@@ -168,7 +163,7 @@ def test_auto_sees_faint_edges_and_asks_the_rays_of_any_lens():
 
     def sheet(level, away, scale):
         place = T().translate([0.05, away, 0.7]).rotate([1, 0.1, 0.2], 90).scale(scale)
-        emitter = {"type": "area", "radiance": {"type": "rgb", "value": level}}
+        emitter = area(level)
         return {"type": "rectangle", "to_world": place, "emitter": emitter}
 
     scene = Own({"card": sheet(101.0, 1.0, 0.3), "wall": sheet(100.0, 2.0, 5.0)})

@@ -5,15 +5,14 @@ import math
 
 import numpy as np
 import pytest
-import torch
 
 from codesign import backend, pose, render
 from codesign.lens import GeoLens, Glass, Pinhole, Surface
 from codesign.render import MitsubaScene
 from codesign.render.charts import emissive_mesh
-from tests.render.solids import CORNERS, CUBE
+from tests.render.differences import to_twist
+from tests.render.solids import CORNERS, CUBE, area
 
-F64 = torch.float64
 RADIANCE = 100.0
 
 
@@ -22,7 +21,7 @@ def card(right_m, distance_m, tilt_deg=0.0, half_height_m=0.3):
     axis."""
     T = backend.mitsuba().ScalarTransform4f
     place = T().translate([right_m - 5.0, 0, distance_m]).rotate([1, 0, 0], tilt_deg).rotate([0, 1, 0], 180)
-    emitter = {"type": "area", "radiance": {"type": "rgb", "value": RADIANCE}}
+    emitter = area(RADIANCE)
     return MitsubaScene(
         {
             "card": {
@@ -36,11 +35,14 @@ def card(right_m, distance_m, tilt_deg=0.0, half_height_m=0.3):
 
 def sideways(camera, scene):
     """Derivative of the sum of all pixels to the motion of the camera along +x, per metre."""
-    twist = torch.zeros(6, dtype=F64, requires_grad=True)
-    path = torch.eye(4, dtype=F64)[None] @ pose.se3_exp(twist[None])
-    image = render.frames(camera, scene, path, gradient="boundary")
-    (found,) = torch.autograd.grad(image.double().sum(), twist)
-    return float(found[0])
+    return float(moved(camera, scene)[0])
+
+
+def moved(camera, scene, **more):
+    """Derivatives [6] of the sum of all pixels to the motion of the camera."""
+    return to_twist(
+        lambda t: render.frames(camera, scene, pose.se3_exp(t), "boundary", **more).double().sum()
+    )
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 50.0, -65.0])
@@ -135,11 +137,9 @@ def test_light_of_a_small_far_tube_grows_as_the_camera_comes_nearer():
     across the view is seen, which falls with the square of the distance."""
     radius, across = 0.8 / 580, math.hypot(5e-4, 7e-4)
     tube = {"type": "cylinder", "p0": [0, 0, 0.8], "p1": [5e-4, 7e-4, 0.805], "radius": radius}
-    emitter = {"type": "area", "radiance": {"type": "rgb", "value": RADIANCE}}
+    emitter = area(RADIANCE)
     scene = MitsubaScene({"tube": {**tube, "emitter": emitter}})
     camera = render.Camera(Pinhole(11.0), 16, 16, 0.0168, 4)
-    twist = torch.zeros(6, dtype=F64, requires_grad=True)
-    image = render.frames(camera, scene, pose.se3_exp(twist[None]), gradient="boundary", per_px=24.0)
-    (found,) = torch.autograd.grad(image.double().sum(), twist)
+    found = moved(camera, scene, per_px=24.0)
     light = RADIANCE * 2 * radius * across / (0.8025 * camera.slope_per_px()) ** 2
     assert float(found[2]) == pytest.approx(2 / 0.8025 * light, rel=0.05)

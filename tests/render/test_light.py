@@ -15,13 +15,14 @@ from codesign.render.charts import chart_of, emissive_mesh
 from codesign.types import Rays
 from scenes import textures, worlds
 from scenes.build import sky
+from tests.render.solids import area
 
 D = torch.float64
 
 
 def grey(albedo, radiance=0.0) -> Any:
     """A Lambertian surface that also glows."""
-    glow = {"emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}}} if radiance else {}
+    glow = {"emitter": area(radiance)} if radiance else {}
     return {"bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}}, **glow}
 
 

@@ -8,6 +8,7 @@ from codesign import lens, render
 from codesign.pose import inverse, look_at, se3_exp
 from codesign.render import Camera, MitsubaScene, MovingScene, TexturedPlane
 from scenes import textures
+from tests.render.solids import area
 
 D = torch.float64
 TRIPLET = lens.load("cooke-triplet").scaled(0.08)
@@ -55,7 +56,7 @@ def test_nearest_of_several_objects_and_the_background_where_nothing_is_met():
     side."""
 
     def ball(radiance, *place):
-        glow = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
+        glow = area(radiance)
         return MitsubaScene({"ball": {"type": "sphere", "radius": 0.2, "emitter": glow}}), at(*place)[None]
 
     scene = MovingScene(even(70.0), {"far": ball(10.0, 0.0, 5.0), "near": ball(20.0, 0.1, 4.0)})

@@ -15,7 +15,7 @@ from codesign.render.silhouettes import Segments, outlines
 from codesign.render.silhouettes.crossings import Overlaps, find_crossings, overlaps
 from codesign.render.silhouettes.intersections import Intersections
 from codesign.render.silhouettes.shapes import Mesh, read
-from tests.render.solids import CORNERS, CUBE, squares
+from tests.render.solids import CORNERS, CUBE, area, squares
 
 F64 = torch.float64
 EYE = torch.tensor([0.3, -4.0, 2.0], dtype=F64)
@@ -110,7 +110,7 @@ def test_faces_in_one_plane_are_refused_where_they_are_seen(shift):
 
     def tile(x, value, half=0.5, height=0.0):
         to_world = T.translate([x, 0.2, height]).rotate([0, 0, 1], 20).scale([half, half, 1])
-        light = {"type": "area", "radiance": {"type": "rgb", "value": value}}
+        light = area(value)
         return {"type": "rectangle", "to_world": to_world, "emitter": light}
 
     def seen(picture, eye):

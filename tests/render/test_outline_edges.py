@@ -13,11 +13,11 @@ from codesign.render.silhouettes import Circles, Segments, mesh_edges
 from codesign.render.silhouettes.edges import edges_once, rims_once, segments
 from scenes.build import pole
 from tests.render import solids
-from tests.render.solids import CUBE
+from tests.render.solids import CUBE, area
 
 F64 = torch.float64
 CORNERS = (solids.CORNERS + 1) / 2
-LIGHT = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
+LIGHT = area(1.0)
 
 
 def tube(sides=64):

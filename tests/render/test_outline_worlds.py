@@ -17,13 +17,10 @@ from scenes.silhouettes import smooth
 from studies.gradient_flow.silhouettes.frames import PITCH_MM, SIZE_PX, STEPS, Task
 from tests.hostile import judge
 from tests.hostile.outline_cases import icosphere
+from tests.render.solids import area
 
 F64 = torch.float64
 SCALE = torch.tensor(STEPS["pose"], dtype=F64)
-
-
-def light(value):
-    return {"type": "area", "radiance": {"type": "rgb", "value": float(value)}}
 
 
 def picture(seed, cycles=6):
@@ -89,7 +86,7 @@ def test_poles_however_thin_and_far(ratio):
         "p0": start.tolist(),
         "p1": end.tolist(),
         "radius": radius,
-        "emitter": light(100),
+        "emitter": area(100),
     }
     task = Task(MitsubaScene({"pole": pole}), "pinhole")
     step = 1e-5
@@ -109,31 +106,6 @@ def test_poles_however_thin_and_far(ratio):
     assert noise < 0.04
 
 
-def five_poles():
-    """Of 5 to 8 mm at a metre, with their ends in view."""
-    return {
-        f"pole{k}": {
-            "type": "cylinder",
-            "p0": [-0.5 + 0.25 * k, -0.2 + 0.02 * k, 0.7 + 0.03 * k],
-            "p1": [-0.4 + 0.25 * k, -0.15, 1.2 - 0.02 * k],
-            "radius": 0.0025 + 0.0004 * k,
-            "emitter": light(60 + 40 * k),
-        }
-        for k in range(5)
-    }
-
-
-def test_poles_with_their_ends_in_view():
-    """With points up to their very ends: an estimate of 2.5 points a pixel is off by no more than its usual
-    noise, whichever the seed."""
-    task = Task(MitsubaScene({**five_poles(), "wall": wall()}), "pinhole")
-    truth = torch.stack([task.differences("pose", 256, seed) for seed in (11, 12)]).mean(0) * SCALE
-    whole = task.gradient("pose", 256, 13, "boundary", 32.0) * SCALE
-    assert float((whole - truth).norm() / truth.norm()) < 0.03
-    single = torch.stack([task.gradient("pose", 16, seed, "boundary") for seed in range(20)]) * SCALE
-    assert float((single - whole).norm(dim=1).max() / whole.norm()) < 0.3
-
-
 def test_the_outline_of_a_fine_mesh_through_a_wide_pupil():
     """An aperture of 5 mm sees the outline of a ball of 20,480 faces move over edges next to it."""
     vertices, faces = icosphere(5)
@@ -150,7 +122,7 @@ def test_the_outline_of_a_fine_mesh_through_a_wide_pupil():
 def test_lines_without_width_between_faces_are_no_jumps():
     """Rays along the middle row of the film meet edges of a mesh exactly, and may slip through."""
     vertices, faces = icosphere(4)
-    ball = emissive_mesh(backend.mitsuba(), 0.5 * vertices + [0, 2, 0], faces, light(200))
+    ball = emissive_mesh(backend.mitsuba(), 0.5 * vertices + [0, 2, 0], faces, area(200))
     camera = render.Camera(lens.Pinhole(11.0), 32, 32, 0.3575, 4)
     frames = render.frames(camera, MitsubaScene({"ball": ball, "sky": SKY}), AHEAD[None], gradient="boundary")
     assert not bool(frames.isnan().any())
@@ -163,8 +135,8 @@ def test_a_dark_ball_through_a_mesh_however_far(ratio):
     behind the ball, both nearer to what is seen than rays pass beside them."""
     radius, distance = 0.3, 0.3 * ratio
     vertices, faces = icosphere(2)
-    ball = {"type": "sphere", "center": [0.06, distance - 0.24, 0.03], "radius": 0.15, "emitter": light(0)}
-    mesh = emissive_mesh(backend.mitsuba(), radius * vertices + [0, distance, 0], faces, light(200))
+    ball = {"type": "sphere", "center": [0.06, distance - 0.24, 0.03], "radius": 0.15, "emitter": area(0)}
+    mesh = emissive_mesh(backend.mitsuba(), radius * vertices + [0, distance, 0], faces, area(200))
     found = judged(0.3, 22 * radius / distance / 12, distance - radius, mesh=mesh, ball=ball, sky=SKY)
     assert found.error < 0.05 + 2 * found.noise
     assert found.noise < 0.05
@@ -183,9 +155,9 @@ def test_a_view_is_looked_at_though_another_was_right(twist, nearer, monkeypatch
     aside = T().scale(1 / nearer).translate([-7.2, 0, 10.0]).rotate([1, 1, 0], 40).scale(0.8)
     static = {
         "wall": {"type": "rectangle", "to_world": far, "emitter": picture(2)},
-        "cube": {"type": "cube", "to_world": aside, "emitter": light(200)},
+        "cube": {"type": "cube", "to_world": aside, "emitter": area(200)},
     }
-    ball = MitsubaScene({"ball": {"type": "sphere", "radius": 0.55 / nearer, "emitter": light(20)}})
+    ball = MitsubaScene({"ball": {"type": "sphere", "radius": 0.55 / nearer, "emitter": area(20)}})
     place = torch.eye(4, dtype=F64)[None].clone()
     place[0, :3, 3] = torch.tensor([-6.6, 0.1, 9.3]) / nearer
     world = render.MovingScene(MitsubaScene(static), {"ball": (ball, place)})
@@ -209,7 +181,7 @@ def test_no_surface_is_nearer_than_it_is_said(kind, generator):
     place = (
         backend.mitsuba().ScalarTransform4f().translate(centre.tolist()).rotate([0.6, 0.8, 0], 50).scale(0.4)
     )
-    scene = MitsubaScene({"thing": {"type": kind, "to_world": place, "emitter": light(1)}})
+    scene = MitsubaScene({"thing": {"type": kind, "to_world": place, "emitter": area(1)}})
     at = torch.randn(40_000, 2, 3, generator=generator, dtype=F64)
     direction = torch.nn.functional.normalize(centre + 0.4 * at[:, 1] - at[:, 0], dim=1)
     point, _, valid = scene.hit(at[:, 0], direction)

@@ -12,6 +12,7 @@ from codesign.render.moving import views_of
 from codesign.render.wavefront import light_and_nearness
 from scenes import textures, worlds
 from tests.render.differences import assert_gradients
+from tests.render.solids import area
 
 D = torch.float64
 PITCH_MM = 0.02
@@ -148,7 +149,7 @@ def half_before(front, behind):
     T = worlds.backend.mitsuba().ScalarTransform4f
 
     def card(level, place):
-        light = {"type": "area", "radiance": {"type": "rgb", "value": level}}
+        light = area(level)
         return {"type": "rectangle", "to_world": place, "emitter": light}
 
     near, far = T().translate([-2.0, 0, 1.0]).scale(2.0), T().scale(4.0)

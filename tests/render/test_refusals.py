@@ -15,6 +15,7 @@ from codesign.render import Camera, Film, MitsubaScene, MovingScene, TexturedPla
 from codesign.render.charts import emissive_mesh
 from codesign.types import Rays
 from scenes import textures, worlds
+from tests.render.solids import area
 from tests.render.test_own_lens import Barrel
 
 D = torch.float64
@@ -38,10 +39,6 @@ show: Any = render
 def refused(*calls):
     """Tests of rows (call, kind of error, part of the sentence)."""
     return pytest.mark.parametrize(("call", "kind", "sentence"), calls)
-
-
-def area(value):
-    return {"type": "area", "radiance": {"type": "rgb", "value": value}}
 
 
 def mesh(vertices=SQUARE, faces=FACES, radiance: Any = (5.0, 5.0)):

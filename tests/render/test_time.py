@@ -15,6 +15,7 @@ from codesign.render import Camera, Film, MitsubaScene, MovingScene, TexturedPla
 from codesign.render.film import coarse_pixels
 from scenes import trajectories, worlds
 from tests.render.differences import assert_gradients
+from tests.render.solids import area
 
 D = torch.float64
 FOCAL_MM = 8.0
@@ -50,7 +51,7 @@ def camera(width=24, height=1, samples=1, optics=None):
 
 def shifting(x_m, ground, **description):
     """A bright shape over even ground, moved along x by ``x_m`` of the times."""
-    light = {"type": "area", "radiance": {"type": "rgb", "value": 200.0}}
+    light = area(200.0)
     thing = MitsubaScene({"thing": {**description, "emitter": light}})
 
     def scene(t_s):

@@ -19,6 +19,7 @@ from codesign.render import (
 from scenes import textures, worlds
 from tests.render.differences import assert_gradients
 from tests.render.fitted_lenses import OPTICS, PITCH_MM, SENSOR_PX
+from tests.render.solids import area
 
 D = torch.float64
 
@@ -30,7 +31,7 @@ def plane(seed=1, height_m=0.0):
 
 
 def emitting(radiance=100.0, **description):
-    light = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
+    light = area(radiance)
     return MitsubaScene({"shape": {**description, "emitter": light}})
 
 
