@@ -102,9 +102,7 @@ class Camera:
 
     def with_film(self, film: Film) -> "Camera":
         """The same lens and samples before other pixels."""
-        twin = copy.copy(self)
-        twin.film = film.check()
-        return twin
+        return self._with(film=film.check())
 
     def with_seed(self, seed: int) -> "Camera":
         """The same lens and film with other samples."""

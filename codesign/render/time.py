@@ -62,12 +62,12 @@ def exposed_frames(
       scene, trajectory: see the top of this file.
       t_s: [T], middles of the exposures.
       exposure_s: length of the exposure, >= 0.
-      samples: time samples per frame, in the middle of equal shares of the exposure: a moving edge is wrong by
-        at most its jump / (2 samples).
+      samples: time samples per frame, in the middle of equal shares of the exposure: a moving edge is wrong
+        by at most its jump / (2 samples).
       gradient, per_px: as ``frames`` takes them, for every time sample; "boundary" has the motion of
         silhouettes in it.
-      line_s: rolling shutter: row r of the sensor is exposed r * line_s later than row 0, whose middle is t_s;
-        each row is a launch of its own.
+      line_s: rolling shutter: row r of the sensor is exposed r * line_s later than row 0, whose middle is
+        t_s; each row is a launch of its own.
     Returns: [..., T, *film.shape], the mean of the irradiance over the exposure, in the scene's units.
     Gradient: lens, and whatever the trajectory's poses depend on; what it holds says ``gradient``.
     Raises: DomainError on a negative exposure, a line time that is not finite, fewer than one sample, poses
@@ -98,7 +98,8 @@ def exposed_frames(
 
 
 def _exposed(camera, scene, trajectory, t_s, nodes_s, gradient, per_px):
-    """Mean of the frames at all ``nodes_s`` from t_s; the lens is traced once where ``gradient`` allows it."""
+    """Mean of the frames at all ``nodes_s`` from t_s; the lens is traced once where ``gradient`` allows
+    it."""
     rays = camera.rays() if gradient in PROVEN else None
     total = 0.0
     for node_s in nodes_s:
