@@ -3,7 +3,7 @@ network files, flow files, sources of windows, and flow along a stream of events
 
 from codesign.doors import explain
 from codesign.flow import contrast, losses, metrics, sources
-from codesign.flow.baselines import ECN, FlowNetEvents, IDNet, SpikeFlowNet
+from codesign.flow.baselines import FlowNetEvents, SpikeFlowNet
 from codesign.flow.checkpoint import load, save
 from codesign.flow.choice import estimate
 from codesign.flow.export import export
@@ -13,9 +13,7 @@ from codesign.flow.refiner import Refiner
 from codesign.flow.tracker import TrackedWindow, Tracker
 
 __all__ = [
-    "ECN",
     "FlowNetEvents",
-    "IDNet",
     "Refiner",
     "SpikeFlowNet",
     "TrackedWindow",

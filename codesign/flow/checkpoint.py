@@ -24,19 +24,17 @@ from codesign.flow.checks import check_kind, check_path
 from codesign.reading import building, check_regular, reading
 
 if TYPE_CHECKING:
-    from codesign.flow.baselines import ECN, FlowNetEvents, IDNet, SpikeFlowNet
+    from codesign.flow.baselines import FlowNetEvents, SpikeFlowNet
     from codesign.flow.refiner import Refiner
 
-    Network = Refiner | FlowNetEvents | SpikeFlowNet | ECN | IDNet  # the classes of NETWORKS
+    Network = Refiner | FlowNetEvents | SpikeFlowNet  # the classes of NETWORKS
 
 VERSION = 1
 NETWORKS = {
     "refiner": "codesign.flow.refiner:Refiner",
     "flownet-events": "codesign.flow.baselines:FlowNetEvents",
     "spike-flownet": "codesign.flow.baselines:SpikeFlowNet",
-    "ecn": "codesign.flow.baselines:ECN",
-    "idnet": "codesign.flow.baselines:IDNet",
-}  # name -> module:class, imported when asked for
+}  # name -> module:class, imported when asked for; a study adds its own
 DELIVERED = {"refiner": Path(__file__).with_name("refiner.safetensors")}
 
 

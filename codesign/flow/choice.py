@@ -14,14 +14,14 @@ from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample, max_pool2d
+from torch.nn.functional import avg_pool2d, max_pool2d
 
 from codesign.flow.lk.estimate import check_slopes, check_start, descended, field
 from codesign.flow.lk.hot_pixels import weighed_down
 from codesign.flow.lk.lanes import Grid
 from codesign.flow.lk.level import along_path, blurred_to
 from codesign.flow.lk.path import Path
-from codesign.flow.warp import pixel_grid
+from codesign.flow.warp import pixel_grid, read_at
 from codesign.types import EventVolume, FlowField
 
 BLUR_PX = 1.0
@@ -74,18 +74,19 @@ class Agreement:
         """Agreement along a flow [B, 2, H, W] px per way, on the pixels of the start."""
         place = (way.place - way.start[:, None]).to(flow)
         at = pixel_grid(*flow.shape[2:], flow) + place[:, :, None, None, None] * flow[:, None]
-        size = torch.tensor([flow.shape[3], flow.shape[2]]).to(flow)[:, None, None]
-        unit = (2 * at + 1) / size - 1
-        inside = (unit.abs() <= 1).all(2).all(1)
+        last = torch.tensor([flow.shape[3], flow.shape[2]]).to(flow)[:, None, None] - 0.5
+        inside = ((at >= -0.5) & (at <= last)).all(2).all(1)
         inside = inside & (inside.to(flow).mean((1, 2), keepdim=True) > LEAST_SHARE)
-        unit = unit.permute(0, 1, 3, 4, 2).flatten(0, 1)
-        found = inside[:, None] * _read(self.signed, unit) * way.direction.to(flow)[:, :, None, None]
+        images = torch.stack([self.signed, self.events] if sure else [self.signed], 2)
+        read = read_at(images.flatten(0, 1), at.flatten(0, 1)).reshape(images.shape)
+        read = read * inside[:, None, None]
+        found = read[:, :, 0] * way.direction.to(flow)[:, :, None, None]
         size = found.square().sum((2, 3)).sqrt()
         product, most = self._pairs(found), self._pairs(size)
         alike = product.sum((1, 2)) / (most + TINY)
         if not sure:
             return Agreed(alike, alike.new_empty(0), alike.new_empty(0))
-        events = self._pairs(inside[:, None] * _read(self.events, unit)).clamp_min(0)
+        events = self._pairs(read[:, :, 1]).clamp_min(0)
         variance = events / (8 * math.pi * BLUR_PX**2)
         return Agreed(
             alike, most.square() / (variance.sum((1, 2)) + TINY), product / (variance + SOME).sqrt()
@@ -95,12 +96,6 @@ class Agreement:
         """Sum of the products of bins [B, n, ...] that are ``apart`` or more."""
         apart = [bins[:, lag:] * bins[:, :-lag] for lag in range(self.apart, bins.shape[1])]
         return torch.cat(apart, 1).sum(1)
-
-
-def _read(bins, unit):
-    """Bins [B, n, H, W] at places [B n, H, W, 2] in grid_sample's units."""
-    flat = bins.flatten(0, 1)[:, None]
-    return grid_sample(flat, unit, padding_mode="border", align_corners=False).reshape(bins.shape)
 
 
 def estimate(volume: EventVolume, start_px: Tensor | None = None) -> FlowField:

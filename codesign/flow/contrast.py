@@ -49,10 +49,24 @@ class EventTracks:
     height_px: int
     width_px: int
 
+    def __post_init__(self) -> None:
+        """Raises: DomainError, ShapeError unless the parts fit each other."""
+        for name in ("height_px", "width_px"):
+            check_count(check_kind(getattr(self, name), int, name), name, 1, MOST_SIDE_PX)
+        for name in ("x_px", "y_px", "time", "count", "flow_px"):
+            check_real(getattr(self, name), f"{name} of the tracks")
+        flow = self.flow_px
+        lone = [self.x_px.shape, self.y_px.shape, self.time.shape]
+        fits = flow.ndim == 3 and flow.shape[1] == 2 and self.count.shape == flow.shape
+        if not fits or any(shape != flow.shape[2:] for shape in lone):
+            raise ShapeError(
+                f"the tracks have flow {list(flow.shape)}, count {list(self.count.shape)}, x, y and time "
+                f"{list(map(list, lone))}; [B, 2, N] twice and [N] are needed."
+            )
+
     def positions(self, at: float | Tensor) -> tuple[Tensor, Tensor]:
         """Places (x, y), [B, N] each, at the time ``at``."""
-        _check_tracks(self)
-        moved = (_time(at, self) - self.time) * self.flow_px
+        moved = (_number(at) - self.time) * self.flow_px
         return self.x_px + moved[:, 0], self.y_px + moved[:, 1]
 
 
@@ -135,17 +149,22 @@ def count_image(tracks: EventTracks, at: float | Tensor) -> Tensor:
     """Image [B, 2, H, W] of the events moved to the time ``at``, each shared between the four pixels around
     it in proportion to its nearness.
 
-    A share that falls on no pixel is lost: the image and ``leaving`` add up to all events. Gradient: counts
-    and flow; piecewise smooth, with a kink where an event crosses the centre line of a pixel.
+    A share that falls on no pixel is lost. Gradient: counts and flow; piecewise smooth, with a kink where
+    an event crosses the centre line of a pixel.
     """
-    return _shared(check_kind(tracks, EventTracks, "the tracks"), tracks.count, at)
-
-
-def time_image(tracks: EventTracks, at: float | Tensor) -> Tensor:
-    """Mean time [B, 2, H, W] of the events that share in a pixel, 0 where there are none. Gradient: as in
-    count_image, but without bound where a count goes to 0."""
-    _check_tracks(tracks)
-    return _ratio(_shared(tracks, tracks.count * tracks.time, at), _shared(tracks, tracks.count, at))
+    x, y = check_kind(tracks, EventTracks, "the tracks").positions(at)
+    left = x.detach().floor()
+    top = y.detach().floor()
+    right = x - left
+    down = y - top
+    corners = (
+        (0, 0, (1 - right) * (1 - down)),
+        (1, 0, right * (1 - down)),
+        (0, 1, (1 - right) * down),
+        (1, 1, right * down),
+    )
+    parts = ((step_x, step_y, tracks.count * share[:, None]) for step_x, step_y, share in corners)
+    return _gathered(tracks, left.long(), top.long(), parts)
 
 
 def nearest_images(tracks: EventTracks, at: float | Tensor) -> tuple[Tensor, Tensor]:
@@ -157,13 +176,8 @@ def nearest_images(tracks: EventTracks, at: float | Tensor) -> tuple[Tensor, Ten
         _gathered(tracks, column, row, [(0, 0, value)])
         for value in (tracks.count, tracks.count * tracks.time)
     )
-    return counts, _ratio(sums, counts)
-
-
-def leaving(tracks: EventTracks, at: float | Tensor) -> Tensor:
-    """[B] number of events that are outside the image at the time ``at`` (shares of events in part)."""
-    _check_tracks(tracks)
-    return tracks.count.sum((1, 2)) - count_image(tracks, at).sum((1, 2, 3))
+    empty = counts == 0
+    return counts, torch.where(empty, 0.0, sums / torch.where(empty, 1.0, counts))
 
 
 def smooth_image(tracks: EventTracks, at: float | Tensor, weight: Tensor | None = None) -> Tensor:
@@ -178,10 +192,6 @@ def smooth_image(tracks: EventTracks, at: float | Tensor, weight: Tensor | None 
     column, row = (value.detach().add(0.5).floor() for value in (x, y))
     share_x = _spline(x - column)
     share_y = _spline(y - row)
-    if weight is not None and check_real(weight, "the weight").shape != tracks.count[:, 0].shape:
-        raise ShapeError(
-            f"the weight is {list(weight.shape)}; one per event, {list(tracks.count[:, 0].shape)}, is needed."
-        )
     count = tracks.count if weight is None else tracks.count * weight[:, None]
     parts = ((i - 1, k - 1, count * (share_x[i] * share_y[k])[:, None]) for i in range(3) for k in range(3))
     return _gathered(tracks, column.long(), row.long(), parts)
@@ -189,10 +199,6 @@ def smooth_image(tracks: EventTracks, at: float | Tensor, weight: Tensor | None 
 
 def still_image(counts: Tensor) -> Tensor:
     """What smooth_image gives at zero flow, for counts [B, 2, bins, H, W], much faster."""
-    if check_real(counts, "the counts").ndim != 5 or counts.shape[1] != 2 or 0 in counts.shape:
-        raise ShapeError(
-            f"the counts are {list(counts.shape)}; [B, 2, bins, H, W], no axis empty, is needed."
-        )
     image = counts.sum(2)
     for axis in (2, 3):
         nothing = torch.zeros_like(image.narrow(axis, 0, 1))
@@ -212,7 +218,7 @@ def warp_jacobian(
     Returns: dx'/dx, dx'/dy, dy'/dx, dy'/dy, [B, bins, H, W] each. Gradient: flow. Raises: ShapeError for
       images less than 2 pixels high or wide.
     """
-    _check_tracks(tracks)
+    check_kind(tracks, EventTracks, "the tracks")
     shape = (check_whole(bins, "bins", 1), tracks.height_px, tracks.width_px)
     if math.prod(shape) != tracks.flow_px.shape[2]:
         raise ShapeError(
@@ -224,7 +230,7 @@ def warp_jacobian(
             f"an image of {shape[1]} x {shape[2]} pixels has no slope of the flow; at least 2 x 2 are needed."
         )
     by_y, by_x = torch.gradient(tracks.flow_px.unflatten(2, shape), dim=(3, 4))
-    span = _time(at, tracks) - tracks.time.reshape(1, *shape)
+    span = _number(at) - tracks.time.reshape(1, *shape)
     return 1 + span * by_x[:, 0], span * by_y[:, 0], span * by_x[:, 1], 1 + span * by_y[:, 1]
 
 
@@ -234,15 +240,7 @@ def area_change(jacobian: tuple[Tensor, Tensor, Tensor, Tensor]) -> Tensor:
     Source: Shiba, Aoki, Gallego, Event collapse in contrast maximization frameworks, Sensors 2022, sec.
       3.4.2.
     """
-    if not isinstance(jacobian, (tuple, list)) or len(jacobian) != 4:
-        raise ShapeError(
-            "a Jacobian is four tensors dx'/dx, dx'/dy, dy'/dx, dy'/dy, as warp_jacobian gives them."
-        )
-    xx, xy, yx, yy = (check_real(part, "a part of the Jacobian") for part in jacobian)
-    if not xx.shape == xy.shape == yx.shape == yy.shape:
-        raise ShapeError(
-            f"the Jacobian has parts {[list(part.shape) for part in jacobian]}; four alike are needed."
-        )
+    xx, xy, yx, yy = jacobian
     return xx * yy - xy * yx
 
 
@@ -255,10 +253,6 @@ def sharpness(image: Tensor) -> Tensor:
     Gradient: image.
     Source: Gallego et al., Focus is all you need, CVPR 2019.
     """
-    if check_real(image, "the image").ndim != 4 or image.shape[1] != 2 or min(image.shape[2:]) < 2:
-        raise ShapeError(
-            f"the image is {list(image.shape)}; [B, 2, H, W] of at least 2 x 2 pixels is needed."
-        )
     return image.diff(dim=2).square().mean((2, 3)).sum(1) + image.diff(dim=3).square().mean((2, 3)).sum(1)
 
 
@@ -268,39 +262,9 @@ def _spline(offset):
     return (0.5 - offset).square() / 2, 0.75 - offset.square(), (0.5 + offset).square() / 2
 
 
-def _time(at, tracks):
-    """A time that tracks are moved to: a number, or a tensor that fits them."""
-    if not isinstance(at, Tensor):
-        return check_number(at, "the time the events are moved to")
-    if check_real(at, "the time the events are moved to").numel() not in (1, tracks.time.numel()):
-        raise ShapeError(f"the time is {list(at.shape)}; one for all events, or one for each, is needed.")
-    return at
-
-
-def _check_tracks(tracks):
-    """Raise unless the parts of tracks fit each other."""
-    check_kind(tracks, EventTracks, "the tracks")
-    for side in (tracks.height_px, tracks.width_px):
-        check_count(
-            check_kind(side, int, "height_px, width_px of the tracks"),
-            "a side of the tracks",
-            1,
-            MOST_SIDE_PX,
-        )
-    for name in ("x_px", "y_px", "time", "count", "flow_px"):
-        check_real(getattr(tracks, name), f"{name} of the tracks")
-    flow = tracks.flow_px
-    if (
-        flow.ndim != 3
-        or flow.shape[1] != 2
-        or tracks.count.shape != flow.shape
-        or any(part.shape != flow.shape[2:] for part in (tracks.x_px, tracks.y_px, tracks.time))
-    ):
-        raise ShapeError(
-            f"the tracks have flow {list(flow.shape)}, count {list(tracks.count.shape)}, x, y and time "
-            f"{[list(part.shape) for part in (tracks.x_px, tracks.y_px, tracks.time)]}; [B, 2, N] twice and [N] "
-            "are needed."
-        )
+def _number(at):
+    """A time that tracks are moved to, or times that fit them."""
+    return at if isinstance(at, Tensor) else check_number(at, "the time the events are moved to")
 
 
 def _entered(flow_px, shape):
@@ -317,27 +281,6 @@ def _carried(flow, own, x, y, time, steps):
         start = torch.stack([x, y]) - time * found
         found = read_at(flow, start[:, :, None])[:, :, 0]
     return found
-
-
-def _shared(tracks, values, at):
-    """Bilinear shares of values [B, 2, N] at the places of the tracks, summed on the pixels [B, 2, H, W]."""
-    x, y = tracks.positions(at)
-    left = x.detach().floor()
-    top = y.detach().floor()
-    right = x - left
-    down = y - top
-    corners = (
-        (0, 0, (1 - right) * (1 - down)),
-        (1, 0, right * (1 - down)),
-        (0, 1, (1 - right) * down),
-        (1, 1, right * down),
-    )
-    return _gathered(
-        tracks,
-        left.long(),
-        top.long(),
-        ((step_x, step_y, values * share[:, None]) for step_x, step_y, share in corners),
-    )
 
 
 def _gathered(tracks, column, row, parts):
@@ -363,8 +306,3 @@ def _gathered(tracks, column, row, parts):
             2, (cell + (step_y * padded_width + step_x))[:, None].expand_as(values), values.to(image.dtype)
         )
     return image.unflatten(2, (height + 2 * margin, padded_width))[..., margin:-margin, margin:-margin]
-
-
-def _ratio(sums, counts):
-    empty = counts == 0
-    return torch.where(empty, 0.0, sums / torch.where(empty, 1.0, counts))

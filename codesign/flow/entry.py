@@ -1,13 +1,13 @@
-"""What every network does around its layers: check the volume and bring it to the weights' type,
-normalise it, pad it to the stride, and fade the flow in with the events."""
+"""The layer that networks are made of, and what each does around its layers: check the volume and bring it
+to the weights' type, normalise it, pad it to the stride, and fade the flow in with the events."""
 
 from collections.abc import Callable
 from dataclasses import replace
 from functools import wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
-from torch import Tensor
-from torch.nn.functional import pad
+from torch import Tensor, nn
+from torch.nn.functional import pad, silu
 
 from codesign.errors import DomainError, shown
 from codesign.flow.checks import check_volume
@@ -17,7 +17,22 @@ Given = ParamSpec("Given")
 Found = TypeVar("Found")
 WIDEST = 4096  # channels of a first layer
 MOST_BINS = 1024
+GROUPS = 4  # of the normalisation
 FEW = 10.0  # events of a sample at which half of the flow is believed
+
+
+class Layer(nn.Module):
+    """3 x 3 convolution, group normalisation, SiLU; ``active=False`` leaves the last out."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int = 1, active: bool = True) -> None:
+        super().__init__()
+        self.convolution = nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False)
+        self.norm = nn.GroupNorm(GROUPS, outputs)
+        self.active = active
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.norm(self.convolution(x))
+        return silu(x) if self.active else x
 
 
 def check_bins(bins: int, even: bool = False) -> None:

@@ -29,9 +29,9 @@ REFERENCES = (
     (0.5, 0.5),
     (1.0, 0.25),
 )  # (time, weight): start, middle and end of the window, as in Shiba et al., ECCV 2022, sec. 3.2
+PUBLISHED = (1e-3, 0.45)  # epsilon and exponent of EV-FlowNet's losses
 PRIOR_PX = 8.0  # of a prediction that claims a confidence only
-LAPLACE_FLOOR_PX = 0.05
-LEAST_AREA = 0.8  # of the published guard
+FLOOR_PX = 0.05  # deviation added to every claim, in squares
 SLOWEST_PX = 1.0  # motion that errors are shares of, at least
 # sharpness, (events per pixel)^2, far below that of any scene: no events count as sharp as at zero flow
 _FAINT = 1e-6
@@ -44,9 +44,7 @@ _MOST = 2.5
 def charbonnier(squared: Tensor, epsilon: float, exponent: float = 0.5) -> Tensor:
     """(s + epsilon^2)^exponent - epsilon^(2 exponent) of squared lengths s: 0 at 0 to rounding, smooth,
     s^exponent far away. Source: Charbonnier et al., ICIP 1994; Sun et al., IJCV 2014."""
-    check_real(squared, "the squared lengths")
     epsilon = check_number(epsilon, "epsilon", above=0.0)
-    exponent = check_number(exponent, "exponent", above=0.0)
     return (squared + epsilon**2) ** exponent - epsilon ** (2 * exponent)
 
 
@@ -64,12 +62,11 @@ def supervised_loss(
       truth: FlowField of the same size.
       gamma: prediction i counts gamma^(n - 1 - i), scaled so that the weights sum to 1.
       epsilon: width of the parabola at 0, in the unit of the error.
-      unit_per_px: what one pixel is worth: 1 for an error in px, ``relative_unit(truth)`` [B] for parts
-        of the motion of the sample, ``metrics.mrad_per_pixel(direction)`` [H, W] or [B, H, W] for an
-        angle.
+      unit_per_px: what one pixel is worth, a number or [B]: 1 for an error in px,
+        ``relative_unit(truth)`` for parts of the motion of the sample.
     Returns: scalar. Only valid pixels of the truth count. A sample without any counts 0, its place in the
       mean of the batch included, so that the denominator
-      does not depend on how a batch is split; ``require_valid`` refuses such samples where data enter.
+      does not depend on how a batch is split.
     Gradient: flow_px of the predictions.
     Raises: ShapeError.
     Source: the weights are those of Teed and Deng, RAFT, ECCV 2020, sec. 3.4.
@@ -79,7 +76,7 @@ def supervised_loss(
     >>> round(float(supervised_loss([still, still], right)), 2), float(supervised_loss([right], right))
     (4.23, 0.0)
     """
-    unit = _per_pixel(unit_per_px, check_field(truth, "the truth").flow_px)
+    unit = _per_sample(unit_per_px, check_field(truth, "the truth").flow_px)
     return _over_predictions(
         predictions,
         truth,
@@ -88,57 +85,33 @@ def supervised_loss(
     )
 
 
-def likelihood_loss(
-    predictions: Sequence[FlowField],
-    truth: FlowField,
-    gamma: float = 0.8,
-    floor_px: float = 0.1,
-) -> Tensor:
-    """Negative log likelihood of the error under the covariance that each prediction claims for itself, a
-    Gaussian less its constant ln 2 pi.
-
-    Args:
-      predictions, truth, gamma: as in supervised_loss. Each prediction has covariance_px2, or else
-        confidence c, read as the share of the prior that the events have removed: variance 64 px^2
-        (1 - c) per axis.
-      floor_px: standard deviation added to every claim (in squares), so that no claim is exact and the
-        loss stays bounded below by 2 ln floor_px.
-    Returns: scalar, (m^2 + ln det S) / 2 with S = covariance + floor_px^2 and m^2 = e^T S^-1 e, over the
-      valid pixels as in supervised_loss. Another unit only shifts it.
-    Gradient: flow_px, covariance_px2 or confidence.
-    Raises: ShapeError; DomainError for a prediction with neither claim, and for a covariance that is not
-      positive semidefinite.
-    Source: Nix and Weigend, ICNN 1994, in two dimensions.
-    """
-
-    floor_px = check_number(floor_px, "floor_px", above=0.0)
-
-    def nll(field, error):
-        squared, log_determinant = _distance(field, error, floor_px)
-        return (squared + log_determinant) / 2
-
-    return _over_predictions(predictions, truth, gamma, nll)
-
-
 def laplace_loss(
     predictions: Sequence[FlowField],
     truth: FlowField,
     gamma: float = 0.8,
 ) -> Tensor:
-    """As likelihood_loss, for errors with long tails: a density that falls as exp(-sqrt(3) m), less its
-    constant.
+    """Negative log likelihood of the error under the covariance that each prediction claims for itself,
+    for errors with long tails: a density that falls as exp(-sqrt(3) m), less its constant.
 
-    Returns: scalar, sqrt(3) m + ln det S / 2. Of all densities exp(-k m) of two components this one has the
-      covariance S. A pixel far off pulls no harder than one at a deviation; where little is claimed
-      errors count less, so what nothing can be known of leaves the rest alone.
-    Gradient, raises: as likelihood_loss; smooth below a hundredth of a deviation.
+    Args:
+      predictions, truth, gamma: as in supervised_loss. Each prediction has covariance_px2, or else
+        confidence c, read as the share of the prior that the events have removed: variance 64 px^2
+        (1 - c) per axis.
+    Returns: scalar, sqrt(3) m + ln det S / 2 with m^2 = e^T S^-1 e, over the valid pixels as in
+      supervised_loss; S is the claim and 0.05 px in squares, so that no claim is exact and the loss stays
+      bounded below. Of all densities exp(-k m) of two components this one has the covariance S. A pixel
+      far off pulls no harder than one at a deviation; where little is claimed errors count less, so what
+      nothing can be known of leaves the rest alone. Another unit only shifts it.
+    Gradient: flow_px, covariance_px2 or confidence; smooth below a hundredth of a deviation.
+    Raises: ShapeError; DomainError for a prediction with neither claim, and for a covariance that is not
+      positive semidefinite.
     Source: Ilg et al., Uncertainty estimates and multi-hypotheses networks for optical flow, ECCV
       2018, for the likelihood; the covariance follows from the integral of m^3 exp(-k m) over that of
       m exp(-k m), 6 / k^2 = 2.
     """
 
     def nll(field, error):
-        squared, log_determinant = _distance(field, error, LAPLACE_FLOOR_PX)
+        squared, log_determinant = _distance(field, error)
         return math.sqrt(3) * (squared + 1e-4).sqrt() + log_determinant / 2
 
     return _over_predictions(predictions, truth, gamma, nll)
@@ -151,19 +124,6 @@ def relative_unit(truth: FlowField) -> Tensor:
         1
     ).clamp_min(1)
     return (squared + SLOWEST_PX**2).rsqrt()
-
-
-def require_valid(truth: FlowField) -> FlowField:
-    """Raise DomainError when a sample of the truth has no valid pixel; return the truth unchanged
-    otherwise."""
-    check_field(truth, "the truth")
-    empty = (~truth.valid.flatten(1).any(1)).nonzero().flatten().tolist()
-    if empty:
-        raise DomainError(
-            f"samples {empty} have no pixel with known flow, so nothing can be learnt from them; leave "
-            "these windows out or repair their valid masks."
-        )
-    return truth
 
 
 def contrast_loss(
@@ -199,49 +159,7 @@ def contrast_loss(
     return total.mean()
 
 
-def plain_contrast_loss(
-    volume: EventVolume,
-    flow_px: Tensor,
-    carry_steps: int = 0,
-) -> Tensor:
-    """The objective as published, zero-flow sharpness over mean sharpness, without a guard: a flow into one
-    point beats the true one.
-
-    To compare with, and for flows that cannot contract. Arguments, gradient and source as in contrast_loss.
-    """
-    tracks = volume_tracks(volume, flow_px, carry_steps)
-    moved = torch.stack([share * sharpness(smooth_image(tracks, at)) for at, share in REFERENCES]).sum(0)
-    return ((sharpness(still_image(volume.counts)) + _FAINT) / (moved + _FAINT)).mean()
-
-
-def collapse_penalty(
-    volume: EventVolume,
-    flow_px: Tensor,
-) -> Tensor:
-    """Mean over the events of max(0, 0.8 - area change of the warp)^2: the published guard, to be added to
-    plain_contrast_loss with a weight.
-
-    Contractions to less than that share of the area are punished whether they are true or not. Returns:
-    scalar; 0 for a sample without events.
-    Gradient: counts and flow. Source: Shiba et al., Sensors 2022, sec. 3.4.2 and 3.6 (here squared beyond the
-      threshold, to be smooth).
-    """
-    tracks = volume_tracks(volume, flow_px)
-    events = volume.counts.sum(1)
-    total = sum(
-        share
-        * (
-            events
-            * (LEAST_AREA - area_change(warp_jacobian(tracks, events.shape[1], at))).clamp_min(0).square()
-        ).sum((1, 2, 3))
-        for at, share in REFERENCES
-    )
-    return (total / (events.sum((1, 2, 3)) + _FAINT)).mean()
-
-
-def photometric_loss(
-    frames: Tensor | None, flow_px: Tensor, epsilon: float = 1e-3, exponent: float = 0.45
-) -> Tensor:
+def photometric_loss(frames: Tensor | None, flow_px: Tensor) -> Tensor:
     """Charbonnier difference between the start frame and the end frame read where the flow leads.
 
     Args:
@@ -271,43 +189,26 @@ def photometric_loss(
     # 1 on the image, 0 from one pixel outside on
     depth = (torch.minimum(at, last - at) + 1).clamp(0, 1)
     inside = (depth.square() * (3 - 2 * depth)).prod(1, keepdim=True)
-    moved, still = (charbonnier((image - start).square(), epsilon, exponent) for image in (read, end))
+    moved, still = (charbonnier((image - start).square(), *PUBLISHED) for image in (read, end))
     return (inside * moved + (1 - inside) * still).mean()
 
 
-def smoothness_loss(
-    flow_px: Tensor,
-    frame: Tensor | None = None,
-    epsilon: float = 1e-3,
-    exponent: float = 0.45,
-    edge: float = 0.1,
-) -> Tensor:
+def smoothness_loss(flow_px: Tensor) -> Tensor:
     """Charbonnier difference between the flows of neighbours in a row and in a column.
 
     Args:
       flow_px: [B, 2, H, W].
-      frame: [B, H, W] intensity 0..255; a difference d (in units of 255) between neighbours lets them
-        part, by a factor exp(-|d| / edge). None: everywhere alike.
     Returns: scalar, the mean over rows plus the mean over columns. Gradient: flow.
-    Source: Zhu et al., EV-FlowNet, RSS 2018; edge weights: Heise et al., ICCV 2013.
+    Raises: ShapeError.
+    Source: Zhu et al., EV-FlowNet, RSS 2018.
     """
     flow_px = _full(flow_px)
-    edge = check_number(edge, "edge", above=0.0)
-    if frame is not None and check_real(frame, "the frame").shape != flow_px[:, 0].shape:
-        raise ShapeError(
-            f"the frame must be {list(flow_px[:, 0].shape)} for this flow, got {list(frame.shape)}."
-        )
     if min(flow_px.shape[2:]) < 2:
         raise ShapeError(
             f"a flow of {list(flow_px.shape[2:])} pixels has no neighbours both ways; give at least 2 x 2."
         )
-    total = flow_px.new_zeros(())
-    for axis in (2, 3):
-        penalty = charbonnier(flow_px.diff(dim=axis).square().sum(1), epsilon, exponent)
-        if frame is not None:
-            penalty = penalty * torch.exp(-(frame.detach() / 255).diff(dim=axis - 1).abs() / edge)
-        total = total + penalty.mean()
-    return total
+    across, down = (flow_px.diff(dim=axis).square().sum(1) for axis in (3, 2))
+    return charbonnier(across, *PUBLISHED).mean() + charbonnier(down, *PUBLISHED).mean()
 
 
 def _over_predictions(predictions, truth, gamma, per_pixel):
@@ -339,25 +240,21 @@ def _valid_mean(values, valid):
     return ((values * valid).flatten(1).sum(1) / valid.flatten(1).sum(1).clamp_min(1)).mean()
 
 
-def _per_pixel(unit, flow):
+def _per_sample(unit, flow):
+    """[B, 1, 1], or [1, 1, 1] of a number."""
     if not isinstance(unit, torch.Tensor):
         unit = torch.tensor(check_number(unit, "unit_per_px", 0.0))
-    unit = check_real(unit, "unit_per_px").to(flow)
-    if unit.ndim == 1:
-        unit = unit[:, None, None]
-    try:
-        return unit.expand_as(flow[:, 0])
-    except RuntimeError:
+    if check_real(unit, "unit_per_px").shape not in ((), flow.shape[:1]):
         raise ShapeError(
-            f"unit_per_px must be a number, [B], [H, W] or [B, H, W] for a flow {list(flow.shape)}; got "
-            f"{list(unit.shape)}."
-        ) from None
+            f"unit_per_px must be a number or [B] for a flow {list(flow.shape)}; got {list(unit.shape)}."
+        )
+    return unit.to(flow).reshape(-1, 1, 1)
 
 
-def _distance(field, error, floor_px):
-    """m^2 = e^T S^-1 e and ln det S of errors [B, 2, H, W], S the claim + floor_px^2."""
+def _distance(field, error):
+    """m^2 = e^T S^-1 e and ln det S of errors [B, 2, H, W], S the claim + FLOOR_PX^2."""
     xx, xy, yy = _covariance(field)
-    spare = floor_px**2
+    spare = FLOOR_PX**2
     # xx yy - xy^2 >= 0 apart from rounding; taken by itself it cannot cancel the floor's part of the
     # determinant
     determinant = spare**2 + spare * (xx + yy) + (xx * yy - xy.square()).clamp_min(0)

@@ -14,12 +14,9 @@ from codesign.flow.checks import (
     check_mask,
     check_number,
     check_real,
-    check_size,
     check_volume,
-    shown,
 )
 from codesign.flow.contrast import nearest_images, stream_tracks
-from codesign.flow.warp import pixel_grid
 from codesign.types import EventStream, EventVolume, FlowField
 
 
@@ -121,55 +118,6 @@ def angular_error_deg(flow: Tensor, truth: Tensor, mask: Tensor | None = None) -
     ).mean()
 
 
-def ray_error_mrad(flow: Tensor, truth: Tensor, direction: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Mean angle between the rays at the estimated and the true end of each pixel's motion, milliradians per
-    window.
-
-    Args:
-      flow, truth: [..., 2, H, W] px.
-      mask: [..., H, W] or None.
-      direction: [H, W, 3] of the rays through the pixel centres (camera axes, z forward), of any
-        length: chief rays of a camera, or pinhole_directions.
-    Returns: scalar. Between pixels x/z and y/z are bilinear, outside the image linear like its outermost
-      pixels: exact for a pinhole.
-    Gradient: flow, truth, direction. Raises: ShapeError; DomainError for rays that do not go forward.
-    """
-    flow, truth = _check(flow, truth)
-    plane = _slopes(direction, flow)
-    return 1000 * _masked(_angle(_ray_at(plane, flow), _ray_at(plane, truth)), mask).mean()
-
-
-def mrad_per_pixel(direction: Tensor) -> Tensor:
-    """Angle that one pixel spans, milliradians [H, W]: the root of its solid angle, from rays [H, W, 3] by
-    central differences. Gradient: direction."""
-    x, y = _slopes(direction, direction)
-    (x_by_y, x_by_x), (y_by_y, y_by_x) = torch.gradient(x), torch.gradient(y)
-    return 1000 * ((x_by_x * y_by_y - x_by_y * y_by_x).abs() * (1 + x.square() + y.square()) ** -1.5).sqrt()
-
-
-def pinhole_directions(
-    height_px: int,
-    width_px: int,
-    focal_px: float,
-    centre_px: tuple[float, float] | None = None,
-) -> Tensor:
-    """Directions [H, W, 3], z = 1, of a pinhole camera; centre_px: (x, y) of the axis, the image's middle
-    when None."""
-    height_px, width_px = check_size((height_px, width_px), "the picture")
-    check_number(focal_px, "focal_px", above=0.0)
-    if centre_px is not None and (not isinstance(centre_px, (tuple, list)) or len(centre_px) != 2):
-        raise ShapeError(f"centre_px is {shown(centre_px)}; (x, y) in pixels is needed.")
-    for coordinate in centre_px or ():
-        check_number(coordinate, "a coordinate of centre_px")
-    centre_x, centre_y = ((width_px - 1) / 2, (height_px - 1) / 2) if centre_px is None else centre_px
-    y, x = torch.meshgrid(
-        torch.arange(height_px, dtype=torch.float64) - centre_y,
-        torch.arange(width_px, dtype=torch.float64) - centre_x,
-        indexing="ij",
-    )
-    return torch.stack([x / focal_px, y / focal_px, torch.ones_like(x)], -1)
-
-
 def event_mask(volume: EventVolume) -> Tensor:
     """Pixels [B, H, W] with at least a part of an event of either polarity in the window."""
     return (check_volume(volume).detach() > 0).flatten(1, 2).any(1)
@@ -245,37 +193,3 @@ def rsat(stream: EventStream, flow_px: Tensor, t0_us: int, t1_us: int, carry_ste
 
 def _angle(a, b):
     return torch.atan2(torch.linalg.vector_norm(torch.linalg.cross(a, b, dim=-3), dim=-3), (a * b).sum(-3))
-
-
-def _slopes(direction, like):
-    """x/z and y/z, [2, H, W]."""
-    check_real(direction, "the directions")
-    if (
-        direction.ndim != 3
-        or direction.shape[2] != 3
-        or (like is not direction and direction.shape[:2] != like.shape[-2:])
-        or min(direction.shape[:2]) < 2
-    ):
-        raise ShapeError(
-            "directions must be [H, W, 3] for each pixel of the flow, at least 2 x 2; got "
-            f"{tuple(direction.shape)} for {tuple(like.shape)}."
-        )
-    if not bool((direction[..., 2] > 0).all()):
-        raise DomainError(
-            "a direction does not go forward (z > 0 is needed, camera axes: x right, y down, z forward)."
-        )
-    return (direction[..., :2] / direction[..., 2:]).movedim(2, 0).to(like)
-
-
-def _ray_at(plane, flow):
-    """Rays (x/z, y/z, 1) at the ends of a flow: bilinear in the nearest cell of four pixels."""
-    height, width = plane.shape[1:]
-    x, y = (pixel_grid(height, width, flow) + flow).unbind(-3)
-    column = x.detach().floor().long().clamp(0, width - 2)
-    row = y.detach().floor().long().clamp(0, height - 2)
-    right = x - column
-    down = y - row
-    above = plane[:, row, column] * (1 - right) + plane[:, row, column + 1] * right
-    below = plane[:, row + 1, column] * (1 - right) + plane[:, row + 1, column + 1] * right
-    ray = above * (1 - down) + below * down
-    return torch.cat([ray, torch.ones_like(ray[:1])]).movedim(0, -3)

@@ -10,8 +10,7 @@ from torch.nn.functional import avg_pool2d, pad, pixel_shuffle, silu, unfold
 
 from codesign.errors import DomainError
 from codesign.flow.checks import check_count
-from codesign.flow.entry import check_bins, pad_to, presence, takes_volume
-from codesign.flow.layers import Layer
+from codesign.flow.entry import Layer, check_bins, pad_to, presence, takes_volume
 from codesign.flow.lk import estimate_lk
 from codesign.flow.refiner_evidence import AROUND, CELL, FEW, SOLVED, TOLD, TRIED, Evidence, larger
 from codesign.types import EventVolume, FlowField

@@ -3,7 +3,7 @@ confidence, as the chunks of a camera come in."""
 
 import inspect
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,7 @@ from codesign.events.volumes.volume import check_bins, from_stream
 from codesign.flow.checks import check_dense, check_field, check_number, check_size
 from codesign.flow.sources.packet import EMPTY
 from codesign.flow.warp import pixel_grid, read_at
-from codesign.types import EventStream, EventVolume, FlowField
+from codesign.types import EventStream, FlowField
 
 Chunk = EventStream | tuple[Any, Any, Any, Any]
 SKIPPABLE = (EMPTY, BACKWARDS, OFF_SENSOR)
@@ -131,119 +131,108 @@ class Tracker:
         Raises: DomainError for what is no such stream, for events before those of the chunks before or
           off the sensor; ShapeError for another sensor.
         """
-        stream = self._checked(chunk)
-        if not len(stream):
+        rows = self._checked(chunk)
+        if not rows.shape[1]:
             return []
-        self._parts.append(stream)
-        self._last_us = int(stream.t_us[-1])
-        self._waiting += len(stream)
+        self._rows.append(rows)
+        self._last_us = int(rows[0, -1])
         if self._start_us is None:
-            self._start_us = int(stream.t_us[0])
+            self._start_us = int(rows[0, 0])
         if self.window_us is not None and self._last_us < self._start_us + self.window_us:
             return []
-        if self.number is not None and self._waiting <= self.number:
+        if self.number is not None and sum(rows.shape[1] for rows in self._rows) <= self.number:
             return []
-        return self._cut(_joined(self._parts), self._start_us, last=False)
+        return self._cut(self._start_us, last=False)
 
     def finish(self) -> list[TrackedWindow]:
         """Return the last window, which ends at the last event (a microsecond later where that is its
         start), and
         forget stream and clock: what is added next is another stream."""
-        rest = _joined(self._parts) if self._parts else None
-        found = [] if rest is None or self._start_us is None else self._cut(rest, self._start_us, last=True)
+        found = [] if self._start_us is None else self._cut(self._start_us, last=True)
         self._forget()
         return found
 
     def _forget(self):
-        self._parts: list[EventStream] = []
-        self._waiting = 0
+        self._rows: list[Tensor] = []  # of [4, N]: t_us, x, y, p
         self._last_us: int | None = None
         self._start_us: int | None = None
         self._before: TrackedWindow | None = None
 
     def _checked(self, chunk):
-        """The chunk as an EventStream of this sensor, no event before the last one of the chunks before."""
+        """The chunk as rows [4, N] of this sensor, no event before the last one of the chunks before."""
         if isinstance(chunk, EventStream):
             stream = check_stream(chunk, slice(0))
-            self.size_px = self.size_px or (stream.height_px, stream.width_px)
-            if (stream.height_px, stream.width_px) != self.size_px:
+            size_px = stream.height_px, stream.width_px
+            self.size_px = self.size_px or size_px
+            if size_px != self.size_px:
                 raise ShapeError(
                     f"the stream is of a sensor of {stream.width_px} x {stream.height_px} px, the tracker of "
                     f"{self.size_px[1]} x {self.size_px[0]}; take one tracker for each."
                 )
-            columns = _columns_of(stream)
+            rows = torch.stack([stream.t_us, stream.x, stream.y, stream.p])
         else:
-            columns = _columns(chunk)
+            rows = _rows_of(chunk)
         if self.size_px is None:
             raise DomainError(
                 "events as arrays do not say how large the sensor is; give size_px to the tracker."
             )
-        columns = self._in_order(self._on_sensor(columns))
-        return check_stream(_stream(columns, self.size_px))
-
-    def _on_sensor(self, columns):
-        height, width = self.size_px or (0, 0)
-        _, x, y, _ = columns
+        height, width = self.size_px
+        _, x, y, _ = rows
         outside = (x < 0) | (x >= width) | (y < 0) | (y >= height)
-        return self._without(OFF_SENSOR, outside, columns) if bool(outside.any()) else columns
+        rows = self._without(OFF_SENSOR, outside, rows, f"lies outside the sensor of {width} x {height} px")
+        t_us = rows[0]
+        before = t_us[:1] if self._last_us is None else t_us.new_tensor([self._last_us])
+        latest = torch.cat([before, t_us]).cummax(0).values[1:] if len(t_us) else t_us
+        rows = self._without(BACKWARDS, t_us < latest, rows, "lies before {} us", latest)
+        check_stream(EventStream(*rows, height, width))
+        return rows
 
-    def _in_order(self, columns):
-        t_us = columns[0]
-        if not len(t_us):
-            return columns
-        before = int(t_us[0]) if self._last_us is None else self._last_us
-        latest = torch.cummax(torch.cat([t_us.new_tensor([before]), t_us]), 0).values[1:]
-        return self._without(BACKWARDS, t_us < latest, columns) if bool((t_us < latest).any()) else columns
-
-    def _without(self, fault, bad, columns):
+    def _without(self, fault, bad, rows, reason, latest=None):
+        if not bool(bad.any()):
+            return rows
         if fault not in self.skip:
             at = int(bad.nonzero()[0])
-            t_us, x, y, _ = (int(values[at]) for values in columns)
-            height, width = self.size_px or (0, 0)
-            reason = (
-                f"lies before {self._last_us if at == 0 else int(columns[0][:at].max())} us"
-                if fault == BACKWARDS
-                else f"lies outside the sensor of {width} x {height} px"
-            )
+            t_us, x, y, _ = rows[:, at].tolist()
+            reason = reason if latest is None else reason.format(int(latest[at]))
             raise DomainError(
                 f"event {at} of the chunk, at {t_us} us and ({x}, {y}), {reason}; order the stream, or leave such events "
                 f"out with skip=({fault!r},)."
             )
         self.left_out[fault] += int(bad.sum())
-        return tuple(values[~bad] for values in columns)
+        return rows[:, ~bad]
 
-    def _cut(self, stream: EventStream, start_us: int, last: bool) -> list[TrackedWindow]:
+    def _cut(self, start_us: int, last: bool) -> list[TrackedWindow]:
         """The complete windows of the waiting events, and with ``last`` the rest of them; what is not
         complete waits on."""
+        rows = torch.cat(self._rows, 1)
+        t_us = rows[0]
         found = []
         at = 0
-        while at < len(stream):
+        while at < len(t_us):
             if self.window_us is not None:
-                found += self._idle(start_us, int(stream.t_us[at]), stream.t_us.device)
-                start_us += (int(stream.t_us[at]) - start_us) // self.window_us * self.window_us
-            to = self._end(stream, at, start_us)
-            if to == len(stream) and not last:  # nothing has come that lies behind this window
+                found += self._idle(start_us, int(t_us[at]), rows[:, :0])
+                start_us += (int(t_us[at]) - start_us) // self.window_us * self.window_us
+            to = self._end(t_us, at, start_us)
+            if to == len(t_us) and not last:  # nothing has come that lies behind this window
                 break
-            end_us = int(stream.t_us[-1]) if to == len(stream) else int(stream.t_us[to])
-            if self.window_us is not None and to < len(stream):
+            end_us = int(t_us[-1]) if to == len(t_us) else int(t_us[to])
+            if self.window_us is not None and to < len(t_us):
                 end_us = start_us + self.window_us
-            found.append(self._window(_part(stream, at, to), start_us, max(end_us, start_us + 1)))
+            found.append(self._window(rows[:, at:to], start_us, max(end_us, start_us + 1)))
             start_us = end_us
             at = to
-        rest = _part(stream, at, len(stream))
-        self._parts = [_stream([values.clone() for values in _columns_of(rest)], self.size_px)]
-        self._waiting = len(rest)
+        self._rows = [rows[:, at:].clone()]
         self._start_us = start_us
         return found
 
-    def _end(self, stream, at, start_us):
+    def _end(self, t_us, at, start_us):
         """Number of the first event behind the window that begins with event ``at``; all of them where
         there is none."""
         if self.number is not None:
-            return min(at + self.number, len(stream))
-        return int(torch.searchsorted(stream.t_us, start_us + (self.window_us or 0)))
+            return min(at + self.number, len(t_us))
+        return int(torch.searchsorted(t_us, start_us + (self.window_us or 0)))
 
-    def _idle(self, start_us, next_us, device) -> list[TrackedWindow]:
+    def _idle(self, start_us, next_us, nothing) -> list[TrackedWindow]:
         """The windows without events before the next event, as they are to be handed out."""
         length_us = self.window_us or 1
         count = (next_us - start_us) // length_us
@@ -256,42 +245,35 @@ class Tracker:
                 f"{count} windows of {length_us} us in a row hold no event, the next is at {next_us} us; did the clock "
                 f"jump? Leave such windows out with skip=({EMPTY!r},), or take longer ones."
             )
-        nothing = _stream([torch.zeros(0, dtype=torch.int64, device=device)] * 4, self.size_px)
-        return [
-            self._window(nothing, t0_us, t0_us + length_us)
-            for t0_us in range(start_us, start_us + count * length_us, length_us)
-        ]
+        starts = range(start_us, start_us + count * length_us, length_us)
+        return [self._window(nothing, t0_us, t0_us + length_us) for t0_us in starts]
 
     @torch.no_grad()
-    def _window(self, stream, t0_us, t1_us):
+    def _window(self, rows, t0_us, t1_us):
         began = time.process_time()
-        before = (
-            self._before if self.warm_start and self._before is not None and self._before.events else None
-        )
-        warm = before is not None and len(stream) > 0
-        if len(stream):
-            volume = from_stream(stream, t0_us, t1_us, self.bins)
-            start = {} if before is None else {"start_px": _carried_on(before, t1_us - t0_us)}
-            field = self._answer(self.estimate(volume, **start), volume)
-        else:
-            field = _nothing(self.size_px, t1_us - t0_us, stream.t_us.device)
+        before = self._before if self.warm_start else None
+        count = rows.shape[1]
+        warm = before is not None and before.events > 0 and count > 0
+        height, width = self.size_px or (0, 0)
+        if count:
+            volume = from_stream(EventStream(*rows, height, width), t0_us, t1_us, self.bins)
+            start = {"start_px": _carried_on(before, t1_us - t0_us)} if warm else {}
+            field = check_field(self.estimate(volume, **start), "what the estimator returned")
+            if tuple(field.flow_px.shape) != (1, 2, height, width):
+                raise ShapeError(
+                    f"the estimator returned a flow {list(field.flow_px.shape)} for a volume "
+                    f"{list(volume.counts.shape)}; {[1, 2, height, width]} is needed."
+                )
+        else:  # all of one number in memory
+            zero = torch.zeros((), device=rows.device).expand(1, 2, height, width)
+            field = FlowField(zero, zero[:, 0].bool(), (t1_us - t0_us) * 1e-6, zero[:, 0])
         spent_s = time.process_time() - began
-        window = TrackedWindow(t0_us, t1_us, len(stream), field, warm, spent_s)
-        self._before = window
+        self._before = TrackedWindow(t0_us, t1_us, count, field, warm, spent_s)
         self.windows += 1
-        self.events += len(stream)
+        self.events += count
         self.processor_s += spent_s
         self.event_s += (t1_us - t0_us) * 1e-6
-        return window
-
-    def _answer(self, field, volume: EventVolume):
-        wanted = (1, 2, *volume.counts.shape[3:])
-        if tuple(check_field(field, "what the estimator returned").flow_px.shape) != wanted:
-            raise ShapeError(
-                f"the estimator returned a flow {list(field.flow_px.shape)} for a volume "
-                f"{list(volume.counts.shape)}; {list(wanted)} is needed."
-            )
-        return field
+        return self._before
 
 
 def _takes_start(estimate):
@@ -303,8 +285,8 @@ def _takes_start(estimate):
         return False
 
 
-def _columns(chunk):
-    """t_us, x, y, p as int64 tensors of arrays, p +1 and -1."""
+def _rows_of(chunk):
+    """t_us, x, y, p [4, N] int64 of arrays, p +1 and -1."""
     if not isinstance(chunk, (tuple, list)) or len(chunk) != 4:
         raise DomainError(
             f"the chunk is {shown(chunk)}; an EventStream or arrays (t_us, x, y, p) are needed."
@@ -314,42 +296,19 @@ def _columns(chunk):
         if isinstance(given, Tensor):
             given = check_dense(given, name).detach().cpu().numpy()
         values = np.asarray(given)
-        whole = values.dtype.kind in "iub"
+        whole = values.dtype.kind in "iub" or not values.size
         if values.dtype.kind == "f":
-            values = values.astype(np.float64)
-            whole = bool((np.abs(values) < 2**53).all()) and bool((values % 1 == 0).all())
-        if values.ndim != 1 or not (whole or not values.size):
+            whole = bool(((np.abs(values) < 2**53) & (values % 1 == 0)).all())
+        if values.ndim != 1 or not whole:
             raise DomainError(f"{name} is {shown(values)}; a list [N] of whole numbers is needed.")
         columns.append(torch.from_numpy(values.astype(np.int64)))
     if len({len(values) for values in columns}) > 1:
         raise ShapeError(
             f"t_us, x, y, p have {[len(values) for values in columns]} entries; equal lists are needed."
         )
-    t_us, x, y, p = columns
-    return t_us, x, y, torch.where(p == 0, -1, p)
-
-
-def _columns_of(stream: EventStream) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return stream.t_us, stream.x, stream.y, stream.p
-
-
-def _stream(columns: Sequence[Tensor], size_px: Any) -> EventStream:
-    t_us, x, y, p = columns
-    height, width = size_px
-    return EventStream(t_us, x, y, p, height, width)
-
-
-def _joined(parts):
-    first = parts[0]
-    if len(parts) == 1:
-        return first
-    columns = [torch.cat(columns) for columns in zip(*map(_columns_of, parts), strict=True)]
-    return _stream(columns, (first.height_px, first.width_px))
-
-
-def _part(stream, first, last):
-    columns = [values[first:last] for values in _columns_of(stream)]
-    return _stream(columns, (stream.height_px, stream.width_px))
+    rows = torch.stack(columns)
+    rows[3] = torch.where(rows[3] == 0, -1, rows[3])
+    return rows
 
 
 def _carried_on(before, duration_us):
@@ -358,9 +317,3 @@ def _carried_on(before, duration_us):
     flow = before.field.flow_px
     came_from = pixel_grid(*flow.shape[2:], flow) - flow
     return read_at(flow, came_from) * (duration_us / (before.t1_us - before.t0_us))
-
-
-def _nothing(size_px: Any, duration_us: int, device: torch.device) -> FlowField:
-    """FlowField of a window without events, all of one number in memory."""
-    zero = torch.zeros((), device=device).expand(1, 2, *size_px)
-    return FlowField(zero, zero[:, 0].bool(), duration_us * 1e-6, zero[:, 0])

@@ -1,12 +1,8 @@
-"""Pixel grids, bins of an event volume looked up along a flow, and flow over a long window from flows
-over parts of it."""
+"""Pixel grids, images read between pixels, and flow over a long window from flows over parts of it."""
 
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
-
-from codesign.errors import ShapeError
-from codesign.flow.checks import check_mask, check_real
 
 EDGE_PX = 0.75  # flows of the four pixels around a place that differ by more belong to different surfaces
 
@@ -36,38 +32,6 @@ def read_at(images: Tensor, at_px: Tensor, padding: str = "border") -> Tensor:
     return grid_sample(images, unit, padding_mode=padding, align_corners=False)
 
 
-def along_flow(bins: Tensor, flow_px: Tensor, time: Tensor) -> Tensor:
-    """What each bin holds where a point of the start has got to.
-
-    Args:
-      bins: [B, T, H, W], or [B, C, T, H, W] with polarities or the like.
-      flow_px: [B, 2, H, W] px per window on pixels of the start.
-      time: [T] bin times, 0 at the start of the window, 1 at its end.
-    Returns: as bins: bin k at q + time_k flow(q) for every pixel q, bilinear; 0 outside the image.
-    Raises: ShapeError, DomainError.
-    Gradient: bins and flow; piecewise smooth in the flow, as bilinear lookups are.
-    """
-    for value, name in ((bins, "the bins"), (flow_px, "the flow"), (time, "the bins' times")):
-        check_real(value, name)
-    fits = bins.ndim in (4, 5) and 0 not in bins.shape and time.shape == bins.shape[-3:-2]
-    if (
-        not fits
-        or tuple(flow_px.shape) != (bins.shape[0], 2, *bins.shape[-2:])
-        or flow_px.dtype != bins.dtype
-    ):
-        raise ShapeError(
-            f"bins {list(bins.shape)} ({bins.dtype}), flow {list(flow_px.shape)} ({flow_px.dtype}) and times "
-            f"{list(time.shape)} do not fit; [B, (C,) T, H, W], [B, 2, H, W] of one type and [T] are needed."
-        )
-    *_, count, height, width = bins.shape
-    batch = bins.shape[0]
-    # [B, T, 2, H, W]
-    at = pixel_grid(height, width, flow_px) + time.to(flow_px)[:, None, None, None] * flow_px[:, None]
-    each = bins.reshape(batch, -1, count, height, width).transpose(1, 2)
-    found = read_at(each.flatten(0, 1), at.flatten(0, 1), "zeros")
-    return found.reshape(each.shape).transpose(1, 2).reshape(bins.shape)
-
-
 def chained(flows_px: Tensor, valid: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Follow every pixel of the first instant through all flows.
 
@@ -81,12 +45,6 @@ def chained(flows_px: Tensor, valid: Tensor, hidden: Tensor | None = None) -> tu
       surfaces whose flows differ by more than 0.75 px.
     Gradient: flows_px.
     """
-    check_real(flows_px, "the flows")
-    if flows_px.ndim != 4 or flows_px.shape[1] != 2 or 0 in flows_px.shape:
-        raise ShapeError(f"the flows are {list(flows_px.shape)}; [K, 2, H, W], no axis empty, is needed.")
-    for mask, name in ((valid, "valid"), (hidden, "hidden")):
-        if mask is not None or name == "valid":
-            check_mask(mask, name, (len(flows_px), *flows_px.shape[2:]))
     height, width = flows_px.shape[2:]
     total = flows_px[0]
     seen = valid[0]

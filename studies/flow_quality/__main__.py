@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
-import matplotlib.pyplot as plt
 import torch
 
 from codesign import flow
@@ -24,6 +23,7 @@ from studies.flow_quality import recordings
 from studies.flow_quality.estimators import estimators
 from studies.flow_quality.measures import figures, join, mean_of_known, measure
 from studies.frame.run import Run, StudyConfig, main
+from studies.frame.show import pictures
 
 SEED = 77  # of what is judged here: windows that guided no choice
 SHOWN = 3  # windows of a set in its picture
@@ -268,28 +268,21 @@ def _worlds(run, measured):
 
 def _pictures(shown, who):
     """Figure: a row per window of its events, true flow, every estimate, and the network's claim."""
-    size = (len(shown), len(who) + 3)
-    figure, axes = plt.subplots(
-        *size, figsize=(2.1 * size[1], 2.2 * size[0]), layout="constrained", squeeze=False
-    )
-    for row, (given, fields, k) in zip(axes, shown, strict=True):
+    rows = {}
+    for number, (given, fields, k) in enumerate(shown, 1):
         counts = given.volume.counts[k]
-        row[0].imshow((counts[0] - counts[1]).sum(0).numpy(), cmap="RdBu_r", vmin=-4, vmax=4)
-        truth = given.truth.flow_px[k]
-        most = float(truth.square().sum(0).sqrt().max())
-        for axis, each in zip(row[1:-1], [truth, *(fields[name].flow_px[k] for name in who)], strict=True):
-            axis.imshow(flow_colours(each.numpy(), most))
+        flows = {"true flow": given.truth.flow_px[k]}
+        flows |= {name.replace("_", " "): fields[name].flow_px[k] for name in who}
+        most = float(flows["true flow"].square().sum(0).sqrt().max())
+        rows[f"{number}"] = {"events": (counts[0] - counts[1]).sum(0)} | {
+            name: flow_colours(flow.numpy(), most) for name, flow in flows.items()
+        }
         covariance = fields[BEST].covariance_px2
         if covariance is not None:
-            deviation = ((covariance[k, 0] + covariance[k, 2]) / 2).sqrt()
-            row[-1].imshow(deviation.numpy(), cmap="gray", vmin=0, vmax=DEVIATION_PX)
-    names = [name.replace("_", " ") for name in who]
-    titles = ("events", "true flow", *names, f"claimed (white: {DEVIATION_PX:g} px)")
-    for axis, title in zip(axes[0], titles, strict=True):
-        axis.set_title(title, fontsize=8)
-    for axis in axes.flat:
-        axis.set_axis_off()
-    return figure
+            claimed = ((covariance[k, 0] + covariance[k, 2]) / 2).sqrt() / DEVIATION_PX
+            grey = claimed.clamp(max=1)[..., None].expand(-1, -1, 3)
+            rows[f"{number}"][f"claimed (white: {DEVIATION_PX:g} px)"] = grey
+    return pictures(rows, signed=["events"], side=2.1)
 
 
 if __name__ == "__main__":

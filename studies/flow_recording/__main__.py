@@ -88,7 +88,7 @@ def study(run: Run[Config]) -> None:
     if recording is None:
         recording = run.folder / "recording"
         run.say(
-            "No --recording given: making a small synthetic one (a camera that turns in a rendered room)."
+            "No --recording given: making a small synthetic one (a camera that turns before a photograph)."
         )
         made.make(recording, *((0.06, MADE_QUICK_PX) if config.quick else (0.2, MADE_PX)), config.seed)
     read = options(config)

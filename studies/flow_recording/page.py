@@ -4,12 +4,11 @@ events left out, and why a true flow may be none."""
 import statistics
 
 import torch
-from matplotlib.figure import Figure
 
 from codesign.flow.contrast import count_image, stream_tracks
 from codesign.report.flow_colours import flow_colours
+from studies.frame.show import pictures as show_pictures
 
-BRIGHT = 0.99  # quantile of the counts of the still events that is shown white
 SHARPER = 1.02  # times the truth's FWL: estimates are sharper than a truth that is right by less
 NAMED = 5  # packets that a sentence names
 UNITS = {
@@ -44,7 +43,7 @@ def show(run, packets, rows, names, film):
         run.card(f"FWL, {best}", f"{main['fwl']:.3f}", share)
     synthetic = run.config.recording is None
     made_up = (
-        "**The recording is synthetic**: a camera that turns in a rendered room; the simulator's events, "
+        "**The recording is synthetic**: a camera that turns before a photograph; the simulator's events, "
         "the gyroscope's exact rates. "
     )
     notes = " ".join(f"{note}." for note in packets[0].notes)
@@ -192,37 +191,23 @@ def caption(packet):
 def pictures(packet, fields):
     """Figure: per estimator a row of the events as they came, the events warped to the window's end, the
     flow, and the true flow. fields: {name: FlowField}."""
-    height, width = packet.stream.height_px, packet.stream.width_px
-    figure = Figure(figsize=(12, (2.9 * height / width + 0.35) * len(fields)), layout="constrained")
-    axes = figure.subplots(len(fields), 4, squeeze=False)
-    still = _warped(packet, torch.zeros(1, 2, height, width))
-    bright = float(still[still > 0].quantile(BRIGHT)) if bool((still > 0).any()) else 1.0
+    still = _warped(packet, torch.zeros(1, 2, packet.stream.height_px, packet.stream.width_px))
     truth = packet.truth
     longest = None
     if truth is not None and bool(truth.valid.any()):
         longest = float(truth.flow_px.abs().amax(1)[truth.valid].max())
-    for row, (name, field) in zip(axes, fields.items(), strict=True):
+    rows = {}
+    for name, field in fields.items():
         full = longest or max(float(field.flow_px.abs().max()), 1e-6)
         known = field.valid[0] if field.confidence is None else field.valid[0] & (field.confidence[0] > 0)
-        gray = {"cmap": "gray", "vmin": 0, "vmax": 2 * bright}
-        row[0].imshow(still.numpy(), **gray)
-        row[1].imshow(_warped(packet, field.flow_px).numpy(), **gray)
-        row[2].imshow(_colours(field.flow_px[0], known, full))
+        row = rows[f"{name}, full colour {full:.1f} px"] = {
+            "events as they came": still,
+            "warped by the flow": _warped(packet, field.flow_px),
+            "flow": _colours(field.flow_px[0], known, full),
+        }
         if truth is not None:
-            row[3].imshow(_colours(truth.flow_px[0], truth.valid[0], full))
-        else:
-            row[3].set_aspect(height / width)
-        titles = (
-            "events as they came",
-            f"warped by {name}",
-            f"{name}, full colour {full:.1f} px",
-            "no true flow" if truth is None else "true flow",
-        )
-        for axis, title in zip(row, titles, strict=True):
-            axis.set_title(title, fontsize=9)
-            axis.set_xticks([])
-            axis.set_yticks([])
-    return figure
+            row["true flow"] = _colours(truth.flow_px[0], truth.valid[0], full)
+    return show_pictures(rows, side=3.0)
 
 
 def _colours(flow_px, known, full):

@@ -12,7 +12,7 @@ import torch
 
 from codesign import events, lens
 from codesign.flow import estimate_lk
-from codesign.flow.baselines import ECN, FlowNetEvents, IDNet, SpikeFlowNet
+from codesign.flow.baselines import FlowNetEvents, SpikeFlowNet
 from codesign.flow.baselines.parts import count_weights
 from codesign.flow.refiner import Refiner
 from codesign.mount import Mount
@@ -26,6 +26,7 @@ from studies.frame.run import Run
 from studies.frame.show import Asked, tabulate
 from studies.frame.sweep import sweep
 from studies.speed_error import Config
+from studies.train_flow.peers import ECN, IDNet
 
 CLOSED = "closed form"
 CELLS = "closed form with cells"

@@ -26,6 +26,7 @@ from codesign.train import (
 from codesign.train import checkpoint as training
 from codesign.train.batches import probe
 from scenes.windows.sets import TRAINING, VALIDATION, Shape
+from studies.train_flow import peers  # noqa: F401  which networks files know
 
 # the last window in so many of a data set is judged on: whole stretches, since neighbours look alike
 HELD_OUT = 10

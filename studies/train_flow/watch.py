@@ -7,7 +7,6 @@ import sys
 from dataclasses import asdict
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
@@ -18,10 +17,11 @@ from codesign.report.flow_colours import flow_colours
 from codesign.train import checkpoint as training
 from codesign.train.batches import to_device
 from codesign.train.validation import batches, score
+from studies.frame.show import Panel, panels
+from studies.frame.show import pictures as show_pictures
 
 tensorboard = optional("torch.utils.tensorboard", "training-logs", "the log of a training")
 RECENT = 50  # steps over which the shown loss is averaged
-OURS = "#1b6ca8"
 
 
 class Watch:
@@ -182,7 +182,7 @@ def show(run, job, scores):
         f"{progress.validation_s / 60:.2f} min validation (not part of the budget). Gradients shortened in "
         f"{progress.clipped} of {progress.step} steps.",
     )
-    run.figure(curves(progress), "curves", "Loss, gradient norm and validation by step. Dashed: closed form.")
+    run.figure(curves(progress), "curves", "Loss and gradient norm (running means), and validation by step.")
     run.figure(
         pictures(job, scores),
         "flows",
@@ -198,24 +198,20 @@ def show(run, job, scores):
 
 def curves(progress):
     """Figure of loss, gradient norm and validation."""
-    figure, axes = plt.subplots(1, 3, figsize=(13, 3.4), layout="constrained")
-    steps = np.arange(1, progress.step + 1)
-    for axis, values, label in ((axes[0], progress.loss, "loss"), (axes[1], progress.norm, "gradient norm")):
-        width = max(1, min(50, len(values) // 5))
-        axis.plot(steps, values, color=OURS, linewidth=0.5, alpha=0.4)
-        axis.plot(steps[width - 1 :], np.convolve(values, np.ones(width) / width, "valid"), color=OURS)
-        axis.set(xlabel="step", ylabel=label, yscale="log")
-    names = [name for name in (progress.validation[-1] if progress.validation else {}) if name != "step"]
-    for number, name in enumerate(names):
+    width = max(1, min(RECENT, progress.step // 5))
+    at = np.arange(width, progress.step + 1)
+    charts = [
+        Panel({label: (at, np.convolve(values, np.ones(width) / width, "valid"))}, "step", label, "y")
+        for label, values in (("loss", progress.loss), ("gradient norm", progress.norm))
+    ]
+    series = {}
+    for name in [name for entry in progress.validation[-1:] for name in entry if name != "step"]:
         entries = [entry for entry in progress.validation if name in entry]
-        at = [entry["step"] for entry in entries]
-        for key, style, label in (("ratio", ".-", name), ("closed_form_ratio", "--", None)):
-            values = [entry[name][key] for entry in entries]
-            axes[2].plot(at, values, style, color=f"C{number}", label=label, linewidth=0.8)
-    axes[2].set(xlabel="step", ylabel="error over zero flow's", ylim=(0, None))
-    if names:
-        axes[2].legend(fontsize=7)
-    return figure
+        for key, label in (("ratio", name), ("closed_form_ratio", f"{name}, closed form")):
+            series[label] = [entry["step"] for entry in entries], [entry[name][key] for entry in entries]
+    if series:
+        charts.append(Panel(series, "step", "error over zero flow's"))
+    return panels(*charts)
 
 
 @torch.no_grad()
@@ -223,23 +219,20 @@ def pictures(job, scores):
     """Figure: one window of each set, in rows."""
     network = job.learner.delivered.eval()
     device = next(network.parameters()).device
-    size = (len(scores), 4)
-    figure, axes = plt.subplots(*size, figsize=(9, 2.3 * size[0]), layout="constrained", squeeze=False)
-    for row, name in zip(axes, scores, strict=True):
+    rows = {}
+    for name in scores:
         windows = job.validation[name].batch([0])
         counts = windows.volume.counts[0]
         truth = windows.truth
         lengths = truth.flow_px.square().sum(1).sqrt()[truth.valid]
         longest = max(float(lengths.max()), 1e-6) if len(lengths) else 1.0
-        row[0].imshow((counts[0] - counts[1]).sum(0).clamp(-3, 3).numpy(), cmap="RdBu", vmin=-3, vmax=3)
-        closed = flow.estimate_lk(windows.volume).flow_px
-        ours = network(to_device(windows, device).volume).flow_px.float().cpu()
-        valid = truth.valid[0].numpy()[..., None]
-        row[1].imshow(np.where(valid, flow_colours(truth.flow_px[0].numpy(), longest), 0.6))
-        for axis, estimate in zip(row[2:], (closed, ours), strict=True):
-            axis.imshow(flow_colours(estimate[0].numpy(), longest))
-        titles = (name, f"truth, up to {longest:.1f} px", "closed form", "network")
-        for axis, title in zip(row, titles, strict=True):
-            axis.set_title(title, fontsize=8)
-            axis.axis("off")
-    return figure
+        flows = {
+            "truth": truth.flow_px,
+            "closed form": flow.estimate_lk(windows.volume).flow_px,
+            "network": network(to_device(windows, device).volume).flow_px.float().cpu(),
+        }
+        shown = {title: flow_colours(each[0].numpy(), longest) for title, each in flows.items()}
+        shown["truth"] = np.where(truth.valid[0].numpy()[..., None], shown["truth"], 0.6)
+        label = f"{name}, up to {longest:.1f} px"
+        rows[label] = {"events": (counts[0] - counts[1]).sum(0), **shown}
+    return show_pictures(rows, signed=["events"])

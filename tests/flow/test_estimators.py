@@ -13,6 +13,7 @@ import torch
 from codesign import flow
 from codesign.errors import CodesignError
 from codesign.flow.export import evenly_timed
+from studies.train_flow.peers import ECN, IDNet
 
 D = torch.float64
 BINS = 4
@@ -32,8 +33,8 @@ NETWORKS = {
     "refiner": drawn(flow.Refiner(BINS, width=16, steps=1)),
     "flownet": drawn(flow.FlowNetEvents(BINS, width=4.0)),
     "spiking": drawn(flow.SpikeFlowNet(BINS, width=4.0)),
-    "ecn": drawn(flow.ECN(BINS, width=4.0)),
-    "idnet": drawn(flow.IDNet(BINS, width=4.0)),
+    "ecn": drawn(ECN(BINS, width=4.0)),
+    "idnet": drawn(IDNet(BINS, width=4.0)),
 }
 WIDE = {name: deepcopy(network).double() for name, network in NETWORKS.items()}
 CLOSED = {

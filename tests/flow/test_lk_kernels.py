@@ -1,5 +1,5 @@
-"""The kernels of the closed form against the same as operations of torch, against scipy, and against a plane that
-moves; what a recording of a kernel promises."""
+"""The kernels of the closed form against the same as operations of torch and against scipy; what a
+recording of a kernel promises."""
 # pyright: reportArgumentType=false, reportCallIssue=false, reportOptionalMemberAccess=false
 
 import gc
@@ -96,24 +96,6 @@ def test_kernels_are_the_plain_operations_and_their_gradients(case, dtype, gener
         assert float(off) <= 100 * torch.finfo(dtype).eps * float(other.detach().abs().max())
 
 
-def test_a_plane_carried_back_along_its_flow_stands_still():
-    grid = Grid(21, 33, 2)
-    time, contrast = times(5)
-    y, x = (2 * torch.arange(count, dtype=D) + 0.5 for count in grid.shape)
-    flow = torch.tensor([3.0, -2.0], dtype=D)
-    shift = time[:, None, None] * flow
-    bins = 0.7 * (x - shift[..., :1]) + 0.3 * (y[:, None] - shift[..., 1:])
-    flow = flow[:, None, None].expand(1, 2, *grid.shape)
-    mean, slope, seen = moving(bins[None], flow, time, contrast, grid, FADE_PX)
-    inner = (0, slice(1, -1), slice(1, -1))  # the outermost samples read beyond the border
-    torch.testing.assert_close(mean[inner], (0.7 * x + 0.3 * y[:, None])[1:-1, 1:-1])
-    assert float(slope[inner].abs().max()) < 1e-13
-    sums = cell_sums(mean, slope, seen, 2 * seen, grid)[0, :, 2:-2, 2:-2]
-    window = seen[0, 2:-2, 2:-2]
-    squares = torch.tensor([0.49, 0.21, 0.09, 0, 0, 0, 1], dtype=D)[:, None, None] * window
-    torch.testing.assert_close(sums, torch.cat([squares, 2 * window[None].square()]))
-
-
 @pytest.mark.parametrize(
     ("shape", "stride"), [((2, 3, 150, 21), 1), ((1, 2, 31, 42), 4), ((1, 2, 3, 2), 1), ((3, 1, 1, 5), 1)]
 )
@@ -154,7 +136,7 @@ def test_other_sizes_need_no_new_kernel_but_for_copies_to_scatter_into(generator
         return {entry["hash"] for entry in history if entry["type"] == dr.KernelType.JIT}
 
     first = kernels((1, 3, 8, 9, 2, 2))
-    assert len(first) >= 9
+    assert len(first) >= 7
     # several threads scatter into a copy each, whose size is part of the one kernel that does
     assert len(kernels((4, 3, 80, 21, 4, 5)) - first) <= (dr.thread_count() > 1)
 

@@ -99,49 +99,6 @@ def test_nan_is_no_inlier(measure):
     assert measure(flow, TRUTH, mask).item() == measure(FOUND, TRUTH, mask).item()
 
 
-# rays
-
-
-@pytest.mark.parametrize(
-    ("flow", "other", "degrees"),
-    # focal length 50 px, axis at (2, 1): the end (52, 1) lies at 45 degrees, (2, 51) too, 60 degrees from it
-    [
-        ((50.0, 0.0), (0.0, 0.0), 45.0),
-        ((50.0, 0.0), (0.0, 50.0), 60.0),
-        ((-50.0, 0.0), (50.0, 0.0), 90.0),
-        ((7.3, 1.0), (7.3, 1.0), 0.0),
-    ],
-)
-def test_ray_errors_of_a_pinhole_in_closed_form(flow, other, degrees):
-    direction = metrics.pinhole_directions(3, 5, 50.0)
-    axis = torch.zeros(3, 5, dtype=torch.bool)
-    axis[1, 2] = True
-    found, truth = (torch.tensor(pair, dtype=D)[:, None, None].expand(2, 3, 5) for pair in (flow, other))
-    # the ends lie far outside the image: linear beyond its border is exact for a pinhole; rays of any
-    # length count the same
-    for scale in (1.0, 0.1):
-        error = metrics.ray_error_mrad(found, truth, scale * direction, axis).item()
-        assert error == pytest.approx(1000 * math.radians(degrees), abs=1e-9)
-
-
-def test_the_angle_of_a_pixel_in_closed_form():
-    # solid angle of a pixel of a pinhole: cos^3 / f^2
-    focal = 20.0
-    direction = metrics.pinhole_directions(7, 9, focal)
-    found = metrics.mrad_per_pixel(direction)
-    y, x = torch.meshgrid(torch.arange(7, dtype=D) - 3, torch.arange(9, dtype=D) - 4, indexing="ij")
-    cosine = focal / (x.square() + y.square() + focal**2).sqrt()
-    torch.testing.assert_close(found, 1000 * cosine**1.5 / focal, rtol=1e-12, atol=0)
-    # and a short flow of one pixel is that angle on the axis
-    truth = torch.zeros(2, 7, 9, dtype=D)
-    short = truth + torch.tensor([1e-6, 0.0], dtype=D)[:, None, None]
-    error = metrics.ray_error_mrad(short, truth, direction, cosine == 1)
-    assert error.item() == pytest.approx(1e-6 * found[3, 4].item(), rel=1e-9)
-    off = metrics.pinhole_directions(3, 5, 10.0, centre_px=(0.0, 2.0))
-    assert off[2, 0].tolist() == [0, 0, 1]
-    assert off[0, 4].tolist() == pytest.approx([0.4, -0.2, 1])
-
-
 # events alone
 
 
@@ -197,11 +154,10 @@ def test_polarities_share_an_image_in_fwl_but_not_in_rsat():
 
 
 NOTHING = torch.zeros(1, 5, dtype=torch.bool)
-STILL = torch.zeros(2, 3, 5, dtype=D)
 ONES = torch.ones(4, dtype=torch.int64)
 EVERYWHERE = ordered(torch.arange(4), torch.tensor([0, 1, 0, 1]), torch.tensor([0, 0, 1, 1]), ONES, 2, 2)
 AT_ONCE = ordered(0 * ONES[:1], 0 * ONES[:1], 0 * ONES[:1], ONES[:1], 2, 2)
-FOUR = STILL[:, :2, :2]
+FOUR = torch.zeros(2, 2, 2, dtype=D)
 
 
 @pytest.mark.parametrize(
@@ -210,14 +166,6 @@ FOUR = STILL[:, :2, :2]
         (lambda: metrics.aee(FOUND, TRUTH, NOTHING), "selects no pixel"),
         (lambda: metrics.aee(FOUND, TRUTH[:, :, :3]), r"\[\.\.\., 2, H, W\]"),
         (lambda: metrics.aee(FOUND, TRUTH, torch.ones(4, 4) > 0), r"mask.*\(4, 4\)"),
-        (
-            lambda: metrics.ray_error_mrad(STILL, STILL, metrics.pinhole_directions(3, 4, 10.0)),
-            r"directions must be \[H, W, 3\]",
-        ),
-        (
-            lambda: metrics.ray_error_mrad(STILL, STILL, -metrics.pinhole_directions(3, 5, 10.0)),
-            "does not go forward",
-        ),
         (lambda: metrics.fwl(EVERYWHERE, FOUR, 5, 9), "no event lies between"),
         (lambda: metrics.fwl(EVERYWHERE, FOUR, 0, 3), "equally many events"),
         (lambda: metrics.rsat(AT_ONCE, FOUR, 0, 3), "at the start of the interval"),

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch
 from kornia.geometry.calibration import distort_points
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from codesign.errors import CodesignError, FileFormatError
 from codesign.events.formats import text as text_events
 from codesign.flow.files import write_flow
-from codesign.flow.sources import PacketOptions, read_packets, read_text_events
+from codesign.flow.sources import PacketOptions, read_packets, read_recording
 from codesign.flow.sources.camera import (
     Calibration,
     read_calibration,
@@ -42,7 +43,7 @@ def test_events_are_read_as_written_whatever_the_chunks(form, tmp_path, monkeypa
     path.write_bytes(eth_text(columns, form).encode())
     for chunk in (text_events.CHUNK_BYTES, 997):  # borders fall anywhere within a line
         monkeypatch.setattr(text_events, "CHUNK_BYTES", chunk)
-        found = read_text_events(path)
+        found = read_recording(path)
         np.testing.assert_array_equal([found.t_us, found.x, found.y, found.on], columns)
         assert (found.height_px, found.width_px) == DAVIS
 
@@ -56,12 +57,15 @@ def test_the_sensor_is_the_one_told_or_the_smallest_that_holds_the_events(tmp_pa
         ((1280, 4), (5, 1281)),
     ):
         path.write_text(f"0.5 {reach[0]} {reach[1]} 1\n0.6 0 0 0\n")
-        found = read_text_events(path)
+        found = read_recording(path)
         assert (found.height_px, found.width_px) == size
     with pytest.raises(FileFormatError, match=r"line 1: .*x = 1280; the sensor has 1280 pixels"):
-        read_text_events(path, size=(720, 1280))
-    with pytest.raises(FileFormatError, match=r"height_px 5 by the frames, but 700 was asked for"):
-        read_text_events(path, size=(700, 1300), told=(5, 1281), told_by="the frames")
+        read_recording(path, PacketOptions(size_px=(720, 1280)))
+    (tmp_path / "images").mkdir()
+    Image.new("L", (1281, 5)).save(tmp_path / "images" / "1.png")
+    assert read_recording(path).size_from == "its frames"
+    with pytest.raises(FileFormatError, match=r"height_px 5 by its frames, but 700 was asked for"):
+        read_recording(path, PacketOptions(size_px=(700, 1300)))
 
 
 # the camera and how it turns
@@ -153,7 +157,7 @@ def test_gyroscope_and_poses_give_the_turn(tmp_path):
             attitude.turn(5.39, 5.41)
     assert by_rate.moved_m(5.1, 5.2) is None
     assert by_place.moved_m(5.1, 5.2) == pytest.approx(0.05)
-    turned = read_gyroscope(tmp_path / "imu.txt", signed_axes("-y+xz")).turn(5.1, 5.2)
+    turned = read_gyroscope(tmp_path / "imu.txt", "-y+xz").turn(5.1, 5.2)
     right = Rotation.from_rotvec([-0.09, -0.04, -0.06]).as_matrix()
     np.testing.assert_allclose(turned, right, rtol=0, atol=1e-9)
     lines = (tmp_path / "imu.txt").read_text().splitlines()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from codesign.errors import FileFormatError
-from codesign.flow.sources import PacketOptions, read_packets, read_text_events
+from codesign.flow.sources import PacketOptions, read_packets, read_recording
 from codesign.flow.sources.packet import across, gaps
 from tests.recording_case import DAVIS, eth_text, made, recording
 
@@ -35,7 +35,7 @@ def test_events_off_the_sensor_or_back_in_time(kind, tmp_path):
     if kind == "txt":
         path.write_text(eth_text((t_us, x + 250, y, on)))
         with pytest.raises(FileFormatError, match="no event that is on the sensor"):
-            read_text_events(path, DAVIS, skip=SKIP)
+            read_recording(path, PacketOptions(size_px=DAVIS, skip=SKIP))
 
 
 def test_gaps_and_empty_windows(tmp_path):

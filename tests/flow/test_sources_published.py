@@ -183,7 +183,7 @@ MAPS = {"x_flow_dist": np.ones((11, 26, 34)), "y_flow_dist": np.ones((11, 26, 34
         (
             dsec,
             lambda at: rewritten(at / FLOW / "forward_timestamps.txt", "1310000, 1410000", ""),
-            "2 lines for 3 files",
+            "for 3 flow",
         ),
         (
             dsec,

@@ -169,7 +169,7 @@ def test_what_waits_is_no_more_than_a_window():
     tracker = flow.Tracker(summed, events=50)
     for k in range(10):
         tracker.add(stream_of(k * 10_000 + torch.arange(997), seed=k))
-        assert sum(part.t_us.untyped_storage().nbytes() for part in tracker._parts) <= 50 * 8
+        assert sum(rows.untyped_storage().nbytes() for rows in tracker._rows) <= 4 * 50 * 8
 
 
 def test_arrays_are_taken_and_faults_left_out_on_request():

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from codesign import events, flow
-from codesign.flow.baselines import ECN, FlowNetEvents, IDNet, SpikeFlowNet
+from codesign.flow.baselines import FlowNetEvents, SpikeFlowNet
 from codesign.system import Batch, System
 from codesign.types import Rays
 
@@ -22,8 +22,6 @@ ESTIMATORS = {
     "refiner": lambda: flow.Refiner(width=16),
     "flownet-events": lambda: FlowNetEvents.with_weights(20_000, bins=8),
     "spike-flownet": lambda: SpikeFlowNet.with_weights(20_000, bins=8),
-    "ecn": lambda: ECN.with_weights(20_000, bins=8),
-    "idnet": lambda: IDNet.with_weights(60_000, bins=8),
 }
 JUMPS = {"spike-flownet"}  # spikes jump: their derivative is a stand-in, and none of the sum's
 

@@ -5,7 +5,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate, silu
 
 from codesign.flow.baselines.parts import Baseline, channels, rescale_flow, start
-from codesign.flow.layers import Layer
+from codesign.flow.entry import Layer
 from codesign.types import EventVolume
 
 

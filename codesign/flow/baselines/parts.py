@@ -1,15 +1,14 @@
 """What the networks that event flow is compared with share: from volume to fields of flow, layers, how
 many weights they have, where these start, and the widths that fill a budget."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from codesign.errors import DomainError, ShapeError, check_seed, check_whole
-from codesign.flow.checks import check_real, check_size
+from codesign.errors import DomainError, check_seed, check_whole
 from codesign.flow.entry import check_bins, check_sizes, normalise, pad_to, takes_volume, to_field
 from codesign.types import EventVolume, FlowField
 
@@ -70,7 +69,7 @@ class Baseline(nn.Module):
         return [to_field(rescale_flow(flow, full)[..., :height, :width], volume) for flow in flows]
 
 
-def rescale_flow(flow_px: Tensor, size: tuple[int, int] | torch.Size) -> Tensor:
+def rescale_flow(flow_px: Tensor, size: Sequence[int]) -> Tensor:
     """The same motion on a grid of ``size`` (height, width) pixels over the same image.
 
     Args:
@@ -79,20 +78,11 @@ def rescale_flow(flow_px: Tensor, size: tuple[int, int] | torch.Size) -> Tensor:
     Returns: [B, 2, height, width] in pixels of the new grid: resampled bilinearly between pixel centres
       (constant beyond the outermost), x times width / W, y times height / H.
     Gradient: flow_px.
-    Raises: ShapeError.
     """
-    height, width = check_size(tuple(size) if isinstance(size, torch.Size) else size, "the new size")
-    check_real(flow_px, "the flow")
-    if flow_px.ndim != 4 or flow_px.shape[1] != 2 or min(height, width, *flow_px.shape[2:]) < 1:
-        raise ShapeError(
-            f"a flow is [B, 2, H, W] and its new size at least 1 x 1; got {tuple(flow_px.shape)} and "
-            f"{height} x {width}."
-        )
+    height, width = size
     if (height, width) == tuple(flow_px.shape[2:]):
         return flow_px
-    factor = torch.tensor(
-        [width / flow_px.shape[3], height / flow_px.shape[2]], dtype=flow_px.dtype, device=flow_px.device
-    )
+    factor = flow_px.new_tensor([width / flow_px.shape[3], height / flow_px.shape[2]])
     return interpolate(flow_px, (height, width), mode="bilinear", align_corners=False) * factor[:, None, None]
 
 

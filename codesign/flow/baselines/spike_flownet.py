@@ -5,10 +5,9 @@ from torch import Tensor, nn
 from torch.nn.functional import conv_transpose2d, leaky_relu
 
 from codesign.backend import NoSecondDerivative
-from codesign.errors import ShapeError
 from codesign.events.spiking.surrogate import FastSigmoid, Surrogate
 from codesign.flow.baselines.parts import Baseline, channels, rescale_flow, start
-from codesign.flow.checks import check_number, check_real
+from codesign.flow.checks import check_number
 from codesign.types import EventVolume
 
 _FIRST_ONLY = (
@@ -91,18 +90,6 @@ class SpikeFlowNet(Baseline):
           halves: [B, 4, H, W, steps], ON and OFF of the former half of the window, then of the latter;
             H and W multiples of 16.
         """
-        check_real(halves, "the encoder's input")
-        if (
-            halves.ndim != 5
-            or halves.shape[1] != 4
-            or 0 in halves.shape
-            or halves.shape[2] % self.STRIDE
-            or halves.shape[3] % self.STRIDE
-        ):
-            raise ShapeError(
-                f"the encoder takes [B, 4, H, W, steps] with H and W multiples of {self.STRIDE}, got "
-                f"{tuple(halves.shape)}."
-            )
         steps = halves.shape[4]
         halves = halves.to(next(self.parameters()).dtype)
         x = halves.permute(4, 0, 1, 2, 3).flatten(0, 1).contiguous(memory_format=torch.channels_last)
@@ -153,16 +140,9 @@ def to_halves(counts: Tensor) -> Tensor:
       added. The bins keep their shared borders, so an event that crosses one, also the middle of the window,
       changes the input continuously.
     Gradient: counts.
-    Raises: ShapeError for an odd number of bins.
     Source: Lee et al., Spike-FlowNet, ECCV 2020, sec. 3.1.
     """
-    check_real(counts, "the counts")
-    if counts.ndim != 5 or counts.shape[1] != 2 or counts.shape[2] % 2 or counts.shape[2] == 0:
-        raise ShapeError(
-            "two halves need counts [B, 2, bins, H, W] with an even number of bins, got "
-            f"{tuple(counts.shape)}."
-        )
-    batch, _, bins, height, width = counts.shape
+    bins = counts.shape[2]
     split = counts.unflatten(2, (2, bins // 2)).transpose(1, 2)  # [B, half, polarity, k, H, W]
     return split.flatten(1, 2).permute(0, 1, 3, 4, 2)
 
@@ -214,13 +194,8 @@ def integrate_and_fire(current: Tensor, threshold: float, surrogate: Surrogate) 
     Returns: [T, ...] spikes, 0 or 1.
     Gradient: current; lambda_t = g_t rho(u_t - threshold) + (1 - s_t) lambda_{t+1}, the reset taken as it
       happened. First derivatives only.
-    Raises: GradientError for a second derivative; ShapeError without a step; DomainError for a threshold <=
-      0.
+    Raises: GradientError for a second derivative.
     Source: Lee et al., Spike-FlowNet, ECCV 2020, eqs. 1 to 3, which lets rho be 1 / threshold above it and 0
       below.
     """
-    check_real(current, "the current")
-    if current.ndim < 1 or len(current) < 1:
-        raise ShapeError(f"the current needs a time axis with at least one step, got {tuple(current.shape)}.")
-    check_number(threshold, "the threshold", above=0.0)
     return _Fire.apply(current, threshold, surrogate)

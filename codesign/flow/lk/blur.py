@@ -1,5 +1,4 @@
-"""Means over squares and a symmetric kernel along both axes, mirrored at the border: in drjit, and as
-operations of torch.
+"""A symmetric kernel along both axes, mirrored at the border: in drjit, and as operations of torch.
 
 A lane goes down a column: it takes the horizontal sum of each row and keeps the last ones for the
 vertical sum, so nothing is stored between the two. An even continuation makes the blur A self-adjoint
@@ -13,7 +12,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from codesign.errors import ShapeError
 from codesign.exclusive import exclusive
 from codesign.flow.lk.lanes import Form, Grid, Lanes, in_graph, plain_wanted, recorded, tensors
 
@@ -30,21 +28,12 @@ def blurred(images: Tensor, grid: Grid, taps: Sequence[float]) -> Tensor:
     Returns: [B, n, h, w]. Beyond the outermost samples the image is continued by its mirror image,
       again and again where the kernel is longer.
     Gradient: images; exact, the first one.
-    Raises: ShapeError where images and grid do not fit; GradientError for a second derivative.
+    Raises: GradientError for a second derivative.
     """
-    if images.ndim != 4 or images.shape[2:] != (grid.height, grid.width) or 0 in grid.shape:
-        raise ShapeError(
-            f"images are {list(images.shape)}, the grid has {grid.height} x {grid.width} pixels and {grid.shape[0]} "
-            f"x {grid.shape[1]} samples; give [B, n, {grid.height}, {grid.width}] and at least one sample."
-        )
-    if plain_wanted():
-        return _plain(images, grid, taps)
-    return in_graph(_forward, _adjoint, (grid, tuple(taps)), images)[0]
-
-
-def _plain(images, grid, taps):
     pooled = avg_pool2d(images, grid.stride) if grid.stride > 1 else images
-    return _along_rows(_along_rows(pooled, taps).mT, taps).mT
+    if plain_wanted():
+        return _along_rows(_along_rows(pooled, taps).mT, taps).mT
+    return in_graph(_forward, _adjoint, (grid, tuple(taps)), pooled)[0]
 
 
 def _along_rows(images, taps):
@@ -66,25 +55,29 @@ def _mirrored(place, size):
 
 
 @exclusive
-def _forward(grid, taps, images):
-    form = Form.of(images.flatten(0, 1), grid)
-    (source,) = form.load(images)
-    if grid.stride > 1:
-        source = _pooled(form, source)
-    found = _blurred(form, False, source, form.scalars(list(taps)))
-    return tensors((*images.shape[:2], *grid.shape), found), ()
+def _forward(grid, taps, samples):
+    form = Form.of(samples.flatten(0, 1), grid)
+    found = _blurred(form, *form.load(samples), form.scalars(list(taps)))
+    return tensors(samples.shape, found), ()
 
 
-@exclusive
-def _adjoint(grid, taps, images, grads, wanted):
-    form = Form.of(images.flatten(0, 1), grid)
-    found = _blurred(form, True, *form.load(grads[0]), form.scalars(list(taps)))
-    return tensors(images.shape, _spread(form, found) if grid.stride > 1 else found)
+def _adjoint(grid, taps, samples, grads, wanted):
+    rows, columns = (_ends(count, samples) for count in grid.shape)
+    ends = rows[:, None] * columns
+    ((found,), _) = _forward(grid, taps, grads[0] * ends)
+    return (found / ends,)
+
+
+def _ends(count, like):
+    """[count] 2 at either end, 1 within."""
+    found = torch.ones(count).to(like)
+    found[[0, -1]] = 2
+    return found
 
 
 @recorded
-def _blurred(form, adjoint, source, taps):
-    """Of samples; ``adjoint``: its adjoint."""
+def _blurred(form, source, taps):
+    """Of samples."""
     lanes = Lanes(form)
     dr = lanes.dr
     arr = lanes.arr
@@ -98,21 +91,14 @@ def _blurred(form, adjoint, source, taps):
     start = image * lanes.area
     top = block * lanes.count(ROWS)
     taken = [row.at(x + j) for j in range(2 * radius + 1)]
-    counts = [row.ends(at) for at in taken] if adjoint else None
     target = lanes.empty(lanes.images * lanes.samples)
 
     def body(k, *above):
         y = column.at(k)
         values = [lanes.take(source, start + y * lanes.across + at) for at in taken]
-        if adjoint:
-            values = [value * count for value, count in zip(values, counts, strict=True)]
         here = _weighed(dr, values, taps)
-        if adjoint:
-            here *= column.ends(y)
         found = _weighed(dr, [*above, here], taps)
         y = k - 2 * radius
-        if adjoint:
-            found *= dr.rcp(row.ends(x) * column.ends(y))
         at = start + y * lanes.across + x
         dr.scatter(target, found, at, active=k >= top + 2 * radius, mode=dr.ReduceMode.NoConflicts)
         return *above[1:], here
@@ -121,48 +107,6 @@ def _blurred(form, adjoint, source, taps):
     lanes.loop(top, end, body, *([dr.zeros(arr.Float, width)] * (2 * radius)))
     dr.eval(target)
     return target
-
-
-@recorded
-def _pooled(form, source):
-    """Means over the squares."""
-    lanes = Lanes(form)
-    dr = lanes.dr
-    side = lanes.count(form.stride)
-    across = lanes.count(form.width)
-    image, place = lanes.split(lanes.lanes(lanes.images * lanes.samples), lanes.samples)
-    y, x = lanes.split(place, lanes.columns)
-    corner = image * lanes.count(form.height * form.width) + (y * across + x) * side
-
-    def body(k, total, right, down):
-        total += lanes.take(source, corner + down * across + right)
-        ends = right + 1 == side
-        return total, dr.select(ends, 0, right + 1), dr.select(ends, down + 1, down)
-
-    zero = dr.zeros(lanes.arr.UInt32, dr.width(place))
-    begun = dr.zeros(lanes.arr.Float, dr.width(place)), zero, zero
-    total, *_ = lanes.loop(zero, side * side, body, *begun)
-    total *= lanes.number(1 / form.stride**2)
-    dr.eval(total)
-    return total
-
-
-@recorded
-def _spread(form, source):
-    """Adjoint of ``_pooled``."""
-    lanes = Lanes(form)
-    dr = lanes.dr
-    area = form.height * form.width
-    image, place = lanes.split(lanes.lanes(lanes.images * area), area)
-    row, column = lanes.split(place, form.width)
-    y = lanes.split(row, form.stride)[0]
-    x = lanes.split(column, form.stride)[0]
-    inside = (y < lanes.count(lanes.rows)) & (x < lanes.across)
-    at = image * lanes.area + y * lanes.across + x
-    found = dr.gather(lanes.arr.Float, source, at, active=inside)
-    found *= lanes.number(1 / form.stride**2)
-    dr.eval(found)
-    return found
 
 
 def _weighed(dr, values, taps):
@@ -188,7 +132,3 @@ class _Mirrored:
         """Sample at an index that counts from ``radius`` before the first."""
         rest = self.lanes.split(index + self.shift, self.period)[1]
         return self.lanes.dr.minimum(rest, self.whole - rest)
-
-    def ends(self, at):
-        """2 at either end, 1 within."""
-        return self.lanes.dr.select((at == 0) | (at == self.last), self.lanes.arr.Float(2), 1)

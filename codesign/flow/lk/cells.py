@@ -12,7 +12,7 @@ import math
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample, interpolate, pad
+from torch.nn.functional import avg_pool2d, interpolate, pad
 
 from codesign.flow.lk import quadtree
 from codesign.flow.lk.level import CALIBRATION, DOUBT, OVERLAP, RIDGE, TINY, Level
@@ -49,14 +49,6 @@ class Cells:
         rows, columns = level.grid.shape
         found = interpolate(self.value, scale_factor=CELL / level.stride, mode="bilinear")
         return found[:, :, :rows, :columns]
-
-    def at(self, x_px: Tensor, y_px: Tensor) -> tuple[Tensor, Tensor]:
-        """Flow [B, 2, H, W] and its covariance [B, 3, H, W] at pixel coordinates [B, H, W]."""
-        rows, columns = self.value.shape[2:]
-        places = torch.stack([(2 * x_px + 1) / (CELL * columns) - 1, (2 * y_px + 1) / (CELL * rows) - 1], -1)
-        both = torch.cat([self.value, self.covariance], 1).to(places)
-        found = grid_sample(both, places, padding_mode="border", align_corners=False)
-        return found[:, :2], found[:, 2:]
 
     def step(self, level: Level, products: Tensor, change: Tensor) -> None:
         """Moves to the posterior mean.
@@ -110,7 +102,7 @@ class Cells:
         texture = near + few * whole[:, :3] / (whole[:, 3:] + few)
         scattered_too = scattered + few * level.texture_noise
         ridge = RIDGE * (xx + yy + 2 * events * level.texture_noise).mean((1, 2), keepdim=True) + TINY
-        square = _square(texture)
+        square = _commuting(texture, texture)
         doubt = (DOUBT * scattered_too).square() + ridge.square()
         trust = _commuting(square, _inverse(_plus(square, doubt)))
         own = torch.stack([xx, xy, yy], 1)
@@ -152,11 +144,6 @@ def _apply(matrix, vector):
 def _inverse(matrix):
     xx, xy, yy = matrix.unbind(1)
     return torch.stack([yy, -xy, xx], 1) / (xx * yy - xy * xy)[:, None]
-
-
-def _square(matrix):
-    xx, xy, yy = matrix.unbind(1)
-    return torch.stack([xx * xx + xy * xy, xy * (xx + yy), xy * xy + yy * yy], 1)
 
 
 def _commuting(one, other):

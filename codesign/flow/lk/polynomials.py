@@ -5,7 +5,6 @@ A field is u = sum p_k b_k(x, y), v = sum q_k b_k(x, y) with b = 1, x, y, x^2, x
 reach from -1 to 1 along the longer side. Parameters are [B, 2K]: p_1..p_K, q_1..q_K.
 """
 
-from collections.abc import Callable
 from functools import cached_property
 
 import torch
@@ -115,45 +114,12 @@ class Polynomials:
         """Mean squared length [B] of the flow over the square [-1, 1]^2."""
         return ((parameters @ self.second_moments.to(parameters)) * parameters).sum(1)
 
-    def at_start(
-        self,
-        parameters: Tensor,
-        start: Tensor,
-        local: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
-        joined: bool,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """From the field v at the mean place of the events to the flow on the pixels of the start, by
-        fixed point: w(x) = v(x - start w(x)).
-
-        Args:
-          parameters: [B, 2K].
-          start: [B] place of the start on the way, -1/2 for even motion.
-          local: local part and its covariance at pixel coordinates, (x, y) -> ([B, 2, H, W], [B, 3, H,
-            W]).
-          joined: whether it is part of v.
-        Returns: flow [B, 2, H, W] px per way; where each pixel is at the mean place: the basis [B, K,
-          H, W], the local part and its covariance.
-        """
-        p = parameters.reshape(len(parameters), 2, self.terms)
-        y, x = torch.meshgrid(torch.arange(self.height).to(p), torch.arange(self.width).to(p), indexing="ij")
-        back = -start.to(p)[:, None, None]
-        flow = p.new_zeros(len(p), 2, self.height, self.width)
-        for _ in range(FIXED_POINT_STEPS):
-            flow, *_ = self._along(p, x + back * flow[:, 0], y + back * flow[:, 1], local if joined else None)
-        at = x + back * flow[:, 0], y + back * flow[:, 1]
-        flow, places = self._along(p, *at, None)
-        part, covariance = local(*at)
-        return flow + part if joined else flow, places, part, covariance
-
-    def _along(self, p, x_px, y_px, local):
-        """Flow and basis at pixel coordinates."""
-        places = self.basis(*self.scaled(x_px, y_px), 1)
-        flow = (p @ places.flatten(2)).unflatten(2, places.shape[2:])
-        return flow if local is None else flow + local(x_px, y_px)[0], places
-
     def fitted(self, flow_px: Tensor, start: Tensor) -> Tensor:
         """Numbers [B, 2K], float64, for which unit @ numbers are the parameters whose flow on the
-        pixels of the start is nearest to this one, px per way; args as of ``at_start``."""
+        pixels of the start is nearest to this one, px per way.
+
+        start: [B] place of the start on the way, -1/2 for even motion.
+        """
         side = max(1, min(POOL, self.height // 2, self.width // 2))
         flow = avg_pool2d(flow_px.double(), side)
         y, x = (torch.arange(count).to(flow) * side + (side - 1) / 2 for count in flow.shape[2:])
@@ -180,13 +146,6 @@ class Polynomials:
         place = (sums[:, None] == powers).all(2).to(covariance)  # [K^2, M]
         blocks = torch.stack([covariance[:, :k, :k], covariance[:, :k, k:], covariance[:, k:, k:]])
         return blocks.flatten(2) @ place
-
-    def covariance(self, covariance: Tensor, places: Tensor) -> Tensor:
-        """Covariance [B, 3, H, W] (xx, xy, yy) of the flow from that of the parameters [B, 2K, 2K]."""
-        k = self.terms
-        at = places.flatten(2)
-        blocks = torch.stack([covariance[:, :k, :k], covariance[:, :k, k:], covariance[:, k:, k:]], 1)
-        return ((blocks @ at[:, None]) * at[:, None]).sum(2).unflatten(2, places.shape[2:])
 
 
 class Moments:

@@ -78,37 +78,17 @@ def _plain(data, steps):
     passed = []
     for step in steps:
         variance = step.repeat_interleave(batch * len(SHIFTS))[:, None, None]
-        xx, xy, yy, px, py = trees.unbind(1)
-        a = 1 + variance * xx
-        b = variance * xy
-        d = 1 + variance * yy
-        determinant = a * d - b * b
-        gain = d / determinant, -b / determinant, a / determinant  # (1 + variance P)^-1
-        up = _times(gain, px, py)
-        fit = variance * (px * up[0] + py * up[1])
-        evidence = evidence + (fit - determinant.log()).sum((1, 2)) / 2
-        passed.append((gain, px, py, variance))
-        above = torch.stack(
-            [gain[0] * xx + gain[1] * xy, gain[0] * xy + gain[1] * yy, gain[1] * xy + gain[2] * yy, *up], 1
-        )
-        trees = 4 * avg_pool2d(above, 2) if len(passed) < scales else above
+        passed.append((variance, *trees.unbind(1)))
+        *above, more = _above(torch.log, *passed[-1])
+        evidence = evidence + more.sum((1, 2))
+        trees = torch.stack(above, 1)
+        if len(passed) < scales:
+            trees = 4 * avg_pool2d(trees, 2)
     value = trees.new_zeros(len(trees), 5, *trees.shape[2:])  # mean x, y, covariance xx, xy, yy
-    for number, (gain, px, py, variance) in enumerate(reversed(passed)):
+    for number, given in enumerate(reversed(passed)):
         if number:
             value = interpolate(value, scale_factor=2.0)
-        x, y, xx, xy, yy = value.unbind(1)
-        mean = _times(gain, x + variance * px, y + variance * py)
-        first = _times(gain, xx, xy)
-        second = _times(gain, xy, yy)
-        value = torch.stack(
-            [
-                *mean,
-                gain[0] * first[0] + gain[1] * second[0] + variance * gain[0],
-                gain[1] * first[0] + gain[2] * second[0] + variance * gain[1],
-                gain[1] * first[1] + gain[2] * second[1] + variance * gain[2],
-            ],
-            1,
-        )
+        value = torch.stack(_below(*given, *value.unbind(1)), 1)
     value = value.unflatten(0, (sizes, batch, len(SHIFTS)))
     each = torch.stack(
         [value[:, :, k, :, y : y + height, x : x + width] for k, (y, x) in enumerate(SHIFTS)], 2
@@ -294,34 +274,11 @@ class _Cells(Lanes):
             found = self.dr.select(self.tree == number, shift[axis], found)
         return found
 
-    def gain(self, xx, xy, yy):
-        """(1 + variance P)^-1 and its determinant."""
-        a = 1 + self.variance * xx
-        b = self.variance * xy
-        d = 1 + self.variance * yy
-        determinant = self.dr.rcp(a * d - b * b)
-        return (d * determinant, -b * determinant, a * determinant), determinant
+    def above(self, *given):
+        return _above(self.dr.log, self.variance, *given)
 
-    def above(self, xx, xy, yy, px, py):
-        """What cells say of their parents, and the logarithm of their evidence."""
-        (a, b, d), determinant = self.gain(xx, xy, yy)
-        x, y = _times((a, b, d), px, py)
-        evidence = (self.variance * (px * x + py * y) + self.dr.log(determinant)) / 2
-        return a * xx + b * xy, a * xy + b * yy, b * xy + d * yy, x, y, evidence
-
-    def below(self, xx, xy, yy, px, py, x, y, uu, uv, vv):
-        """Mean and covariance of cells, from what is summed up there and the mean and covariance of
-        their parents."""
-        (a, b, d), _ = self.gain(xx, xy, yy)
-        mean = _times((a, b, d), x + self.variance * px, y + self.variance * py)
-        first = _times((a, b, d), uu, uv)
-        second = _times((a, b, d), uv, vv)
-        return (
-            *mean,
-            a * first[0] + b * second[0] + self.variance * a,
-            b * first[0] + d * second[0] + self.variance * b,
-            b * first[1] + d * second[1] + self.variance * d,
-        )
+    def below(self, *given):
+        return _below(self.variance, *given)
 
     def mean_below(self, *given):
         """Mean and covariance over trees with the same data, and what they differ by."""
@@ -333,6 +290,38 @@ class _Cells(Lanes):
             xy = xy + (here_x - x) * (here_y - y) / self.trees
             yy = yy + (here_y - y) ** 2 / self.trees
         return x, y, xx, xy, yy
+
+
+def _above(log, variance, xx, xy, yy, px, py):
+    """What cells say of their parents, and the logarithm of their evidence."""
+    (a, b, d), scale = _gain(variance, xx, xy, yy)
+    x, y = _times((a, b, d), px, py)
+    evidence = (variance * (px * x + py * y) + log(scale)) / 2
+    return a * xx + b * xy, a * xy + b * yy, b * xy + d * yy, x, y, evidence
+
+
+def _below(variance, xx, xy, yy, px, py, x, y, uu, uv, vv):
+    """Mean and covariance of cells, from what is summed up there and the mean and covariance of their
+    parents."""
+    (a, b, d), _ = _gain(variance, xx, xy, yy)
+    mean = _times((a, b, d), x + variance * px, y + variance * py)
+    first = _times((a, b, d), uu, uv)
+    second = _times((a, b, d), uv, vv)
+    return (
+        *mean,
+        a * first[0] + b * second[0] + variance * a,
+        b * first[0] + d * second[0] + variance * b,
+        b * first[1] + d * second[1] + variance * d,
+    )
+
+
+def _gain(variance, xx, xy, yy):
+    """(1 + variance P)^-1 and its determinant."""
+    a = 1 + variance * xx
+    b = variance * xy
+    d = 1 + variance * yy
+    scale = 1 / (a * d - b * b)
+    return (d * scale, -b * scale, a * scale), scale
 
 
 def _times(matrix, x, y):

@@ -5,7 +5,6 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from codesign.backend import pull_back
-from codesign.errors import DomainError, ShapeError
 from codesign.exclusive import exclusive
 from codesign.flow.lk.lanes import Form, Grid, Lanes, in_graph, plain_wanted, recorded, tensors
 
@@ -25,17 +24,8 @@ def cell_sums(
       s, y s, s s, 1, density, where x and y are the slopes of the mean per px (central differences,
       one-sided at the border; 0 where there is one sample) and s is the slope over time.
     Gradient: mean, slope, seen, density; exact, the first one.
-    Raises: ShapeError where shapes do not fit; DomainError where cell < 1; GradientError for a second
-      derivative.
+    Raises: GradientError for a second derivative.
     """
-    shapes = [list(x.shape) for x in (mean, slope, seen, density)]
-    if any(shape != [len(mean), *grid.shape] for shape in shapes):
-        raise ShapeError(
-            f"mean, slope, seen and density are {', '.join(map(str, shapes))}; give [B, {grid.shape[0]}, "
-            f"{grid.shape[1]}] for all."
-        )
-    if cell < 1:
-        raise DomainError(f"cell is {cell}; give a side of at least 1 sample.")
     if plain_wanted():
         return _plain(mean, slope, seen, density, grid, cell)
     return in_graph(_forward, _adjoint, (grid, cell), mean, slope, seen, density)[0]

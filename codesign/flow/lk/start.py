@@ -17,6 +17,7 @@ from codesign.exclusive import exclusive
 from codesign.flow.lk.cells import CELL, Cells
 from codesign.flow.lk.lanes import Form, Grid, Lanes, in_graph, plain_wanted, recorded, tensors
 from codesign.flow.lk.polynomials import FIXED_POINT_STEPS, Polynomials
+from codesign.flow.warp import read_at
 
 # flow x, y, covariance xx, xy, yy, confidence
 OUT = 6
@@ -66,10 +67,7 @@ def at_start(
     Gradient: parameters, spread, cells, start; exact, the first one.
     """
     prior = (shape.unit @ shape.unit.T).to(parameters)[None]
-    spread = spread.to(parameters)
-    if plain_wanted():
-        return _plain(shape, parameters, spread, prior, cells, joined, start)
-    xx, xy, yy = shape.squares(spread)
+    xx, xy, yy = shape.squares(spread.to(parameters))
     widest = shape.squares(prior)
     widest = widest[0] + widest[2]
     widest[:, 0] += 2 * cells.widest
@@ -79,20 +77,13 @@ def at_start(
     setting = Setting(powers, shape.of_squares, *cells.value.shape[2:], CELL, FIXED_POINT_STEPS, joined)
     of_cells = cells.value.to(parameters), cells.covariance.to(parameters)
     grid = Grid(shape.height, shape.width)
+    if plain_wanted():
+        images = _PlainPixels(grid, setting, torch.cat(of_cells, 1))
+        given = torch.cat([of_flow, of_rest], 1)[:, :, None, None].unbind(1)
+        found = torch.stack(torch.broadcast_tensors(*images.outcome(given, images.y, None)), 1)
+        return found[:, :2], found[:, 2:5], found[:, 5]
     flow, rest = in_graph(_forward, _adjoint, (grid, setting), of_flow, of_rest, *of_cells)
     return flow, rest[:, :3], rest[:, 3]
-
-
-def _plain(shape, parameters, spread, prior, cells, joined, start):
-    flow, places, misfit, doubt = shape.at_start(parameters, start, cells.at, joined)
-    covariance = doubt + shape.covariance(spread, places)
-    if not joined:
-        x, y = misfit.unbind(1)
-        covariance = covariance + torch.stack([x * x, x * y, y * y], 1)
-    widest = shape.covariance(prior, places)
-    widest = widest[:, 0] + widest[:, 2] + 2 * cells.widest
-    confidence = 1 - (covariance[:, 0] + covariance[:, 2]) / widest
-    return flow, covariance, confidence.clamp(0, 1)
 
 
 @exclusive
@@ -187,7 +178,80 @@ class _Read(NamedTuple):
     values: list[Any]
 
 
-class _Pixels(Lanes):
+class _Outcome:
+    """What is found at pixels, by the numbers ``x``, ``middle``, ``per_half`` and ``setting`` and the
+    operations ``fma``, ``share`` (cut off at 0 and 1) and ``of_cells`` of its kinds."""
+
+    def flow(self, given, y, read):
+        """Flow on a pixel of the start, and where that is at the mean place. ``read`` takes what cells
+        gave."""
+        back, *given = given
+        terms = len(self.setting.powers)
+        field = given[:terms], given[terms : 2 * terms]
+        joined = self.setting.joined
+        flow = 0, 0
+        for _ in range(self.setting.rounds + 1):
+            place = self.x + back * flow[0], y + back * flow[1]
+            flow = self.polynomials(field, self.setting.powers, place)
+            if joined:
+                flow = [a + b for a, b in zip(flow, self.of_cells(place, (0, 1), read), strict=True)]
+        return flow, place
+
+    def outcome(self, given, y, read):
+        """The six values of a pixel; ``read`` takes what cells gave."""
+        flow, place = self.flow(given, y, read)
+        size = len(self.setting.of_variance)
+        rest = given[self.setting.of_flow :]
+        rest = [rest[k * size : (k + 1) * size] for k in range(4)]
+        xx, xy, yy, widest = self.polynomials(rest, self.setting.of_variance, place)
+        of_xx, of_xy, of_yy = self.of_cells(place, (2, 3, 4), read)
+        xx = xx + of_xx
+        xy = xy + of_xy
+        yy = yy + of_yy
+        if not self.setting.joined:
+            part_x, part_y = self.of_cells(place, (0, 1), read)
+            xx = xx + part_x * part_x
+            xy = xy + part_x * part_y
+            yy = yy + part_y * part_y
+        return *flow, xx, xy, yy, self.share(1 - (xx + yy) / widest)
+
+    def polynomials(self, rows, powers, place):
+        """Values of several polynomials with the same powers."""
+        u, v = ((at - middle) * self.per_half for at, middle in zip(place, self.middle, strict=True))
+        of_u = _powers(u, max(x for x, _ in powers))
+        of_v = _powers(v, max(y for _, y in powers))
+        found = [row[0] for row in rows]  # of power 0
+        for number, (x, y) in list(enumerate(powers))[1:]:
+            value = of_v[y] if not x else of_u[x] if not y else of_u[x] * of_v[y]
+            found = [self.fma(row[number], value, total) for row, total in zip(rows, found, strict=True)]
+        return found
+
+
+class _PlainPixels(_Outcome):
+    """All pixels of images, as tensors."""
+
+    def __init__(self, grid, setting, cells):
+        """Args: cells: [B, 5, rows, columns]."""
+        self.setting = setting
+        self.cells = cells
+        self.y, self.x = torch.meshgrid(
+            torch.arange(grid.height).to(cells), torch.arange(grid.width).to(cells), indexing="ij"
+        )
+        self.middle = (grid.width - 1) / 2, (grid.height - 1) / 2
+        self.per_half = 2 / max(grid.height, grid.width)
+
+    def fma(self, a, b, c):
+        return a * b + c
+
+    def share(self, value):
+        return value.clamp(0, 1)
+
+    def of_cells(self, place, parts, read):
+        at = (torch.stack(place, 1) + 0.5) / CELL - 0.5
+        return read_at(self.cells[:, parts], at).unbind(1)
+
+
+class _Pixels(_Outcome, Lanes):
     """Parts of columns of images, and what is found at a pixel of them."""
 
     def __init__(self, form, setting, cells):
@@ -226,53 +290,11 @@ class _Pixels(Lanes):
         """Of [B, parts, H, W]."""
         return (self.image * parts + part) * self.area + y * self.across + self.column
 
-    def flow(self, given, y, read):
-        """Flow on a pixel of the start, and where that is at the mean place. ``read`` takes what cells
-        gave."""
-        back, *given = given
-        terms = len(self.setting.powers)
-        field = given[:terms], given[terms : 2 * terms]
-        joined = self.setting.joined
-        flow = 0, 0
-        for _ in range(self.setting.rounds):
-            place = self.x + back * flow[0], y + back * flow[1]
-            flow = self.polynomials(field, self.setting.powers, place)
-            if joined:
-                flow = [a + b for a, b in zip(flow, self.of_cells(place, (0, 1), read), strict=True)]
-        place = self.x + back * flow[0], y + back * flow[1]
-        flow = self.polynomials(field, self.setting.powers, place)
-        if joined:
-            flow = [a + b for a, b in zip(flow, self.of_cells(place, (0, 1), read), strict=True)]
-        return flow, place
+    def fma(self, a, b, c):
+        return self.dr.fma(a, b, c)
 
-    def outcome(self, given, y, read):
-        """The six values of a pixel; ``read`` takes what cells gave."""
-        flow, place = self.flow(given, y, read)
-        size = len(self.setting.of_variance)
-        rest = given[self.setting.of_flow :]
-        rest = [rest[k * size : (k + 1) * size] for k in range(4)]
-        xx, xy, yy, widest = self.polynomials(rest, self.setting.of_variance, place)
-        of_xx, of_xy, of_yy = self.of_cells(place, (2, 3, 4), read)
-        xx = xx + of_xx
-        xy = xy + of_xy
-        yy = yy + of_yy
-        if not self.setting.joined:
-            part_x, part_y = self.of_cells(place, (0, 1), read)
-            xx = xx + part_x * part_x
-            xy = xy + part_x * part_y
-            yy = yy + part_y * part_y
-        return *flow, xx, xy, yy, self.dr.clip(1 - (xx + yy) / widest, 0, 1)
-
-    def polynomials(self, rows, powers, place):
-        """Values of several polynomials with the same powers."""
-        u, v = ((at - middle) * self.per_half for at, middle in zip(place, self.middle, strict=True))
-        of_u = _powers(u, max(x for x, _ in powers))
-        of_v = _powers(v, max(y for _, y in powers))
-        found = [row[0] for row in rows]  # of power 0
-        for number, (x, y) in list(enumerate(powers))[1:]:
-            value = of_v[y] if not x else of_u[x] if not y else of_u[x] * of_v[y]
-            found = [self.dr.fma(row[number], value, total) for row, total in zip(rows, found, strict=True)]
-        return found
+    def share(self, value):
+        return self.dr.clip(value, 0, 1)
 
     def of_cells(self, place, parts, read):
         """Bilinear values of the cells' ``parts``, beyond the outermost as there."""

@@ -8,12 +8,11 @@ one by one.
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from codesign.backend import pull_back
-from codesign.errors import ShapeError
 from codesign.exclusive import exclusive
 from codesign.flow.lk.lanes import Form, Grid, Lanes, in_graph, plain_wanted, recorded, tensors
+from codesign.flow.warp import pixel_grid, read_at
 
 # in one kernel
 BINS = 16
@@ -38,23 +37,13 @@ def moving(
         are read.
     Gradient: rate, flow_px; exact, the first one. The flow has none through bins that it reads beyond
       the outermost samples.
-    Raises: ShapeError where shapes do not fit; GradientError for a second derivative.
+    Raises: GradientError for a second derivative.
     Cost: one pass forward, two backward; nothing of n bins is stored forward. Backward four values per
       sample and bin, or ``MOST_VALUES`` where that is less, in each thread. One kernel for each number
       of bins, whatever the sizes; it is traced once for each size.
     Source: Lucas and Kanade, 1981; Jaderberg et al., Spatial Transformer Networks, NeurIPS 2015, for
       the reading.
     """
-    batch, bins = rate.shape[:2]
-    if rate.shape[2:] != grid.shape or flow_px.shape != (batch, 2, *grid.shape):
-        raise ShapeError(
-            f"bins are {list(rate.shape)}, their flow is {list(flow_px.shape)}, samples are {list(grid.shape)}; give "
-            "[B, n, h, w] and [B, 2, h, w]."
-        )
-    if time.shape != (bins,) or contrast.shape != (2, bins):
-        raise ShapeError(
-            f"{bins} bins have times {list(time.shape)} and shares {list(contrast.shape)}; give [n] and [2, n]."
-        )
     if plain_wanted():
         return _plain(rate, flow_px, time, contrast, grid, fade_px)
     weights = torch.cat([time[None], contrast]).to(rate).T.flatten().tolist()
@@ -62,22 +51,13 @@ def moving(
 
 
 def _plain(rate, flow_px, time, contrast, grid, fade_px):
-    rows, columns = rate.shape[2:]
-    y, x = torch.meshgrid(torch.arange(rows).to(rate), torch.arange(columns).to(rate), indexing="ij")
+    place = pixel_grid(*grid.shape, rate)
     shift = time.to(rate)[:, None, None, None] * flow_px[:, None]
-    at = torch.stack([x, y]) + shift / grid.stride  # [B, n, 2, h, w]
-    last = torch.tensor([max(columns - 1, 1), max(rows - 1, 1)]).to(rate)[:, None, None]
-    scaled = 2 * at / last - 1  # -1 and 1 at the outermost samples; any value where there is one
-    warped = grid_sample(
-        rate.flatten(0, 1)[:, None],
-        scaled.flatten(0, 1).permute(0, 2, 3, 1),
-        padding_mode="border",
-        align_corners=True,
-    ).reshape(rate.shape)
+    at = place + shift / grid.stride  # [B, n, 2, h, w]
+    warped = read_at(rate.flatten(0, 1)[:, None], at.flatten(0, 1)).reshape(rate.shape)
     mean, slope = torch.einsum("kn,bnyx->kbyx", contrast.to(rate), warped).unbind(0)
     reach = (torch.tensor([grid.width, grid.height]).to(rate)[:, None, None] - 1) / 2
-    first = (grid.stride - 1) / 2
-    off = torch.stack([x, y]) * grid.stride + first + shift[:, [0, -1]] - reach
+    off = place * grid.stride + (grid.stride - 1) / 2 + shift[:, [0, -1]] - reach
     inside = ((reach - off.abs()) / fade_px).clamp(0, 1)
     window = inside.square() * (3 - 2 * inside)
     window = window[:, 0] * window[:, 1]

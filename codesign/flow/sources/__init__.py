@@ -5,7 +5,7 @@ from codesign.doors import explain
 from codesign.flow.sources.dsec import DsecWindows
 from codesign.flow.sources.mvsec import MvsecWindows
 from codesign.flow.sources.packet import SKIPPABLE, Packet, PacketOptions
-from codesign.flow.sources.packets import read_packets, read_recording, read_text_events
+from codesign.flow.sources.packets import read_packets, read_recording
 from codesign.flow.sources.recorded import RecordingWindows, open_windows
 from codesign.flow.sources.rendered import DatasetWindows
 
@@ -20,7 +20,6 @@ __all__ = [
     "open_windows",
     "read_packets",
     "read_recording",
-    "read_text_events",
 ]
 
 explain(globals())

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation, Slerp
 
-from codesign.errors import DomainError, FileFormatError, shown
+from codesign.errors import DomainError, FileFormatError
 from codesign.flow.checks import check_kind, check_path
 from codesign.reading import open_regular, read_text, reading
 
@@ -200,19 +200,13 @@ class Attitude:
         return float(np.linalg.norm(places[:, 1] - places[:, 0]))
 
 
-def read_gyroscope(path: str | Path, axes: np.ndarray | None = None) -> Attitude:
+def read_gyroscope(path: str | Path, axes: str = "xyz") -> Attitude:
     """Attitude of ``t ax ay az gx gy gz`` (seconds, m/s^2, rad/s): rates integrated from sample to sample,
-    each interval at the mean of its ends.
+    each interval at the mean of its ends. The gyroscope's offset is not removed.
 
-    Args:
-      axes: [3, 3], camera axes from the gyroscope's (identity when None). The gyroscope's offset is not
-        removed.
+    axes: the camera's from the gyroscope's, as ``signed_axes`` takes them.
     """
-    turned = np.eye(3) if axes is None else np.asarray(axes)
-    if turned.shape != (3, 3) or turned.dtype.kind not in "fiu" or not np.isfinite(turned).all():
-        raise DomainError(
-            f"the gyroscope's axes are {shown(axes)}; a matrix [3, 3] of finite numbers is needed."
-        )
+    turned = signed_axes(axes)
     table = _table(path, 7, "t ax ay az gx gy gz")
     t_s = table[:, 0]
     rate = table[:, 4:] @ turned.T

@@ -7,7 +7,6 @@ Source: Gehrig et al., "DSEC: A Stereo Event Camera Dataset for Driving Scenario
   description of the data format.
 """
 
-import re
 from itertools import product
 from pathlib import Path
 
@@ -18,14 +17,13 @@ from torch import Tensor
 from codesign.errors import FileFormatError
 from codesign.events.formats.hdf5 import Hdf5Events
 from codesign.events.formats.hdf5_rows import Rows
-from codesign.flow.files import read_flow
+from codesign.flow.files import PNG_START, read_flow
 from codesign.flow.sources.folders import natural
-from codesign.flow.sources.windows import Sample, Windows, check_lengths
-from codesign.reading import read_text
+from codesign.flow.sources.truth import read_spans
+from codesign.flow.sources.windows import Recording, Windows, check_lengths
 
 SIZE_PX = (480, 640)
 SLACK_US = 2000  # of the clock of the flow beyond the events
-PNG_START = b"\x89PNG\r\n\x1a\n"
 
 
 class DsecWindows(Windows):
@@ -52,13 +50,16 @@ class DsecWindows(Windows):
     ) -> None:
         size_px = int(size_px[0]), int(size_px[1])
         sequences = [Sequence(events, flow, size_px) for events, flow in _places(Path(folder))]
-        windows = [(k, index) for k, sequence in enumerate(sequences) for index in range(len(sequence.files))]
-        spans_us = [span for sequence in sequences for span in sequence.spans_us]
-        check_lengths([(t1 - t0) * 1e-6 for t0, t1 in spans_us], f"DSEC in {folder}")
+        windows = [
+            (k, span_us, file)
+            for k, sequence in enumerate(sequences)
+            for file, span_us in zip(sequence.files, sequence.spans_us, strict=True)
+        ]
+        check_lengths([(t1 - t0) * 1e-6 for _, (t0, t1), _ in windows], f"DSEC in {folder}")
         super().__init__(sequences, windows, bins, crop_px, seed)
 
 
-class Sequence:
+class Sequence(Recording):
     """One sequence. files: its flow files. spans_us: [(from, to)] of each, on the clock of the events with
     t_offset added."""
 
@@ -84,28 +85,25 @@ class Sequence:
                 f"run from {first_us} to {last_us} us."
             )
 
-    def sample(self, bins: int, index: int) -> Sample:
-        """One window: its events, rectified, and its flow."""
-        t0_us, t1_us = self.spans_us[index]
-        flow, valid = read_flow(self.files[index])
+    def flow(self, file: Path) -> tuple[Tensor, Tensor]:
+        """What a file holds."""
+        flow, valid = read_flow(file)
         if tuple(valid.shape) != self.size_px:
             raise FileFormatError(
-                f"{self.files[index]} has {valid.shape[1]} x {valid.shape[0]} px; {self.size_px[1]} x "
-                f"{self.size_px[0]} are needed."
+                f"{file} has {valid.shape[1]} x {valid.shape[0]} px; {self.size_px[1]} x {self.size_px[0]} "
+                "are needed."
             )
-        t_us, x_px, y_px, on = self.rectified(t0_us, t1_us)
-        counts = splatted(t_us, x_px, y_px, on, t0_us, t1_us, bins, *self.size_px)
-        return Sample(counts, flow, valid, (t1_us - t0_us) * 1e-6)
+        return flow, valid
 
-    def rectified(self, t0_us: int, t1_us: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """(t_us, x_px, y_px, on) of the events of a window, on the rectified picture."""
+    def counts(self, bins: int, t0_us: int, t1_us: int) -> Tensor:
+        """Of the events on the rectified picture."""
         stream = self.events.window(t0_us, t1_us, self.size_px)
         place = torch.from_numpy(self.map[stream.y.numpy(), stream.x.numpy()])
         if not bool(torch.isfinite(place).all()):
             raise FileFormatError(
                 f"{self.path.parent / 'rectify_map.h5'} is not finite where there are events."
             )
-        return stream.t_us, place[:, 0], place[:, 1], stream.p > 0
+        return splatted(stream.t_us, *place.T, stream.p > 0, t0_us, t1_us, bins, *self.size_px)
 
 
 def _places(folder):
@@ -138,22 +136,14 @@ def _places(folder):
 def _flows(folder):
     """(flow files, [(from, to) us]) of a sequence."""
     files = sorted((folder / "forward").glob("*.png"), key=natural)
-    lines = [
-        line
-        for line in read_text(folder / "forward_timestamps.txt").splitlines()
-        if line.strip() and not line.startswith("#")
-    ]
-    numbers = [re.fullmatch(r"\s*(\d{1,18})\s*,\s*(\d{1,18})\s*", line) for line in lines]
-    if not all(numbers) or len(lines) != len(files) or not files:
-        raise FileFormatError(
-            f"{folder / 'forward_timestamps.txt'} has {len(lines)} lines for {len(files)} files of flow; "
-            "one line 'from, to' in microseconds for each is needed."
-        )
+    if not files:
+        raise FileFormatError(f"{folder / 'forward'} holds no files of flow; download them too.")
+    spans = read_spans(folder / "forward_timestamps.txt", len(files))
     for file in files:
         with file.open("rb") as opened:
             if opened.read(8) != PNG_START:
                 raise FileFormatError(f"{file} is not a PNG file.")
-    return files, [(int(found[1]), int(found[2])) for found in numbers if found]
+    return files, [(round(1e6 * first), round(1e6 * last)) for first, last in spans]
 
 
 def splatted(

@@ -20,8 +20,7 @@ from codesign.arrays import open_npz
 from codesign.errors import DomainError, FileFormatError
 from codesign.events.formats.hdf5 import Hdf5Events
 from codesign.events.formats.hdf5_rows import Rows
-from codesign.events.volumes.volume import from_stream
-from codesign.flow.sources.windows import ALIKE, Sample, Windows
+from codesign.flow.sources.windows import ALIKE, Recording, Windows
 from codesign.flow.warp import chained
 
 DATA = "_data.hdf5"
@@ -73,12 +72,16 @@ class MvsecWindows(Windows):
                 "the part asked for too short?"
             )
         middle = float(np.median([t1 - t0 for _, t0, t1 in found]))
-        windows = [window for window in found if abs(window[2] - window[1] - middle) <= ALIKE * middle]
+        windows = [
+            (k, (round(t0 * 1e6), round(t1 * 1e6)), t0, t1)
+            for k, t0, t1 in found
+            if abs(t1 - t0 - middle) <= ALIKE * middle
+        ]
         self.left_out = len(found) - len(windows)
         super().__init__(sequences, windows, bins, crop_px, seed)
 
 
-class Sequence:
+class Sequence(Recording):
     """One sequence. flow_s: [N] times of the true flows. frame_s: [M] times of the grey frames. size_px:
     (height, width)."""
 
@@ -128,14 +131,6 @@ class Sequence:
             for t0, t1 in zip(ends[0][: -ends[1]], ends[0][ends[1] :], strict=True)
             if first <= t0 and t1 <= last
         ]
-
-    def sample(self, bins: int, t0_s: float, t1_s: float) -> Sample:
-        """The window of these times."""
-        flow, valid = self.flow(t0_s, t1_s)
-        t0_us = round(t0_s * 1e6)
-        t1_us = round(t1_s * 1e6)
-        volume = from_stream(self.events.window(t0_us, t1_us, self.size_px), t0_us, t1_us, bins)
-        return Sample(volume.counts[0], flow.float(), valid, t1_s - t0_s)
 
     def flow(self, t0_s: float, t1_s: float) -> tuple[Tensor, Tensor]:
         """(flow_px [2, H, W], valid [H, W]) on the pixels of t0_s, to t1_s."""

@@ -106,35 +106,26 @@ class PacketOptions:
 
 def check_options(options: PacketOptions, truth_path: object) -> None:
     """Raise DomainError, ShapeError or FileFormatError unless options and path mean something."""
-    check_kind(options, PacketOptions, "the options")
-    for name in ("window_s", "truth_interval_s"):
-        if getattr(options, name) is not None:
-            check_number(getattr(options, name), name, above=0.0)
-    for name in ("count", "events"):
-        if getattr(options, name) is not None:
-            check_whole(getattr(options, name), name, 1)
-    if options.start_s is not None:
-        check_number(options.start_s, "start_s", 0.0)
-    for name in ("window_s", "truth_interval_s", "start_s"):
-        if (getattr(options, name) or 0) > MOST_S:
-            raise DomainError(
-                f"{name} is {shown(getattr(options, name))}; at most {MOST_S:g} s are possible."
-            )
-    if options.size_px is not None:
+    given = {
+        n: v for n, v in vars(check_kind(options, PacketOptions, "the options")).items() if v is not None
+    }
+    for name, above in (("window_s", 0.0), ("truth_interval_s", 0.0), ("start_s", None)):
+        if name in given and check_number(given[name], name, 0.0, above) > MOST_S:
+            raise DomainError(f"{name} is {shown(given[name])}; at most {MOST_S:g} s are possible.")
+    for name in {"count", "events"} & given.keys():
+        check_whole(given[name], name, 1)
+    if "size_px" in given:
         check_size(options.size_px, "size_px")
     for name in ("columns", "time_unit", "gyro_axes"):
         check_kind(getattr(options, name), str, name)
     for path in (options.calibration, truth_path):
         if path is not None:
             check_path(path)
-    if options.truth_unit not in ("px", "px/s"):
-        raise DomainError(
-            f"the truth's unit is {shown(options.truth_unit)}; 'px' (per interval) or 'px/s' is possible."
-        )
-    if options.truth_pixels not in ("raw", "undistorted"):
-        raise DomainError(
-            f"truth_pixels is {shown(options.truth_pixels)}; 'raw' or 'undistorted' is possible."
-        )
+    for name, possible in (("truth_unit", ("px", "px/s")), ("truth_pixels", ("raw", "undistorted"))):
+        if getattr(options, name) not in possible:
+            raise DomainError(
+                f"{name} is {shown(getattr(options, name))}; {' or '.join(map(repr, possible))} is possible."
+            )
     if not isinstance(options.skip, tuple) or not set(options.skip) <= set(SKIPPABLE):
         raise DomainError(f"skip is {shown(options.skip)}; a tuple of {', '.join(SKIPPABLE)} is possible.")
     if options.window_s is not None and options.events is not None:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import torch
@@ -16,7 +17,6 @@ from codesign.flow.sources.camera import (
     read_calibration,
     read_gyroscope,
     read_poses,
-    signed_axes,
 )
 from codesign.flow.sources.packet import Packet, PacketOptions, across, gaps
 from codesign.flow.sources.truth import TrueFlow, read_truth
@@ -67,55 +67,91 @@ def read_source(
         return Truth(None, poses, poses, read_calibration(calibration))
     recorded = folders.side_file(Path(path), "groundtruth.txt")
     places = None if recorded is None else read_poses(recorded)
-    return Truth(
-        None, read_gyroscope(path, signed_axes(options.gyro_axes)), places, read_calibration(calibration)
-    )
+    return Truth(None, read_gyroscope(path, options.gyro_axes), places, read_calibration(calibration))
 
 
-def packet(
-    name: str,
-    held: EventColumns,
-    window: tuple[int, int],
-    source: Truth | None,
-    index: int,
-    whole: tuple[int, int],
-    options: PacketOptions,
-    notes: tuple[str, ...] = (),
-    left_out: Mapping[str, int] | None = None,
-) -> Packet:
-    """One packet; a flow is brought to its window.
+@dataclass(frozen=True)
+class Opened:
+    """An event file that becomes packets. events: of it all. truth: None without any. whole: (from, to) us.
+    notes: of every packet."""
 
-    Args:
-      index: of the flow among several.
-      whole: what a flow without times covers.
-      left_out: see Packet.
-    """
-    t0_us, t1_us = window
-    empty = gaps(held.t_us)
-    notes = (*notes, f"sensor {held.width_px} x {held.height_px} px by {held.size_from}")
-    if len(empty):
-        longest = float(np.diff(empty, axis=1).max()) * 1e-6
-        notes = (
-            *notes,
-            f"the recording has {len(empty)} gap(s) without any event, the longest of {longest:.3f} s",
+    file: Path
+    events: EventColumns
+    truth: Truth | None
+    whole: tuple[int, int]
+    options: PacketOptions
+    notes: tuple[str, ...]
+
+    def packet(
+        self,
+        name: str,
+        window: tuple[int, int],
+        flow: TrueFlow | None = None,
+        over: tuple[int, int] | None = None,
+        left_out: Mapping[str, int] = MappingProxyType({}),
+    ) -> Packet:
+        """One packet; its flow is brought to its window.
+
+        Args:
+          window: (from, to) us.
+          flow: of the truth's files, where it is of such.
+          over: what a flow without times covers, (from, to) us; ``whole`` when None.
+          left_out: see Packet.
+        """
+        empty = gaps(self.events.t_us)
+        notes = [
+            *self.notes,
+            f"sensor {self.events.width_px} x {self.events.height_px} px by {self.events.size_from}",
+        ]
+        if len(empty):
+            longest = float(np.diff(empty, axis=1).max()) * 1e-6
+            notes.append(
+                f"the recording has {len(empty)} gap(s) without any event, the longest of {longest:.3f} s"
+            )
+        found = Packet(
+            name,
+            self.events.window(*window),
+            *window,
+            None,
+            tuple(notes),
+            across_gap=bool(across([window], empty)[0]),
+            left_out={**self.events.left_out, **left_out},
         )
-    found = Packet(
-        name,
-        held.window(t0_us, t1_us),
-        t0_us,
-        t1_us,
-        None,
-        notes,
-        across_gap=bool(across([window], empty)[0]),
-        left_out={**held.left_out, **(left_out or {})},
-    )
-    if source is None:
-        return found
-    return (
-        _with_rotation(found, source)
-        if source.flows is None
-        else _with_flow(found, source, index, whole, options)
-    )
+        if flow is not None:
+            return self._with_flow(found, flow, over or self.whole)
+        return found if self.truth is None else _with_rotation(found, self.truth)
+
+    def _with_flow(self, found, true, over):
+        seconds = (found.t1_us - found.t0_us) * 1e-6
+        over_s = self.options.truth_interval_s or (over[1] - over[0]) * 1e-6
+        span_s = over_s if true.span_s is None else true.span_s[1] - true.span_s[0]
+        notes = [*found.notes, f"true flow from {Path(true.name).name}"]
+        scale = seconds
+        if self.options.truth_unit == "px":
+            scale = seconds / span_s
+            if abs(scale - 1) > 1e-3:
+                notes.append(
+                    f"true flow over {1e3 * span_s:.3f} ms scaled linearly to {1e3 * seconds:.3f} ms"
+                )
+            else:
+                scale = 1.0
+        flow = true.flow * scale
+        valid = true.valid
+        off_px = 0.0
+        calibration = None if self.truth is None else self.truth.calibration
+        if calibration is not None and any(calibration.distortion):
+            raw, seen = calibration.raw_flow(flow, valid)
+            both = seen & valid
+            if self.options.truth_pixels == "undistorted":
+                flow, valid = raw, seen
+                notes.append("true flow carried from undistorted to the sensor's pixels")
+            elif both.any():
+                off_px = float(np.hypot(*(raw - flow))[both].mean())
+                notes.append(
+                    f"the camera has distortion: if the true flow is of undistorted pixels, it is {off_px:.2f} px off in "
+                    "the mean (truth_pixels says which)"
+                )
+        return replace(found, truth=_field(flow, valid, seconds), notes=tuple(notes), undistorted_px=off_px)
 
 
 def _with_rotation(found, source):
@@ -137,7 +173,7 @@ def _with_rotation(found, source):
     )
     return replace(
         found,
-        truth=_field(flow, valid, ends_s),
+        truth=_field(flow, valid, ends_s[1] - ends_s[0]),
         notes=(
             *found.notes,
             f"true flow of the camera's rotation alone, from {Path(source.motion.name).name}{left_out}",
@@ -147,42 +183,9 @@ def _with_rotation(found, source):
     )
 
 
-def _with_flow(found, source, index, whole, options):
-    seconds = (found.t1_us - found.t0_us) * 1e-6
-    true = source.flows[index if len(source.flows) > 1 else 0]
-    span_s = (
-        true.span_s[1] - true.span_s[0]
-        if true.span_s is not None
-        else options.truth_interval_s or (whole[1] - whole[0]) * 1e-6
-    )
-    notes = [*found.notes, f"true flow from {Path(true.name).name}"]
-    scale = seconds if options.truth_unit == "px/s" else seconds / span_s
-    if options.truth_unit == "px" and abs(scale - 1) > 1e-3:
-        notes.append(f"true flow over {1e3 * span_s:.3f} ms scaled linearly to {1e3 * seconds:.3f} ms")
-    elif options.truth_unit == "px":
-        scale = 1.0
-    flow = true.flow * scale
-    valid = true.valid
-    off_px = 0.0
-    if source.calibration is not None and any(source.calibration.distortion):
-        raw, seen = source.calibration.raw_flow(flow, valid)
-        both = seen & valid
-        if options.truth_pixels == "undistorted":
-            flow, valid = raw, seen
-            notes.append("true flow carried from undistorted to the sensor's pixels")
-        elif both.any():
-            off_px = float(np.hypot(*(raw - flow))[both].mean())
-            notes.append(
-                f"the camera has distortion: if the true flow is of undistorted pixels, it is {off_px:.2f} px off in "
-                "the mean (truth_pixels says which)"
-            )
-    truth = _field(flow, valid, (found.t0_us * 1e-6, found.t1_us * 1e-6))
-    return replace(found, truth=truth, notes=tuple(notes), undistorted_px=off_px)
-
-
-def _field(flow, valid, ends_s):
+def _field(flow, valid, seconds):
     return FlowField(
         torch.from_numpy(np.ascontiguousarray(flow)).float()[None],
         torch.from_numpy(np.ascontiguousarray(valid))[None],
-        ends_s[1] - ends_s[0],
+        seconds,
     )

@@ -1,6 +1,6 @@
 """Packets of a recording: windows of events, each with its true flow where there is one."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -12,7 +12,6 @@ from codesign.errors import DomainError, FileFormatError
 from codesign.events.columns import EventColumns
 from codesign.events.files import read_columns
 from codesign.events.formats.arrival import Asked
-from codesign.flow.checks import check_kind, check_path, check_size
 from codesign.flow.sources import folders, truth
 from codesign.flow.sources.packet import (
     OUTSIDE,
@@ -24,7 +23,7 @@ from codesign.flow.sources.packet import (
     windows,
     without,
 )
-from codesign.flow.sources.packet_truth import NO_TRUTH, Truth, is_motion, packet, read_source
+from codesign.flow.sources.packet_truth import NO_TRUTH, Opened, is_motion, read_source
 from codesign.reading import open_regular, reading
 
 LONGEST_S = 1.0  # of a packet that is a file of its own
@@ -93,43 +92,18 @@ def read_recording(path: str | Path, options: PacketOptions | None = None) -> Ev
 
 
 def read_events(path: Path, options: PacketOptions, truth_path: Path | None = None) -> EventColumns:
-    """EventColumns of one event file of any kind that events.read takes."""
-    told = truth.size_of(truth_path) if truth_path is not None else None
-    told_by = f"the flow in {truth_path}"
-    if told is None and Path(path).suffix.lower() in (".txt", ".csv"):
-        told, told_by = _size_of_images(Path(path).parent), "its frames"
-    return read_text_events(
-        path, options.size_px, told, told_by, options.columns, options.time_unit, options.skip
-    )
-
-
-def read_text_events(
-    path: str | Path,
-    size: tuple[int, int] | None = None,
-    told: tuple[int, int] | None = None,
-    told_by: str = "the file",
-    columns: str = "auto",
-    time_unit: str = "auto",
-    skip: Collection[str] = (),
-) -> EventColumns:
-    """Read events from a file of text, or any other that events.read takes.
-
-    Args:
-      path: file.
-      size: (height, width) of the sensor.
-      told, told_by: the same from what lies beside, and what that is. Without either, the smallest
-        sensor of SENSORS_PX that holds the events, where the file does not say.
-      columns, time_unit: as of events.read.
-      skip: faults whose events are left out and counted instead of refused: events_back_in_time,
-        events_off_sensor.
-    Returns: EventColumns in order of time. Events up to 1 ms late are put in order.
-    Raises: FileFormatError, as events.read, and where no event is left.
-    """
-    height, width = (None, None) if size is None else check_size(size, "the sensor's size asked for")
-    told = None if told is None else check_size(told, f"the sensor's size by {told_by}")
-    skip = tuple(check_kind(fault, str, "a fault to skip") for fault in skip)
+    """EventColumns of one event file of any kind that events.read takes, in order of time; events up to
+    1 ms late are put in order. The sensor is the one asked for, or that of the flow or of the frames
+    beside, or the smallest of SENSORS_PX that holds the events."""
+    told, told_by = None, "the file"
+    if truth_path is not None:
+        told, told_by = truth.size_of(truth_path), f"the flow in {truth_path}"
+    if told is None and path.suffix.lower() in (".txt", ".csv"):
+        told, told_by = _size_of_images(path.parent), "its frames"
+    height, width = options.size_px or (None, None)
     found = read_columns(
-        check_path(path), Asked(height, width, told, told_by, SENSORS_PX, columns, time_unit, skip)
+        path,
+        Asked(height, width, told, told_by, SENSORS_PX, options.columns, options.time_unit, options.skip),
     )
     if not len(found):
         raise FileFormatError(f"{path} holds no event that is on the sensor and in order of time.")
@@ -154,17 +128,23 @@ def _numbered(truth_path, chosen, total):
     return [(truth_path, k, total) for k in range(len(chosen))]
 
 
+def _opened(file, truth_path, options):
+    """An event file with what is known of it."""
+    sized = truth_path is not None and not is_motion(truth_path)
+    held = read_events(file, options, truth_path if sized else None)
+    if len(held) < 2 or held.t_us[-1] <= held.t_us[0]:
+        raise FileFormatError(f"{file} holds {len(held)} event(s) at one time; a packet lasts some time.")
+    others = ", ".join(path.name for path in folders.passed_over(file))
+    notes = (f"events from {file.name}; {others} beside it not read",) if others else ()
+    source = read_source(file, truth_path, held, options)
+    return Opened(file, held, source, (int(held.t_us[0]), int(held.t_us[-1])), options, notes)
+
+
 def _as_packet(file, own, options):
     """The packet that a whole event file is."""
     path, index, total = own if isinstance(own, tuple) else (own, None, 1)
-    held = read_events(
-        file,
-        options,
-        path
-        if path is not None and Path(path).suffix.lower() in folders.FLOW_SUFFIXES and not is_motion(path)
-        else None,
-    )
-    t0_us, t1_us = _ends(file, held)
+    one = _opened(file, path, options)
+    t0_us, t1_us = one.whole
     if options.window_s is not None:
         t1_us = t0_us + round(options.window_s * 1e6)
     elif t1_us - t0_us > LONGEST_S * 1e6:
@@ -172,93 +152,77 @@ def _as_packet(file, own, options):
             f"{file} lasts {(t1_us - t0_us) * 1e-6:.3f} s, too long for one packet of several; give its "
             "folder alone to cut it, or a window."
         )
-    source = read_source(file, path, held, options)
-    if source is not None and source.flows is not None:
-        flows = source.flows
+    flow = None
+    if one.truth is not None and one.truth.flows is not None:
+        flows = one.truth.flows
         if index is not None and len(flows) not in (1, total):
             raise FileFormatError(
                 f"{path} holds {len(flows)} flows for {total} packets; one for each, or one for all, is "
                 "needed."
             )
-        own_flow = flows[index if index is not None and len(flows) > 1 else 0]
-        source = replace(source, flows=[own_flow])
-        if own_flow.span_s is not None and options.window_s is None:
-            ends = round(own_flow.span_s[0] * 1e6), round(own_flow.span_s[1] * 1e6)
+        flow = flows[index if index is not None and len(flows) > 1 else 0]
+        if flow.span_s is not None and options.window_s is None:
+            ends = round(flow.span_s[0] * 1e6), round(flow.span_s[1] * 1e6)
             if not covers((t0_us, t1_us), ends):
                 raise FileFormatError(
-                    f"{own_flow.name} runs from {own_flow.span_s[0]:.6f} to {own_flow.span_s[1]:.6f} s, "
+                    f"{flow.name} runs from {flow.span_s[0]:.6f} to {flow.span_s[1]:.6f} s, "
                     f"the events of {file} do not; are both on one clock?"
                 )
             t0_us, t1_us = ends
-    name = f"{file.parent.name}/{file.name}"
-    return packet(name, held, (t0_us, t1_us), source, 0, _ends(file, held), options, _beside(file))
+    return one.packet(f"{file.parent.name}/{file.name}", (t0_us, t1_us), flow)
 
 
 def _cut(file, truth_path, options):
     """Windows of one event file."""
-    held = read_events(
-        file, options, truth_path if truth_path is not None and not is_motion(truth_path) else None
-    )
-    source = read_source(file, truth_path, held, options)
-    whole = _ends(file, held)
-    start_us = whole[0] + round((options.start_s or 0.0) * 1e6)
-    notes = _beside(file)
-    if source is not None and source.flows is not None:
-        return _cut_by_flows(file, held, source, source.flows, whole, start_us, options, notes)
-    chosen, left_out = windows(held, whole, start_us, options, in_turn=False)
+    one = _opened(file, truth_path, options)
+    start_us = one.whole[0] + round((options.start_s or 0.0) * 1e6)
+    if one.truth is not None and one.truth.flows is not None:
+        return _cut_by_flows(one, one.truth.flows, start_us)
+    chosen, left_out = windows(one.events, one.whole, start_us, options, in_turn=False)
     return [
-        packet(
-            f"{file.name} {(t0 - whole[0]) * 1e-6:.3f} s",
-            held,
-            (t0, t1),
-            source,
-            0,
-            whole,
-            options,
-            notes,
-            left_out,
-        )
+        one.packet(f"{file.name} {(t0 - one.whole[0]) * 1e-6:.3f} s", (t0, t1), left_out=left_out)
         for t0, t1 in chosen
     ]
 
 
-def _cut_by_flows(file, held, source: Truth, flows, whole, start_us, options, notes):
+def _cut_by_flows(one, flows, start_us):
     """Windows of one event file with a flow for each: those of the flows' own times, or one after the
     other."""
-    asked = options.window_s is not None or options.events is not None
-    unlimited = replace(options, skip=(), count=options.count or len(flows))
+    options = one.options
+    whole = one.whole
     left_out = {}
+    over = None
     if all(flow.span_s is not None for flow in flows[:-1] or flows):
-        spans = [tuple(round(end * 1e6) for end in flow.span_s or ()) for flow in flows]
-        inside = [k for k, span in enumerate(spans) if span and covers((start_us, whole[1]), span)]
-        timed = sum(map(bool, spans))
-        if not inside:
+        ends = enumerate(flow.span_s for flow in flows)
+        spans = [(k, (round(span[0] * 1e6), round(span[1] * 1e6))) for k, span in ends if span]
+        pairs = [(k, span) for k, span in spans if covers((start_us, whole[1]), span)]
+        if not pairs:
             raise FileFormatError(
-                f"none of the {timed} flows lies within the recording's {whole[0] * 1e-6:.6f} to "
+                f"none of the {len(spans)} flows lies within the recording's {whole[0] * 1e-6:.6f} to "
                 f"{whole[1] * 1e-6:.6f} s; are both on one clock?"
             )
-        if len(inside) < timed:
-            left_out[OUTSIDE] = timed - len(inside)
-            notes = (
-                f"{timed - len(inside)} of {timed} true flows lie outside the recording or before the start asked for",
-                *notes,
-            )
-        length_us = round(options.window_s * 1e6) if options.window_s else 0
-        pairs = [(k, (spans[k][0], spans[k][0] + length_us if length_us else spans[k][1])) for k in inside]
-        wholes = [whole] * len(pairs)
-    elif asked or options.start_s is not None:
-        pairs = list(enumerate(windows(held, whole, start_us, unlimited, in_turn=True)[0][: len(flows)]))
-        wholes = [whole] * len(pairs)  # one flow says nothing of a second window
+        if outside := len(spans) - len(pairs):
+            left_out[OUTSIDE] = outside
+            note = f"{outside} of {len(spans)} true flows lie outside the recording or before the start asked for"
+            one = replace(one, notes=(note, *one.notes))
+        if options.window_s:
+            length_us = round(options.window_s * 1e6)
+            pairs = [(k, (t0_us, t0_us + length_us)) for k, (t0_us, _) in pairs]
+    elif options.window_s is not None or options.events is not None or options.start_s is not None:
+        unlimited = replace(options, skip=(), count=options.count or len(flows))
+        # one flow says nothing of a second window
+        cut = windows(one.events, whole, start_us, unlimited, in_turn=True)[0]
+        pairs = list(enumerate(cut[: len(flows)]))
     else:
         edges = np.rint(np.linspace(whole[0], whole[1], len(flows) + 1)).astype(np.int64).tolist()
         if options.truth_interval_s is not None:
             edges = [whole[0] + round(k * options.truth_interval_s * 1e6) for k in range(len(flows) + 1)]
         pairs = list(enumerate(pairwise(edges)))[: options.count]
-        wholes = [window for _, window in pairs]
-    kept, more = without([window for _, window in pairs], held, options.skip)
+        over = edges[:2]
+    kept, more = without([window for _, window in pairs], one.events, options.skip)
     found = [
-        packet(f"{file.name} {k}", held, window, source, k, one, options, notes, left_out | more)
-        for (k, window), one in zip(pairs, wholes, strict=True)
+        one.packet(f"{one.file.name} {k}", window, flows[k], over, left_out | more)
+        for k, window in pairs
         if window in kept
     ]
     return spread(found, options.count)
@@ -270,22 +234,6 @@ def _with_truth_somewhere(packets: Sequence[Packet]) -> list[Packet]:
     if len(missing) == len(packets):
         raise FileFormatError(f"{missing[0].removeprefix(NO_TRUTH)}, nor any other; are both on one clock?")
     return list(packets)
-
-
-def _beside(file):
-    """Notes of the event files of the same name that were passed over."""
-    others = folders.passed_over(file)
-    return (
-        (f"events from {file.name}; {', '.join(path.name for path in others)} beside it not read",)
-        if others
-        else ()
-    )
-
-
-def _ends(file, held):
-    if len(held) < 2 or held.t_us[-1] <= held.t_us[0]:
-        raise FileFormatError(f"{file} holds {len(held)} event(s) at one time; a packet lasts some time.")
-    return int(held.t_us[0]), int(held.t_us[-1])
 
 
 def _size_of_images(folder):

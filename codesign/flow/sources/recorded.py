@@ -1,7 +1,7 @@
 """Training data, whichever of the layouts it has, and windows of any recording that ``read_packets``
 reads."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -10,10 +10,10 @@ from codesign.events.volumes.volume import from_stream
 from codesign.flow.checks import check_path
 from codesign.flow.sources.dsec import DsecWindows
 from codesign.flow.sources.mvsec import DATA, MvsecWindows
-from codesign.flow.sources.packet import Packet, PacketOptions
+from codesign.flow.sources.packet import PacketOptions
 from codesign.flow.sources.packets import read_packets
 from codesign.flow.sources.rendered import DatasetWindows
-from codesign.flow.sources.windows import Sample, Windows, check_lengths
+from codesign.flow.sources.windows import Recording, Windows, check_lengths
 
 WINDOW_S = 0.02
 ALL = 2**31  # more windows than any recording has
@@ -45,27 +45,25 @@ class RecordingWindows(Windows):
         self.packets = read_packets(path, None, replace(options, count=options.count or ALL))
         if options.events is None:
             check_lengths([1e-6 * (packet.t1_us - packet.t0_us) for packet in self.packets], str(path))
-        windows = [(k,) for k in range(len(self.packets))]
-        super().__init__([_Window(packet) for packet in self.packets], windows, bins, crop_px, seed)
+        windows = [(k, (packet.t0_us, packet.t1_us)) for k, packet in enumerate(self.packets)]
+        super().__init__([_Recorded(packet) for packet in self.packets], windows, bins, crop_px, seed)
 
 
-@dataclass(frozen=True)
-class _Window:
-    packet: Packet
+class _Recorded(Recording):
+    """One packet."""
 
-    @property
-    def size_px(self):
-        return self.packet.stream.height_px, self.packet.stream.width_px
+    def __init__(self, packet):
+        self.packet = packet
+        self.size_px = packet.stream.height_px, packet.stream.width_px
 
-    def sample(self, bins):
-        packet = self.packet
-        counts = from_stream(packet.stream, packet.t0_us, packet.t1_us, bins).counts[0]
-        if packet.truth is None or packet.translates:  # what rotation alone says is no truth then
-            flow = torch.zeros(2, *counts.shape[-2:])
-            valid = torch.zeros(counts.shape[-2:], dtype=torch.bool)
-        else:
-            flow, valid = packet.truth.flow_px[0].float(), packet.truth.valid[0]
-        return Sample(counts, flow, valid, 1e-6 * (packet.t1_us - packet.t0_us))
+    def counts(self, bins, t0_us, t1_us):
+        return from_stream(self.packet.stream, t0_us, t1_us, bins).counts[0]
+
+    def flow(self, *which):
+        truth = self.packet.truth
+        if truth is None or self.packet.translates:  # what rotation alone says is no truth then
+            return torch.zeros(2, *self.size_px), torch.zeros(self.size_px, dtype=torch.bool)
+        return truth.flow_px[0], truth.valid[0]
 
 
 def open_windows(

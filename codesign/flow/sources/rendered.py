@@ -2,7 +2,7 @@
 frame interval or several, and the frames."""
 
 import shlex
-from collections.abc import Iterable
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +12,9 @@ from torch import Tensor
 from codesign.errors import DomainError, FileFormatError
 from codesign.events.formats.hdf5 import Hdf5Events
 from codesign.events.formats.hdf5_rows import Rows
-from codesign.events.volumes.volume import from_stream
+from codesign.flow.checks import check_count
 from codesign.flow.sources.camera_fit import CameraFit
-from codesign.flow.sources.windows import Sample, Windows
+from codesign.flow.sources.windows import Recording, Windows
 from codesign.flow.warp import chained
 from codesign.reading import read_json, reading
 
@@ -29,10 +29,8 @@ class DatasetWindows(Windows):
       folder: a data set (with manifest.json) or one sequence of it.
       bins: of the volumes.
       window_frames: frame intervals per window.
-      stride_frames: between the starts of windows (window_frames when None).
       crop_px: (height, width) of a piece at a random place, or None.
       seed: of that place.
-      sequences: names to use, all when None.
     Raises: FileFormatError, before anything is read in earnest, for files that are missing, cut, or do not
       fit together; DomainError for sequences too short.
 
@@ -46,21 +44,15 @@ class DatasetWindows(Windows):
         folder: str | Path,
         bins: int = 8,
         window_frames: int = 1,
-        stride_frames: int | None = None,
         crop_px: tuple[int, int] | None = None,
         seed: int = 0,
-        sequences: Iterable[str] | None = None,
     ) -> None:
-        if window_frames < 1 or (stride_frames is not None and stride_frames < 1):
-            raise DomainError(
-                f"window_frames is {window_frames}, stride_frames {stride_frames}; whole numbers from 1 are "
-                "needed."
-            )
-        sequences = [Sequence(place, sizes) for place, sizes in _places(Path(folder), sequences)]
+        check_count(window_frames, "window_frames", 1)
+        sequences = [Sequence(place, sizes) for place, sizes in _places(Path(folder))]
         windows = [
-            (k, first, first + window_frames)
+            (k, tuple(sequence.times_us[[first, last]].tolist()), first, last)
             for k, sequence in enumerate(sequences)
-            for first in range(0, sequence.count - window_frames, stride_frames or window_frames)
+            for first, last in pairwise(range(0, sequence.count, window_frames))
         ]
         if not windows:
             raise DomainError(
@@ -70,7 +62,7 @@ class DatasetWindows(Windows):
         super().__init__(sequences, windows, bins, crop_px, seed)
 
 
-class Sequence:
+class Sequence(Recording):
     """One sequence folder. times_us: [T] frame times. size_px: (height, width). count: T."""
 
     def __init__(self, folder: Path, sizes: dict[str, int] | None = None) -> None:
@@ -118,34 +110,36 @@ class Sequence:
         self.rays = camera
         self.fit = None
 
-    def sample(self, bins: int, first: int, last: int) -> Sample:
-        """The window from one frame to another."""
-        flow, valid = self.flow(first, last)
-        t0_us, t1_us = (int(self.times_us[k]) for k in (first, last))
-        volume = from_stream(self.events.window(t0_us, t1_us, self.size_px), t0_us, t1_us, bins)
-        frames = torch.from_numpy(np.stack([self.rows["frames"][k] for k in (first, last)]))
-        for values, name in ((frames, "frames"), (flow[:, valid], "flow marked as valid")):
-            if not bool(values.isfinite().all()):
-                raise FileFormatError(
-                    f"{self.folder / 'frames.h5'} holds {name} that is NaN or infinite, at frame {first} or {last}; "
-                    "make the sequence anew."
-                )
-        return Sample(volume.counts[0], flow, valid, (t1_us - t0_us) * 1e-6, frames)
+    def frames(self, first: int, last: int) -> Tensor:
+        """[2, H, W] at both ends."""
+        return self._finite(
+            "frames", torch.from_numpy(np.stack([self.rows["frames"][k] for k in (first, last)]))
+        )
 
     def flow(self, first: int, last: int) -> tuple[Tensor, Tensor]:
         """(flow_px [2, H, W] float32, valid [H, W]) on the pixels of frame ``first``, to frame ``last``."""
         if last == first + 1:
-            return torch.from_numpy(self.rows["flow"][first]), torch.from_numpy(self.rows["valid"][first])
-        moving = torch.from_numpy(self.rows["object_id"][first]) > 0
-        flow, seen = self.carried(first, last)
-        if bool(moving.any()):
-            flows, valid, occluded = (
-                torch.from_numpy(self.rows[name].read(first, last)) for name in ("flow", "valid", "occluded")
-            )
-            moving_flow, followed = chained(flows.double(), valid, occluded)
-            flow = torch.where(moving, moving_flow, flow)
-            seen = torch.where(moving, followed, seen)
+            flow, seen = (torch.from_numpy(self.rows[name][first]) for name in ("flow", "valid"))
+        else:
+            moving = torch.from_numpy(self.rows["object_id"][first]) > 0
+            flow, seen = self.carried(first, last)
+            if bool(moving.any()):
+                flows, valid, occluded = (
+                    torch.from_numpy(self.rows[name].read(first, last))
+                    for name in ("flow", "valid", "occluded")
+                )
+                moving_flow, followed = chained(flows.double(), valid, occluded)
+                flow = torch.where(moving, moving_flow, flow)
+                seen = torch.where(moving, followed, seen)
+        self._finite("flow marked as valid", flow[:, seen])
         return flow.float(), seen
+
+    def _finite(self, name, values):
+        if not bool(values.isfinite().all()):
+            raise FileFormatError(
+                f"{self.folder / 'frames.h5'} holds {name} that is NaN or infinite; make the sequence anew."
+            )
+        return values
 
     def carried(self, first: int, last: int) -> tuple[Tensor, Tensor]:
         """Flow of points at rest, by their depth, both poses and the camera's rays: [2, H, W] float64, valid
@@ -170,7 +164,7 @@ class Sequence:
         return torch.from_numpy(np.where(valid, flow, 0.0)), torch.from_numpy(valid)
 
 
-def _places(folder, names):
+def _places(folder):
     """[(sequence folder, {file: bytes by the manifest} or None)]."""
     if (folder / "frames.h5").is_file():
         return [(folder, None)]
@@ -192,18 +186,10 @@ def _places(folder, names):
         )
     if kind != FORMAT:
         raise FileFormatError(f"{path} says format {kind!r}; {FORMAT!r} is read.")
-    unknown = sorted(set(names or ()) - set(sequences))
-    if unknown:
-        raise FileFormatError(f"{folder} has no sequence {unknown[0]!r}; it has {', '.join(sequences)}.")
-    chosen = [name for name in sequences if names is None or name in names]
     return [
         (
             folder / name,
-            {
-                file.removeprefix(f"{name}/"): size
-                for file, size in files.items()
-                if file.startswith(f"{name}/")
-            },
+            {file[len(name) + 1 :]: size for file, size in files.items() if file.startswith(f"{name}/")},
         )
-        for name in chosen
+        for name in sequences
     ]

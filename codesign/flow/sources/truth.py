@@ -208,35 +208,26 @@ def _spans_of(path, arrays, count):
 
 
 def _spans_beside(folder, inside, count):
-    """[(from, to)] in seconds of the text file of times of a folder, in whole microseconds or in seconds;
-    None without one."""
+    """``read_spans`` of the text file of times of a folder; None without one."""
     names = ("forward_timestamps.txt", "timestamps.txt")
-    file = next(
-        (
-            place / name
-            for place in (inside, inside.parent, folder)
-            for name in names
-            if (place / name).is_file()
-        ),
-        None,
-    )
-    if file is None:
-        return None
-    with reading(file, "it is no list of times: lines of 'from, to' are needed"):
-        rows = [
-            [float(word) for word in re.split(r"[,\s]+", line.strip())]
-            for line in read_text(file).splitlines()
-            if line.strip() and not line.startswith("#")
-        ]
+    files = (place / name for place in (inside, inside.parent, folder) for name in names)
+    file = next(filter(Path.is_file, files), None)
+    return None if file is None else read_spans(file, count)
+
+
+def read_spans(path: Path, count: int) -> list[tuple[float, float]]:
+    """[(from, to)] seconds of ``count`` flows by lines of two times, or of one and one more than there are
+    flows; whole numbers are microseconds.
+
+    Raises: FileFormatError for anything else.
+    """
+    with reading(path, "it is no list of times: lines of 'from, to' are needed"):
+        lines = [line.strip() for line in read_text(path).splitlines()]
+        rows = [re.split(r"[,\s]+", line) for line in lines if line and not line.startswith("#")]
         ends = np.array(rows, np.float64)
-    if ends.ndim == 2 and ends.shape[1] == 1 and len(ends) == count + 1:
+    if ends.shape == (count + 1, 1):
         ends = np.concatenate([ends[:-1], ends[1:]], 1)
-    if ends.ndim != 2 or ends.shape[1] != 2:
-        raise FileFormatError(
-            f"{file} has {list(ends.shape)} numbers; one line of two times per flow is needed, or one time "
-            "more than there are flows."
-        )
-    return _checked_spans(file, ends, count)
+    return _checked_spans(path, ends, count)
 
 
 def _checked_spans(path, ends, count):
@@ -264,45 +255,42 @@ def _of_table(path, size_px):
             table = np.loadtxt(file, ndmin=2, delimiter="," if "," in first else None)
     height, width = size_px
     if not header and table.shape == (2 * height, width):
-        return _filled(
-            path, table.reshape(2, height, width), np.isfinite(table.reshape(2, height, width)).all(0)
-        )
+        return _whole(path, table.reshape(2, height, width))
     names = tuple(COLUMNS.get(word, "?") for word in words) if header else TABLES.get(table.shape[1], ())
+    columns = dict(zip(names, table.T, strict=False))
     if (
-        len(names) != table.shape[1]
-        or not {"u", "v"} <= set(names)
-        or ("x" in names) != ("y" in names)
-        or len(set(names)) != len(names)
+        not len(columns) == len(names) == table.shape[1]
+        or not {"u", "v"} <= columns.keys()
+        or ("x" in columns) != ("y" in columns)
     ):
         raise FileFormatError(
             f"{path} has {table.shape[0]} lines of {table.shape[1]} numbers; 'u v' for all pixels row by "
             f"row, 'x y u v', 'x y u v valid', 't x y p u v' or 2 x {height} lines of {width} are read."
         )
-    uv = table[:, [names.index("u"), names.index("v")]]
-    if "x" not in names:
-        if len(uv) not in (1, height * width):
+    uv = np.stack([columns["u"], columns["v"]])
+    if "x" not in columns:
+        if len(table) not in (1, height * width):
             raise FileFormatError(
-                f"{path} has {len(uv)} lines of 'u v'; one for all pixels or {height * width} ({height} "
+                f"{path} has {len(table)} lines of 'u v'; one for all pixels or {height * width} ({height} "
                 f"rows of {width}) are needed."
             )
-        flow = np.broadcast_to(uv, (height * width, 2)).reshape(height, width, 2).transpose(2, 0, 1)
-        return _filled(path, flow, np.isfinite(flow).all(0))
-    x = table[:, names.index("x")]
-    y = table[:, names.index("y")]
+        return _whole(path, np.broadcast_to(uv, (2, height * width)).reshape(2, height, width))
+    x, y = columns["x"], columns["y"]
     outside = ~((x % 1 == 0) & (y % 1 == 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
     if bool(outside.any()):
         raise FileFormatError(
             f"{path}, row {int(np.argmax(outside)) + 1} of numbers: pixel ({x[outside][0]:g}, "
             f"{y[outside][0]:g}) is none of a sensor of {width} x {height}."
         )
-    use = np.isfinite(uv).all(1) & (table[:, names.index("valid")] > 0 if "valid" in names else True)
+    use = np.isfinite(uv).all(0) & (columns.get("valid", np.ones(1)) > 0)
     cell = (y * width + x).astype(np.int64)[use]
-    count = np.bincount(cell, minlength=height * width)
-    flow = np.stack(
-        [np.bincount(cell, uv[use, k], height * width) / np.maximum(count, 1) for k in (0, 1)]
-    )  # the mean of several flows of a pixel
-    return _filled(path, flow.reshape(2, height, width), (count > 0).reshape(height, width))
+    sums = np.stack([np.bincount(cell, part[use], height * width) for part in uv])
+    with np.errstate(invalid="ignore"):  # the mean of several flows of a pixel, NaN where there is none
+        flow = sums / np.bincount(cell, minlength=height * width)
+    return _whole(path, flow.reshape(2, height, width))
 
 
-def _filled(path, flow, valid):
+def _whole(path, flow):
+    """The flow of a file where it is finite."""
+    valid = np.isfinite(flow).all(0)
     return TrueFlow(np.where(valid, flow, 0.0), valid, None, str(path))

@@ -1,5 +1,5 @@
-"""Windows of recordings as samples to learn from: what every source of them shares, samples of a batch
-put together, and pieces cut out of large pictures."""
+"""Windows of recordings as samples to learn from: what a recording has to tell, whatever its layout, pieces
+cut out of large pictures, and samples of a batch put together."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
+from codesign.events.volumes.volume import from_stream
 from codesign.flow.checks import check_count, check_number
 from codesign.types import EventVolume, FlowField, FlowWindows
 
@@ -27,51 +28,41 @@ class Sample:
     frames: Tensor | None = None
 
 
-@dataclass(frozen=True)
-class Crop:
-    """A piece of every picture, at a place that depends on the seed and the sample's number alone. size_px:
-    (height, width); None: the whole."""
+class Recording:
+    """Events and true flow of one recording, by window. Layouts say ``flow``, and what else is not as here.
 
-    size_px: tuple[int, int] | None
-    seed: int = 0
+    size_px: (height, width). events: with ``window(t0_us, t1_us, size_px)``, an EventStream.
+    """
 
-    def check(self, height_px: int, width_px: int) -> None:
-        """Raise ShapeError unless the piece fits."""
-        if self.size_px is not None and not (
-            0 < self.size_px[0] <= height_px and 0 < self.size_px[1] <= width_px
-        ):
-            raise ShapeError(
-                f"pieces of {self.size_px[1]} x {self.size_px[0]} px were asked for; the pictures have "
-                f"{width_px} x {height_px}."
-            )
+    size_px: tuple[int, int]
+    events: Any
 
-    def __call__(self, index: int, sample: Sample) -> Sample:
-        """The piece of sample ``index``."""
-        if self.size_px is None:
-            return sample
-        height, width = sample.valid.shape
-        draw = torch.Generator().manual_seed((1_000_003 * self.seed + index) % 2**63)
-        top, left = (
-            int(torch.randint(n - m + 1, (), generator=draw))
-            for n, m in zip((height, width), self.size_px, strict=True)
-        )
-        cut = (..., slice(top, top + self.size_px[0]), slice(left, left + self.size_px[1]))
-        frames = None if sample.frames is None else sample.frames[cut]
-        return Sample(
-            sample.counts[cut].contiguous(),
-            sample.flow_px[cut].contiguous(),
-            sample.valid[cut].contiguous(),
-            sample.seconds,
-            frames,
-        )
+    def sample(self, bins: int, ends_us: tuple[int, int], *which: Any) -> Sample:
+        """The window of these times; ``which`` tells it to ``flow`` and ``frames``."""
+        flow, valid = self.flow(*which)
+        counts = self.counts(bins, *ends_us)
+        return Sample(counts, flow.float(), valid, (ends_us[1] - ends_us[0]) * 1e-6, self.frames(*which))
+
+    def flow(self, *which: Any) -> tuple[Tensor, Tensor]:
+        """(flow_px [2, H, W] on the pixels of the window's start, valid [H, W])."""
+        raise NotImplementedError
+
+    def frames(self, *which: Any) -> Tensor | None:
+        """[2, H, W] at both ends, or None."""
+        return None
+
+    def counts(self, bins: int, t0_us: int, t1_us: int) -> Tensor:
+        """[2, bins, H, W]."""
+        stream = self.events.window(t0_us, t1_us, self.size_px)
+        return from_stream(stream, t0_us, t1_us, bins).counts[0]
 
 
 class Windows:
     """A source of windows: ``len(source)`` and ``source.batch(indices)``.
 
     Args:
-      sequences: each with ``size_px``, (height, width), and ``sample(bins, *window)``, a Sample.
-      windows: [(number of the sequence, *window)].
+      recordings: what the windows are of.
+      windows: [(number of the recording, (t0_us, t1_us), *which)], as ``Recording.sample`` takes them.
       bins: of the volumes.
       crop_px: (height, width) of a piece at a random place, or None.
       seed: of that place.
@@ -79,18 +70,23 @@ class Windows:
 
     def __init__(
         self,
-        sequences: Sequence[Any],
+        recordings: Sequence[Recording],
         windows: Sequence[tuple[Any, ...]],
         bins: int,
         crop_px: tuple[int, int] | None,
         seed: int,
     ) -> None:
-        self.sequences = sequences
+        self.recordings = recordings
         self.windows = windows
         self.bins = check_count(bins, "bins", 1)
-        self.crop = Crop(crop_px, seed)
-        for sequence in sequences:
-            self.crop.check(*sequence.size_px)
+        self.crop_px = crop_px
+        self.seed = seed
+        for height, width in (recording.size_px for recording in recordings):
+            if crop_px is not None and not (0 < crop_px[0] <= height and 0 < crop_px[1] <= width):
+                raise ShapeError(
+                    f"pieces of {crop_px[1]} x {crop_px[0]} px were asked for; the pictures have "
+                    f"{width} x {height}."
+                )
 
     def __len__(self) -> int:
         return len(self.windows)
@@ -103,10 +99,27 @@ class Windows:
             raise DomainError(
                 f"sample {wrong[0]} was asked for; the source has {len(self)} (0 to {len(self) - 1})."
             )
-        return collate([self.crop(index, self._sample(*self.windows[index])) for index in chosen])
+        return collate([self._sample(index) for index in chosen])
 
-    def _sample(self, number, *window):
-        return self.sequences[number].sample(self.bins, *window)
+    def _sample(self, index):
+        """Sample ``index``, or a piece of it at a place that depends on the seed and the number alone."""
+        number, *window = self.windows[index]
+        sample = self.recordings[number].sample(self.bins, *window)
+        if self.crop_px is None:
+            return sample
+        draw = torch.Generator().manual_seed((1_000_003 * self.seed + index) % 2**63)
+        cut = [...]
+        for size, piece in zip(sample.valid.shape, self.crop_px, strict=True):
+            first = int(torch.randint(size - piece + 1, (), generator=draw))
+            cut.append(slice(first, first + piece))
+        cut = tuple(cut)
+        return Sample(
+            sample.counts[cut].contiguous(),
+            sample.flow_px[cut].contiguous(),
+            sample.valid[cut].contiguous(),
+            sample.seconds,
+            None if sample.frames is None else sample.frames[cut],
+        )
 
 
 def collate(samples: Sequence[Sample]) -> FlowWindows:
