@@ -8,7 +8,7 @@ never seen by van Rossum distance, number, rates over time, flicker and delay. W
 """
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -17,9 +17,9 @@ from codesign import events
 from codesign.errors import DomainError
 from studies.frame.compare import Interval
 from studies.frame.run import Run, StudyConfig, main
-from studies.frame.show import Panel, panels, pictures, table
+from studies.frame.show import Panel, panels, pictures, table, tabulate
 from studies.spike_esim import classes, judge
-from studies.spike_esim.train import generators, rendered
+from studies.spike_esim.train import SENSOR, generators, rendered
 
 TRAINING = [
     (world, family, 10 + k)
@@ -36,6 +36,8 @@ UNSEEN = {
     ],
 }
 PICTURE_S = 0.03
+PATCHES = 6
+FACTORS = (0.5, 0.7, 1.0, 1.5, 2.0)  # of the thresholds at test time
 TITLES = {
     "thesis": "thesis network, SLAYER's reset",
     "esim": "ESIM, best threshold",
@@ -114,6 +116,14 @@ def compare(run):
         show(run, f"unseen_{name}", shown, some[0].dt_s)
         of = {row["generator"]: row["loss"].value for row in rows}
         lead.append(f"unseen {name} {of[TITLES['ours']]:.3f} (ESIM {of[TITLES['esim']]:.3f})")
+    tabulate(
+        run,
+        "Thresholds at test time",
+        swept(ours, [one for some in unseen for one in some]),
+        "factor",
+        prefix="theta_times",
+        caption="Events of ours over those of a sensor without noise, both with their thresholds times the factor.",
+    )
     run.finish("Learnt event generators", f"Loss of ours over that of silence: {', '.join(lead)}.")
 
 
@@ -130,8 +140,25 @@ def sequences(run, wanted):
     return made
 
 
+@torch.no_grad()
+def swept(ours, sequences):
+    """Rows of factor and rate_ratio: how the number of events follows the thresholds."""
+    rows = []
+    for factor in FACTORS:
+        theta_on, theta_off = factor * SENSOR.theta_on, factor * SENSOR.theta_off
+        sensor = replace(SENSOR, theta_on=theta_on, theta_off=theta_off, shot_rate_hz=0.0, leak_rate_hz=0.0)
+        made = wanted = 0.0
+        for k, one in enumerate(sequences):
+            draw = torch.Generator().manual_seed(k)
+            made += float(ours(one.frames, one.t_s, theta_scale=factor)[0].sum())
+            wanted += float(events.dense_counts(one.frames, one.t_s, sensor, draw).sum())
+        rows.append({"factor": factor, "rate_ratio": made / wanted})
+    return rows
+
+
 def show(run, name, shown, dt_s):
-    """Figures of counts by title: pictures of 30 ms at three times, and rates of the whole picture."""
+    """Figures of counts by title: pictures of 30 ms at three times, rates of the whole picture and behind a
+    median, and of random patches. The first of ``shown`` is the target."""
     steps = round(PICTURE_S / dt_s)
     rows = {}
     for quarter in (1, 2, 3):
@@ -140,15 +167,31 @@ def show(run, name, shown, dt_s):
             title: events.picture(part.sum(0), 3.0).numpy() for title, part in parts.items()
         }
     run.figure(pictures(rows), f"{name}_pictures", "Events of 30 ms. Red ON, blue OFF.")
-    rates = {title: judge.binned(counts, dt_s)[..., 0, 0].T for title, counts in shown.items()}
-    charts = []
-    for polarity, label in enumerate(("ON", "OFF")):
-        series = {
-            title: (1e3 * judge.BIN_S * (torch.arange(rate.shape[1]) + 0.5), rate[polarity])
-            for title, rate in rates.items()
-        }
-        charts.append(Panel(series, "time, ms", f"{label} events of 10 ms"))
-    run.figure(panels(*charts), f"{name}_rates", "Events of the whole picture.")
+
+    def chart(rates, label):
+        times = {title: 1e3 * judge.BIN_S * (torch.arange(len(rate)) + 0.5) for title, rate in rates.items()}
+        series = {title: (times[title], rate) for title, rate in rates.items()}
+        return Panel(series, "time, ms", f"{label} events of 10 ms")
+
+    totals = {title: judge.binned(counts, dt_s)[..., 0, 0].T for title, counts in shown.items()}
+    medians = {title: judge.filtered(counts, dt_s).sum((2, 3)).T for title, counts in shown.items()}
+    charts = [
+        chart({title: rate[polarity] for title, rate in rates.items()}, f"{label}{where}")
+        for rates, where in ((totals, ""), (medians, " behind the median,"))
+        for polarity, label in enumerate(("ON", "OFF"))
+    ]
+    caption = "Events of the whole picture, and what a median of 5 x 5 px leaves of every 10 ms."
+    run.figure(panels(*charts), f"{name}_rates", caption)
+    cells = {
+        title: judge.binned(counts, dt_s, judge.CELL_PX).sum(1).flatten(1).T
+        for title, counts in shown.items()
+    }
+    busy = next(iter(cells.values())).sum(1).nonzero()[:, 0]
+    draw = torch.Generator().manual_seed(run.config.seed)
+    chosen = busy[torch.randperm(len(busy), generator=draw)[:PATCHES]].tolist()
+    charts = [chart({title: cell[at] for title, cell in cells.items()}, f"patch {at}:") for at in chosen]
+    caption = f"Random patches of {judge.CELL_PX} x {judge.CELL_PX} px in which the sensor has events, ON and OFF."
+    run.figure(panels(*charts, width=3), f"{name}_patches", caption)
 
 
 if __name__ == "__main__":

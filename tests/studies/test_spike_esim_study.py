@@ -104,6 +104,22 @@ def test_flicker_is_the_power_above_fifty_hertz():
     assert power[0] / power[1] == pytest.approx(4.0, rel=1e-6)  # the taper leaks below 1e-6 at this distance
 
 
+def test_the_median_takes_lone_events_out_and_leaves_edges():
+    counts = torch.zeros(5, 2, 16, 16)  # one bin of 10 ms
+    counts[0, 0, 4, 4] = 3
+    counts[2, 1, :, 8:] = 1
+    found = judge.filtered(counts, DT_S)
+    assert torch.equal(found, torch.stack([torch.zeros(16, 16), counts[2, 1]])[None])
+
+
+def test_an_ideal_generator_follows_an_ideal_sensor_through_every_threshold(monkeypatch):
+    noisy = SensorModel(0.18, 0.22, shot_rate_hz=50.0, leak_rate_hz=5.0)  # both are left out of the sweep
+    monkeypatch.setattr(study, "SENSOR", noisy)
+    rows = study.swept(SpikeEsim(0.18, 0.22), [made(walk(16), None)])
+    # some 5000 events; a level within rounding of a threshold may tell one more or less
+    assert [row["rate_ratio"] for row in rows] == pytest.approx([1.0] * len(study.FACTORS), abs=1e-3)
+
+
 def test_delay_is_found_with_its_sign():
     target = noise(6, 0.1)
     for steps in (-3, 0, 4):
