@@ -68,8 +68,7 @@ kill-test: setup ## long studies killed at random moments, resumed and compared:
 
 test-bits: setup ## tests that promise equal bits, as other processors and numbers of threads round
 	@failed=0; for how in \
-	    "CODESIGN_TEST_ROUNDING=place" \
-	    "MKL_CBWR=COMPATIBLE ATEN_CPU_CAPABILITY=default CODESIGN_TEST_THREADS=2" \
+	    "CODESIGN_TEST_ROUNDING=place MKL_CBWR=COMPATIBLE ATEN_CPU_CAPABILITY=default CODESIGN_TEST_THREADS=2" \
 	    "MKL_CBWR=AVX2 ATEN_CPU_CAPABILITY=avx2" \
 	    "MKL_CBWR=AVX512 CODESIGN_TEST_THREADS=2"; do \
 	  echo "== $$how"; \
@@ -92,5 +91,5 @@ doctor: setup ## what is installed, what is missing, what to do
 	@$(RUN) -m codesign doctor
 
 clean: ## remove the environment and caches; results in runs/ stay
-	rm -rf .venv build *.egg-info .pytest_cache .pytest_log .ruff_cache
+	rm -rf .venv build *.egg-info .pytest_cache .pytest_log .pytest_core .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -209,7 +209,7 @@ def plane_loss_rows():
     return _camera_rows(loss, 24, 8, 0, 0.002, ladder=ladder, tolerance=1e-6)
 
 
-def hard_rows(seed, count):
+def hard_rows(seed, count, moved=("curvature", "pose")):
     """Straight-through gradient against central differences of the hard loss.
 
     Steps of half a pixel of ray motion and 1 to 2 pixels of image motion move several counts per pixel row.
@@ -221,17 +221,18 @@ def hard_rows(seed, count):
     task = make_task("cooke-triplet", seed)
     pool = make_worlds(TRAINING)
     task_cases = [draw_case(pool, 50_000 + i) for i in range(count)]
-    fn, params, scales = _final(task, task_cases, "memory", 16)
+    fn, start, scales = _final(task, task_cases, "memory", 16)
+    params = {name: start[name] for name in moved}
     step = {"curvature": 0.5, "pose": 1.0}
     slopes, differences = ({name: [] for name in params} for _ in range(2))
     for case in task_cases:
         leaves = {name: value.clone().requires_grad_(True) for name, value in params.items()}
-        grads = torch.autograd.grad(fn(leaves, [case]), list(leaves.values()))
+        grads = torch.autograd.grad(fn({**start, **leaves}, [case]), list(leaves.values()))
         for (name, value), grad in zip(params.items(), grads, strict=True):
             slopes[name].append(grad * scales[name])
             with torch.no_grad():
                 ends = [
-                    [fn({**params, name: value + sign * h}, [case]) for sign in (1, -1)]
+                    [fn({**start, name: value + sign * h}, [case]) for sign in (1, -1)]
                     for h in step[name] * scales[name] * torch.eye(value.numel(), dtype=value.dtype)
                 ]
             change = torch.stack([ahead - behind for ahead, behind in ends])
@@ -322,13 +323,23 @@ def draw_batch(drives: int, seed: int, frames: int = 9) -> Batch:
 
 def joint_rows(system: System, batch: Batch, directions: int) -> list[CertificateRow]:
     """Autograd against differences, a row per group; the network along random directions."""
-    fn, params = by_group(system, lambda call: call(batch).loss, GROUPS)
+    with torch.no_grad():
+        frames = system.begin(batch)["frames"]
+
+    def behind_frames(call):
+        # gradients pass through the whole graph; differences of what lies behind the frames need one rendering
+        recorded = {} if torch.is_grad_enabled() else {"frames": frames}
+        return call(batch, recorded=recorded).loss
+
+    whole, params = by_group(system, lambda call: call(batch).loss, GROUPS)
+    behind, _ = by_group(system, behind_frames, GROUPS)
+    loss = {"lens": whole, "mount": whole, "thresholds": behind, "network": behind}
     scales = {"lens": 1.0, "mount": 1.0, "thresholds": 1.0, "network": float(params["network"].norm()) / 4}
     return [
         row
         for name in params
         for row in certify(
-            lambda p, name=name: fn({**params, **p}),
+            lambda p, name=name: loss[name]({**params, **p}),
             {name: params[name]},
             scales={name: scales[name]},
             ladder=LADDER if name in ("lens", "mount") else (0.1, 0.03, 0.01),
