@@ -14,6 +14,7 @@ import os
 import re
 import resource
 import shlex
+import signal
 import subprocess
 import sys
 import tempfile
@@ -99,17 +100,22 @@ def outcome(command: str, limit_s: float) -> tuple[bool, str, str]:
             words = ["make", "-C", str(ROOT), words[0], f"ARGS={given}"]
         else:
             words = [sys.executable, *([] if name == "python" else ["-m", name]), *words, *more]
+        pipe = subprocess.PIPE
+        # in a session of its own, so that what make has started ends with it
+        started = subprocess.Popen(
+            words, cwd=folder, env=environment, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+        )
         try:
-            done = subprocess.run(
-                words, cwd=folder, env=environment, capture_output=True, text=True, timeout=limit_s
-            )
-        except subprocess.TimeoutExpired:
+            _, errors = started.communicate(timeout=limit_s)
+        except BaseException as error:
+            os.killpg(started.pid, signal.SIGKILL)
+            started.communicate()
+            if not isinstance(error, subprocess.TimeoutExpired):
+                raise
             return False, "time", ""
-    code = re.findall(r"^make: \*\*\* .* Error (\d+)", done.stderr, re.M) or [str(done.returncode)]
-    traced = "Traceback (most" in done.stderr
-    lines = [line for line in done.stderr.splitlines() if line.strip() and not line.startswith("make")] or [
-        ""
-    ]
+    code = re.findall(r"^make: \*\*\* .* Error (\d+)", errors, re.M) or [str(started.returncode)]
+    traced = "Traceback (most" in errors
+    lines = [line for line in errors.splitlines() if line.strip() and not line.startswith("make")] or [""]
     # exit 2 is right only where the command names data of the reader's own, or asks for an option that it lacks
     asked = NEEDS.search(lines[0])
     theirs = OWN.search(command) or (asked and asked[1] not in command)
