@@ -77,12 +77,19 @@ FUNCTIONS = {
 @pytest.mark.bits
 @pytest.mark.parametrize("dtype", [torch.float32, D])
 @pytest.mark.parametrize("name", LAYERS)
-def test_a_layer_is_its_function_and_silent_before_a_still_scene(name, dtype):
+def test_a_layer_is_its_function(name, dtype):
     frames, t_s = drifting(6, 5, dtype=dtype)
     counts = layer(name, PLAIN)(frames, t_s)
     assert (counts.dtype, counts.shape) == (dtype, (29, 2, 6, 5))
     assert torch.equal(counts, FUNCTIONS[name](frames, t_s).to(dtype))
     assert counts.sum() > 50
+
+
+# not of the marker bits: where log rounds by address, equal frames may differ by eps
+@pytest.mark.parametrize("dtype", [torch.float32, D])
+@pytest.mark.parametrize("name", LAYERS)
+def test_a_layer_is_silent_before_a_still_scene(name, dtype):
+    frames, t_s = drifting(6, 5, dtype=dtype)
     still = layer(name, SensorModel(theta_sigma=0.03, cutoff_hz=30.0))(frames[:1].expand(5, 6, 5), t_s[:5])
     ghosts = 1 / (1 + math.exp(5)) if name == "sigmoid" else 0.0
     torch.testing.assert_close(still, torch.full_like(still, ghosts), rtol=1e-6, atol=0)
