@@ -58,7 +58,7 @@ gradcheck: ## gradients against differences: make gradcheck ARGS="--cases chain 
 gradcheck: STUDY := gradient_flow
 
 test: setup ## all tests, on all cores
-	@$(RUN) -m pytest -n auto --maxprocesses 8 $(ARGS)
+	@$(RUN) -m pytest -n auto --maxprocesses 8 --dist worksteal $(ARGS)
 
 fuzz: setup ## mutants of every file format for hours: make fuzz ARGS="--minutes 120 --format .npz"
 	@$(RUN) -m tests.hostile fuzz $(ARGS)
