@@ -190,7 +190,9 @@ def show(run, name, shown, dt_s):
     draw = torch.Generator().manual_seed(run.config.seed)
     chosen = busy[torch.randperm(len(busy), generator=draw)[:PATCHES]].tolist()
     charts = [chart({title: cell[at] for title, cell in cells.items()}, f"patch {at}:") for at in chosen]
-    caption = f"Random patches of {judge.CELL_PX} x {judge.CELL_PX} px in which the sensor has events, ON and OFF."
+    caption = (
+        f"Random patches of {judge.CELL_PX} x {judge.CELL_PX} px in which the sensor has events, ON and OFF."
+    )
     run.figure(panels(*charts, width=3), f"{name}_patches", caption)
 
 
