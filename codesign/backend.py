@@ -335,7 +335,7 @@ def _adjoint(ctx, inputs, grads):
     return [None if g is None else _to_torch(g, x.shape, inputs) for g, x in zip(found, inputs, strict=True)]
 
 
-_FIRST_ONLY = "drjit kernels give first derivatives only; a second derivative through the lens or the renderer was asked for. Use differences of gradients instead."
+_FIRST_ONLY = "drjit kernels give first derivatives only; a second derivative was asked for. Use differences of gradients instead."
 
 
 def first_only(found: Sequence[Tensor | None], sources: Iterable[Tensor | None]) -> Sequence[Tensor | None]:

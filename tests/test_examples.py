@@ -14,7 +14,7 @@ MODULES = sorted(
 )
 FIRST_MET = {  # modules whose examples a user meets first
     "codesign.events.files",
-    "codesign.events.layers.by_name",
+    "codesign.events.layers.comparators",
     "codesign.events.level_path",
     "codesign.events.layers.memory",
     "codesign.events.layers.soft",

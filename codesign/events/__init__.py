@@ -7,43 +7,35 @@ Hard: ``simulate`` (sensor), ``naive`` (frame difference). Differentiable: ``mem
 
 from codesign.doors import explain
 from codesign.events.files import read, write
-from codesign.events.formats.aedat4 import RecordedFrames, read_frames
+from codesign.events.formats.aedat import RecordedFrames, read_frames
 from codesign.events.intensity import lin_log
-from codesign.events.layers.by_name import LAYERS, layer
-from codesign.events.layers.comparators import ComparatorLayer
+from codesign.events.layers.comparators import LAYERS, ComparatorLayer, layer
 from codesign.events.layers.layer import EventLayer, HardSensor, PositiveValues, Settled
 from codesign.events.layers.memory import memory, soft_counts
 from codesign.events.layers.physical import PhysicalLayer, PhysicalState, sensor_counts
-from codesign.events.layers.soft import annealed, dense, expected, soft
+from codesign.events.layers.soft import dense, expected, soft
 from codesign.events.level_path import finer
 from codesign.events.low_pass import low_pass, one_pole
 from codesign.events.sensor.model import PRESETS, SensorModel, draw_shot_counts, draw_thresholds
 from codesign.events.sensor.simulate import dense_counts, naive, simulate
 from codesign.events.sensor.state import SensorState
-from codesign.events.sources.opening import open_frames
+from codesign.events.sources.frames import open_frames
 from codesign.events.spiking.losses import count_loss, van_rossum
 from codesign.events.spiking.spike_esim import SpikeEsim, SpikeEsimState
-from codesign.events.spiking.srm import alpha_response, drive_scale, srm
-from codesign.events.spiking.srm_state import SrmState
+from codesign.events.spiking.srm import SrmState, alpha_response, drive_scale, srm
 from codesign.events.spiking.surrogate import FastSigmoid, Laplace, Triangular
 from codesign.events.spiking.thesis_network import TwoBranchSpikes
 from codesign.events.stream import concatenate, to_counts
 from codesign.events.upsampling.upsample import upsample, upsample_stream
 from codesign.events.views.pictures import decay_video, gray_picture, picture, rates, write_video
 from codesign.events.volumes.surface import (
+    decay,
+    decay_from_stream,
     surface_from_counts,
     surface_from_hard_counts,
     surface_from_stream,
-    surface_from_times,
 )
-from codesign.events.volumes.traces import decay, decay_from_stream
-from codesign.events.volumes.volume import (
-    from_counts,
-    from_stream,
-    spikes_from_counts,
-    spikes_from_stream,
-    stream_from_spikes,
-)
+from codesign.events.volumes.volume import from_counts, from_stream, spikes_from_stream
 
 __all__ = [
     "LAYERS",
@@ -66,7 +58,6 @@ __all__ = [
     "Triangular",
     "TwoBranchSpikes",
     "alpha_response",
-    "annealed",
     "concatenate",
     "count_loss",
     "decay",
@@ -97,14 +88,11 @@ __all__ = [
     "simulate",
     "soft",
     "soft_counts",
-    "spikes_from_counts",
     "spikes_from_stream",
     "srm",
-    "stream_from_spikes",
     "surface_from_counts",
     "surface_from_hard_counts",
     "surface_from_stream",
-    "surface_from_times",
     "to_counts",
     "upsample",
     "upsample_stream",

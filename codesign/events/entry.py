@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -75,14 +76,13 @@ def check_per_pixel(
     Raises: DomainError when a value is no number from 1e-30 to 1e30, beyond which single precision ends; ShapeError
       when it does not broadcast.
     """
-    is_real = isinstance(value, (Tensor, float, int)) and not isinstance(value, bool)
-    if isinstance(value, Tensor):
-        is_real = value.dtype in REAL and value.layout == torch.strided and not value.is_meta
-    if not is_real:
-        given = f"a tensor of {value.dtype} on {value.device}" if isinstance(value, Tensor) else shown(value)
-        raise DomainError(f"{name} is {given}; give a real number, or a dense tensor of them, > 0.")
     if not isinstance(value, Tensor):
         value = as_number(value, name)
+    elif value.dtype not in REAL or value.layout != torch.strided or value.is_meta:
+        raise DomainError(
+            f"{name} is a tensor of {value.dtype} on {value.device}; give a real number, or a dense tensor of "
+            "them, > 0."
+        )
     value = torch.as_tensor(value, dtype=torch.float64 if dtype is None else dtype, device=frames.device)
     pixels = frames.shape[1:]
     fits = value.ndim <= len(pixels) and all(
@@ -101,26 +101,31 @@ def check_per_pixel(
     return value.to(frames.dtype if dtype is None else dtype)
 
 
+def as_seconds(times: Any, name: str) -> Tensor:
+    """Real numbers as a float64 tensor; DomainError for anything else."""
+    try:
+        found = torch.as_tensor(times)
+        if found.is_complex() or found.is_meta:
+            raise TypeError
+        return torch.as_tensor(times, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise DomainError(
+            f"{name} is {str(times)[:60]!r} ({type(times).__name__}); a list or tensor of real numbers, "
+            "seconds, is needed."
+        ) from None
+
+
 def check_times(t_s: Times, count: int | None = None) -> Tensor:
     """Return frame times as a float64 tensor [count] on the CPU, strictly increasing; any number with None.
 
     Raises: ShapeError when the number of times differs; DomainError when they are no real numbers, do not
       increase strictly, are not finite, or require a gradient, which nothing gives to times.
     """
-    try:
-        times_s = torch.as_tensor(t_s)
-        if times_s.is_complex() or times_s.is_meta:
-            raise TypeError
-        times_s = torch.as_tensor(t_s, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError):
-        raise DomainError(
-            f"t_s is {str(t_s)[:60]!r} ({type(t_s).__name__}); times are a list or tensor of real numbers, "
-            "seconds."
-        ) from None
+    times_s = as_seconds(t_s, "t_s")
     if isinstance(t_s, Tensor) and t_s.requires_grad:
         raise DomainError("t_s requires a gradient, and events give none to frame times; pass t_s.detach().")
     times_s = times_s.cpu()
-    if times_s.ndim != 1 or len(times_s) != (len(times_s) if count is None else count):
+    if times_s.ndim != 1 or count not in (None, len(times_s)):
         raise ShapeError(
             f"t_s has shape {list(times_s.shape)}; one time per frame is needed, [{count or 'T'}]."
         )
@@ -176,16 +181,10 @@ def check_choice(value: str, name: str, allowed: Iterable[str]) -> str:
     return value
 
 
-def check_dtype(dtype: torch.dtype, device: torch.device | str = "cpu") -> None:
-    """Raise DomainError for what is no real type of tensors, or no device."""
+def check_dtype(dtype: torch.dtype) -> None:
+    """Raise DomainError for what is no real type of tensors."""
     if not any(dtype is one for one in REAL):
         raise DomainError(f"dtype is {shown(dtype)}; a real type is needed, such as torch.float32.")
-    try:
-        torch.empty(0, device=device)
-    except (TypeError, ValueError, RuntimeError, AssertionError):
-        raise DomainError(
-            f"device is {shown(device)}; a device that is there is needed, such as 'cpu'."
-        ) from None
 
 
 def check_room(values: float, what: str) -> None:
@@ -235,3 +234,28 @@ def check_level(state: Tensor, level: Tensor) -> Tensor:
             "sensor."
         )
     return check_finite(state, "state")
+
+
+def check_state(state: object, kind: type) -> None:
+    """Raise DomainError for a state that is neither None nor of its kind."""
+    if state is not None and not isinstance(state, kind):
+        raise DomainError(f"the state is a {type(state).__name__}; pass what the call before returned.")
+
+
+def check_chunk(frames: Tensor, shape: torch.Size, dtype: torch.dtype) -> None:
+    """Raise ShapeError for frames [T, ...] of another size or type than the frame [...] of the chunk before."""
+    if (frames.shape[1:], frames.dtype) != (shape, dtype):
+        raise ShapeError(
+            f"{frames.dtype} frames of {list(frames.shape[1:])} follow {dtype} frames of {list(shape)}; chunks of "
+            "time keep their size and type, a batch its samples."
+        )
+
+
+def check_later(times_s: Tensor, before_s: float) -> Tensor:
+    """The times of a chunk with that of the frame before it ahead; DomainError where they go back."""
+    if float(times_s[0]) <= before_s:
+        raise DomainError(
+            f"the chunk starts at {float(times_s[0])!r} s, the last frame seen was at {before_s!r} s; times "
+            "must go on increasing."
+        )
+    return torch.cat((torch.tensor([before_s], dtype=torch.float64), times_s))

@@ -8,13 +8,11 @@ from codesign.atomic import replacing
 from codesign.errors import FileFormatError
 from codesign.events.columns import LIMIT_PX, EventColumns
 from codesign.events.entry import check_path, check_whole
-from codesign.events.formats.aedat2 import read_aedat2, write_aedat2
-from codesign.events.formats.aedat4 import read_aedat4, write_aedat4
+from codesign.events.formats.aedat import read_aedat2, read_aedat4, write_aedat2, write_aedat4
 from codesign.events.formats.arrays import read_arrays, write_npz
 from codesign.events.formats.arrival import Asked, check_asked
-from codesign.events.formats.dat import read_dat, write_dat
 from codesign.events.formats.hdf5 import read_hdf5, write_hdf5
-from codesign.events.formats.raw import read_raw, write_raw
+from codesign.events.formats.prophesee import read_dat, read_raw, write_dat, write_raw
 from codesign.events.formats.text import read_text, write_csv
 from codesign.events.stream import check_stream
 from codesign.reading import check_regular, reading

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from codesign import backend
-from codesign.errors import DomainError, as_number
 from codesign.events.entry import check_flag, check_frames
 from codesign.exclusive import exclusive
 
@@ -56,59 +55,36 @@ def light_share(intensity: Any) -> Any:
 
 @dataclass(frozen=True)
 class FrontEnd:
-    """How frames become log levels: lin-log of the 0-255 scale, or ln(I + eps) of linear frames in any unit,
-    or frames that are log levels already.
-
-    log_input: the frames are log levels. log_eps: eps > 0, in the frames' unit; None: lin-log.
-    """
+    """How frames become log levels: lin-log of the 0-255 scale, or frames that are log levels already
+    (``log_input``)."""
 
     log_input: bool = False
-    log_eps: float | None = None
 
     def __post_init__(self):
         check_flag(self.log_input, "log_input", " (frames are log levels)")
-        if self.log_eps is not None and (
-            self.log_input or not 0 < as_number(self.log_eps, "log_eps") < math.inf
-        ):
-            given = "log_input is set" if self.log_input else f"log_eps is {self.log_eps!r}"
-            raise DomainError(
-                f"{given}; give frames of log levels, or a finite log_eps > 0 in the unit of linear frames, "
-                "or neither for lin-log."
-            )
 
     def level(self, frames):
         """Log level of a tensor of frames; gradient: frames."""
-        if self.log_input:
-            return frames
-        return _lin_log(frames) if self.log_eps is None else (frames + self.log_eps).log()
+        return frames if self.log_input else _lin_log(frames)
 
     def frames(self, level):
         """Frames [...] whose level a tensor is, the inverse of ``level``; a linear one is never below 0."""
-        if self.log_input:
-            return level
-        if self.log_eps is not None:
-            return (level.exp() - self.log_eps).clamp(min=0)
-        return backend.run_kernel(_linear, (level,), [level.shape])[0]
+        return level if self.log_input else backend.run_kernel(_linear, (level,), [level.shape])[0]
 
     def slope(self, frames):
         """Derivative of the level to the frame."""
         if self.log_input:
             return torch.ones_like(frames)
-        if self.log_eps is not None:
-            return 1 / (frames + self.log_eps)
         return torch.where(frames <= JOINT, DARK_SLOPE, 1 / frames.clamp(min=JOINT))
 
     def traced(self, dr, frames):
         """The same of a drjit array, and its slope as a function (called where a gradient is wanted)."""
         if self.log_input:
             return frames, lambda: frames * 0 + 1
-        if self.log_eps is not None:
-            return dr.log(frames + self.log_eps), lambda: dr.rcp(frames + self.log_eps)
         dark = frames <= JOINT
         safe = dr.maximum(frames, JOINT)
-        return dr.select(dark, frames * DARK_SLOPE, dr.log(safe)), lambda: dr.select(
-            dark, DARK_SLOPE, dr.rcp(safe)
-        )
+        level = dr.select(dark, frames * DARK_SLOPE, dr.log(safe))
+        return level, lambda: dr.select(dark, DARK_SLOPE, dr.rcp(safe))
 
     def accepts(self, dr, frames):
         """Mask of drjit values that may enter: finite, and >= 0 where they are linear."""

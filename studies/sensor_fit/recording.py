@@ -9,7 +9,7 @@ from torch import Tensor
 from codesign import events
 from codesign.arrays import open_npz
 from codesign.errors import FileFormatError, ShapeError
-from codesign.events.formats.aedat4 import read_frames
+from codesign.events.formats.aedat import read_frames
 from codesign.types import EventStream
 
 PLACE = Path("shared") / "data" / "davis346_newton_cradle" / "demo-01.npz"

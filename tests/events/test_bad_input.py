@@ -56,7 +56,6 @@ TAKE_COUNTS = (
     lambda counts: events.from_counts(counts, T_S, 2),
     lambda counts: events.surface_from_counts(counts, T_S, 0.1),
     lambda counts: events.surface_from_hard_counts(counts, T_S, T_S, 0.1),
-    events.spikes_from_counts,
 )
 TAKE_STREAMS = (
     check_stream,
@@ -123,12 +122,6 @@ def test_what_is_of_another_kind(takers, given, words, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def surface_of_times(**changed):
-    zero = torch.zeros(2, dtype=torch.int64)
-    given = {"t_s": torch.zeros(2), "x": zero, "y": zero, "p": zero + 1} | changed
-    return events.surface_from_times(**given, height_px=3, width_px=4, at_s=[1.0], tau_s=1.0)
-
-
 def going_on(**changed):
     """A layer's second chunk."""
     made = layer("memory", SensorModel(theta_sigma=0.03))
@@ -136,11 +129,18 @@ def going_on(**changed):
     return made.advance(**given)
 
 
+def potential(drive):
+    return events.srm(drive, theta=1.0, tau_r=1.0)[1].sum()
+
+
 def streamed(frames, t_s):
     return list(events.upsample_stream(frames, t_s))
 
 
 GENERATOR = torch.Generator()
+OURS = events.SpikeEsim()
+STATE = OURS(FRAMES, T_S)[1]
+NETWORK = events.TwoBranchSpikes(1)
 UNSTABLE = {"cutoff_hz": 300.0, "shot_rate_hz": 5.0, "photoreceptor_noise": True, "timing": "v2e"}
 WRONG = [
     # streams, volumes, surfaces, spikes
@@ -151,12 +151,8 @@ WRONG = [
     (lambda: events.HardSensor(SENSOR, 5)(FRAMES, T_S), r"\[N, T, H, W\]"),
     (lambda: events.from_counts(COUNTS, T_S, 20), "fewer bins"),
     (lambda: events.from_stream(STREAM, 5, 2, 2), "t1 > t0"),
-    (lambda: events.stream_from_spikes(torch.full((2, 1, 1, 1), 0.5), 0, 1), "other than 0 and 1"),
     (lambda: events.surface_from_hard_counts(COUNTS / 2, T_S, T_S, 0.1), r"counts hold 0\.5; whole numbers"),
     (lambda: events.surface_from_stream(STREAM, [5, 5], 1.0), "whole microseconds"),
-    (lambda: surface_of_times(x=torch.tensor([0, 4])), "below 4"),
-    (lambda: surface_of_times(p=torch.tensor([0, 1])), "polarity"),
-    (lambda: surface_of_times(t_s=torch.tensor([0, 1])), "floating-point"),
     (lambda: events.decay(COUNTS, T_S, 1e-200), "tau_s is 1e-200"),
     (lambda: events.decay_from_stream(STREAM, [10], 0.1, start=(COUNTS[0], 2**40)), "the trace is of"),
     (lambda: events.decay_from_stream(STREAM, [10], 0.1, start=(torch.zeros(2, 6, 4), 0)), "the sensor's"),
@@ -172,7 +168,6 @@ WRONG = [
     (lambda: events.simulate(FRAMES[:, 0], T_S, SENSOR), "H, W"),
     (lambda: events.simulate(FRAMES, T_S, "noisy"), "events.PRESETS"),
     (lambda: events.simulate(FRAMES, T_S, SENSOR, 3), "the generator is 3"),
-    (lambda: events.simulate(FRAMES, T_S, SENSOR, log_eps=1.0, log_input=True), "log_input"),
     (lambda: events.dense_counts(FRAMES, T_S, SensorModel(timing="v2e")), "interpolated"),
     (lambda: SensorModel(theta_on=torch.tensor(0.2)), "events.sensor_counts"),
     (lambda: SensorModel(photoreceptor_noise=True), "needs cutoff_hz and shot_rate_hz"),
@@ -209,6 +204,31 @@ WRONG = [
         lambda: events.Settled(layer("memory"), 0.007).volume(FRAMES, T_S, 2),
         r"no frame stands 0\.007 s after",
     ),
+    # spikes
+    (lambda: events.drive_scale(torch.zeros(10, 2), theta=0.7), "silent"),
+    (lambda: events.drive_scale(FRAMES, theta=0.7, share=1.0), "share"),
+    (lambda: events.Laplace(0.0, 1.0), "alpha"),
+    (lambda: events.Triangular(1.0, math.inf), "beta"),
+    (lambda: events.FastSigmoid(1.0, 1.0).torch_density(torch.ones(2, dtype=torch.int64)), "real numbers"),
+    (lambda: torch.autograd.functional.hessian(potential, FRAMES[:2, :2, :1]), "second derivative"),
+    (lambda: OURS(FRAMES[:, 0], T_S), "H, W"),
+    (lambda: OURS(FRAMES, T_S[:3]), r"\[5\]"),
+    (lambda: OURS(FRAMES, T_S, STATE), "go on increasing"),
+    (lambda: OURS(FRAMES.double(), T_S + 1, STATE), "keep their size"),
+    (lambda: OURS(FRAMES, T_S, 3), "the state is a int"),
+    (lambda: OURS(FRAMES, T_S, theta_scale=torch.ones(3)), "theta_scale"),
+    (lambda: events.SpikeEsim(theta_on=0.0), "theta_on"),
+    (lambda: events.SpikeEsim(width=2**40), "width is"),
+    (lambda: events.SpikeEsim(comparator="soft"), "comparator"),
+    (lambda: events.SpikeEsim(refractory_s=1e-3, comparator="srm"), "dead time"),
+    (lambda: NETWORK(FRAMES * NAN), "NaN"),
+    (lambda: NETWORK(FRAMES[:, None].expand(-1, 3, -1, -1)), "channels=1"),
+    (lambda: NETWORK(FRAMES[:, :3], NETWORK(FRAMES)[2]), "keep their size"),
+    (lambda: NETWORK(FRAMES, 3), "is a int"),
+    (lambda: NETWORK.wake(torch.full((10, 4, 4), 3.0)), "silent"),
+    (lambda: events.van_rossum(COUNTS, COUNTS[..., :2], tau_s=1.0), "no distance"),
+    (lambda: events.van_rossum(COUNTS[:, 0, 0], COUNTS[:, 0, 0], tau_s=1.0), "ON first"),
+    (lambda: events.count_loss(COUNTS, COUNTS, side_px=5, steps=2), "do not fit"),
 ]
 
 
@@ -228,7 +248,7 @@ def test_states_of_other_frames_or_layers(name):
         with pytest.raises(ShapeError):
             made.advance(frames, T_S + 1, state)
     for other in set(events.LAYERS) - {name}:
-        with pytest.raises(DomainError, match="pass what this layer returned"):
+        with pytest.raises(DomainError, match=r"pass what (this layer|the call before) returned"):
             layer(other).advance(FRAMES, T_S + 1, state)
 
 

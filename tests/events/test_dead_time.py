@@ -8,10 +8,10 @@ import torch
 
 from codesign.errors import DomainError
 from codesign.events import SensorModel, dense_counts, sensor_counts
-from codesign.events.layers.dead_time import GOLDEN, STEPS, mean_counts
-from codesign.events.layers.dead_time_kernel import PHASES, WIDTH
+from codesign.events.layers.dead_time import GOLDEN, PHASES, STEPS, WIDTH, mean_counts
 from codesign.events.level_path import parts
 from codesign.events.sensor.state import SensorState, begin
+from tests.events.slopes import cosine_and_scale
 
 D = torch.float64
 
@@ -222,8 +222,7 @@ def test_gradients_follow_differences_of_hard_counts_over_beginnings(
         counted(s, lambda level, values: hard_mean(level, t_s, SensorModel(**values))) for s in (1.0, -1.0)
     ]
     truth = (ends[0] - ends[1]) / 2
-    found_cosine = float(found @ truth / (found.norm() * truth.norm()))
-    found_scale = float(found @ truth / (truth @ truth))
+    found_cosine, found_scale = cosine_and_scale(found, truth)
     assert found_cosine > cosine
     assert low < found_scale < 1.1
 

@@ -14,6 +14,7 @@ from codesign import System, events
 from codesign.events.level_path import finer
 from codesign.system import Batch
 from codesign.types import FlowField
+from tests.events.slopes import cosine_and_scale
 
 D = torch.float64
 C = 0.15
@@ -53,10 +54,6 @@ def steered(found, level, move):
     tangent = way(move, len(level) - 1)
     slopes = [(torch.autograd.grad(x, level, retain_graph=True)[0] * tangent).sum() for x in found.flatten()]
     return torch.stack(slopes)
-
-
-def cosine_and_scale(found, truth):
-    return float(found @ truth / (found.norm() * truth.norm())), float(found @ truth / (truth @ truth))
 
 
 @cache

@@ -15,7 +15,7 @@ import zstandard
 from codesign.errors import FileFormatError
 from codesign.events import read, write
 from codesign.events.formats import text
-from codesign.events.formats.aedat4 import read_frames
+from codesign.events.formats.aedat import read_frames
 from codesign.flow.sources import read_recording
 from tests.event_streams import (
     FIELDS,

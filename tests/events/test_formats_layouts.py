@@ -15,7 +15,7 @@ import zstandard
 from codesign.errors import FileFormatError
 from codesign.events import read, write
 from codesign.events.formats import hdf5
-from codesign.events.formats.aedat4 import read_frames
+from codesign.events.formats.aedat import read_frames
 from codesign.events.formats.hdf5_rows import new_hdf5
 from codesign.events.stream import ordered
 from tests.event_streams import (

@@ -9,6 +9,7 @@ import torch
 from codesign import events
 from codesign.events import LAYERS, SensorModel, layer
 from codesign.events.sensor.model import draw_deviates
+from tests.events.slopes import seeded
 
 D = torch.float64
 PLAIN = SensorModel(0.15, 0.2)
@@ -25,10 +26,6 @@ PHYSICAL = SensorModel(
     refractory_s=2e-3,
 )
 LEARNT = ("theta_on", "theta_off", "cutoff_hz")
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def drifting(*shape, frames=30, seed=1, dtype=D):
@@ -141,20 +138,6 @@ def test_gradients_of_batches_and_chunks_are_those_of_samples_and_the_whole(name
     for loss in (samples, chunks):
         for mine, wanted in zip(torch.autograd.grad(loss, inputs), whole, strict=True):
             torch.testing.assert_close(mine, wanted, rtol=1e-7, atol=1e-9 * float(wanted.abs().max()))
-
-
-@pytest.mark.parametrize("name", ["sigmoid", "counts", "expected"])
-def test_gradients_of_smooth_layers_are_differences(name):
-    frames, t_s = drifting(1, 2, frames=5)
-    made = layer(name, NOISY, learn=LEARNT)
-    names, variables = zip(*made.named_parameters(), strict=True)
-
-    def counts(frames, *values):
-        given = dict(zip(names, values, strict=True))
-        return torch.func.functional_call(made, given, (frames, t_s))
-
-    assert names == tuple(f"learnt.raw.{name}" for name in LEARNT)
-    assert torch.autograd.gradcheck(counts, (frames.requires_grad_(), *variables))
 
 
 def test_noise_is_that_of_the_drawing_functions():

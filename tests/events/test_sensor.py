@@ -172,10 +172,6 @@ def test_events_equal_the_published_algorithm_as_far_as_single_precision_tells(s
     slack = slack_us(levels.double().numpy(), t_s.numpy(), t, x, y, 0.2)
     assert (np.abs(stream.t_us.numpy()[mine] - 1e6 * t) <= slack).all()
     assert (slack < 0.75).mean() > 0.95  # what was allowed was little
-    # the front end of high dynamic range gives the same counts but for levels that meet a threshold in the
-    # last bits of single precision
-    direct = simulate(frames / 255, t_s, SensorModel(), log_eps=1e-3)
-    assert int((to_counts(direct, t_s) - to_counts(stream, t_s)).abs().sum()) <= 2e-5 * len(stream)
 
 
 BEGAN = SensorModel(

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from codesign import events
-from codesign.errors import CodesignError, FileFormatError
+from codesign.errors import FileFormatError
 from codesign.events import SensorModel, lin_log, spiking
 from codesign.events.spiking.losses import count_loss, van_rossum
 from codesign.events.spiking.spike_esim import SpikeEsim
@@ -229,17 +229,6 @@ def test_network_of_the_thesis_equals_the_reference(shared, through_reset, name)
         assert (found[0] - data["smooth_gw_fd_pos"]).abs().max() <= 1e-6
 
 
-def test_smoothing_is_the_alpha_response_of_the_drive():
-    network = TwoBranchSpikes(1, theta=1.0, smoothing_tau=10.0).double()
-    with torch.no_grad():
-        network.weight_on.zero_()[0, 1, 1] = 0.01  # far below the threshold: no reset
-    frames = torch.ones(201, 3, 3, dtype=D).index_fill(0, torch.tensor(0), 0.0)  # one step of brightness
-    _, potential, _ = network(frames)
-    k = torch.arange(200, dtype=D)
-    truth = 0.01 * k / 10 * torch.exp(1 - k / 10)
-    assert (potential[:, 0, 1, 1] - truth).abs().max() <= 1e-14
-
-
 def test_a_woken_network_reaches_its_threshold_with_the_share_asked():
     frames = torch.rand(30, 16, 16, generator=torch.Generator().manual_seed(2), dtype=D)
     network = TwoBranchSpikes(1, theta=0.7, kernel="step").double()
@@ -261,38 +250,3 @@ def test_losses_have_their_closed_forms():
     found[1, 0, 1, 1] = 1  # the same block: 1 against 3, (1 - 3)^2/(3 + 1) = 1
     found[3, 1, 3, 3] = 2  # OFF, another block: 2 against 0, 4/1
     assert float(count_loss(found, target, side_px=2, steps=2)) == 2.5
-
-
-FRAMES, T_S = clip(frames=4)
-OURS = SpikeEsim()
-STATE = OURS(FRAMES, T_S)[1]
-NETWORK = TwoBranchSpikes(1)
-COUNTS = torch.zeros(4, 2, 3, 3)
-
-
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (lambda: OURS(FRAMES[:, 0], T_S), "H, W"),
-        (lambda: OURS(FRAMES, T_S[:3]), r"\[4\]"),
-        (lambda: OURS(FRAMES, T_S, STATE), "go on increasing"),
-        (lambda: OURS(FRAMES.float(), T_S + 1, STATE), "keeps its frame size"),
-        (lambda: OURS(FRAMES, T_S, 3), "the state is a int"),
-        (lambda: OURS(FRAMES, T_S, theta_scale=torch.ones(3)), "theta_scale"),
-        (lambda: SpikeEsim(theta_on=0.0), "theta_on"),
-        (lambda: SpikeEsim(width=2**40), "width is"),
-        (lambda: SpikeEsim(comparator="soft"), "comparator"),
-        (lambda: SpikeEsim(refractory_s=1e-3, comparator="srm"), "dead time"),
-        (lambda: NETWORK(FRAMES * math.nan), "NaN"),
-        (lambda: NETWORK(FRAMES[:, None].expand(-1, 3, -1, -1)), "channels=1"),
-        (lambda: NETWORK(FRAMES[:, :4], NETWORK(FRAMES)[2]), "keeps its frame size"),
-        (lambda: NETWORK(FRAMES, 3), "is a int"),
-        (lambda: NETWORK.wake(torch.full((10, 4, 4), 3.0)), "silent"),
-        (lambda: van_rossum(COUNTS, COUNTS[..., :2], tau_s=1.0), "no distance"),
-        (lambda: van_rossum(COUNTS[:, 0, 0], COUNTS[:, 0, 0], tau_s=1.0), "ON first"),
-        (lambda: count_loss(COUNTS, COUNTS, side_px=4, steps=2), "do not fit"),
-    ],
-)
-def test_bad_input_is_refused(call, words):
-    with pytest.raises(CodesignError, match=words):
-        call()

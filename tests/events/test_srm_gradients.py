@@ -13,26 +13,22 @@ import pytest
 import torch
 
 from codesign import events
-from codesign.events.spiking import srm_mean
+from codesign.events.kernels import recursion
+from codesign.events.spiking import srm_means
 from codesign.events.spiking.srm import srm
-from codesign.events.spiking.srm_mean import PACE, WIDTH, rested
-from codesign.events.spiking.srm_play import held_back
-from codesign.events.spiking.step_by_step import recursion
+from codesign.events.spiking.srm_means import PACE, WIDTH, held_back, rested
+from tests.events.slopes import cosine_and_scale, seeded
 
 D = torch.float64
 THETA = 0.2
-KINDS = {"pair": 2, "late": 1, "early": 1}
+KINDS = {"pair": 2, "early": 1}
 FADING = {"theta": THETA, "kernel": "exp", "response": "alpha", "tau_s": 2.4, "tau_r": 1.2}
 STEP = {"theta": THETA, "kernel": "step", "response": "step", "reset_scale": 1.0, "coupled": True}
 
 
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
 def mean_spikes(kind, response, theta, a, m, pace, start):
     """Mean spikes, and shares and states after them, of a noise whose pace is given."""
-    step = partial(srm_mean._step, kind, start.shape[1])
+    step = partial(srm_means._step, kind, start.shape[1])
     numbers = torch.stack([x.expand(response.shape[1]) for x in (theta, a, m, pace)])
     mean, after = recursion(step, response, numbers, start.flatten(0, 1))
     return mean, after.reshape(start.shape)
@@ -137,19 +133,16 @@ def test_a_layer_passes_the_gradient_of_the_mean_on_to_drive_and_parameters():
         numbers = (theta.expand(5), (-h).exp(), -2 * theta * math.e * h, pace)
         return (mean_spikes("pair", response, *numbers, rested(6, 2, h))[0] * weights).sum()
 
-    leaves = [x.clone().requires_grad_() for x in given]
-    names = ("theta", "tau_s", "tau_r")
-    layer = FADING | {"kernel": "slayer"} | dict(zip(names, leaves[1:], strict=True))
-    spikes, _, _ = srm(leaves[0], **layer, gradient="mean")
-    found = torch.autograd.grad((spikes * weights).sum(), leaves)
-    step = 1e-6
-    for place, slope in enumerate(found):
-        for seed in range(3 if place == 0 else 1):
-            way = torch.randn(slope.shape, generator=seeded(seed), dtype=D)
-            ends = [[*given], [*given]]
-            ends[0][place], ends[1][place] = given[place] + step * way, given[place] - step * way
-            wanted = float(mean(*ends[0]) - mean(*ends[1])) / (2 * step)
-            assert float((slope * way).sum()) == pytest.approx(wanted, rel=1e-5, abs=1e-7)
+    def by_layer(drive, theta, tau_s, tau_r):
+        options = FADING | {"kernel": "slayer", "theta": theta, "tau_s": tau_s, "tau_r": tau_r}
+        return (srm(drive, **options, gradient="mean")[0] * weights).sum()
+
+    found = []
+    for total in (by_layer, mean):
+        leaves = [x.clone().requires_grad_() for x in given]
+        found.append(torch.autograd.grad(total(*leaves), leaves))
+    for slope, wanted in zip(*found, strict=True):
+        torch.testing.assert_close(slope, wanted, rtol=1e-9, atol=1e-12)
 
 
 def test_pixels_of_a_batch_have_gradients_of_their_own():
@@ -190,18 +183,17 @@ def test_the_mean_points_to_where_hard_spikes_go(kernel):
     truth = sum(sixths(1.3 * wave, state=begun(k)) - sixths(0.7 * wave, state=begun(k)) for k in range(32))
     truth = (truth @ group / 32).flatten()
 
-    def cosine_and_scale(**options):
+    def beside_truth(**options):
         total = torch.zeros(6, 8, dtype=D)
         for contrast in (0.775, 0.925, 1.075, 1.225):
             drive = (contrast * wave).requires_grad_()
             for row, sums in enumerate(sixths(drive, **options).sum(1)):
                 (slope,) = torch.autograd.grad(sums, drive, retain_graph=True)
                 total[row] += 0.15 * (slope * wave).sum(0) @ group
-        found = total.flatten()
-        return found @ truth / (found.norm() * truth.norm()), found @ truth / (truth @ truth)
+        return cosine_and_scale(total.flatten(), truth)
 
-    found, scale = cosine_and_scale(gradient="mean")
-    other, _ = cosine_and_scale(surrogate=events.Triangular.unit(THETA), through_reset="bounded")
+    found, scale = beside_truth(gradient="mean")
+    other, _ = beside_truth(surrogate=events.Triangular.unit(THETA), through_reset="bounded")
     assert found > 0.985
     assert 1 - found < 0.75 * (1 - other)
     assert 0.9 < scale < 1.05

@@ -8,9 +8,8 @@ import torch
 
 from codesign.events import decay, from_counts, from_stream, surface_from_counts, surface_from_hard_counts
 from codesign.events.stream import ordered
-from codesign.events.volumes.surface import surface_from_stream, surface_from_times
-from codesign.events.volumes.traces import decay_from_stream
-from codesign.events.volumes.volume import spikes_from_counts, spikes_from_stream, stream_from_spikes
+from codesign.events.volumes.surface import decay_from_stream, surface_from_stream
+from codesign.events.volumes.volume import spikes_from_stream
 from tests.event_streams import random_stream, rows
 
 D = torch.float64
@@ -70,29 +69,17 @@ def test_the_window_of_a_stream_holds_both_ends_and_its_centroids_are_those_of_a
     torch.testing.assert_close(volume.centroid_s, truth, rtol=1e-14, atol=0)
 
 
-def test_spikes_are_events_per_step_and_go_back_exactly():
+def test_spikes_are_events_per_step():
     stream = random_stream(3000, 3, 4, 99_999, first_us=EPOCH_US)
     spikes = spikes_from_stream(stream, EPOCH_US, 1000, 100)
     truth = torch.zeros(2, 4, 3, 100)
     for t_us, x, y, p in rows(stream):
         truth[int(p < 0), x, y, (t_us - EPOCH_US) // 1000] = 1
     assert torch.equal(spikes, truth)
-    back = stream_from_spikes(spikes, EPOCH_US, 1000)
-    assert len(back) == int(spikes.sum())
-    assert set(((back.t_us - EPOCH_US) % 1000).tolist()) == {0}
-    assert torch.equal(spikes_from_stream(back, EPOCH_US, 1000, 100), spikes)
     # outside the steps; from 11 on one microsecond is too early
     few = at_one_pixel(9, 10, 29, 30)
     for first_us, steps, found in ((10, 2, [1, 1]), (20, 3, [1, 1, 0]), (11, 1, [0])):
         assert spikes_from_stream(few, first_us, 10, steps)[0, 0, 0].tolist() == found
-
-
-def test_spikes_of_counts_are_binary_for_whole_and_shares_for_soft_ones(generator):
-    counts = torch.tensor([[0.0, 1.0], [3.0, 0.25]])[:, None, :, None].expand(2, 2, 2, 1)
-    assert spikes_from_counts(counts)[:, 0].tolist() == [[[0, 1], [1, 0.25]]] * 2  # [2, W = 1, H = 2, T]
-    soft = (0.05 + 0.9 * torch.rand(3, 2, 2, 2, dtype=D, generator=generator)).requires_grad_()
-    assert torch.autograd.gradcheck(spikes_from_counts, (soft,))
-    assert not torch.autograd.grad(spikes_from_counts(soft + 1).sum(), soft)[0].any()
 
 
 def by_hand(stream, at_us, last_only):
@@ -122,24 +109,6 @@ def test_streams_give_surface_and_trace_as_defined_at_any_time(offset_us):
     late = part(stream, stream.t_us > cut_us)
     found = decay_from_stream(late, at_us[3:], TAU_S, start=(first, cut_us), dtype=D)
     torch.testing.assert_close(found, trace[3:], rtol=1e-12, atol=1e-14)
-    if offset_us == 0:  # real times in any order; seconds are rounded to 1e-17, of tau 1e-15
-        any_way = torch.randperm(400, generator=torch.Generator().manual_seed(1))
-        t_s, x, y, p = (one[any_way] for one in (stream.t_us.to(D) * 1e-6, stream.x, stream.y, stream.p))
-        found = surface_from_times(t_s, x, y, p, 3, 4, [1e-6 * t for t in at_us], TAU_S)
-        torch.testing.assert_close(found, surface, rtol=1e-13, atol=0)
-
-
-def test_gradient_to_times_is_that_of_the_last_event():
-    t_s = torch.tensor([0.001, 0.004, 0.002, 0.0055, 0.009], dtype=D, requires_grad=True)
-    x, p = torch.tensor([0, 0, 1, 1, 0]), torch.tensor([1, 1, -1, 1, 1])
-
-    def surface(times_s):
-        return surface_from_times(times_s, x, torch.zeros_like(x), p, 1, 2, [0.005, 0.006], TAU_S)
-
-    assert torch.autograd.gradcheck(surface, (t_s,))
-    (slopes,) = torch.autograd.grad(surface(t_s)[1].sum(), t_s)
-    truth = [math.exp(-since_s / TAU_S) / TAU_S for since_s in (math.inf, 0.002, 0.004, 0.0005, math.inf)]
-    torch.testing.assert_close(slopes, torch.tensor(truth, dtype=D), rtol=1e-12, atol=0)
 
 
 def test_whole_counts_give_the_surface_of_events_at_the_middles_of_their_intervals(generator):

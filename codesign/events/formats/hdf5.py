@@ -29,36 +29,9 @@ from codesign.reading import check_regular, reading
 LAST_T = 2**32 - 1
 MVSEC = "davis/left"
 EVENTS_PER_CHUNK = 2**17
+PACKING = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
 BLOCK = 2**20  # events that are read at once
 FINE = 4096  # events that are read to find one
-
-
-def to_dsec(stream):
-    """(arrays, attributes) that hold a stream; t_offset is the time of the first event.
-
-    Raises: FileFormatError for a stream longer than 2^32 us, because t has 32 bits, and for a sensor beyond
-      65536 x 65536.
-    """
-    t_us, x, y, p = columns(stream, "DSEC's layout", 2**16, -(2**61), 2**61)
-    offset_us = int(t_us[0]) if t_us.size else 0
-    t = t_us - offset_us
-    if t.size and int(t[-1]) > LAST_T:
-        raise FileFormatError(
-            f"the stream lasts {int(t[-1])} us; DSEC's times have 32 bits (71 minutes); split it or write "
-            ".npz instead."
-        )
-    milliseconds = np.arange(
-        int(t[-1]) // 1000 + 2 if t.size else 1, dtype=np.int64
-    )  # the last entry closes the last millisecond
-    arrays = {
-        "events/t": t.astype(np.uint32),
-        "events/x": x.astype(np.uint16),
-        "events/y": y.astype(np.uint16),
-        "events/p": (p > 0).astype(np.uint8),
-        "t_offset": np.array(offset_us, np.int64),
-        "ms_to_idx": np.searchsorted(t, milliseconds * 1000).astype(np.uint64),
-    }
-    return arrays, {"height_px": stream.height_px, "width_px": stream.width_px}
 
 
 def check_index(path, t, first, index):
@@ -188,19 +161,33 @@ def read_hdf5(path, asked):
 
 
 def write_hdf5(path, stream):
-    """Write events to ``path`` in DSEC's layout, with checksums."""
-    arrays, attributes = to_dsec(stream)
+    """Write events to ``path`` in DSEC's layout, with checksums; t_offset is the time of the first event.
+
+    Raises: FileFormatError for a stream longer than 2^32 us, because t has 32 bits, and for a sensor beyond
+      65536 x 65536.
+    """
+    t_us, x, y, p = columns(stream, "DSEC's layout", 2**16, -(2**61), 2**61)
+    offset_us = int(t_us[0]) if t_us.size else 0
+    t = t_us - offset_us
+    last_us = int(t[-1]) if t.size else -1000
+    if last_us > LAST_T:
+        raise FileFormatError(
+            f"the stream lasts {last_us} us; DSEC's times have 32 bits (71 minutes); split it or write "
+            ".npz instead."
+        )
+    # the last entry closes the last millisecond
+    milliseconds = np.arange(last_us // 1000 + 2, dtype=np.int64)
+    arrays = {
+        "events/t": t.astype(np.uint32),
+        "events/x": x.astype(np.uint16),
+        "events/y": y.astype(np.uint16),
+        "events/p": (p > 0).astype(np.uint8),
+        "t_offset": np.array(offset_us, np.int64),
+        "ms_to_idx": np.searchsorted(t, milliseconds * 1000).astype(np.uint64),
+    }
     # from 1.10 on, HDF5 keeps checksums of its own structure too
     with new_hdf5(path, libver=("v110", "v110")) as file:
         for name, array in arrays.items():
-            packing = {}
-            if array.size > 1:
-                packing = {
-                    "chunks": (min(len(array), EVENTS_PER_CHUNK),),
-                    "compression": "gzip",
-                    "compression_opts": 1,
-                    "shuffle": True,
-                    "fletcher32": True,
-                }
+            packing = PACKING | {"chunks": (min(len(array), EVENTS_PER_CHUNK),)} if array.size > 1 else {}
             file.create_dataset(name, data=array, **packing)
-        file["events"].attrs.update(attributes)
+        file["events"].attrs.update(height_px=stream.height_px, width_px=stream.width_px)

@@ -1,33 +1,36 @@
-"""The comparators of an event layer: from what a pixel sees to counts, all called alike.
+"""Event layers by name, and their comparators: from what a pixel sees to counts, all called alike.
 
-Each is a small object with ``comparator(frames, theta_on, theta_off, state, log_input) -> counts, state``:
-frames [T, ...] give counts [T-1, 2, ...], ON first, and with a state of an earlier call [T, 2, ...].
+A comparator is a small object with ``comparator(frames, theta_on, theta_off, state, log_input) -> counts, state``:
+frames [T, ...] on the 0-255 scale, or log levels with log_input, give counts [T-1, 2, ...], ON first, and with a
+state of an earlier call [T, 2, ...]. theta_on, theta_off: 0-dim or [...].
 ``mismatched`` says whether it takes the thresholds of every pixel, or the nominal ones. ``refines`` says
 whether it may be asked between frames, for the times of events: whether it counts the same events, or more of
 the sensor's, the more often it looks. Without it the events of an interval are spread evenly.
 ``whole`` says whether it counts whole events.
 """
 
+import difflib
 import warnings
 from collections.abc import Callable, Container, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Generator, Tensor
 
-from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import check_times, check_whole
+from codesign.errors import DomainError
+from codesign.events.entry import check_chunk, check_later, check_state, check_times, check_whole
 from codesign.events.intensity import log_levels
 from codesign.events.layers.layer import EventLayer
 from codesign.events.layers.memory import memory, soft_counts
+from codesign.events.layers.physical import PhysicalLayer
 from codesign.events.layers.soft import dense, expected, soft
 from codesign.events.low_pass import low_pass
 from codesign.events.sensor.model import (
     SensorModel,
     draw_deviates,
     draw_shot_counts,
-    mismatched,
+    of_pixels,
 )
 from codesign.events.spiking.srm import count_spikes
 
@@ -38,57 +41,32 @@ MOST_STEPS = 4096  # of spiking neurons per frame interval
 class LastDraw:
     """Remembers one draw: what was asked for, the generators' states before and behind it, and what came."""
 
-    def __init__(self) -> None:
-        self._asked: Any = None
-        self._before: list[Tensor] = []
-        self._behind: list[Tensor] = []
-        self._drawn: tuple[Tensor | None, ...] = ()
+    def __init__(self):
+        self._known = None
 
     def __deepcopy__(self, memo):
         return LastDraw()
 
-    def __call__(
-        self, asked: Any, generators: Sequence[Generator], draw: Callable[[], tuple[Tensor | None, ...]]
-    ) -> tuple[Tensor | None, ...]:
+    def __call__(self, asked, generators, draw):
         """What ``draw()`` returns, and the generators as it leaves them.
 
         Args: asked: all that the draw depends on but its generators, to be compared by ==. generators: in the
-          order in which they are drawn from, also several times. draw: without arguments; what it returns is
-          not changed afterwards.
+          order in which they are drawn from, also several times. draw: without arguments; what it returns, a tuple
+          of tensors or None, is not changed afterwards.
         """
         own = list(dict.fromkeys(generators))
         place = {generator: number for number, generator in enumerate(own)}
         asked = asked, [place[generator] for generator in generators]
         before = [generator.get_state() for generator in own]
-        if asked == self._asked and all(map(torch.equal, before, self._before)):
-            for generator, state in zip(own, self._behind, strict=True):
+        if self._known and self._known[0] == asked and all(map(torch.equal, before, self._known[1])):
+            _, _, behind, drawn = self._known
+            for generator, state in zip(own, behind, strict=True):
                 generator.set_state(state)
-            return self._drawn
+            return drawn
         drawn = draw()
-        if sum(0 if numbers is None else numbers.numel() for numbers in drawn) <= MOST_REMEMBERED:
-            self._asked = asked
-            self._before = before
-            self._behind = [generator.get_state() for generator in own]
-            self._drawn = drawn
+        if sum(numbers.numel() for numbers in drawn if numbers is not None) <= MOST_REMEMBERED:
+            self._known = asked, before, [generator.get_state() for generator in own], drawn
         return drawn
-
-
-class Comparator(Protocol):
-    """What ``ComparatorLayer`` calls. frames: [T, ...] on the 0-255 scale, or log levels with log_input;
-    theta_on, theta_off: 0-dim or [...]; state: what the call before returned, None at first."""
-
-    @property
-    def mismatched(self) -> bool: ...
-
-    @property
-    def refines(self) -> bool: ...
-
-    @property
-    def whole(self) -> bool: ...
-
-    def __call__(
-        self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Any, log_input: bool, /
-    ) -> tuple[Tensor, Any]: ...
 
 
 @dataclass
@@ -151,7 +129,7 @@ class Memory:
 @dataclass
 class Expected:
     """``events.expected``: mean counts under threshold mismatch. spread: relative standard deviation of the
-    thresholds, in place of a drawn one; assign to anneal it (see ``events.annealed``)."""
+    thresholds, in place of a drawn one; assign to anneal it."""
 
     spread: float = 0.15
     mismatched = False
@@ -267,7 +245,9 @@ class ComparatorLayer(EventLayer):
 
     learnable = ("theta_on", "theta_off", "theta_sigma", "cutoff_hz")
 
-    def __init__(self, comparator: Comparator, sensor: SensorModel | None = None, **options: Any):
+    def __init__(
+        self, comparator: Callable[..., tuple[Tensor, Any]], sensor: SensorModel | None = None, **options: Any
+    ):
         super().__init__(sensor, **options)
         check_comparator(comparator, self.sensor, self.learnt)
         self.comparator = comparator
@@ -276,29 +256,28 @@ class ComparatorLayer(EventLayer):
         self.whole = getattr(comparator, "whole", False)
 
     def _count(self, frames, t_s, state, generators):
-        if state is not None and not isinstance(state, LayerState):
-            raise DomainError(f"the state is a {type(state).__name__}; pass what this layer returned.")
-        if state is not None and state.kind is not type(self.comparator):
+        check_state(state, LayerState)
+        times_s = check_times(t_s, len(frames))
+        if state is None:
+            kept = (generators, frames.shape[1:], frames.dtype, type(self.comparator))
+            state = LayerState(None, None, None, None, 0.0, *kept)
+        elif state.kind is not type(self.comparator):
             raise DomainError(
                 f"the state comes from a layer with the comparator {state.kind.__name__}, this one has "
                 f"{type(self.comparator).__name__}; pass what this layer returned."
             )
-        if state is not None and state.level is None and self.sensor.cutoff_hz > 0:
+        elif state.level is None and self.sensor.cutoff_hz > 0:
             raise DomainError("the layer has a bandwidth, the one that began the state had not; begin anew.")
-        if state is not None and (state.shape, state.dtype) != (frames.shape[1:], frames.dtype):
-            raise ShapeError(
-                f"{frames.dtype} frames of {list(frames.shape[1:])} follow {state.dtype} frames of "
-                f"{list(state.shape)}; a sensor keeps its size and type, a batch its samples."
-            )
-        times_s = _times(frames, t_s, None if state is None else state.time_s)
-        if state is None:
-            kept = (generators, frames.shape[1:], frames.dtype, type(self.comparator))
-            state = LayerState(None, None, None, None, 0.0, *kept)
+        else:
+            check_chunk(frames, state.shape, state.dtype)
+            times_s = check_later(times_s, state.time_s)
         deviates, shots = self._noise(frames, times_s.diff(), state)
         seen, level = self._seen(frames, times_s.diff(), state)
-        on, off = (None, None) if deviates is None else deviates
-        theta_on = self._threshold("theta_on", frames, on)
-        theta_off = self._threshold("theta_off", frames, off)
+        drawn = (None, None) if deviates is None or not self.comparator.mismatched else deviates
+        theta_on, theta_off = (
+            of_pixels(self.value(name), self.value("theta_sigma"), deviate, frames)
+            for name, deviate in zip(("theta_on", "theta_off"), drawn, strict=True)
+        )
         is_level = self.log_input or level is not None
         counts, comparator = self.comparator(seen, theta_on, theta_off, state.comparator, is_level)
         if shots is not None:
@@ -346,22 +325,53 @@ class ComparatorLayer(EventLayer):
         level = low_pass(level, intensity, interval_s, self.value("cutoff_hz"), state.level)
         return level[-len(frames) :], level[-1]
 
-    def _threshold(self, name, frames, deviate):
-        theta = torch.as_tensor(self.value(name), dtype=frames.dtype, device=frames.device)
-        if deviate is None or not self.comparator.mismatched:
-            return theta
-        sigma = torch.as_tensor(self.value("theta_sigma"), dtype=frames.dtype, device=frames.device)
-        return mismatched(theta, sigma, deviate)
+
+COMPARATORS = {
+    "sigmoid": Sigmoid,
+    "counts": SoftCounts,
+    "dense": Dense,
+    "memory": Memory,
+    "expected": Expected,
+    "srm": Spikes,
+}
+LAYERS = (*COMPARATORS, "physical")
 
 
-def _times(frames, t_s, before_s):
-    """Times of the frames, and before them that of the last frame of the chunk before."""
-    times_s = check_times(t_s, len(frames))
-    if before_s is None:
-        return times_s
-    if float(times_s[0]) <= before_s:
+def layer(name: str = "memory", sensor: SensorModel | None = None, **options: Any) -> EventLayer:
+    """The event layer of that name, a module with learnable thresholds.
+
+    Args:
+      name: "sigmoid" (per frame pair, no memory: the baseline), "counts" (the same without cap or ghosts),
+        "dense" (comparator with surrogate, at most one event per frame), "memory" (memorised level,
+        straight-through counts: the default), "expected" (mean counts under threshold mismatch), "srm"
+        (spike response model, at most one event per frame), "physical" (the full sensor).
+      sensor: SensorModel to start from. options: learn, log_input (see ``EventLayer``), and spread of
+        "expected", sharpness of "sigmoid" and "dense", gradient ("play" or "surrogate") and steps (per frame
+        interval) of "srm".
+    Raises: DomainError for an unknown name, with the nearest one, an unknown option, or a value that cannot
+      be learnt. A warning names what the sensor has and the layer does not know (leak, dead time, ...).
+
+    Example:
+    >>> import torch
+    >>> from codesign import events
+    >>> sensor = events.layer("memory", events.SensorModel(theta_on=0.2, theta_off=0.3))
+    >>> frames = torch.tensor([40.0, 100.0, 30.0]).reshape(3, 1, 1)
+    >>> sensor(frames, torch.tensor([0.0, 0.01, 0.02])).flatten(1).tolist()  # ON: ln(100/40)/0.2
+    [[4.0, 0.0], [0.0, 3.0]]
+    """
+    if name not in LAYERS:
+        near = difflib.get_close_matches(str(name), LAYERS, n=1)
         raise DomainError(
-            f"the chunk starts at {float(times_s[0])!r} s, the last frame seen was at {before_s!r} s; times "
-            "must go on increasing."
+            f"there is no event layer {name!r}{f', did you mean {near[0]!r}?' if near else ''}; event layers "
+            f"are {', '.join(map(repr, LAYERS))}."
         )
-    return torch.cat((torch.tensor([before_s], dtype=torch.float64), times_s))
+    own = () if name == "physical" else tuple(field.name for field in fields(COMPARATORS[name]))
+    known = ("learn", "log_input", *own)
+    if unknown := [option for option in options if option not in known]:
+        raise DomainError(
+            f"the event layer {name!r} has no option {unknown[0]!r}; its options are {', '.join(known)}."
+        )
+    if name == "physical":
+        return PhysicalLayer(sensor, **options)
+    values = {option: options.pop(option) for option in own if option in options}
+    return ComparatorLayer(COMPARATORS[name](**values), sensor, **options)

@@ -20,8 +20,7 @@ from codesign.events.sensor.model import (
     check_sensor,
 )
 from codesign.events.sensor.simulate import simulate
-from codesign.events.volumes.surface import surface_from_counts, surface_from_hard_counts
-from codesign.events.volumes.traces import check_tau
+from codesign.events.volumes.surface import check_tau, surface_from_counts, surface_from_hard_counts
 from codesign.events.volumes.volume import check_bins, from_counts, from_stream
 from codesign.types import EventVolume
 
@@ -41,10 +40,6 @@ class PositiveValues(nn.Module):
 
     def __init__(self, start: Mapping[str, float]):
         super().__init__()
-        if not isinstance(start, Mapping):
-            raise DomainError(
-                f"start is {shown(start)}; values by name are needed, such as {{'tau_s': 0.01}}."
-            )
         start = {name: check_positive(value, name) for name, value in start.items()}
         zeros = [(name, nn.Parameter(torch.zeros((), dtype=torch.float64))) for name in start]
         self.raw = nn.ParameterDict(zeros)
@@ -53,7 +48,7 @@ class PositiveValues(nn.Module):
 
     def __getitem__(self, name: str) -> Tensor:
         """The value as it is now, a 0-dim float64 tensor. Gradient: its variable."""
-        if not isinstance(name, str) or name not in self.raw:
+        if name not in self.raw:
             raise DomainError(f"no value is called {shown(name)}; there are {', '.join(self.raw)}.")
         return getattr(self, f"start_{name}") * (STEP * self.raw[name]).exp()
 
@@ -175,13 +170,11 @@ class EventLayer(nn.Module):
             fine, times_s = finer(frames.movedim(-3, 0), t_s, longest_s, log_input=self.log_input)
             return self(fine.movedim(0, -3), times_s, generator), times_s
         counts = self(frames, t_s, generator)
-        interval, share, times_s = parts(
-            check_times(t_s, counts.shape[-4] + 1), longest_s, counts.select(-4, 0).numel()
-        )
+        given_s = check_times(t_s, frames.shape[-3])
+        interval, _, times_s = parts(given_s, longest_s, counts.select(-4, 0).numel())
         if len(interval) == counts.shape[-4]:
             return counts, times_s
-        alike = torch.bincount(interval)[interval]
-        alike = alike.to(counts).reshape(-1, 1, 1, 1)
+        alike = torch.bincount(interval)[interval].to(counts).reshape(-1, 1, 1, 1)
         return counts.index_select(-4, interval.to(counts.device)) / alike, times_s
 
     def volume(

@@ -31,15 +31,47 @@ youngest. Where a turn needs more, the pair with the least weight x distance is 
 threshold in use: mass is kept.
 """
 
-from codesign.events.layers.pixel_loop import Loop
+import torch
+
+from codesign.backend import frames_per_kernel
+from codesign.events.kernels import Lanes, beyond
 from codesign.exclusive import exclusive
 
 PAIRS = 4
 WIDTH = 6  # values of a pair
 TIE = 1e-5  # thresholds: a pixel on the brink has not fired yet
 MET = 1e-4  # thresholds: nearer pairs have met
-START = 0xFFFFFFFE  # in place of a frame
+# in place of a frame
+START = 0xFFFFFFFE
 NONE = 0xFFFFFFFF
+
+
+class Loop(Lanes):
+    """Frames, thresholds and the loop over time, in chunks."""
+
+    def __init__(self, frames, theta_on, theta_off):
+        super().__init__(frames, frames[0].numel())
+        self.frames = frames
+        self.theta_on, self.theta_off = (
+            self.load(theta if theta.numel() == 1 else theta.expand(frames.shape[1:]))
+            for theta in (theta_on, theta_off)
+        )
+        self.values = self.load(frames)
+
+    def __call__(self, step, carried, target):
+        """Carry values through step(index, value, *carried) for every frame; ``target`` is what the steps
+        write to."""
+        size = frames_per_kernel(self.width)
+
+        def body(index, *carried):
+            return step(index, self.at(self.values, index), *carried)
+
+        with self.dr.suspend_grad():
+            for first in range(0, len(self.frames), size):
+                end = min(first + size, len(self.frames))
+                carried = self.loop(self.opaque(first), self.opaque(end), body, *carried)
+                self.dr.eval(carried, target)
+        return carried
 
 
 @exclusive
@@ -47,17 +79,37 @@ def count(frames, start, theta_on, theta_off, front_end):
     """Counts [T, 2, ...] of frames [T, ...] from a start [2, ...] (memorised level, centre of the play); the
     state after them; whether a value may not enter."""
     loop = Loop(frames, theta_on, theta_off)
-    target = loop.fresh(2 * frames.numel())
+    dr = loop.dr
+    target = loop.fresh(2 * len(frames))
 
     def step(index, value, bad, reference, centre):
-        bad |= ~front_end.accepts(loop.dr, value)
-        level = front_end.traced(loop.dr, value)[0]
-        moved = loop.fire(target, index, level - reference)
-        return bad, reference + moved, loop.follow(level, centre)
+        level = front_end.traced(dr, value)[0]
+        difference = level - reference
+        rose = difference > 0
+        theta = dr.select(rose, loop.theta_on, loop.theta_off)
+        total = exact_floor(dr, dr.abs(difference), theta)
+        on = dr.select(rose, total, 0)
+        off = dr.select(rose, 0, total)
+        loop.put(target, on, 2 * index)
+        loop.put(target, off, 2 * index + 1)
+        rise, fall = beyond(dr, level, centre, loop.theta_on, loop.theta_off)
+        bad = bad | ~front_end.accepts(dr, value)
+        return bad, reference + (on - off) * theta, centre + (rise - fall)
 
-    begun = loop.dr.zeros(loop.arr.Bool, loop.width), loop.load(start[0]), loop.load(start[1])
-    bad, *after = loop(step, begun, target)
-    return loop.result(target, after, bad)
+    bad, *after = loop(step, (dr.zeros(loop.arr.Bool, loop.width), *loop.rows(start)), target)
+    bad = bool(dr.any(bad)[0])
+    dr.sync_thread()
+    pixels = frames.shape[1:]
+    counts = target.torch().reshape(len(frames), 2, *pixels)
+    return counts, torch.stack([loop.tensor(value, pixels) for value in after]), bad
+
+
+def exact_floor(dr, value, divisor):
+    """floor(value/divisor) of the two floats as they are, for value >= 0: a rounded quotient may reach the
+    next whole number too early."""
+    whole = dr.floor(value / divisor)
+    rest = dr.fma(-whole, divisor, value)
+    return dr.select(rest < 0, whole - 1, dr.select(rest >= divisor, whole + 1, whole))
 
 
 @exclusive
@@ -74,29 +126,20 @@ def play_adjoint(
     dr = loop.dr
     arr = loop.arr
     seed = loop.load(grad_counts)
-    offset = dr.opaque(arr.UInt32, first)
-    target = dr.zeros(arr.Float, (first + len(frames)) * loop.width)  # steps inside the play keep 0
-    dr.eval(target)
-    never = 0xFFFFFFFF
+    offset = loop.opaque(first)
+    target = loop.zeros(first + len(frames))  # steps inside the play keep 0
 
     def step(index, value, centre, pull, slope, engaged, anchor, grad_start, grad_on, grad_off, grad_width):
         level, now_slope = front_end.traced(dr, value)
-        rise, fall = loop.beyond(level, centre)
+        rise, fall = beyond(dr, level, centre, loop.theta_on, loop.theta_off)
         is_on = rise > 0
         is_off = fall > 0
         moves = is_on | is_off
-        place = 2 * index * loop.pixels + loop.lane
-        seed_on = dr.gather(arr.Float, seed, place, is_on) / loop.theta_on
-        seed_off = dr.gather(arr.Float, seed, place + loop.pixels, is_off) / loop.theta_off
-        now_pull = seed_on - seed_off  # play_adjoint of this level through this step's count
-        known = moves & (engaged != never)
-        dr.scatter(
-            target,
-            (pull - now_pull) * slope,
-            (engaged + offset) * loop.pixels + loop.lane,
-            active=known,
-            mode=dr.ReduceMode.NoConflicts,
-        )
+        seed_on = loop.at(seed, 2 * index, is_on) / loop.theta_on
+        seed_off = loop.at(seed, 2 * index + 1, is_off) / loop.theta_off
+        now_pull = seed_on - seed_off  # of this level through this step's count
+        known = moves & (engaged != NONE)
+        loop.put(target, (pull - now_pull) * slope, engaged + offset, known)
         grad_start = grad_start - dr.select(moves & ~known, now_pull, 0)
         if wants_thetas:
             grad_on = grad_on - seed_on * rise / loop.theta_on
@@ -115,27 +158,12 @@ def play_adjoint(
         return centre + (rise - fall), pull, slope, engaged, anchor, grad_start, grad_on, grad_off, grad_width
 
     zero = dr.zeros(arr.Float, loop.width)
-    begun = (
-        loop.load(start[1]),
-        zero,
-        zero,
-        dr.full(arr.UInt32, never, loop.width),
-        zero + 0.5,
-        zero,
-        zero,
-        zero,
-        zero,
-    )
+    never = dr.full(arr.UInt32, NONE, loop.width)
+    begun = (loop.load(start[1]), zero, zero, never, zero + 0.5, *[zero] * 4)
     _, pull, slope, engaged, anchor, grad_start, grad_on, grad_off, grad_width = loop(step, begun, target)
     end = loop.load(grad_end)
-    known = engaged != never
-    dr.scatter(
-        target,
-        (pull + end) * slope,
-        (engaged + offset) * loop.pixels + loop.lane,
-        active=known,
-        mode=dr.ReduceMode.NoConflicts,
-    )
+    known = engaged != NONE
+    loop.put(target, (pull + end) * slope, engaged + offset, known)
     grad_start = grad_start + dr.select(known, 0, end)
     grad_width = grad_width + end * (anchor - 0.5)
     dr.eval(target, grad_start, grad_on, grad_off, grad_width)
@@ -152,32 +180,29 @@ def turns_adjoint(frames, start, theta_on, theta_off, front_end, grad_counts, gr
     """Gradients of the frames [first + T, ...] (rows before ``first`` are left to the caller) and of the
     place of the box that the pixels begin in, [...].
 
-    Args: as for ``memory_kernel.turns_adjoint``; the box lies from centre - theta_on/2 to centre +
+    Args: as for ``play_adjoint``; the box lies from centre - theta_on/2 to centre +
       theta_off/2.
     """
     loop = Loop(frames, theta_on, theta_off)
     dr = loop.dr
     arr = loop.arr
     seed = loop.load(grad_counts)
-    offset = dr.opaque(arr.UInt32, first)
-    target = dr.zeros(arr.Float, (first + len(frames)) * loop.width)
-    dr.eval(target)
+    offset = loop.opaque(first)
+    target = loop.zeros(first + len(frames))
     share = 2 / (loop.theta_on + loop.theta_off)  # of a pixel per level, in the box
 
     def emit(frame, grad, grad_start):
-        place = (frame + offset) * loop.pixels + loop.lane
-        dr.scatter(target, grad * share, place, active=frame < START, mode=dr.ReduceMode.NoConflicts)
+        loop.put(target, grad * share, frame + offset, frame < START)
         return dr.select(frame == START, grad * share, grad_start)
 
     def step(index, value, grad_start, before, *slots):
         level, slope = front_end.traced(dr, value)
         pairs = _Pairs(loop, level, before, slots)
-        place = 2 * index * loop.pixels + loop.lane + dr.select(pairs.rises, 0, loop.pixels)
-        pairs.walk(dr.gather(arr.Float, seed, place))
+        pairs.walk(loop.at(seed, 2 * index + dr.select(pairs.rises, loop.arr.UInt32(0), 1)))
         grad_start = emit(*pairs.renew(index, slope()), grad_start)
         return grad_start, level, *pairs.joined()
 
-    reference, centre = loop.load(start[0]), loop.load(start[1])
+    reference, centre = loop.rows(start)
     zero = dr.zeros(arr.Float, loop.width)
     none = dr.full(arr.UInt32, NONE, loop.width)
     box = (centre + loop.theta_off / 2, centre - loop.theta_on / 2, zero + 1, zero, zero + 1)

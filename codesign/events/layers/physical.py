@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import Times, check_frames, check_times
+from codesign.errors import ShapeError
+from codesign.events.entry import Times, check_frames, check_later, check_state, check_times
 from codesign.events.intensity import FrontEnd
 from codesign.events.layers import dead_time
 from codesign.events.layers.layer import EventLayer
@@ -17,7 +17,7 @@ from codesign.events.low_pass import low_pass
 from codesign.events.sensor.model import (
     DESIGN,
     SensorModel,
-    mismatched,
+    of_pixels,
     with_design,
 )
 from codesign.events.sensor.simulate import dense_counts
@@ -80,8 +80,7 @@ def sensor_counts(
     Raises: DomainError for other names in ``design`` (they have no gradient) or values outside the sensor's
       domain, or a dead time that its gradient cannot follow over thousands of intervals; and as ``simulate``.
     """
-    if state is not None and not isinstance(state, PhysicalState):
-        raise DomainError(f"the state is a {type(state).__name__}; pass what sensor_counts returned.")
+    check_state(state, PhysicalState)
     front_end = FrontEnd(log_input)
     hard_sensor = with_design(sensor, design)
     value: dict[str, Any] = {name: design.get(name, getattr(sensor, name)) for name in DESIGN}
@@ -91,50 +90,29 @@ def sensor_counts(
     hard = dense_counts(frames, t_s, hard_sensor, state=hard_state, log_input=log_input)
     if state is not None:
         frames = torch.cat((state.frame[None], frames))
-        times_s = torch.cat((torch.tensor([state.time_s], dtype=torch.float64), times_s))
+        times_s = check_later(times_s, state.time_s)
     interval_s = times_s.diff()
     level = front_end.level(frames)
     if hard_sensor.cutoff_hz > 0:
-        level = low_pass(
-            level,
-            frames.exp() if log_input else frames,
-            interval_s,
-            value["cutoff_hz"],
-            None if state is None else state.level,
-        )
+        light = frames.exp() if log_input else frames
+        start = None if state is None else state.level
+        level = low_pass(level, light, interval_s, value["cutoff_hz"], start)
+    scatters = hard_sensor.theta_sigma > 0
+    deviates = (hard_state.deviate_on, hard_state.deviate_off) if scatters else (None, None)
     thetas = [
-        _drawn(value[name], value["theta_sigma"] if hard_sensor.theta_sigma > 0 else None, deviate, level)
-        for name, deviate in (("theta_on", hard_state.deviate_on), ("theta_off", hard_state.deviate_off))
+        of_pixels(value[name], value["theta_sigma"], deviate, level)
+        for name, deviate in zip(("theta_on", "theta_off"), deviates, strict=True)
     ]
     seen = level
     if hard_state.leak_hz is not None:  # a memorised level that falls is a signal that rises
-        seen = level + (
-            (times_s - times_s[0]).to(level).reshape(-1, *[1] * (level.ndim - 1))
-            * hard_state.leak_hz
-            * thetas[0]
-        )
+        since_s = (times_s - times_s[0]).to(level).reshape(-1, *[1] * (level.ndim - 1))
+        seen = level + since_s * hard_state.leak_hz * thetas[0]
     dead = value["refractory_s"] if hard_sensor.refractory_s > 0 else None
     smooth, reference, dead_state = _mean_counts(seen, thetas, interval_s, dead, state)
     counts = hard + (smooth - smooth.detach())
     ramp = (seen[-1] - level[-1]).detach()
-    return counts, PhysicalState(
-        hard_state,
-        reference - ramp,
-        level[-1],
-        frames[-1],
-        float(times_s[-1]),
-        dead_state,
-    )
-
-
-def _drawn(theta, sigma, deviate, level):
-    """Thresholds of every pixel as a function of their mean and spread; None: no spread."""
-    theta = torch.as_tensor(theta, dtype=level.dtype, device=level.device)
-    if sigma is None:
-        return theta
-    return mismatched(
-        theta, torch.as_tensor(sigma, dtype=level.dtype, device=level.device), deviate.to(level)
-    )
+    after = hard_state, reference - ramp, level[-1], frames[-1], float(times_s[-1]), dead_state
+    return counts, PhysicalState(*after)
 
 
 def _mean_counts(seen, thetas, interval_s, refractory_s, state):
@@ -142,9 +120,9 @@ def _mean_counts(seen, thetas, interval_s, refractory_s, state):
     2, ...]; the states of ``memory`` and of the dead time after them."""
     start = seen[0] if state is None else state.reference
     slopes = [seen, start, *thetas, refractory_s]
-    if not (torch.is_grad_enabled() and any(isinstance(x, Tensor) and x.requires_grad for x in slopes)):
-        refractory_s = None  # the values are the hard sensor's: nobody asks for what the mean passes
-    if refractory_s is None:
+    asked = torch.is_grad_enabled() and any(isinstance(x, Tensor) and x.requires_grad for x in slopes)
+    # without gradients the values are the hard sensor's: nobody asks for what the mean passes
+    if refractory_s is None or not asked:
         return *memory(seen[1:], *thetas, state=start, log_input=True), None
     dead_time.warn_beyond(seen, thetas, interval_s, refractory_s)
     dead_s = float(torch.as_tensor(refractory_s).detach())
@@ -167,30 +145,16 @@ class PhysicalLayer(EventLayer):
 
     def _count(self, frames, t_s, state, generators):
         samples = frames.reshape(len(frames), -1, *frames.shape[-2:]).unbind(1)
-        if state is not None and not (
-            isinstance(state, tuple) and all(isinstance(before, PhysicalState) for before in state)
-        ):
-            raise DomainError(f"the state is a {type(state).__name__}; pass what this layer returned.")
+        check_state(state, tuple)
         if state is not None and len(state) != len(samples):
             raise ShapeError(
                 f"{len(samples)} samples follow {len(state)}; a batch keeps its samples over the chunks."
             )
-        design = {name: self.value(name) for name in self.learnt}
-        counts, states = zip(
-            *(
-                sensor_counts(
-                    sample,
-                    t_s,
-                    self.sensor,
-                    generator=generator,
-                    state=before,
-                    log_input=self.log_input,
-                    **design,
-                )
-                for sample, generator, before in zip(
-                    samples, generators, state or [None] * len(samples), strict=True
-                )
-            ),
-            strict=True,
-        )
+        befores = state or [None] * len(samples)
+        options = {"log_input": self.log_input, **{name: self.value(name) for name in self.learnt}}
+        found = [
+            sensor_counts(sample, t_s, self.sensor, generator=generator, state=before, **options)
+            for sample, generator, before in zip(samples, generators, befores, strict=True)
+        ]
+        counts, states = zip(*found, strict=True)
         return torch.stack(counts, 2).reshape(-1, 2, *frames.shape[1:]), states

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from codesign.errors import DomainError, as_number
-from codesign.events.entry import check_level, check_per_pixel, check_positive, check_whole
+from codesign.events.entry import check_level, check_per_pixel, check_positive
 from codesign.events.intensity import log_levels
 
 GHOST_LOGIT = -5.0  # a pixel without change fires sigmoid(-5) = 0.67 % of an event per polarity and frame
@@ -75,22 +75,28 @@ def dense(
     Raises: ShapeError, DomainError as ``memory``.
     Source: comparator surrogate: Zenke and Ganguli 2018 (fast sigmoid).
     """
+    check_positive(sharpness, "sharpness")
+
+    def step(difference, theta_on, theta_off):
+        on = _Step.apply(difference / theta_on - 1, sharpness)
+        off = _Step.apply(-difference / theta_off - 1, sharpness)
+        return (on, off), (on + off) * difference
+
+    return _memorised(frames, theta_on, theta_off, state, log_input, step)
+
+
+def _memorised(frames, theta_on, theta_off, state, log_input, step):
+    """Counts and the memorised level after them; step(way from the memorised level, theta_on, theta_off) gives
+    both counts and what the memorised level moves by."""
     level = log_levels(frames, log_input, minimum=2 if state is None else 1)
     theta_on = check_per_pixel(theta_on, "theta_on", level)
     theta_off = check_per_pixel(theta_off, "theta_off", level)
-    check_positive(sharpness, "sharpness")
     reference = level[0] if state is None else check_level(state, level)
     counts = []
     for now in level[1:] if state is None else level:
-        difference = now - reference
-        fired = torch.stack(
-            (
-                _Step.apply(difference / theta_on - 1, sharpness),
-                _Step.apply(-difference / theta_off - 1, sharpness),
-            )
-        )
-        reference = reference + (fired[0] + fired[1]) * difference
-        counts.append(fired)
+        pair, moved = step(now - reference, theta_on, theta_off)
+        reference = reference + moved
+        counts.append(torch.stack(pair))
     return torch.stack(counts), reference
 
 
@@ -125,37 +131,25 @@ def expected(
     Args:
       frames: [T, ...] linear intensity on the 0-255 scale, or log levels with ``log_input``. theta_on,
         theta_off: median thresholds > 0, scalar or broadcasting over one frame. spread: s, relative standard
-        deviation (sigma/theta), 0.01 to 1; see ``annealed``. state: [...] as for ``memory``.
+        deviation (sigma/theta), 0.01 to 1. state: [...] as for ``memory``.
     Returns: counts [T-1, 2, ...] >= 0 ([T, 2, ...] with a state), ON first; state [...].
     Gradient: frames, thetas, spread, state: exact, smooth for D other than 0, where all derivatives vanish.
     Raises: ShapeError, DomainError as ``memory``, and for a spread outside its range.
     """
-    level = log_levels(frames, log_input, minimum=2 if state is None else 1)
-    theta_on = check_per_pixel(theta_on, "theta_on", level)
-    theta_off = check_per_pixel(theta_off, "theta_off", level)
     number = spread.detach() if isinstance(spread, Tensor) else spread
     if not LEAST_SPREAD <= as_number(number, "spread") <= MOST_SPREAD:
         raise DomainError(
             f"spread is {float(number)!r}; one relative standard deviation from {LEAST_SPREAD:g} to "
             f"{MOST_SPREAD:g} is needed (0.15 is typical)."
         )
-    spread = torch.as_tensor(spread, dtype=level.dtype, device=level.device)
-    reference = level[0] if state is None else check_level(state, level)
-    counts = []
-    for now in level[1:] if state is None else level:
-        on, on_move = _mean_count((now - reference).clamp(min=0), theta_on, spread)
-        off, off_move = _mean_count((reference - now).clamp(min=0), theta_off, spread)
-        reference = reference + on_move - off_move
-        counts.append(torch.stack((on, off)))
-    return torch.stack(counts), reference
 
+    def step(difference, theta_on, theta_off):
+        scatter = torch.as_tensor(spread, dtype=difference.dtype, device=difference.device)
+        on, rise = _mean_count(difference.clamp(min=0), theta_on, scatter)
+        off, fall = _mean_count((-difference).clamp(min=0), theta_off, scatter)
+        return (on, off), rise - fall
 
-def annealed(step: int, steps: int, first: float = 0.5, last: float = 0.02) -> float:
-    """Spread at a step of an optimisation, falling geometrically from ``first`` at step 0 to ``last`` at the
-    end. Raises: DomainError for what is no finite number, or a spread that is not positive."""
-    first, last = check_positive(first, "first"), check_positive(last, "last")
-    step, steps = check_whole(step, "step"), check_whole(steps, "steps")
-    return first * (last / first) ** (min(max(step, 0), steps) / max(steps, 1))
+    return _memorised(frames, theta_on, theta_off, state, log_input, step)
 
 
 def _mean_count(distance, theta, spread):

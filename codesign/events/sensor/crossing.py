@@ -7,8 +7,8 @@ interval lie on one side. Noise events are a Poisson process in continuous time:
 that must still pass until its next one, so nothing depends on the frame rate or on chunks, and nothing is
 drawn in vain.
 
-A sink is where events go, sortable 64-bit keys or dense counts per frame interval. It gives ``tally`` (what
-it carries through the events of one interval of a pixel), ``take`` (one event), ``close`` (the end of the
+A sink is where events go, sortable 64-bit keys or dense counts per frame interval, of a ``Lanes``. It gives ``tally``
+(what it carries through the events of one interval of a pixel), ``take`` (one event), ``close`` (the end of the
 interval) and ``arrays`` (what to evaluate). Random numbers are hashes of a key per pixel and a counter,
 without a state, so that chunks and threads change nothing.
 """
@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from codesign import backend
+from codesign.backend import load
 from codesign.events.intensity import light_share
 from codesign.events.low_pass import coefficients, passed
 
@@ -38,7 +38,7 @@ CARRIED = (
 )  # what changes from frame to frame
 
 
-def hashed(dr, bits):
+def hashed(bits):
     """32 well-mixed bits of 32 bits; one to one. Source: C. Wellons, "Prospecting for Hash Functions"
     (triple32, bias 0.02 of ideal)."""
     bits = (bits ^ (bits >> 17)) * 0xED5AD4BB
@@ -59,8 +59,8 @@ def exponential(dr, arr, bits):
 
 def normal_pair(dr, arr, bits):
     """Two independent standard normal numbers of 32 bits (Box and Muller, 1958)."""
-    radius = dr.sqrt(2 * exponential(dr, arr, hashed(dr, bits)))
-    sine, cosine = dr.sincos((2 * math.pi) * uniform(arr, hashed(dr, bits + 0x9E3779B9)))
+    radius = dr.sqrt(2 * exponential(dr, arr, hashed(bits)))
+    sine, cosine = dr.sincos((2 * math.pi) * uniform(arr, hashed(bits + 0x9E3779B9)))
     return radius * cosine, radius * sine
 
 
@@ -68,59 +68,45 @@ class EventKeys:
     """Events as integers that sort by (t, y, x, p): microseconds since an origin, row, column, polarity, from
     high to low bits."""
 
-    def __init__(self, dr, arr, start_s, end_s, layout, capacity):
+    def __init__(self, lanes, start_s, end_s, layout, capacity):
         """Args: start_s, end_s: lists, ends of every interval, seconds. layout: KeyLayout. capacity: room for
         so many events; ``found`` tells how many there were."""
-        start_us, end_us = ([round(time_s * 1e6) for time_s in times] for times in (start_s, end_s))
-        length_us = [(end - start) * 1e6 for start, end in zip(start_s, end_s, strict=True)]
+        dr, Float = lanes.dr, lanes.arr.Float
+        start_s, end_s = np.array(start_s), np.array(end_s)
+        start_us, end_us = (np.array([round(time_s * 1e6) for time_s in times]) for times in (start_s, end_s))
+        length_us = (end_s - start_s) * 1e6
         # single precision resolves a microsecond of intervals up to a second to better than a tenth
-        self._Time = arr.Float if max(length_us) <= 1e6 else dr.float64_array_t(arr.Float)
-        self._Key = dr.uint64_array_t(arr.Float)
-        self._length_us = self._Time(np.array(length_us))
-        self._fraction_us = self._Time(
-            np.array([time_s * 1e6 - us for time_s, us in zip(start_s, start_us, strict=True)])
-        )
-        self._span_us = self._Time(
-            np.array([end - start for start, end in zip(start_us, end_us, strict=True)], np.float64)
-        )
-        self._start = self._Key(
-            np.array([us - layout.origin_us for us in start_us], np.uint64) << np.uint64(layout.pixel_bits)
-        )
+        self._Time = Float if length_us.max() <= 1e6 else dr.float64_array_t(Float)
+        self._Key = dr.uint64_array_t(Float)
+        self._lanes = lanes
+        # of every interval: its length, the fraction of a microsecond that it starts with, whole ones to its end
+        spans = length_us, start_s * 1e6 - start_us, (end_us - start_us).astype(np.float64)
+        self._spans = [self._Time(span) for span in spans]
+        first = (start_us - layout.origin_us).astype(np.uint64)
+        self._start = self._Key(first << np.uint64(layout.pixel_bits))
         self._pixel = self._Key(layout.pixels())
         self._bits = layout.pixel_bits
         self.capacity = capacity
         self._keys = dr.empty(self._Key, capacity)
-        self._count = dr.zeros(arr.UInt32, 1)
-        dr.eval(
-            self._length_us,
-            self._fraction_us,
-            self._span_us,
-            self._start,
-            self._pixel,
-            self._keys,
-            self._count,
-        )
+        self._count = dr.zeros(lanes.arr.UInt32, 1)
+        dr.eval(self._spans, self._start, self._pixel, self._keys, self._count)
 
-    def tally(self, dr, arr):
-        return arr.UInt32(0)
+    def tally(self):
+        return self._lanes.arr.UInt32(0)
 
-    def take(self, dr, arr, index, when, on, kept, tally):
-        length, fraction, span, start = (
-            dr.gather(type(table), table, index)
-            for table in (self._length_us, self._fraction_us, self._span_us, self._start)
-        )
+    def take(self, index, when, on, kept, tally):
+        dr, UInt32 = self._lanes.dr, self._lanes.arr.UInt32
+        length, fraction, span = (dr.gather(self._Time, table, index) for table in self._spans)
         # after the start, so that rounding moves no event to the interval before
         since_us = dr.clip(dr.round(self._Time(when) * length + fraction), dr.minimum(span, 1), span)
-        key = (
-            (start + (self._Key(since_us) << self._bits))
-            | self._pixel
-            | self._Key(dr.select(on, arr.UInt32(1), 0))
-        )
-        slot = dr.scatter_inc(self._count, arr.UInt32(0), active=kept)
+        start = dr.gather(self._Key, self._start, index)
+        key = (start + (self._Key(since_us) << self._bits)) | self._pixel
+        slot = dr.scatter_inc(self._count, UInt32(0), active=kept)
+        key = key | self._Key(dr.select(on, UInt32(1), 0))
         dr.scatter(self._keys, key, slot, active=kept & (slot < self.capacity))
         return tally
 
-    def close(self, dr, arr, index, lane, tally):
+    def close(self, index, tally):
         pass
 
     def arrays(self):
@@ -174,22 +160,20 @@ class KeyLayout:
 class DenseCounts:
     """Counts [T, 2, ...] per interval, ON first."""
 
-    def __init__(self, dr, arr, intervals, pixels):
-        self._counts = dr.empty(arr.Float, intervals * 2 * pixels)
-        self._pixels = dr.opaque(arr.UInt32, pixels)
+    def __init__(self, lanes, intervals):
+        self._lanes = lanes
+        self._counts = lanes.dr.empty(lanes.arr.Float, 2 * intervals * lanes.width)
 
-    def tally(self, dr, arr):
-        return arr.Float(0), arr.Float(0)
+    def tally(self):
+        return [self._lanes.arr.Float(0)] * 2
 
-    def take(self, dr, arr, index, when, on, kept, tally):
-        return tally[0] + dr.select(kept & on, arr.Float(1), 0), tally[1] + dr.select(
-            kept & ~on, arr.Float(1), 0
-        )
+    def take(self, index, when, on, kept, tally):
+        one, select = self._lanes.arr.Float(1), self._lanes.dr.select
+        return [total + select(kept & way, one, 0) for total, way in zip(tally, (on, ~on), strict=True)]
 
-    def close(self, dr, arr, index, lane, tally):
-        place = 2 * index * self._pixels + lane
-        dr.scatter(self._counts, tally[0], place, mode=dr.ReduceMode.NoConflicts)
-        dr.scatter(self._counts, tally[1], place + self._pixels, mode=dr.ReduceMode.NoConflicts)
+    def close(self, index, tally):
+        for k, total in enumerate(tally):
+            self._lanes.put(self._counts, total, 2 * index + k)
 
     def arrays(self):
         return (self._counts,)
@@ -199,62 +183,49 @@ class DenseCounts:
         return self._counts.torch().reshape(shape)
 
 
-def run(frames, front_end, dt_s, interval_key, sensor, state, sink):
+def run(lanes, frames, front_end, dt_s, interval_key, sensor, state, sink):
     """Run the sensor over a chunk.
 
-    Args: frames: [T, ...] float32 or float64, not yet checked. front_end: FrontEnd. dt_s: [T] length of the
-      interval that ends with each frame.
+    Args: lanes: of a frame's pixels. frames: [T, ...] float32 or float64, not yet checked. front_end: FrontEnd.
+      dt_s: [T] length of the interval that ends with each frame.
       interval_key: [T] int32, random. sensor: SensorModel. state: SensorState (read only).
-      sink: ``EventKeys`` or ``DenseCounts``; takes every event.
+      sink: ``EventKeys`` or ``DenseCounts`` of the lanes; takes every event.
     Returns: dict of the carried tensors after the chunk; what was wrong: 0 nothing, 1 a value that is not
       finite or negative, 2 a pixel with more than ``MOST_EVENTS`` events in an interval (then everything else
       is void).
     """
-    import drjit as dr
-
-    arr = backend.arrays(frames.device.type, frames.dtype)
-    count = frames[0].numel()
-    lane = dr.arange(arr.UInt32, count)
-    pixels = dr.opaque(arr.UInt32, count)
+    dr, arr = lanes.dr, lanes.arr
     names = [name for name in CARRIED if getattr(state, name) is not None]
-    carried = [_load(arr, getattr(state, name)) for name in names]
-    step = _Step(dr, arr, front_end, dt_s, interval_key, sensor, state, sink, lane)
-    values = _load(arr, frames)
-    end = dr.opaque(arr.UInt32, len(frames))
-    dr.eval(values, carried, step.held)
+    carried = [_load(lanes, getattr(state, name)) for name in names]
+    step = _Step(lanes, front_end, dt_s, interval_key, sensor, state, sink)
+    values = lanes.load(frames)
 
     def body(index, bad, busy, *carried):
-        value = dr.gather(arr.Float, values, index * pixels + lane)
+        value = lanes.at(values, index)
         fits = front_end.accepts(dr, value)
-        after, too_many = step(
-            index, dr.select(fits, value, 1), dict(zip(names, carried, strict=True))
-        )  # an infinite level would fire without end
-        return index + 1, bad | ~fits, busy | too_many, *(after[name] for name in names)
+        # an infinite level would fire without end
+        after, too_many = step(index, dr.select(fits, value, 1), dict(zip(names, carried, strict=True)))
+        return bad | ~fits, busy | too_many, *(after[name] for name in names)
 
     with dr.suspend_grad():
-        none = dr.zeros(arr.Bool, count)
-        _, bad, busy, *carried = dr.while_loop(
-            (dr.zeros(arr.UInt32, count), none, none, *carried),
-            lambda index, *_: index < end,
-            body,
-            mode="symbolic",
-        )
+        none = dr.zeros(arr.Bool, lanes.width)
+        bad, busy, *carried = lanes.loop(0, lanes.opaque(len(frames)), body, none, none, *carried)
         wrong = dr.max(dr.select(bad, arr.UInt32(1), dr.select(busy, arr.UInt32(2), 0)))
         dr.eval(carried, wrong, sink.arrays())
     dr.sync_thread()
-    return {
-        name: _unload(arr, value, getattr(state, name)) for name, value in zip(names, carried, strict=True)
-    }, int(wrong[0])
+    after = {}
+    for name, value in zip(names, carried, strict=True):
+        like = getattr(state, name)
+        after[name] = lanes.tensor(arr.Int32(value) if like.dtype == torch.int32 else value, like.shape)
+    return after, int(wrong[0])
 
 
-def _load(arr, tensor):
-    if tensor.dtype == torch.int32:
-        return arr.UInt32(backend.load(arr.Int32, tensor))
-    return backend.load(arr.Float, tensor)
-
-
-def _unload(arr, value, like):
-    return (arr.Int32(value) if like.dtype == torch.int32 else value).torch().reshape(like.shape).clone()
+def _load(lanes, tensor):
+    if tensor.dtype != torch.int32:
+        return lanes.load(tensor)
+    bits = lanes.arr.UInt32(load(lanes.arr.Int32, tensor))
+    lanes.dr.eval(bits)
+    return bits
 
 
 def exact_sum(first, second):
@@ -275,41 +246,30 @@ class _Step:
     """One frame of one pixel, as drjit operations. Built once per chunk; every number that changes between
     chunks is opaque or in memory."""
 
-    def __init__(self, dr, arr, front_end, dt_s, interval_key, sensor, state, sink, lane):
-        self.dr = dr
-        self.arr = arr
+    def __init__(self, lanes, front_end, dt_s, interval_key, sensor, state, sink):
+        self.lanes = lanes
+        self.dr = lanes.dr
+        self.arr = lanes.arr
         self.front_end = front_end
         self.sensor = sensor
         self.sink = sink
-        self.lane = lane
 
         def opaque(value):
-            return dr.opaque(arr.Float, value)
+            return lanes.dr.opaque(lanes.arr.Float, value)
 
-        drawn = (
-            _load(arr, theta.expand(state.reference.shape)) for theta in (state.theta_on, state.theta_off)
-        )
-        self.theta_on, self.theta_off = (
-            drawn if sensor.theta_sigma > 0 else (opaque(sensor.theta_on), opaque(sensor.theta_off))
-        )
-        self.dt_s = _load(arr, dt_s.to(state.reference))
-        self.interval_key = _load(arr, interval_key)
-        self.leak_hz = None if state.leak_hz is None else _load(arr, state.leak_hz)
-        self.key = None if state.key is None else _load(arr, state.key)
+        self.nominal = opaque(sensor.theta_on), opaque(sensor.theta_off)
+        self.thetas = self.nominal
+        if sensor.theta_sigma > 0:
+            self.thetas = [_load(lanes, theta) for theta in (state.theta_on, state.theta_off)]
+        self.dt_s = _load(lanes, dt_s.to(state.reference))
+        self.interval_key = _load(lanes, interval_key)
+        self.leak_hz = None if state.leak_hz is None else _load(lanes, state.leak_hz)
+        self.key = None if state.key is None else _load(lanes, state.key)
         self.omega = opaque(2 * math.pi * sensor.cutoff_hz)
         self.jitter = opaque(sensor.leak_jitter)
         self.refractory_s = opaque(sensor.refractory_s)
         self.noise_level = opaque(sensor.noise_level())
         self.half_rate_hz = opaque(sensor.shot_rate_hz / 2)
-        self.nominal = opaque(sensor.theta_on), opaque(sensor.theta_off)
-        self.jitters = sensor.leaks and sensor.leak_jitter > 0
-        self.held = [
-            self.theta_on,
-            self.theta_off,
-            self.dt_s,
-            self.interval_key,
-            *(x for x in (self.leak_hz, self.key) if x is not None),
-        ]
 
     def __call__(self, index, value, now):
         dr = self.dr
@@ -332,7 +292,7 @@ class _Step:
             now["input_level"] = level
         gauss = (
             normal_pair(dr, self.arr, self.key ^ dr.gather(self.arr.UInt32, self.interval_key, index))
-            if self.jitters or sensor.photoreceptor_noise
+            if sensor.leak_jitters or sensor.photoreceptor_noise
             else (0.0, 0.0)
         )
         signal = now["level"]
@@ -346,7 +306,7 @@ class _Step:
         start = (before - base) - rest
         if self.leak_hz is not None:  # per frame it may be less than the last digit of the memorised level
             rise = self.leak_hz * dt_s
-            leak = (rise * (1 - self.jitter * gauss[1]) if self.jitters else rise) * self.theta_on
+            leak = (rise * (1 - self.jitter * gauss[1]) if sensor.leak_jitters else rise) * self.thetas[0]
             base, now["reference_rest"] = exact_sum(base, rest - leak)
         return now, self._fire(index, dt_s, light, start, signal, base, now)
 
@@ -360,6 +320,7 @@ class _Step:
         dr = self.dr
         arr = self.arr
         sensor = self.sensor
+        theta_on, theta_off = self.thetas
         dead = "last_event_s" in now
         shots = sensor.has_shots
         last_s = now.get("last_event_s", arr.Float(0))
@@ -368,13 +329,11 @@ class _Step:
             share = 1 - 0.75 * dr.minimum(light, 1)
             on_pace, off_pace = (
                 share * self.half_rate_hz * dt_s * nominal / theta
-                for nominal, theta in zip(self.nominal, (self.theta_on, self.theta_off), strict=True)
+                for nominal, theta in zip(self.nominal, self.thetas, strict=True)
             )
             pace = on_pace + off_pace
         end = signal - base
-        too_many = (dr.abs(end) > MOST_EVENTS * dr.minimum(self.theta_on, self.theta_off)) | (
-            pace > MOST_EVENTS
-        )
+        too_many = (dr.abs(end) > MOST_EVENTS * dr.minimum(*self.thetas)) | (pace > MOST_EVENTS)
         end = dr.select(too_many, 0, end)
         pace = dr.select(too_many, 0, pace)
         rest = now["reference_rest"]
@@ -384,26 +343,26 @@ class _Step:
         drawn = now.get("shots", arr.UInt32(0))
 
         def going(nth, start, base, end, rising, last_s, tally, hazard, drawn):
-            more = reaches(dr, dr.abs(end), dr.select(rising, self.theta_on, self.theta_off), nth + 1)
+            more = reaches(dr, dr.abs(end), dr.select(rising, *self.thetas), nth + 1)
             return more | (hazard < pace) if shots else more
 
         def event(nth, start, base, end, rising, last_s, tally, hazard, drawn):
-            crossed = (nth + 1) * dr.select(rising, self.theta_on, -self.theta_off)
+            crossed = (nth + 1) * dr.select(rising, theta_on, -theta_off)
             when = dr.select(slope == 0, 1, dr.clip((crossed - start) / slope, 0, 1))
             is_shot = arr.Bool(False)
             on = rising
             kept = arr.Bool(True)
             if shots:
-                more = reaches(dr, dr.abs(end), dr.select(rising, self.theta_on, self.theta_off), nth + 1)
+                more = reaches(dr, dr.abs(end), dr.select(rising, *self.thetas), nth + 1)
                 is_shot = (hazard < pace) & (~more | (hazard < when * pace))
                 when = dr.select(is_shot, hazard / pace, when)
-                bits = hashed(dr, self.key + hashed(dr, drawn + 1))
+                bits = hashed(self.key + hashed(drawn + 1))
                 on = dr.select(is_shot, uniform(arr, bits) * pace < on_pace, rising)
             if dead:
                 at_s = when * dt_s
                 kept = is_shot | (at_s - last_s >= self.refractory_s)
                 last_s = dr.select(kept & ~is_shot, at_s, last_s)
-            tally = self.sink.take(dr, arr, index, when, on, kept, tally)
+            tally = self.sink.take(index, when, on, kept, tally)
             nth = nth + 1
             if shots:  # a noise event sets the memorised level to the level seen: D is 0 there
                 nth = dr.select(is_shot, 0, nth)
@@ -411,28 +370,26 @@ class _Step:
                 end = dr.select(is_shot, slope * (1 - when), end)
                 base = dr.select(is_shot, signal - end, base)
                 rising = dr.select(is_shot, slope > 0, rising)
-                hazard = dr.select(
-                    is_shot, hazard + exponential(dr, arr, hashed(dr, bits + 0x9E3779B9)), hazard
-                )
+                hazard = dr.select(is_shot, hazard + exponential(dr, arr, hashed(bits + 0x9E3779B9)), hazard)
                 drawn = drawn + dr.select(is_shot, arr.UInt32(1), 0)
             return nth, start, base, end, rising, last_s, tally, hazard, drawn
 
         begun = (
-            dr.zeros(arr.Float, dr.width(self.lane)),
+            dr.zeros(arr.Float, self.lanes.width),
             start,
             base,
             end,
             rising,
             last_s,
-            self.sink.tally(dr, arr),
+            self.sink.tally(),
             hazard,
             drawn,
         )
         nth, _, base, _, rising, last_s, tally, hazard, drawn = dr.while_loop(
             begun, going, event, mode="symbolic"
         )
-        self.sink.close(dr, arr, index, self.lane, tally)
-        now["reference"], lost = exact_sum(base, nth * dr.select(rising, self.theta_on, -self.theta_off))
+        self.sink.close(index, tally)
+        now["reference"], lost = exact_sum(base, nth * dr.select(rising, theta_on, -theta_off))
         now["reference_rest"] = lost + (dr.select(drawn == now["shots"], rest, 0) if shots else rest)
         if dead:
             now["last_event_s"] = dr.maximum(last_s - dt_s, -1e6)

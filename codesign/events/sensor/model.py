@@ -4,14 +4,14 @@ layers share."""
 import math
 import operator
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Generator, Tensor
 
 from codesign.errors import DomainError, ShapeError, as_number, shown
-from codesign.events.entry import MOST_VALUES, check_dtype
+from codesign.events.entry import MOST_VALUES, as_seconds, check_choice, check_dtype, check_flag
 
 THETA_MINIMUM = 0.01  # no drawn threshold falls below, as in v2e
 MOST_NUMBER = 1e30
@@ -70,31 +70,21 @@ class SensorModel:
     hot_pixel_rate_hz: float = 0.0
 
     def __post_init__(self):
-        if self.timing not in TIMINGS:
-            raise DomainError(f"timing is {self.timing!r}; allowed: {', '.join(map(repr, TIMINGS))}.")
-        if not isinstance(self.photoreceptor_noise, bool):
-            raise DomainError(
-                f"SensorModel.photoreceptor_noise is {self.photoreceptor_noise!r}; True or False is needed."
-            )
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name in ("timing", "photoreceptor_noise"):
+        check_choice(self.timing, "timing", TIMINGS)
+        check_flag(self.photoreceptor_noise, "SensorModel.photoreceptor_noise")
+        for name, value in vars(self).items():
+            if name in ("timing", "photoreceptor_noise"):
                 continue
-            positive = field.name in ("theta_on", "theta_off")
-            if (
-                isinstance(value, bool)
-                or not isinstance(value, (int, float))
-                or not 0 <= value < math.inf
-                or value > MOST_NUMBER
-                or (positive and value == 0)
-            ):
+            positive = name in ("theta_on", "theta_off")
+            number = isinstance(value, (int, float)) and not isinstance(value, bool)
+            if not number or not 0 <= value <= MOST_NUMBER or (positive and value == 0):
                 hint = (
                     "; for its gradient pass it to events.sensor_counts, or name it in learn of events.layer"
                     if isinstance(value, Tensor)
                     else ""
                 )
                 raise DomainError(
-                    f"SensorModel.{field.name} is {shown(value)} ({type(value).__name__}); a finite Python "
+                    f"SensorModel.{name} is {shown(value)} ({type(value).__name__}); a finite Python "
                     f"number {'> 0' if positive else '>= 0'} is needed{hint}."
                 )
         if self.hot_pixel_share > 1:
@@ -112,6 +102,11 @@ class SensorModel:
     def leaks(self) -> bool:
         """Whether the memorised level drifts by itself."""
         return self.leak_rate_hz > 0 or self.has_hot_pixels
+
+    @property
+    def leak_jitters(self) -> bool:
+        """Whether the leak changes from frame to frame."""
+        return self.leaks and self.leak_jitter > 0
 
     @property
     def leaks_unevenly(self) -> bool:
@@ -149,30 +144,28 @@ class SensorModel:
         return smaller / 10 ** (-0.0026 * x**3 - 0.036 * x**2 - 0.1949 * x + 0.321)
 
 
-CLEAN = SensorModel(theta_sigma=0.02)
-NOISY = SensorModel(
-    theta_sigma=0.05,
-    cutoff_hz=30.0,
-    leak_rate_hz=0.1,
-    leak_jitter=0.1,
-    rate_cov_decades=0.1,
-    shot_rate_hz=5.0,
-)
-DAVIS = SensorModel(
-    theta_sigma=0.03,
-    cutoff_hz=300.0,
-    leak_rate_hz=0.01,
-    leak_jitter=0.1,
-    rate_cov_decades=0.1,
-    shot_rate_hz=0.001,
-    refractory_s=0.0005,
-)
+# v2e's presets and the defaults of its command line
 PRESETS = {
     "ideal": SensorModel(),
-    "clean": CLEAN,
-    "noisy": NOISY,
-    "default": DAVIS,
-}  # v2e's presets and the defaults of its command line
+    "clean": SensorModel(theta_sigma=0.02),
+    "noisy": SensorModel(
+        theta_sigma=0.05,
+        cutoff_hz=30.0,
+        leak_rate_hz=0.1,
+        leak_jitter=0.1,
+        rate_cov_decades=0.1,
+        shot_rate_hz=5.0,
+    ),
+    "default": SensorModel(
+        theta_sigma=0.03,
+        cutoff_hz=300.0,
+        leak_rate_hz=0.01,
+        leak_jitter=0.1,
+        rate_cov_decades=0.1,
+        shot_rate_hz=0.001,
+        refractory_s=0.0005,
+    ),
+}
 
 
 def check_sensor(sensor: object) -> SensorModel:
@@ -226,7 +219,6 @@ def draw_thresholds(
     generator: Generator,
     *,
     dtype: torch.dtype = torch.float32,
-    device: torch.device | str = "cpu",
 ) -> tuple[Tensor, ...]:
     """Contrast thresholds of every pixel.
 
@@ -238,11 +230,11 @@ def draw_thresholds(
     Source: v2e (Hu et al., CVPR-W 2021), threshold mismatch.
     """
     check_generator(generator)
-    check_dtype(dtype, device)
+    check_dtype(dtype)
     pixels = _shape(pixels)
     draws = check_sensor(sensor).theta_sigma > 0
     deviates = draw_deviates(pixels, generator, dtype=dtype) if draws else (None, None)
-    return thresholds(sensor, pixels, deviates, dtype=dtype, device=device)
+    return thresholds(sensor, pixels, deviates, dtype=dtype, device="cpu")
 
 
 def thresholds(sensor, pixels, deviates, *, dtype, device):
@@ -262,16 +254,21 @@ def draw_deviates(
 ) -> Tensor:
     """Standard normal numbers behind the thresholds of every pixel, [2, *pixels] on the generator's device:
     first all ON, then all OFF."""
-    shape = _shape(pixels)
-    return torch.stack(
-        [torch.randn(shape, generator=generator, dtype=dtype, device=generator.device) for _ in range(2)]
-    )
+    place: dict[str, Any] = {"generator": generator, "dtype": dtype, "device": generator.device}
+    return torch.stack([torch.randn(_shape(pixels), **place) for _ in range(2)])
 
 
 def mismatched(theta: Tensor | float, sigma: Tensor | float, deviate: Tensor) -> Tensor:
     """Thresholds of every pixel: theta + sigma deviate, at least 0.01. Gradient: theta and sigma, none where
     the minimum holds."""
     return (theta + sigma * deviate).clamp(min=THETA_MINIMUM)
+
+
+def of_pixels(theta: Any, sigma: Any, deviate: Tensor | None, like: Tensor) -> Tensor:
+    """``mismatched`` in the type of another tensor; the nominal threshold where no number was drawn. Gradient: theta
+    and sigma."""
+    theta, sigma = (torch.as_tensor(x, dtype=like.dtype, device=like.device) for x in (theta, sigma))
+    return theta if deviate is None else mismatched(theta, sigma, deviate.to(like))
 
 
 def draw_leaks(
@@ -302,6 +299,13 @@ def leak_rates(sensor, pixels, spread, heat, *, dtype, device):
     return rate_hz.to(device, dtype)
 
 
+def draw_keys(shape, generator):
+    """Random int32 of a shape."""
+    whole = torch.iinfo(torch.int32)
+    place: dict[str, Any] = {"generator": generator, "dtype": torch.int64, "device": generator.device}
+    return torch.randint(whole.min, whole.max, shape, **place).to(torch.int32)
+
+
 def draw_shot_counts(
     sensor: SensorModel,
     pixels: Sequence[int],
@@ -309,7 +313,6 @@ def draw_shot_counts(
     generator: Generator,
     *,
     dtype: torch.dtype = torch.float32,
-    device: torch.device | str = "cpu",
 ) -> Tensor:
     """Noise events per pixel and interval: Poisson, shot_rate_hz/2 per polarity. Add them to the counts of
     any event layer.
@@ -326,15 +329,10 @@ def draw_shot_counts(
     """
     check_generator(generator)
     check_sensor(sensor)
-    check_dtype(dtype, device)
+    check_dtype(dtype)
     pixels = _shape(pixels)
-    try:
-        interval_s = torch.as_tensor(interval_s, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError):
-        raise DomainError(
-            f"interval_s is {shown(interval_s)}; a list of lengths in seconds is needed."
-        ) from None
-    if interval_s.is_meta or interval_s.ndim != 1:
+    interval_s = as_seconds(interval_s, "interval_s")
+    if interval_s.ndim != 1:
         raise ShapeError(
             f"interval_s has shape {list(interval_s.shape)}; one length per interval is needed, [T-1]."
         )
@@ -345,10 +343,10 @@ def draw_shot_counts(
         )
     shape = (len(interval_s), 2, *pixels)
     if sensor.shot_rate_hz == 0:
-        return torch.zeros(shape, dtype=dtype, device=device)
+        return torch.zeros(shape, dtype=dtype)
     mean = (sensor.shot_rate_hz / 2) * interval_s.to(generator.device)
     mean = mean.reshape(-1, *[1] * (len(pixels) + 1)).expand(shape).contiguous()
-    return torch.poisson(mean, generator=generator).to(dtype=dtype, device=device)
+    return torch.poisson(mean, generator=generator).to("cpu", dtype)
 
 
 def _shape(pixels):

@@ -8,11 +8,20 @@ from torch import Generator, Tensor
 
 from codesign import backend
 from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import Times, check_frames, check_layout, check_per_pixel, check_times
+from codesign.events.entry import (
+    Times,
+    check_chunk,
+    check_frames,
+    check_later,
+    check_layout,
+    check_per_pixel,
+    check_times,
+)
 from codesign.events.intensity import FrontEnd, kernel_levels, log_levels
+from codesign.events.kernels import Lanes
 from codesign.events.sensor import crossing, v2e
 from codesign.events.sensor.crossing import DenseCounts, EventKeys, KeyLayout
-from codesign.events.sensor.model import SensorModel, check_generator, check_sensor
+from codesign.events.sensor.model import SensorModel, check_generator, check_sensor, draw_keys
 from codesign.events.sensor.state import SensorState, begin, change, check_state
 from codesign.events.stream import concatenate, ordered
 from codesign.exclusive import exclusive
@@ -31,7 +40,6 @@ def simulate(
     state: SensorState | None = None,
     *,
     log_input: bool = False,
-    log_eps: float | None = None,
 ) -> EventStream:
     """Events of a sensor that sees the frames one after the other; log level runs linearly between them.
 
@@ -52,11 +60,8 @@ def simulate(
         (biases that change in a recording): its pixels keep the numbers drawn for them, and those that stand
         beyond their new thresholds fire at once. What the first sensor had not, and needs draws or a memory,
         is refused.
-      log_input: frames are natural-log levels (of the 0-255 scale where the sensor's speed or noise depends
-        on intensity).
-      log_eps: level is ln(I + log_eps) instead of lin-log, for linear frames of high dynamic range (ESIM:
-        1e-3 with frames 0 to 1; where speed or noise
-        depends on intensity, scale frames so that 255 is full light).
+      log_input: frames are natural-log levels, such as ln(I + eps) of linear frames of high dynamic range (ESIM:
+        eps 1e-3 with frames 0 to 1; of the 0-255 scale where the sensor's speed or noise depends on intensity).
     Returns: EventStream sorted by (t, y, x, p), int64 microseconds. The first frame gives no event. float32
       frames time events to the microsecond where the log level moves by 1 per second or more; slower ones to
       about 6e-8 |level| over its speed (float64 frames to the microsecond).
@@ -78,7 +83,7 @@ def simulate(
     check_layout(frames, minimum=1)
     if frames.ndim != 3:
         raise ShapeError(f"frames have shape {list(frames.shape)}; [T, H, W] is needed.")
-    front_end = FrontEnd(log_input, log_eps)
+    front_end = FrontEnd(log_input)
     state = SensorState() if state is None else state
     moved, frames, times_s, generator, at_once = _open(frames, t_s, sensor, generator, state, front_end)
     start_us = round(moved.time_s * 1e6)
@@ -92,19 +97,14 @@ def simulate(
         size = backend.frames_per_kernel(height_px * width_px)
         density = EVENTS_PER_PIXEL
         for first in range(0, len(frames), size):
-            chunk = slice(first, first + size)
-            keys.append(
-                _interpolated_keys(
-                    frames[chunk], times_s[chunk], sensor, generator, moved, front_end, layout, density
-                )
-            )
-            density = 1.25 * len(keys[-1]) / frames[chunk].numel()
+            chunk = frames[first : first + size], times_s[first : first + size]
+            keys.append(_interpolated_keys(*chunk, sensor, generator, moved, front_end, layout, density))
+            density = 1.25 * len(keys[-1]) / chunk[0].numel()
         t_us, x, y, p = layout.columns(keys[0] if len(keys) == 1 else np.concatenate(keys))
         stream = EventStream(t_us, x, y, p, height_px, width_px)
     if at_once is not None:
-        stream = concatenate(
-            [_fired(at_once, start_us + 1), stream]
-        )  # behind the interval before, as all others
+        # behind the interval before, as all others
+        stream = concatenate([_fired(at_once, start_us + 1), stream])
     state.__dict__.update(moved.__dict__)
     return stream
 
@@ -119,7 +119,6 @@ def dense_counts(
     state: SensorState | None = None,
     *,
     log_input: bool = False,
-    log_eps: float | None = None,
 ) -> Tensor:
     """The events of ``simulate`` as counts per interval, without the list between; any pixel shape.
 
@@ -131,15 +130,13 @@ def dense_counts(
             f"dense counts come from timing 'interpolated', the sensor has {sensor.timing!r}; use simulate "
             "and to_counts."
         )
-    front_end = FrontEnd(log_input, log_eps)
+    front_end = FrontEnd(log_input)
     state = SensorState() if state is None else state
     moved, frames, times_s, generator, at_once = _open(frames, t_s, sensor, generator, state, front_end)
-    import drjit as dr
-
-    sink = DenseCounts(dr, backend.arrays(frames.device.type, frames.dtype), len(frames), frames[0].numel())
-    _advance(
-        frames, times_s, _random_keys(len(frames), sensor, moved, generator), sensor, moved, front_end, sink
-    )
+    lanes = Lanes(frames, frames[0].numel())
+    sink = DenseCounts(lanes, len(frames))
+    keys = _random_keys(len(frames), sensor, moved, generator)
+    _advance(lanes, frames, times_s, keys, sensor, moved, front_end, sink)
     state.__dict__.update(moved.__dict__)
     counts = sink.tensor((len(frames), 2, *frames.shape[1:]))
     if at_once is not None:
@@ -155,7 +152,7 @@ def _open(frames, t_s, sensor, generator, state, front_end):
     state = replace(state)
     fresh = state.level is None
     check_layout(frames, minimum=2 if fresh else 1)
-    times_s = check_times(t_s, len(frames)).tolist()
+    times_s = check_times(t_s, len(frames))
     if state.generator is None:
         state.generator = torch.Generator().manual_seed(0)
     generator = state.generator if generator is None else generator
@@ -164,25 +161,17 @@ def _open(frames, t_s, sensor, generator, state, front_end):
     if fresh:
         check_frames(frames[:1], 1, non_negative=not front_end.log_input)
         if sensor.timing == "v2e":
-            level = v2e.front_end(frames[:1]) if front_end == FrontEnd() else front_end.level(frames[:1])
+            level = v2e.levels(frames[:1], front_end)
         else:
             level, _ = kernel_levels(frames[:1], front_end)  # as those of all later frames
         intensity = frames[0].exp() if front_end.log_input else frames[0]
-        begin(state, sensor, intensity, level[0], times_s[0], generator)
-        return state, frames[1:], times_s[1:], generator, None
-    shape = state.level.shape
-    dtype = state.level.dtype
-    if shape != frames.shape[1:] or (dtype != frames.dtype and sensor.timing != "v2e"):
-        raise ShapeError(
-            f"{frames.dtype} frames of {list(frames.shape[1:])} pixels follow {dtype} frames of "
-            f"{list(shape)} pixels; a sensor keeps its size and type."
-        )
-    if times_s[0] <= state.time_s:
-        raise DomainError(
-            f"the chunk starts at {times_s[0]!r} s, the last frame seen was at {state.time_s!r} s; times "
-            "must go on increasing."
-        )
-    return state, frames, times_s, generator, change(state, sensor)
+        begin(state, sensor, intensity, level[0], float(times_s[0]), generator)
+        return state, frames[1:], times_s[1:].tolist(), generator, None
+    # v2e keeps single precision whatever the frames have
+    dtype = frames.dtype if sensor.timing == "v2e" else state.level.dtype
+    check_chunk(frames, state.level.shape, dtype)
+    check_later(times_s, state.time_s)
+    return state, frames, times_s.tolist(), generator, change(state, sensor)
 
 
 def _fired(counts, t_us):
@@ -197,8 +186,8 @@ def _v2e_events(frames, times_s, sensor, generator, state, front_end):
     parts = []
     for frame, time_s in zip(frames, times_s, strict=True):
         check_frames(frame[None], 1, non_negative=not front_end.log_input)
-        level = v2e.front_end(frame) if front_end == FrontEnd() else front_end.level(frame)
         intensity = frame.exp() if front_end.log_input else frame
+        level = v2e.levels(frame, front_end)
         parts.append(v2e.interval(intensity, level, time_s, sensor, generator, state))
     t_us, x, y, p = (torch.cat(column) for column in zip(*parts, strict=True))
     return ordered(t_us, x, y, p, *frames.shape[1:])
@@ -208,16 +197,14 @@ def _v2e_events(frames, times_s, sensor, generator, state, front_end):
 def _interpolated_keys(frames, times_s, sensor, generator, state, front_end, layout, density):
     """Sorted keys of the events of one chunk; a chunk busier than the room made for it is run again with the
     room it needs."""
-    import drjit as dr
-
-    arr = backend.arrays(frames.device.type, frames.dtype)
+    lanes = Lanes(frames, frames[0].numel())
     random_keys = _random_keys(len(frames), sensor, state, generator)
     starts_s = [state.time_s, *times_s[:-1]]
     capacity = 4096 + int(density * frames.numel())
     while True:
-        sink = EventKeys(dr, arr, starts_s, times_s, layout, capacity)
+        sink = EventKeys(lanes, starts_s, times_s, layout, capacity)
         trial = replace(state)
-        _advance(frames, times_s, random_keys, sensor, trial, front_end, sink)
+        _advance(lanes, frames, times_s, random_keys, sensor, trial, front_end, sink)
         if sink.found <= capacity:
             state.__dict__.update(trial.__dict__)
             return sink.sorted()
@@ -226,25 +213,16 @@ def _interpolated_keys(frames, times_s, sensor, generator, state, front_end, lay
 
 def _random_keys(count, sensor, state, generator):
     """One random number per interval, where something is drawn per frame."""
-    if not (sensor.photoreceptor_noise or (sensor.leaks and sensor.leak_jitter > 0)):
+    if not (sensor.photoreceptor_noise or sensor.leak_jitters):
         return torch.zeros(count, dtype=torch.int32)
-    whole = torch.iinfo(torch.int32)
     # one at a time, so that chunks draw what the whole draws
-    drawn = [
-        torch.randint(
-            whole.min, whole.max, (), generator=generator, dtype=torch.int64, device=generator.device
-        )
-        for _ in range(count)
-    ]
-    return torch.stack(drawn).to(torch.int32).to(state.level.device)
+    return torch.stack([draw_keys((), generator) for _ in range(count)]).to(state.level.device)
 
 
-def _advance(frames, times_s, keys, sensor, state, front_end, sink):
+def _advance(lanes, frames, times_s, keys, sensor, state, front_end, sink):
     """Run the kernel and move the state on; on bad frames raise before anything has changed."""
-    dt_s = torch.tensor(times_s, dtype=torch.float64) - torch.tensor(
-        [state.time_s, *times_s[:-1]], dtype=torch.float64
-    )
-    carried, wrong = crossing.run(frames, front_end, dt_s.to(frames), keys, sensor, state, sink)
+    dt_s = torch.tensor([state.time_s, *times_s], dtype=torch.float64).diff()
+    carried, wrong = crossing.run(lanes, frames, front_end, dt_s.to(frames), keys, sensor, state, sink)
     if wrong == 1:
         check_frames(frames, 1, non_negative=not front_end.log_input)
     if wrong:

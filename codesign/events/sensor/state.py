@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.events.sensor.model import draw_deviates, draw_leaks, leak_rates, thresholds
+from codesign.events.sensor.model import draw_deviates, draw_keys, draw_leaks, leak_rates, thresholds
 
 
 @dataclass
@@ -69,10 +69,7 @@ def check_state(state, sensor):
         "a dead time": ("last_event_s", sensor.refractory_s > 0),
         "a bandwidth": ("input_level", sensor.cutoff_hz > 0),
         "noise events": ("hazard", sensor.has_shots and sensor.timing == "interpolated"),
-        "a leak that jitters": (
-            "key",
-            sensor.leaks and sensor.leak_jitter > 0 and sensor.timing == "interpolated",
-        ),
+        "a leak that jitters": ("key", sensor.leak_jitters and sensor.timing == "interpolated"),
         "photoreceptor noise": ("noise", sensor.photoreceptor_noise),
     }
     lacks = [what for what, (name, asked) in needs.items() if asked and getattr(state, name) is None]
@@ -103,9 +100,8 @@ def begin(state, sensor, frame, level, time_s, generator):
         state.reference_rest = torch.zeros_like(level)
     state.start_s = state.time_s = time_s
     if sensor.refractory_s > 0:
-        quiet_s = (
-            sensor.refractory_s if sensor.timing == "v2e" else 1e6
-        )  # seconds; v2e's first event also waits
+        # v2e's first event also waits
+        quiet_s = sensor.refractory_s if sensor.timing == "v2e" else 1e6
         state.last_event_s = torch.full(pixels, -quiet_s, **place)
     _set(state, sensor)
     if sensor.cutoff_hz > 0 or sensor.has_shots:
@@ -114,20 +110,11 @@ def begin(state, sensor, frame, level, time_s, generator):
         state.input_level = level.clone()
     if sensor.photoreceptor_noise:
         state.noise = torch.zeros(pixels, **place)
-    if sensor.timing == "interpolated" and (
-        sensor.has_shots or sensor.photoreceptor_noise or (sensor.leaks and sensor.leak_jitter > 0)
-    ):
+    draws = sensor.has_shots or sensor.photoreceptor_noise or sensor.leak_jitters
+    if sensor.timing == "interpolated" and draws:
         uniform = torch.rand(tuple(pixels), generator=generator, dtype=torch.float64, device=generator.device)
         state.hazard = (-torch.log1p(-uniform)).to(level)
-        whole = torch.iinfo(torch.int32)
-        state.key = torch.randint(
-            whole.min,
-            whole.max,
-            tuple(pixels),
-            generator=generator,
-            dtype=torch.int64,
-            device=generator.device,
-        ).to(level.device, torch.int32)
+        state.key = draw_keys(tuple(pixels), generator).to(level.device)
         state.shots = torch.zeros(pixels, dtype=torch.int32, device=level.device)
 
 

@@ -12,23 +12,25 @@ import math
 import torch
 
 from codesign.errors import DomainError
-from codesign.events.intensity import FrontEnd, light_share
+from codesign.events.intensity import light_share
 
 # up to here single-precision seconds resolve a microsecond, and v2e's rounding is repeated; later slots are
 # computed in double
 EXACT_SINGLE_S = 8.0
 
 
-def front_end(frames):
-    """Lin-log level as v2e rounds it: computed in double precision, to 8 decimals, kept in single. frames:
-    [T, H, W]."""
-    return ((FrontEnd().level(frames.double()) * 1e8).round() / 1e8).float()
+def levels(frames, front_end):
+    """Log levels as v2e has them: lin-log is computed in double precision, rounded to 8 decimals and kept in
+    single."""
+    if front_end.log_input:
+        return frames
+    return ((front_end.level(frames.double()) * 1e8).round() / 1e8).float()
 
 
 def interval(frame, level, time_s, sensor, generator, state):
     """Events of the interval that ends with ``frame``; moves the state on.
 
-    Args: frame: [H, W] intensity 0 to 255. level: [H, W] from ``front_end``. time_s: its time.
+    Args: frame: [H, W] intensity 0 to 255. level: [H, W] from ``levels``. time_s: its time.
     Returns: t_us, x, y, p: int64 [N] each, unsorted.
     """
     dt_s = time_s - state.time_s
@@ -56,24 +58,16 @@ def interval(frame, level, time_s, sensor, generator, state):
             state.last_event_s = torch.where(
                 last > 0, times.to(state.last_event_s.dtype)[(last - 1).clamp(min=0)], state.last_event_s
             )
-    state.reference = (
-        state.reference.to(difference) + on * state.theta_on.float() - off * state.theta_off.float()
-    )  # a single-precision product at all times
+    # a single-precision product at all times
+    moved = on * state.theta_on.float(), off * state.theta_off.float()
+    state.reference = state.reference.to(difference) + moved[0] - moved[1]
     if sensor.has_shots:
         found += _shots(light, dt_s, slots, sensor, generator, state)
     state.time_s = time_s
     y, x, nth, p = (torch.cat(column) for column in zip(*found, strict=True))
-    return (
-        round(state.start_s * 1e6) + ((times.double() + _fraction(state.start_s)) * 1e6).round().long()[nth],
-        x,
-        y,
-        p,
-    )
-
-
-def _fraction(start_s):
-    """Seconds from the nearest whole microsecond to the start."""
-    return start_s - round(start_s * 1e6) / 1e6
+    start_us = round(state.start_s * 1e6)
+    since_s = times.double() + (state.start_s - start_us / 1e6)
+    return start_us + (since_s * 1e6).round().long()[nth], x, y, p
 
 
 def _photoreceptor(level, light, dt_s, sensor, generator, state):
@@ -92,9 +86,8 @@ def _photoreceptor(level, light, dt_s, sensor, generator, state):
             f"frames {dt_s:g} s apart make v2e's noise filter of {sensor.cutoff_hz:g} Hz unstable; use "
             f"frames closer than {2 / omega:.3g} s, or timing 'interpolated'."
         )
-    strength = sensor.noise_level() / math.sqrt(
-        share / (2 - share)
-    )  # the filter lets this part of white noise through
+    # the filter lets this part of white noise through
+    strength = sensor.noise_level() / math.sqrt(share / (2 - share))
     state.noise = (1 - share) * state.noise + share * strength * _randn(state.noise, generator)
     return state.level + state.noise
 
@@ -139,9 +132,8 @@ def _shots(light, dt_s, slots, sensor, generator, state):
     """Noise events: at most one per pixel and frame, in the last slot; they set the memorised level to the
     level seen."""
     chance = sensor.shot_rate_hz / 2 * dt_s * (1 - 0.75 * light)
-    draw = torch.rand(light.shape, generator=generator, dtype=torch.float64, device=generator.device).to(
-        light.device
-    )
+    draw = torch.rand(light.shape, generator=generator, dtype=torch.float64, device=generator.device)
+    draw = draw.to(light.device)
     on = draw > 1 - chance * (sensor.theta_on / state.theta_on)
     off = draw < chance * (sensor.theta_off / state.theta_off)
     state.reference = torch.where(on | off, state.level, state.reference)

@@ -14,6 +14,9 @@ from codesign.events.sources.frames import FrameSource, same_size
 from codesign.optional import optional
 
 imageio_ffmpeg = optional("imageio_ffmpeg", "video", "reading videos")
+# what FFmpeg is asked for: the times of all frames, and their pictures
+TIMES = "-vf scale=2:2:flags=neighbor -fps_mode passthrough -enc_time_base demux -c:v rawvideo -f framecrc -"
+PICTURES = "-fps_mode passthrough -noautoscale -c:v ppm -f image2pipe -"
 
 
 def open_video(path):
@@ -53,19 +56,7 @@ def _times(path):
     Packets alone would be quicker to list, but a video that was cut without coding it again holds packets
     that are not shown.
     """
-    times = [
-        "-vf",
-        "scale=2:2:flags=neighbor",
-        "-fps_mode",
-        "passthrough",
-        "-enc_time_base",
-        "demux",
-        "-c:v",
-        "rawvideo",
-        "-f",
-        "framecrc",
-    ]
-    command = [*_ffmpeg(path), "-map", "0:v:0", *times, "-"]
+    command = [*_ffmpeg(path), *TIMES.split()]
     done = subprocess.run(
         command, capture_output=True, check=False, stdin=subprocess.DEVNULL, start_new_session=True
     )
@@ -78,10 +69,9 @@ def _times(path):
         raise FileFormatError(
             f"{path} cannot be read as a video ({_reason(done.stderr, path)}); is it one, and whole?"
         )
+    complaint = _reason(done.stderr, path) if done.stderr.strip() else ""
     # the quotient of two integers below 2^53 is rounded once: 1/3 s is the float nearest to it
-    return (ticks - ticks[0]) * int(base[1]) / int(base[2]), _reason(
-        done.stderr, path
-    ) if done.stderr.strip() else ""
+    return (ticks - ticks[0]) * int(base[1]) / int(base[2]), complaint
 
 
 def _decode(path, start):
@@ -90,20 +80,7 @@ def _decode(path, start):
     # autoscale off: a video that changes its size is not brought to one in silence; passthrough: no frame is
     # repeated or dropped
     chosen = ["-vf", rf"select=gte(n\,{start})"] if start else []
-    command = [
-        *_ffmpeg(path),
-        "-map",
-        "0:v:0",
-        *chosen,
-        "-fps_mode",
-        "passthrough",
-        "-noautoscale",
-        "-c:v",
-        "ppm",
-        "-f",
-        "image2pipe",
-        "-",
-    ]
+    command = [*_ffmpeg(path), *chosen, *PICTURES.split()]
     with tempfile.TemporaryFile() as notes:
         # a group of its own: Ctrl-C then ends the run between two steps, not the decoder in the middle of one
         with subprocess.Popen(
@@ -138,16 +115,8 @@ def _picture(pipe):
 def _ffmpeg(path):
     # "file:" keeps a name with a colon from being taken for a protocol, and the list keeps playlists inside
     # the machine
-    return [
-        imageio_ffmpeg.get_ffmpeg_exe(),
-        "-v",
-        "error",
-        "-nostdin",
-        "-protocol_whitelist",
-        "file,pipe",
-        "-i",
-        f"file:{path}",
-    ]
+    quiet = "-v error -nostdin -protocol_whitelist file,pipe -i"
+    return [imageio_ffmpeg.get_ffmpeg_exe(), *quiet.split(), f"file:{path}", "-map", "0:v:0"]
 
 
 def _reason(notes, path):

@@ -18,8 +18,12 @@ from codesign.errors import CodesignError, DomainError, FileFormatError, ShapeEr
 from codesign.events.entry import (
     Times,
     check_choice,
+    check_chunk,
     check_frames,
+    check_later,
     check_path,
+    check_positive,
+    check_state,
     check_times,
     check_whole,
     shown,
@@ -88,42 +92,23 @@ class SpikeEsim(nn.Module):
         seed: int = 0,
     ):
         super().__init__()
-        check_choice(comparator, "comparator", COMPARATORS)
-        width, depth = (
-            check_whole(value, name, 1, most)
-            for value, name, most in ((width, "width", 4096), (depth, "depth", 256))
-        )
-        seed = check_seed(seed, "seed")
-        for name, value, least in (
-            ("theta_on", theta_on, 1e-6),
-            ("theta_off", theta_off, 1e-6),
-            ("refractory_s", refractory_s, 0.0),
-            ("cutoff_hz", cutoff_hz, 1e-6),
-        ):
-            if (
-                isinstance(value, bool)
-                or not isinstance(value, (int, float))
-                or not least <= value < math.inf
-            ):
-                raise DomainError(f"{name} is {value!r}; give a finite number of at least {least:g}.")
+        self.settings = {
+            "theta_on": check_positive(theta_on, "theta_on", least=1e-6),
+            "theta_off": check_positive(theta_off, "theta_off", least=1e-6),
+            "refractory_s": refractory_s and check_positive(refractory_s, "refractory_s"),
+            "cutoff_hz": check_positive(cutoff_hz, "cutoff_hz", least=1e-6),
+            "comparator": check_choice(comparator, "comparator", COMPARATORS),
+            "width": check_whole(width, "width", 1, 4096),
+            "depth": check_whole(depth, "depth", 1, 256),
+            "seed": check_seed(seed, "seed"),
+        }
         if comparator == "srm" and refractory_s > 0:
             raise DomainError(
                 f"refractory_s is {refractory_s!r}, but the comparator 'srm' has no dead time; choose "
                 "'memory', or refractory_s=0."
             )
-        self.settings = {
-            "theta_on": theta_on,
-            "theta_off": theta_off,
-            "refractory_s": refractory_s,
-            "cutoff_hz": cutoff_hz,
-            "comparator": comparator,
-            "width": width,
-            "depth": depth,
-            "seed": seed,
-        }
-        self.log_gain = nn.Parameter(
-            torch.zeros(2, dtype=torch.float64)
-        )  # of the thresholds, so that 0 is the given one exactly
+        # of the thresholds, so that 0 is the given one exactly
+        self.log_gain = nn.Parameter(torch.zeros(2, dtype=torch.float64))
         self.log_dead = nn.Parameter(torch.zeros((), dtype=torch.float64)) if refractory_s > 0 else None
         self.prefilter = Prefilter()
         self.tone = ToneCurve()
@@ -253,33 +238,27 @@ class SpikeEsim(nn.Module):
     def _levels(self, frames, times_s, state):
         """What the comparators see, [T, ...], and (level, filtered, slow) after the last frame."""
         intensity = frames.reshape(len(frames), -1, *frames.shape[-2:])
-        log_level = torch.stack(
-            [lin_log(picture[None])[0] for picture in intensity]
-        )  # one by one: logarithms of vectors round by their place
+        # one by one: logarithms of vectors round by their place
+        log_level = torch.stack([lin_log(picture[None])[0] for picture in intensity])
         levels = stepwise(lambda pictures: self.tone(self.prefilter(pictures)), log_level[:, :, None])
         if state is None:
-            filtered = levels[0]
-            slow = levels[0]
-            before = levels[0]
+            filtered = slow = before = levels[0]
             light = intensity[0]
-            rest = levels[1:]
+            follow = [(filtered, slow)]
         else:
-            filtered = state.filtered
-            slow = state.slow
-            before = state.level
+            filtered, slow, before = state.filtered, state.slow, state.level
             light = state.frame.reshape(intensity.shape[1:])
-            rest = levels
-        follow = [(filtered, slow)] if state is None else []
-        for now, picture, step_s in zip(rest, intensity[-len(rest) :], times_s.diff().tolist(), strict=True):
+            follow = []
+        seen = zip(levels[len(follow) :], intensity[len(follow) :], times_s.diff().tolist(), strict=True)
+        for now, picture, step_s in seen:
             filtered = self.bandwidth.advance(filtered, before, now, (light + picture)[:, None] / 2, step_s)
             slow = now + (slow - now) * math.exp(-step_s / SLOW_S)
             follow.append((filtered, slow))
             before = now
             light = picture
         low, mean = (torch.stack(pictures) for pictures in zip(*follow, strict=True))
-        pictures = torch.cat(
-            (levels / 4 - 1, 4 * (levels - low), 2 * (levels - mean)), dim=2
-        )  # of the order of 1
+        # of the order of 1
+        pictures = torch.cat((levels / 4 - 1, 4 * (levels - low), 2 * (levels - mean)), dim=2)
         seen = self.bandwidth.mixed(levels, low) + stepwise(self.branch, pictures)
         return seen.reshape(frames.shape), (before, filtered, slow)
 
@@ -295,18 +274,6 @@ def _checked(frames, t_s, state):
     times_s = check_times(t_s, len(frames))
     if state is None:
         return frames, times_s
-    if not isinstance(state, SpikeEsimState):
-        raise DomainError(f"the state is a {type(state).__name__}; pass the one that was returned.")
-    if state.frame.shape != frames.shape[1:] or state.frame.dtype != frames.dtype:
-        given = f"{frames.dtype} {list(frames.shape[1:])}"
-        wanted = f"{state.frame.dtype} {list(state.frame.shape)}"
-        raise ShapeError(
-            f"frames of {given} follow frames of {wanted}; a generator keeps its frame size and type over "
-            "chunks."
-        )
-    if float(times_s[0]) <= state.time_s:
-        raise DomainError(
-            f"the chunk starts at {float(times_s[0])!r} s, the last frame seen was at {state.time_s!r} s; "
-            "times must go on increasing."
-        )
-    return frames, torch.cat((torch.tensor([state.time_s], dtype=torch.float64), times_s))
+    check_state(state, SpikeEsimState)
+    check_chunk(frames, state.frame.shape, state.frame.dtype)
+    return frames, check_later(times_s, state.time_s)

@@ -2,32 +2,59 @@
 constants, explicit state."""
 
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, as_number
+from codesign.errors import DomainError, ShapeError, as_number, check_finite
 from codesign.events.entry import (
     check_choice,
     check_flag,
     check_layout,
     check_per_pixel,
     check_positive,
-    check_whole,
 )
-from codesign.events.spiking.srm_kernels import RESETS, RESPONSES, STATES
-from codesign.events.spiking.srm_loops import Setup, run
-from codesign.events.spiking.srm_mean import check_mean, mean_spikes
-from codesign.events.spiking.srm_play import check_play, instead, played, with_play
-from codesign.events.spiking.srm_state import SrmState, entering_state
+from codesign.events.spiking.srm_loops import RESETS, RESPONSES, STATES, Setup, Srm
+from codesign.events.spiking.srm_means import (
+    PlayState,
+    check_mean,
+    check_play,
+    mean_spikes,
+    played,
+    straight_through,
+    with_play,
+)
 from codesign.events.spiking.surrogate import FastSigmoid, Laplace, Surrogate
 
 GRADIENTS = ("surrogate", "play", "mean")
 THROUGH_RESET = ("off", "full", "bounded")
-NONFINITE = ("raise", "zero")
 MOST_STEPS = 1e9
+
+
+@dataclass(frozen=True)
+class SrmState:
+    """State after the last step of a chunk. It keeps its graph: ``detach`` it to cut the gradient between
+    chunks.
+
+    response: [states, ...] of the response kernel, float64 whatever the drive (0 to 2 states).
+    reset: [states, ...] of the reset kernel, likewise (1 or 2 states).
+    play: PlayState with ``gradient="play"``, else None.
+    mean: [1 + states, ages, ...] with ``gradient="mean"``, in the type of the drive: shares of neurons by
+      the age of their last spike, and the mean states of their resets; else None.
+    """
+
+    response: Tensor
+    reset: Tensor
+    play: PlayState | None = None
+    mean: Tensor | None = None
+
+    def detach(self) -> "SrmState":
+        """The same state without its graph."""
+        play = None if self.play is None else self.play.detach()
+        mean = None if self.mean is None else self.mean.detach()
+        return SrmState(self.response.detach(), self.reset.detach(), play, mean)
 
 
 def srm(
@@ -46,8 +73,6 @@ def srm(
     surrogate: Surrogate | None = None,
     through_reset: str = "off",
     smooth: bool = False,
-    segment: int | None = None,
-    nonfinite: str = "raise",
 ) -> tuple[Tensor, Tensor, SrmState]:
     """Spikes s_t = [u_t >= theta] of the potential u_t = (response of the drive)_t + sum over k >= 1 of nu_k
     s_{t-k}; a tie u_t = theta spikes.
@@ -82,9 +107,6 @@ def srm(
         0.9 / sum|nu|, so that the adjoint cannot grow.
       smooth: replace the spike by the surrogate's integral: the smooth twin, whose gradient with "full" is
         exact.
-      segment: steps per segment. Potentials are then recomputed in the backward pass from the states kept
-        between segments: O(sqrt(T)) memory at about sqrt(8 T).
-      nonfinite: "raise", or "zero": NaN and infinite drives count as 0 and get no gradient.
     Returns:
       spikes, potential: [T, ...] as ``drive``; spikes are 0 or 1.
       state: SrmState to carry on. The recursion runs in float64 whatever the drive, and chunks equal the
@@ -118,7 +140,6 @@ def srm(
             "stack the two drives on axis 1."
         )
     for value, name, choices in (
-        (nonfinite, "nonfinite", NONFINITE),
         (kernel, "kernel", RESETS),
         (response, "response", RESPONSES),
         (through_reset, "through_reset", THROUGH_RESET),
@@ -132,21 +153,19 @@ def srm(
     tau_s = _time_constant(tau_s, "tau_s", drive, dt) if response == "alpha" else None
     tau_r = _time_constant(tau_r, "tau_r", drive, dt) if kernel != "step" else torch.ones_like(theta)
     if gradient == "play":
-        check_play(drive, kernel, response, reset_scale, coupled, state)
-        layer = {"kernel": kernel, "response": response, "reset_scale": reset_scale, "coupled": True}
+        layer = {"kernel": kernel, "response": response, "reset_scale": reset_scale, "coupled": coupled}
+        check_play(drive, layer, state)
         with torch.no_grad():
             spikes, potential, after = srm(drive, theta=theta, state=state, **layer)
-        spikes, play = played(spikes, drive, theta, state)
+        spikes, play = played(spikes, drive, theta, None if state is None else state.play)
         return spikes, potential, replace(after, play=play)
     if gradient == "mean":
         others = {
             "surrogate": (surrogate, None),
             "through_reset": (through_reset, "off"),
             "smooth": (smooth, False),
-            "segment": (segment, None),
         }
         check_mean(kernel, coupled, others, state)
-        drive = drive if nonfinite == "raise" else drive.where(drive.isfinite(), 0)
         times = {"tau_s": tau_s, "dt": dt, "response": response}
         return _with_mean(drive, theta, tau_r, kernel, reset_scale, state, times)
     if surrogate is None:
@@ -155,34 +174,23 @@ def srm(
         raise DomainError(
             f"surrogate is {surrogate!r}; pass events.Laplace, events.FastSigmoid or events.Triangular."
         )
-    segment = None if segment is None else check_whole(segment, "segment", 1)
     if drive.numel() >= 2**32:
         raise ShapeError(
             f"drive holds {drive.numel()} values, a call addresses up to 2**32; give it in chunks of time "
             "and carry the state."
         )
-    setup = Setup(
-        RESPONSES[response],
-        RESETS[kernel],
-        kernel,
-        2 if coupled else 1,
-        reset_scale,
-        surrogate,
-        smooth,
-        through_reset,
-        nonfinite == "zero",
-        segment,
-        tuple(drive.shape),
-    )
+    channels = 2 if coupled else 1
+    shape = tuple(drive.shape)
+    setup = Setup(RESPONSES[response], kernel, channels, reset_scale, surrogate, smooth, through_reset, shape)
     h_reset = dt / tau_r
     if through_reset == "full" and torch.is_grad_enabled():
         _warn_if_unstable(setup, theta.detach(), h_reset.detach(), drive.shape[0])
-    state = entering_state(state, (STATES[setup.response], STATES[setup.reset]), pixels, drive.device)
+    state = _entering(state, setup, pixels, drive.device)
 
     def lanes(x):
         return x.expand(pixels).reshape(setup.channels, -1).contiguous()
 
-    spikes, potential, *after = run(
+    spikes, potential, *after = Srm.apply(
         setup,
         drive.reshape(drive.shape[0], setup.channels, -1),
         lanes(theta),
@@ -295,7 +303,7 @@ def _with_mean(drive, theta, tau_r, kernel, reset_scale, state, times):
     driven, responded = _response(drive, before, **times)
     before = None if state is None else state.mean
     mean, ages = mean_spikes(driven, theta, times["dt"] / tau_r, kernel, reset_scale, before)
-    return instead(spikes, mean), potential, replace(after, response=responded.response, mean=ages)
+    return straight_through(spikes, mean), potential, replace(after, response=responded.response, mean=ages)
 
 
 def _time_constant(value, name, drive, dt):
@@ -320,3 +328,28 @@ def _warn_if_unstable(setup, theta, h_reset, steps):
             RuntimeWarning,
             stacklevel=3,
         )
+
+
+def _entering(state, setup, pixels, device):
+    """The state a chunk begins with: the given one, checked, or rest.
+
+    Raises: DomainError for something else than an SrmState, or values that are not finite; ShapeError for a
+      state of other size, type or device.
+    """
+    shapes = [(STATES[kind], *pixels) for kind in (setup.response, setup.reset)]
+    if state is None:
+        return SrmState(*(torch.zeros(shape, dtype=torch.float64, device=device) for shape in shapes))
+    if not isinstance(state, SrmState):
+        raise DomainError(
+            f"state is a {type(state).__name__}; pass the SrmState that the chunk before returned, or None "
+            "to begin at rest."
+        )
+    for name, shape in zip(("response", "reset"), shapes, strict=True):
+        given = getattr(state, name)
+        if (given.shape, given.dtype, given.device.type) != (shape, torch.float64, device.type):
+            raise ShapeError(
+                f"state.{name} is {given.dtype} {list(given.shape)} on {given.device}, this layer keeps "
+                f"{torch.float64} {list(shape)} on {device}; pass the state of the same layer and frame."
+            )
+        check_finite(given, f"state.{name}", "begin again from a state that is finite")
+    return state

@@ -1,34 +1,34 @@
 """The spike response model over time as one node of torch's graph: a symbolic drjit loop forward and one
 backward, one lane per pixel (or pair of coupled polarities), in float64 whatever the drive.
 
+Its kernels are linear recursions with one decay a, one amplitude m and at most two states; no sum is cut:
+
+    pair     q <- a (q + p), p <- a p, y = m q, p <- p + z    y_t = m sum_{k>=1} k a^k z_{t-k}
+    early    y = m p, p <- a p + z                            y_t = m sum_{k>=1} a^{k-1} z_{t-k}
+    sum      p <- p + z, y = p                                y_t = sum_{k>=0} z_{t-k}
+    none     y = z
+
 The adjoint is written by hand, since it needs no state of the layer, only its potential: letting drjit
-differentiate one step after the other (``step_by_step``) keeps or computes again the states of every step:
-1.8 times as long, forward and backward, 2 x 128 x 128 pixels, T = 200.
+differentiate one step after the other (``events.kernels.recursion``) keeps or computes again the states of every
+step: 1.8 times as long, forward and backward, 2 x 128 x 128 pixels, T = 200.
 """
 
+import math
 from dataclasses import astuple, dataclass
 
 import torch
 from torch import Tensor
 from torch.autograd import Function
 
-from codesign.backend import NoSecondDerivative, arrays, load
+from codesign.backend import arrays, first_only, load
 from codesign.errors import NonFiniteError, check_finite
-from codesign.events.spiking.srm_kernels import (
-    STATES,
-    advance,
-    reset_coefficients,
-    response_coefficients,
-    retreat,
-    retreat_tangent,
-)
+from codesign.events.kernels import Lanes
 from codesign.events.spiking.surrogate import Operations, Surrogate
 from codesign.exclusive import exclusive
 
-FIRST_ONLY = (
-    "events.srm gives first derivatives only, and a second one was asked for; use differences of gradients "
-    "instead."
-)
+STATES = {"pair": 2, "early": 1, "sum": 1, "none": 0}
+RESPONSES = {"none": "none", "alpha": "pair", "step": "sum"}
+RESETS = {"slayer": "pair", "thesis": "early", "exp": "early", "step": "early"}
 # "bounded" keeps rho * sum|nu| at most this: the adjoint then shrinks by 10 % per pass through the reset
 BOUND = 0.9
 # floats ahead of the potential: where potentials and their gradient share their place in a memory page,
@@ -37,22 +37,92 @@ STAGGER = 768
 
 
 @dataclass(frozen=True)
+class Coefficients:
+    """Decay a and amplitude m per pixel, and their derivatives with respect to h = dt/tau; tensors of one
+    shape."""
+
+    a: Tensor
+    m: Tensor
+    a_h: Tensor
+    m_h: Tensor
+
+
+def response_coefficients(h: Tensor) -> Coefficients:
+    """Alpha kernel (k h) exp(1 - k h), k >= 1."""
+    a = (-h).exp()
+    return Coefficients(a, math.e * h, -a, (0 * h) + math.e)
+
+
+def reset_coefficients(kernel: str, h: Tensor, amplitude: Tensor) -> Coefficients:
+    """Reset kernel of the given name, for k >= 1, with amplitude = -reset_scale * theta: slayer: amplitude k
+    h exp(1 - k h); thesis: amplitude exp(1 - k h); exp: amplitude exp(-(k - 1) h); step: amplitude."""
+    a = (-h).exp()
+    zero = 0 * h
+    if kernel == "slayer":
+        return Coefficients(a, math.e * h * amplitude, -a, math.e * amplitude)
+    if kernel == "thesis":
+        first = math.e * amplitude * a
+        return Coefficients(a, first, -a, -first)
+    if kernel == "exp":
+        return Coefficients(a, amplitude, -a, zero)
+    return Coefficients(zero + 1, amplitude, zero, zero)
+
+
+def advance(kind, states, a, m, z=None):
+    """One step of the recursion up to its output y; returns y and the states, into whose first one the input
+    z is still to be added (``sum`` and ``none`` take z in at once)."""
+    if kind == "pair":
+        p, q = states
+        q = a * (q + p)
+        return m * q, [a * p, q]
+    if kind == "early":
+        return m * states[0], [a * states[0]]
+    if kind == "sum":
+        return states[0] + z, [states[0] + z]
+    return z, []
+
+
+def retreat(kind, adjoint, a, m, y):
+    """Adjoint of the states before a step, from the adjoint after it and the adjoint y of its output."""
+    if kind == "pair":
+        p = adjoint[0]
+        q = adjoint[1] + m * y
+        return [a * (p + q), a * q]
+    if kind == "early":
+        return [a * adjoint[0] + m * y]
+    return [adjoint[0] + y] if kind == "sum" else []
+
+
+def retreat_tangent(kind, tangent, adjoint, a, m, da, dm, y):
+    """Derivative of ``retreat`` where a and m move by da and dm, y being held; da None stands for zero
+    (``adjoint`` is then not needed)."""
+    moved = retreat(kind, tangent, a, dm, y)
+    if da is None:
+        return moved
+    if kind == "early":
+        return [moved[0] + da * adjoint[0]]
+    later = adjoint[1] + m * y
+    return [moved[0] + da * (adjoint[0] + later), moved[1] + da * later]
+
+
+@dataclass(frozen=True)
 class Setup:
-    """Everything about a call that is not a tensor. response, reset: kinds of recursion. kernel: name of the
-    reset.
+    """Everything about a call that is not a tensor. response: kind of recursion. kernel: name of the reset.
     channels: 2 where ON and OFF reset one another, else 1. shape: of the drive as the caller gave it."""
 
     response: str
-    reset: str
     kernel: str
     channels: int
     reset_scale: float
     surrogate: Surrogate
     smooth: bool
     through_reset: str
-    zero_nonfinite: bool
-    segment: int | None
     shape: tuple[int, ...]
+
+    @property
+    def reset(self):
+        """Kind of the reset's recursion."""
+        return RESETS[self.kernel]
 
     def reset_of(self, theta, h_reset):
         return reset_coefficients(self.kernel, h_reset, -self.reset_scale * theta)
@@ -64,61 +134,40 @@ class Setup:
         if self.reset == "pair":
             return self.channels * k.m.abs() * k.a / (1 - k.a) ** 2
         total = ((1 - k.a**steps) / (1 - k.a)).where(k.a < 1, float(steps))
-        return self.channels * (k.m.abs() * (k.a * total if self.reset == "late" else total))
+        return self.channels * (k.m.abs() * total)
 
 
-def run(
-    setup: Setup,
-    drive: Tensor,
-    theta: Tensor,
-    h_response: Tensor | None,
-    h_reset: Tensor,
-    response: Tensor,
-    reset: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Spikes, potential and final states of the layer.
+class Srm(Function):
+    """Spikes, potential and final states of the layer: ``Srm.apply(setup, drive, theta, h_response, h_reset,
+    response, reset)``.
 
-    Args:
-      drive: [T, channels, lanes] float32 or float64.
-      theta, h_response, h_reset: [channels, lanes] float64; h_response None without an alpha response.
-      response, reset: [number of states, channels, lanes] float64.
-    Returns: spikes and potential as ``drive``, states as ``response`` and ``reset``.
+    drive: [T, channels, lanes] float32 or float64, as are spikes and potential. theta, h_response, h_reset:
+    [channels, lanes] float64; h_response None without an alpha response. response, reset: [number of states,
+    channels, lanes] float64.
     """
-    return _Srm.apply(setup, drive, theta, h_response, h_reset, response, reset)
 
-
-class _Srm(Function):
     @staticmethod
     @exclusive
     def forward(ctx, setup, drive, theta, h_response, h_reset, response, reset):
-        import drjit as dr
-
         loops = _Loops(setup, drive, theta, h_response, h_reset)
-        states = loops.split(response, reset)
-        spikes = dr.empty(loops.single.Float, drive.numel())
-        potential = dr.empty(loops.single.Float, drive.numel() + STAGGER)
-        segment = setup.segment if any(ctx.needs_input_grad) else None
-        before = []
-        bad = dr.zeros(loops.single.Bool, loops.lanes)
-        for span in loops.spans(segment):
-            before.append(states)
-            states, found = loops.forward(states, span, 0, spikes, potential, STAGGER)
-            bad |= found
-            dr.eval(spikes, potential, states, bad)
+        dr = loops.dr
+        spikes = dr.empty(loops.arr.Float, drive.numel())
+        potential = dr.empty(loops.arr.Float, drive.numel() + STAGGER)
+        states, bad = loops.forward(loops.split(response, reset), spikes, potential)
+        dr.eval(spikes, potential, states, bad)
         dr.sync_thread()
         if bool(dr.any(bad)):
-            check_finite(drive.view(setup.shape), "drive", 'remove or repair them, or pass nonfinite="zero"')
+            check_finite(
+                drive.view(setup.shape), "drive", "remove or repair them, for example by torch.where"
+            )
             raise NonFiniteError(
                 "the potential of events.srm overflows; scale the drive down (events.drive_scale proposes a "
                 "factor)."
             )
         spikes = spikes.torch().view(drive.shape)
         potential = potential.torch()[STAGGER:].view(drive.shape)
-        kept = None if segment else potential
-        ctx.save_for_backward(drive, theta, h_response, h_reset, response, reset, spikes, kept)
+        ctx.save_for_backward(drive, theta, h_response, h_reset, response, reset, spikes, potential)
         ctx.setup = setup
-        ctx.segment = segment
-        ctx.before = before[1:]  # the first ones are given
         ctx.set_materialize_grads(False)
         return spikes, potential, *loops.join(states)
 
@@ -126,41 +175,27 @@ class _Srm(Function):
     def backward(ctx, *grads):  # pyright: ignore[reportIncompatibleMethodOverride]
         saved = ctx.saved_tensors
         with torch.no_grad():
-            result = _backward(ctx, saved, grads)
-        if torch.is_grad_enabled():
-            live = [g for g in result if g is not None]
-            given = [x for x in (*saved, *grads) if x is not None]
-            sealed = iter(NoSecondDerivative.apply(FIRST_ONLY, len(live), *live, *given))
-            result = [None if g is None else next(sealed) for g in result]
-        return None, *result
+            result = _backward(ctx.setup, saved, grads, ctx.needs_input_grad[1:])
+        return None, *first_only(result, (*saved, *grads))
 
 
 @exclusive
-def _backward(ctx, saved, grads):
+def _backward(setup, saved, grads, need):
     """Gradients of drive, theta, h_response, h_reset, response and reset; the initial states add their share
     to those of the parameters."""
-    import drjit as dr
-
     drive, theta, h_response, h_reset, response, reset, spikes, potential = saved
-    need = ctx.needs_input_grad[1:]
-    setup = ctx.setup
     loops = _Loops(setup, drive, theta, h_response, h_reset)
-    flat = {
-        "spikes": loops.flat(spikes),
-        "grad_spikes": loops.flat(grads[0]),
-        "grad_potential": loops.flat(grads[1]),
-        "potential": loops.flat(potential),
-        "grad_drive": dr.empty(loops.single.Float, drive.numel()) if need[0] else None,
+    dr = loops.dr
+    given = {
+        "spikes": spikes,
+        "grad_spikes": grads[0],
+        "grad_potential": grads[1],
+        "potential": potential,
     }
-    carried = loops.after(need, grads[2], grads[3])
-    spans = loops.spans(ctx.segment)
-    for states, span in reversed(list(zip([loops.split(response, reset), *ctx.before], spans, strict=True))):
-        if ctx.segment:
-            flat["potential"] = dr.empty(loops.single.Float, (span[1] - span[0]) * drive[0].numel())
-            loops.forward(states, span, span[0], None, flat["potential"], 0)
-            dr.eval(flat["potential"])
-        carried = loops.backward(carried, span, span[0] if ctx.segment else 0, flat)
-        dr.eval(carried, flat["grad_drive"])
+    flat = {name: None if tensor is None else loops.load(tensor) for name, tensor in given.items()}
+    flat["grad_drive"] = dr.empty(loops.arr.Float, drive.numel()) if need[0] else None
+    carried = loops.backward(loops.after(need, grads[2], grads[3]), flat)
+    dr.eval(carried, flat["grad_drive"])
     dr.sync_thread()
 
     def rows(name):
@@ -180,71 +215,47 @@ def _backward(ctx, saved, grads):
     ]
 
 
-class _Loops:
+class _Loops(Lanes):
     """The drjit side of one call: per-pixel numbers of every channel, and the loops. Numbers are evaluated
     or opaque, so that no call compiles anew."""
 
     def __init__(self, setup, drive, theta, h_response, h_reset):
-        import drjit as dr
-
-        self.dr = dr
+        self.steps, self.channels, lanes = drive.shape
+        super().__init__(drive, lanes)
         self.setup = setup
-        self.single = arrays(drive.device.type, drive.dtype)
-        self.double = arrays(drive.device.type, torch.float64)
-        self.steps, self.channels, self.lanes = drive.shape
-        self.drive = self.flat(drive)
-        lane = dr.arange(self.single.UInt32, self.lanes)
-        count = dr.opaque(self.single.UInt32, self.lanes)
-        self.index = [lane + k * count for k in range(self.channels)]
-        dr.eval(self.index)
-        self.row = dr.opaque(self.single.UInt32, self.lanes * self.channels)
+        self.Double = arrays(drive.device.type, torch.float64).Float
+        self.drive = self.load(drive)
         self.reset = setup.reset_of(theta, h_reset)
         self.response = h_response if h_response is None else response_coefficients(h_response)
         self.theta = theta
         self.h_reset = h_reset
 
-    def flat(self, tensor):
-        return None if tensor is None else load(self.single.Float, tensor)
-
-    def count(self, value):
-        return self.dr.opaque(self.single.UInt32, value)
-
-    def surrogate(self, types):
-        """The surrogate's numbers, and the functions it is written in."""
+    def surrogate(self, kind):
+        """The functions that the surrogate is written in, and its numbers."""
         dr = self.dr
-        numbers = [dr.opaque(types.Float, value) for value in astuple(self.setup.surrogate)]
-        return Operations(dr.exp2, dr.abs, dr.maximum, dr.select), numbers
-
-    def spans(self, segment):
-        """First step and end of every segment."""
-        length = segment or self.steps
-        return [(first, min(first + length, self.steps)) for first in range(0, self.steps, length)]
+        numbers = [dr.opaque(kind, value) for value in astuple(self.setup.surrogate)]
+        return Operations(dr.exp2, dr.abs, dr.maximum, dr.select), *numbers
 
     def read(self, flat, step, channel):
         """The values of one channel at one step, in float64."""
-        place = step * self.row + self.index[channel]
-        return self.double.Float(self.dr.gather(self.single.Float, flat, place))
+        return self.Double(self.at(flat, step * self.channels + channel))
 
-    def write(self, flat, value, step, channel, shift=0):
-        place = step * self.row + self.index[channel] + shift
-        self.dr.scatter(flat, value, place, mode=self.dr.ReduceMode.NoConflicts)
-
-    def numbers(self, more=None):
+    def numbers(self, **more):
         """Per channel, thresholds, decays and amplitudes [lanes] by name; ``more``: columns [channels,
         lanes] besides."""
-        columns = {"theta": self.theta, "reset_a": self.reset.a, "reset_m": self.reset.m, **(more or {})}
+        columns = {"theta": self.theta, "reset_a": self.reset.a, "reset_m": self.reset.m, **more}
         if self.response:
             columns |= {"response_a": self.response.a, "response_m": self.response.m}
         return [
             {"response_a": None, "response_m": None}
-            | {name: load(self.double.Float, column[k]) for name, column in columns.items()}
+            | {name: load(self.Double, column[k]) for name, column in columns.items()}
             for k in range(self.channels)
         ]
 
     def split(self, response, reset):
         """Per channel, the states of response and reset [states, channels, lanes] as drjit arrays [lanes]."""
         return [
-            [[load(self.double.Float, row[k]) for row in rows] for rows in (response, reset)]
+            [[load(self.Double, row[k]) for row in rows] for rows in (response, reset)]
             for k in range(self.channels)
         ]
 
@@ -257,26 +268,22 @@ class _Loops:
         ]
         return [torch.stack(rows, 1) for rows in zip(*parts, strict=True)]
 
-    def forward(self, states, span, origin, spikes, potential, shift):
-        """Run steps span[0] to span[1] - 1.
+    def forward(self, states, spikes, potential):
+        """Run all steps, which fill flat arrays of spikes and, behind STAGGER, potentials.
 
-        Args: states: per channel, of response and reset. origin: the step that the first row of ``spikes``
-          and ``potential`` belongs to, flat arrays scattered into, or None: not kept. shift: place of the
-          first potential.
+        Args: states: per channel, of response and reset.
         Returns: the states after the last step, and per lane whether something became NaN or infinite.
         """
-        dr, setup, single = self.dr, self.setup, self.single
-        Double = self.double.Float
+        dr, setup = self.dr, self.setup
+        Single, Double = self.arr.Float, self.Double
         numbers = self.numbers()
-        operations, surrogate = self.surrogate(self.double)
-        end, origin, shift = self.count(span[1]), self.count(origin), self.count(shift)
+        surrogate = self.surrogate(Double)
+        shift = self.opaque(STAGGER)
 
         def body(t, bad, states):
             responses, resets, moved = [], [], []
             for k, (n, (response, reset)) in enumerate(zip(numbers, states, strict=True)):
                 z = self.read(self.drive, t, k)
-                if setup.zero_nonfinite:
-                    z = dr.select(dr.isfinite(z), z, 0)
                 y, response = advance(setup.response, response, n["response_a"], n["response_m"], z)
                 r, reset = advance(setup.reset, reset, n["reset_a"], n["reset_m"])
                 if setup.response == "pair":
@@ -288,30 +295,25 @@ class _Loops:
                 u = responses[k] + (resets[k] if self.channels == 1 else resets[k] - resets[1 - k])
                 x = u - n["theta"]
                 if setup.smooth:
-                    s = setup.surrogate.integral(operations, x, *surrogate)
+                    s = setup.surrogate.integral(surrogate[0], x, *surrogate[1:])
                 else:
                     s = dr.select(x >= 0, Double(1), Double(0))
                 reset[0] = reset[0] + s
-                kept = single.Float(u)
+                kept = Single(u)
                 bad |= ~dr.isfinite(kept)
-                if spikes is not None:
-                    self.write(spikes, single.Float(s), t - origin, k)
-                if potential is not None:
-                    self.write(potential, kept, t - origin, k, shift)
-            return t + 1, bad, moved
+                place = self.place(t * self.channels + k)
+                dr.scatter(spikes, Single(s), place, mode=dr.ReduceMode.NoConflicts)
+                dr.scatter(potential, kept, place + shift, mode=dr.ReduceMode.NoConflicts)
+            return bad, moved
 
-        start = self.count(span[0]) + dr.zeros(single.UInt32, self.lanes)
-        healthy = dr.zeros(single.Bool, self.lanes)
-        _, bad, states = dr.while_loop(
-            (start, healthy, states), lambda t, *_: t < end, body, mode="symbolic", label="srm forward"
-        )
+        healthy = dr.zeros(self.arr.Bool, self.width)
+        bad, states = self.loop(0, self.opaque(self.steps), body, healthy, states)
         return states, bad
 
     def after(self, need, grad_response, grad_reset):
         """Per channel, what the loop backward carries, after the last step, by name: adjoints of the states
         of response and reset; where wanted, derivatives of those by h or theta (tangents), and gradients
         gathered so far (sums)."""
-        dr = self.dr
         setup = self.setup
         _, theta, response, reset, _, reset_state = need
         through = setup.through_reset != "off" or reset or reset_state
@@ -327,42 +329,39 @@ class _Loops:
 
         def begun(name, j, k):
             if given.get(name) is None:
-                return dr.zeros(self.double.Float, self.lanes)
-            return load(self.double.Float, given[name][j, k])
+                return self.dr.zeros(self.Double, self.width)
+            return load(self.Double, given[name][j, k])
 
         return [
             {name: [begun(name, j, k) for j in range(count)] for name, count in counts.items()}
             for k in range(self.channels)
         ]
 
-    def backward(self, carried, span, origin, flat):
-        """Run steps span[1] - 1 down to span[0].
+    def backward(self, carried, flat):
+        """Run all steps, the last one first.
 
-        Args: carried: loop variables after the last step. origin: the step at which the potential begins.
-          flat: arrays by name; spikes, grad_spikes, grad_potential and grad_drive (scattered into) hold all
-          steps. None: no such gradient.
+        Args: carried: loop variables after the last step. flat: arrays by name; grad_drive is filled. None:
+          no such gradient.
         Returns: loop variables before the first step.
         """
-        dr, setup, single = self.dr, self.setup, self.single
-        Double = self.double.Float
+        dr, setup = self.dr, self.setup
+        Single, Double = self.arr.Float, self.Double
         reset, response = self.reset, self.response
-        moved = {
-            "reset_a_h": reset.a_h,
-            "reset_m_h": reset.m_h,
-            "reset_m_theta": reset.m / self.theta,
-            "limit": BOUND / setup.reset_sum(self.theta, self.h_reset, self.steps),
-        }
-        if response:
-            moved |= {"response_a_h": response.a_h, "response_m_h": response.m_h}
-        numbers = self.numbers(moved)
-        operations, surrogate = self.surrogate(single)
-        first, origin = self.count(span[0]), self.count(origin)
+        by_h = {"response_a_h": response.a_h, "response_m_h": response.m_h} if response else {}
+        numbers = self.numbers(
+            reset_a_h=reset.a_h,
+            reset_m_h=reset.m_h,
+            reset_m_theta=reset.m / self.theta,
+            limit=BOUND / setup.reset_sum(self.theta, self.h_reset, self.steps),
+            **by_h,
+        )
+        surrogate = self.surrogate(Single)
 
         def through_threshold(t, k, n, part):
             """Gradient of the potential of one channel, and its share that came through the spike."""
-            x = single.Float(self.read(flat["potential"], t - origin, k) - n["theta"])
+            x = Single(self.read(flat["potential"], t, k) - n["theta"])
             # no better known than the stored potential
-            rho = Double(setup.surrogate.density(operations, x, *surrogate))
+            rho = Double(setup.surrogate.density(surrogate[0], x, *surrogate[1:]))
             seeded = flat["grad_spikes"] is not None
             spiking = rho * self.read(flat["grad_spikes"], t, k) if seeded else Double(0)
             if setup.through_reset != "off":
@@ -377,18 +376,16 @@ class _Loops:
             """Through the response kernel to the drive, and one step back."""
             kind, adjoint = setup.response, part["response"]
             coefficients = n["response_a"], n["response_m"]
-            z = self.read(self.drive, t, k)
-            usable = dr.isfinite(z) if setup.zero_nonfinite else True
             after = {"response": retreat(kind, adjoint, *coefficients, y)}
             if "response_sum" in part:
                 tangent, total = part["response_tangent"], part["response_sum"][0]
-                after["response_sum"] = [total + dr.select(usable, z, 0) * tangent[0]]
+                after["response_sum"] = [total + self.read(self.drive, t, k) * tangent[0]]
                 by_h = n["response_a_h"], n["response_m_h"]
                 after["response_tangent"] = retreat_tangent(kind, tangent, adjoint, *coefficients, *by_h, y)
             if flat["grad_drive"] is not None:
-                of_drive = {"none": lambda: y, "sum": lambda: adjoint[0] + y}.get(kind, lambda: adjoint[0])()
-                of_drive = single.Float(of_drive)
-                self.write(flat["grad_drive"], dr.select(usable, of_drive, 0), t, k)
+                # what a response takes in at once reaches its output in the same step
+                of_drive = y if kind == "none" else after["response"][0] if kind == "sum" else adjoint[0]
+                self.put(flat["grad_drive"], Single(of_drive), t * self.channels + k)
             return after
 
         def through_reset(t, k, n, part, y, spiking):
@@ -411,7 +408,6 @@ class _Loops:
             return after
 
         def body(t, carried):
-            t = t - 1
             channels = list(enumerate(zip(numbers, carried, strict=True)))
             found = [through_threshold(t, k, n, part) for k, (n, part) in channels]
             before = []
@@ -420,9 +416,6 @@ class _Loops:
                 of_reset = y if self.channels == 1 else y - found[1 - k][0]
                 moved = respond(t, k, n, part, y) | through_reset(t, k, n, part, of_reset, spiking)
                 before.append({name: moved.get(name, []) for name in part})
-            return t, before
+            return (before,)
 
-        last = self.count(span[1]) + dr.zeros(single.UInt32, self.lanes)
-        return dr.while_loop(
-            (last, carried), lambda t, *_: t > first, body, mode="symbolic", label="srm adjoint"
-        )[1]
+        return self.loop_back(0, self.opaque(self.steps), body, carried)[0]

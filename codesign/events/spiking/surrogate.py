@@ -45,12 +45,8 @@ class Surrogate:
     mass: ClassVar[float]  # integral over the real line, times alpha beta
 
     def __post_init__(self):
-        for name, value in (("alpha", self.alpha), ("beta", self.beta)):
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
-                raise DomainError(
-                    f"{type(self).__name__}: {name} is {shown(value)}; give a finite number > 0, for example "
-                    f"{type(self).__name__}.unit(width=theta)."
-                )
+        for name in ("alpha", "beta"):
+            check_positive(getattr(self, name), f"{type(self).__name__}: {name}")
 
     @classmethod
     def unit(cls, width: float) -> Self:

@@ -1,16 +1,15 @@
 """The spiking network of the thesis: brightness steps, one 3x3 convolution per polarity, a spike response
-threshold; and its smoothed variant."""
+threshold."""
 
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from codesign.errors import DomainError, ShapeError, check_seed
-from codesign.events.entry import check_frames, check_positive, check_whole
+from codesign.errors import ShapeError, check_seed
+from codesign.events.entry import check_chunk, check_frames, check_positive, check_state, check_whole
 from codesign.events.spiking.spike_esim_parts import stepwise
-from codesign.events.spiking.srm import drive_scale, srm
-from codesign.events.spiking.srm_state import SrmState
+from codesign.events.spiking.srm import SrmState, drive_scale, srm
 from codesign.events.spiking.surrogate import Surrogate
 
 MOST_CHANNELS = 1024
@@ -34,9 +33,7 @@ class TwoBranchSpikes(nn.Module):
 
     channels: 3 for RGB, 1 for monochrome frames. theta: threshold > 0. tau_r: time constant of the reset, in
       the unit of dt. dt: length of a step.
-    smoothing_tau: None for the network itself; else time constant of an alpha response of the drive before
-      the threshold (temporal smoothing): weak changes add up over a few tau, and events come later, by 2 tau
-      for a short change. kernel, surrogate, through_reset: as for ``events.srm``; the thesis's own reset is
+    kernel, surrogate, through_reset: as for ``events.srm``; the thesis's own reset is
       "thesis".
     seed: of the weights, uniform in 0 to 1 over their number, so that ON starts as brighter and OFF as
       darker.
@@ -49,7 +46,6 @@ class TwoBranchSpikes(nn.Module):
         theta: Tensor | float = 1.0,
         tau_r: Tensor | float = 1.0,
         dt: float = 1.0,
-        smoothing_tau: Tensor | float | None = None,
         kernel: str = "slayer",
         surrogate: Surrogate | None = None,
         through_reset: str = "off",
@@ -57,8 +53,8 @@ class TwoBranchSpikes(nn.Module):
     ):
         super().__init__()
         dt = check_positive(dt, "dt")
-        for name, value in (("theta", theta), ("tau_r", tau_r), ("smoothing_tau", smoothing_tau)):
-            if not isinstance(value, Tensor) and (value is not None or name != "smoothing_tau"):
+        for name, value in (("theta", theta), ("tau_r", tau_r)):
+            if not isinstance(value, Tensor):
                 check_positive(value, name)
         channels = check_whole(channels, "channels", 1, MOST_CHANNELS)
         seed = check_seed(seed, "seed")
@@ -67,7 +63,6 @@ class TwoBranchSpikes(nn.Module):
         self.weight_off = nn.Parameter(draw[1])
         self.theta = theta
         self.dt = dt
-        self.smoothing_tau = smoothing_tau
         self._options = {
             "tau_r": tau_r,
             "kernel": kernel,
@@ -90,8 +85,7 @@ class TwoBranchSpikes(nn.Module):
         Gradient: weights and frames, by the surrogate.
         Raises: ShapeError for other shapes or too few frames; DomainError for NaN or infinity.
         """
-        if state is not None and not isinstance(state, BranchState):
-            raise DomainError(f"the state is a {type(state).__name__}; pass the one that was returned.")
+        check_state(state, BranchState)
         drive, last = self._drive(frames, state)
         neurons = None if state is None else state.neurons
         spikes, potential, neurons = srm(
@@ -99,7 +93,6 @@ class TwoBranchSpikes(nn.Module):
             theta=self.theta if theta is None else theta,
             state=neurons,
             dt=self.dt,
-            **self._response(),
             **self._options,
         )
         return spikes, potential, BranchState(last, neurons)
@@ -113,12 +106,7 @@ class TwoBranchSpikes(nn.Module):
         """
         drive, _ = self._drive(frames, None)
         for branch, weight in enumerate((self.weight_on, self.weight_off)):
-            weight.mul_(
-                drive_scale(drive[:, branch], theta=self.theta, share=share, dt=self.dt, **self._response())
-            )
-
-    def _response(self):
-        return {} if self.smoothing_tau is None else {"response": "alpha", "tau_s": self.smoothing_tau}
+            weight.mul_(drive_scale(drive[:, branch], theta=self.theta, share=share, dt=self.dt))
 
     def _drive(self, frames, state):
         check_frames(frames, 2 if state is None else 1, non_negative=False)
@@ -130,13 +118,8 @@ class TwoBranchSpikes(nn.Module):
                 f"frames have shape {list(frames.shape)}; [T, {channels}, H, W] is needed "
                 f"(channels={channels})."
             )
-        if state is not None and (state.frame.shape != frames.shape[1:] or state.frame.dtype != frames.dtype):
-            given = f"{frames.dtype} {list(frames.shape[1:])}"
-            wanted = f"{state.frame.dtype} {list(state.frame.shape)}"
-            raise ShapeError(
-                f"frames of {given} follow frames of {wanted}; a network keeps its frame size and type over "
-                "chunks."
-            )
+        if state is not None:
+            check_chunk(frames, state.frame.shape, state.frame.dtype)
         steps = (frames if state is None else torch.cat((state.frame[None], frames))).diff(dim=0)
         weights = (self.weight_on, -self.weight_off)
 

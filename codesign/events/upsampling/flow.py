@@ -4,11 +4,9 @@ picture no longer shows.
 """
 
 import math
-from dataclasses import dataclass
 
 import torch
 from kornia.filters import gaussian_blur2d
-from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, pad
 
 DATA_WEIGHT = 20.0  # lambda, for pictures of natural-log units
@@ -113,7 +111,8 @@ def refined(first, second, flow, warps, iterations):
     """
     dual_x = torch.zeros_like(flow)
     dual_y = torch.zeros_like(flow)
-    buffers = Buffers(flow)
+    # memory that all iterations share: allocating it anew takes longer than the arithmetic
+    buffers = [flow.new_empty(flow[:, :1].shape), *(torch.zeros_like(flow) for _ in range(4))]
     for _ in range(warps):
         flow = median_of_nine(flow)
         seen = inside(flow)
@@ -121,13 +120,8 @@ def refined(first, second, flow, warps, iterations):
         gradient = _gradient((warped + first) / 2) * seen
         square = gradient.square().sum(1, keepdim=True) + LEAST_GRADIENT
         constant = (warped - first) * seen - (gradient * flow).sum(1, keepdim=True)
-        data = Linear(
-            constant,
-            gradient,
-            gradient / square,
-            DATA_WEIGHT * COUPLING * square,
-            -DATA_WEIGHT * COUPLING * square,
-        )
+        most = DATA_WEIGHT * COUPLING * square
+        data = constant, gradient, gradient / square, most, -most
         for _ in range(iterations):
             _iterate(flow, dual_x, dual_y, data, buffers)
     return median_of_nine(flow)
@@ -146,45 +140,22 @@ def median_of_nine(field):
     return values[4]
 
 
-@dataclass(frozen=True)
-class Linear:
-    """The brightness difference about a flow: constant + gradient . flow, [B, 1, H, W] and [B, 2, H, W]; the
-    step along it and its bounds."""
-
-    constant: Tensor
-    gradient: Tensor
-    step: Tensor
-    most: Tensor
-    least: Tensor
-
-
-class Buffers:
-    """Memory that all iterations share: allocating it anew takes longer than the arithmetic."""
-
-    def __init__(self, flow):
-        self.residual = flow.new_empty(flow[:, :1].shape)
-        self.divergence = torch.empty_like(flow)
-        self.size = torch.empty_like(flow)
-        # the last column and row stay 0
-        self.across = torch.zeros_like(flow)
-        self.down = torch.zeros_like(flow)
-
-
 def _iterate(flow, dual_x, dual_y, data, buffers):
-    """One step of the data term, one of the smoothness, in place."""
-    residual = buffers.residual
-    divergence = buffers.divergence
-    size = buffers.size
-    across = buffers.across
-    down = buffers.down
-    torch.addcmul(data.constant, data.gradient[:, :1], flow[:, :1], out=residual)
-    residual.addcmul_(data.gradient[:, 1:], flow[:, 1:])
-    torch.minimum(residual, data.most, out=residual)
-    torch.maximum(residual, data.least, out=residual)
+    """One step of the data term, one of the smoothness, in place.
+
+    Args: data: of the brightness difference constant + gradient . flow, these two, the step along it, and its bounds.
+      buffers: five tensors to work in; the last column and row of the last two stay 0.
+    """
+    constant, gradient, step, most, least = data
+    residual, divergence, size, across, down = buffers
+    torch.addcmul(constant, gradient[:, :1], flow[:, :1], out=residual)
+    residual.addcmul_(gradient[:, 1:], flow[:, 1:])
+    torch.minimum(residual, most, out=residual)
+    torch.maximum(residual, least, out=residual)
     torch.add(dual_x, dual_y, out=divergence)
     divergence[..., 1:] -= dual_x[..., :-1]
     divergence[..., 1:, :] -= dual_y[..., :-1, :]
-    flow.addcmul_(residual, data.step, value=-1).add_(divergence, alpha=COUPLING)
+    flow.addcmul_(residual, step, value=-1).add_(divergence, alpha=COUPLING)
     torch.sub(flow[..., 1:], flow[..., :-1], out=across[..., :-1])
     torch.sub(flow[..., 1:, :], flow[..., :-1, :], out=down[..., :-1, :])
     torch.mul(across, across, out=size).addcmul_(down, down).sqrt_().mul_(DUAL_STEP / COUPLING).add_(1)
@@ -194,13 +165,9 @@ def _iterate(flow, dual_x, dual_y, data, buffers):
 
 def _gradient(picture):
     around = pad(picture, (1, 1, 1, 1), mode="replicate")
-    return (
-        torch.cat(
-            (around[..., 1:-1, 2:] - around[..., 1:-1, :-2], around[..., 2:, 1:-1] - around[..., :-2, 1:-1]),
-            1,
-        )
-        / 2
-    )
+    across = around[..., 1:-1, 2:] - around[..., 1:-1, :-2]
+    down = around[..., 2:, 1:-1] - around[..., :-2, 1:-1]
+    return torch.cat((across, down), 1) / 2
 
 
 def with_matches(levels, flow):

@@ -10,7 +10,8 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from codesign.errors import DomainError, ShapeError
+from codesign.errors import ShapeError
+from codesign.events.entry import check_whole
 
 ON_COLOUR, OFF_COLOUR = (
     "#d55e00",
@@ -19,13 +20,12 @@ ON_COLOUR, OFF_COLOUR = (
 PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
 
 
-def rate_figure(middle_s, rate_hz, title="Event rate"):
+def rate_figure(middle_s, rate_hz):
     """Figure of event rates.
 
     Args:
       middle_s: [K] middle of each interval, seconds. rate_hz: [K, 2] events per second, ON first (both as
         ``rates`` gives them).
-      title: heading.
     Returns: matplotlib Figure; time in milliseconds below ten seconds of recording, else in seconds.
     Raises: ShapeError when the two do not fit.
     """
@@ -58,7 +58,7 @@ def rate_figure(middle_s, rate_hz, title="Event rate"):
             label=name,
         )
     axis.set(xlabel=f"time ({unit}){shift}", ylabel=f"{prefix}events per second")
-    axis.set_title(title, loc="left", fontsize=11)
+    axis.set_title("Event rate", loc="left", fontsize=11)
     axis.set_ylim(bottom=0)
     axis.margins(x=0)
     axis.grid(alpha=0.3)
@@ -69,24 +69,21 @@ def rate_figure(middle_s, rate_hz, title="Event rate"):
     return figure
 
 
-def space_time_figure(stream, *, points=20_000, generator=None, total=None, title="Events in space and time"):
+def space_time_figure(stream, *, points=20_000, total=None):
     """3-D figure of a stream: time to the right, columns into depth, rows downwards; rows and columns have
     the same scale.
 
     Args:
       stream: EventStream with at least one event.
       points: at most so many events are shown, drawn evenly from all of them.
-      generator: torch.Generator that chooses them; None: one with seed 0.
       total: number of events that the stream is itself a sample of; None: it holds all.
-      title: first line of the heading; the second says how many of the events are shown.
     Returns: matplotlib Figure; milliseconds since the first event.
     Raises: ShapeError for a stream without events; DomainError for points that are not a whole number >= 1.
     """
     if not len(stream):
         raise ShapeError("the stream holds no event; a figure needs at least one.")
-    if isinstance(points, bool) or not isinstance(points, int) or points < 1:
-        raise DomainError(f"points is {points!r}; a whole number >= 1 is needed.")
-    shown = sample(len(stream), points, torch.Generator().manual_seed(0) if generator is None else generator)
+    points = check_whole(points, "points", 1)
+    shown = sample(len(stream), points, torch.Generator().manual_seed(0))
     t_ms = (stream.t_us[shown] - stream.t_us[0]).numpy() / 1e3
     x, y, p = (column[shown].numpy() for column in (stream.x, stream.y, stream.p))
     figure = Figure(figsize=(10, 5.6))
@@ -133,7 +130,7 @@ def space_time_figure(stream, *, points=20_000, generator=None, total=None, titl
         if len(shown) == total
         else f"{len(shown):,} of {total:,} events, drawn at random"
     )
-    figure.suptitle(f"{title}\n{number}", fontsize=12, y=0.985)
+    figure.suptitle(f"Events in space and time\n{number}", fontsize=12, y=0.985)
     axis.legend(frameon=False, loc="upper right", bbox_to_anchor=(0.9, 0.98))
     return figure
 

@@ -13,7 +13,7 @@ from codesign.atomic import replacing
 from codesign.errors import DomainError, FileFormatError, ShapeError, as_number
 from codesign.events.entry import Times, check_counts, check_layout, check_positive, check_times
 from codesign.events.stream import to_counts
-from codesign.events.volumes.traces import decay
+from codesign.events.volumes.surface import decay
 from codesign.optional import optional
 from codesign.types import EventStream
 

@@ -1,5 +1,5 @@
-"""Time surfaces: how long ago the last event was, per pixel and polarity, as exp(-(t_ref - t_last) / tau); 0
-where none was yet.
+"""What fades, per pixel and polarity. Time surfaces: how long ago the last event was, as exp(-(t_ref - t_last) / tau);
+0 where none was yet. Traces, which grow by one with every event and fade between them.
 
 The gradient of the surface of hard counts is that of its mean over where pixels stand inside their
 thresholds. In the mean over places inside a threshold C it is (1/C) times the integral of exp(-age/tau) over
@@ -18,11 +18,20 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
 from codesign.errors import DomainError, ShapeError, check_finite
-from codesign.events.entry import Times, check_counts, check_times
+from codesign.events.entry import (
+    Times,
+    check_counts,
+    check_dtype,
+    check_layout,
+    check_positive,
+    check_times,
+    check_whole,
+    shown,
+)
 from codesign.events.stream import check_stream
-from codesign.events.volumes.traces import check_tau, segments
 from codesign.types import EventStream
 
+NANOSECOND = 1e-9
 NEVER_US = torch.iinfo(torch.int64).min
 
 
@@ -38,7 +47,7 @@ def surface_from_stream(
       tau_s: time in which the surface fades to 1/e, seconds, > 0.
     Returns: [K, 2, H, W] in 0 to 1, ON first; the difference of times is taken in whole microseconds, so
       epoch times lose nothing.
-    Gradient: none (timestamps are integers); ``surface_from_times`` has one.
+    Gradient: none (timestamps are integers).
     Raises: DomainError for reference times that are not whole or do not increase, and for tau.
     Source: Lagorce et al., HOTS, PAMI 2017, eq. 2 and 3.
     """
@@ -57,67 +66,6 @@ def surface_from_stream(
             .to(dtype)
             .reshape(2, height, width)
         )
-    return torch.stack(surfaces)
-
-
-def surface_from_times(
-    t_s: Tensor,
-    x: Tensor,
-    y: Tensor,
-    p: Tensor,
-    height_px: int,
-    width_px: int,
-    at_s: Tensor | Sequence[float],
-    tau_s: float,
-) -> Tensor:
-    """Time surface of events whose times are real numbers, such as analytic crossing times.
-
-    Args:
-      t_s: [N] floating-point times, seconds, in any order. x, y: [N] int64 column and row. p: [N] +1 or -1.
-      height_px, width_px: sensor size. at_s: [K] reference times, seconds, strictly increasing. tau_s:
-        seconds, > 0.
-    Returns: [K, 2, H, W] of the type of t_s, ON first.
-    Gradient: t_s: surface / tau for the last event of a pixel, 0 for the others (where two events are last
-      together, to one of them).
-    Raises: ShapeError when lengths differ; DomainError for times that are not finite, events outside the
-      sensor, another polarity, and for tau.
-    Numerics: give times relative to the start of a recording; float64 epoch times are exact to 0.2 us.
-    """
-    tau_s = check_tau(tau_s)
-    if not (t_s.ndim == 1 and t_s.shape == x.shape == y.shape == p.shape) or not t_s.is_floating_point():
-        given = [(str(v.dtype), list(v.shape)) for v in (t_s, x, y, p)]
-        raise ShapeError(
-            f"t_s, x, y, p are {given}; four lists of equal length are needed, t_s of floating-point seconds."
-        )
-    check_finite(t_s, "t_s")
-    if any(values.is_floating_point() for values in (x, y, p)):
-        raise DomainError("x, y and p hold fractions; tensors of whole numbers are needed.")
-    outside = (x < 0) | (x >= width_px) | (y < 0) | (y >= height_px) | (p.abs() != 1)
-    if bool(outside.any()):
-        at = int(outside.nonzero()[0])
-        raise DomainError(
-            f"event {at} is x {int(x[at])}, y {int(y[at])}, p {int(p[at])}; x below {width_px}, y below "
-            f"{height_px}, and polarity +1 or -1 are allowed."
-        )
-    order = torch.argsort(t_s.detach(), stable=True)
-    times_s = t_s[order]
-    cell = (((p < 0).long() * height_px + y) * width_px + x)[order]
-    rank = torch.arange(len(order), device=cell.device)
-    surfaces = []
-    for time_s in check_times(at_s).tolist():
-        seen = int(
-            torch.searchsorted(
-                times_s.detach(), torch.tensor(time_s, dtype=t_s.dtype, device=t_s.device), right=True
-            )
-        )
-        last = torch.full((2 * height_px * width_px,), -1, device=cell.device).scatter_reduce_(
-            0, cell[:seen], rank[:seen], "amax"
-        )
-        fired = (last >= 0).nonzero().flatten()
-        surface = torch.zeros(last.shape, dtype=t_s.dtype, device=t_s.device).index_put(
-            (fired,), torch.exp((times_s[last[fired]] - time_s) / tau_s)
-        )
-        surfaces.append(surface.reshape(2, height_px, width_px))
     return torch.stack(surfaces)
 
 
@@ -236,3 +184,114 @@ class _LastEvents(Function):
             now, begun, begun_before = (torch.where(quiet, value, 0) for value in (now, begun, begun_before))
             pull[index] = now + (now_past - begun - begun_before - begun_past) / 2
         return pull, None, None, None
+
+
+def decay(counts: Tensor, t_s: Times, tau_s: float) -> Tensor:
+    """Exponentially fading sum of events, per polarity, after every frame interval.
+
+    Args:
+      counts: [T-1, 2, ...] hard or soft counts per interval, counted as if at the interval's end.
+      t_s: [T] times around the intervals, seconds, strictly increasing.
+      tau_s: time in which a trace fades to 1/e, seconds, > 0.
+    Returns: [T-1, 2, ...]; after each interval of length d: s = s exp(-d/tau) + counts.
+    Gradient: counts (the sum is linear in them).
+    """
+    tau_s = check_tau(tau_s)
+    check_layout(counts, 1, name="counts")
+    check_finite(counts, "counts")
+    fade = torch.exp(check_times(t_s, len(counts) + 1).diff() / -tau_s).tolist()
+    trace = torch.zeros_like(counts[0])
+    traces = []
+    for now, factor in zip(counts, fade, strict=True):
+        trace = trace * factor + now
+        traces.append(trace)
+    return torch.stack(traces)
+
+
+def decay_from_stream(
+    stream: EventStream,
+    at_us: Tensor | Sequence[int],
+    tau_s: float,
+    *,
+    start: tuple[Tensor, int] | None = None,
+    dtype: torch.dtype = torch.float32,
+) -> Tensor:
+    """Exponentially fading sum of single events at given times: sum over t <= t_ref of exp(-(t_ref - t) /
+    tau).
+
+    Args:
+      stream: EventStream.
+      at_us: [K] reference times, whole microseconds, strictly increasing. Events at a reference time belong
+        to it.
+      tau_s: seconds, > 0.
+      start: (trace [2, H, W], its time in whole microseconds) of an earlier chunk, whose events are then not
+        in the stream; None: nothing before.
+    Returns: [K, 2, H, W], summed in float64, ON first.
+    Gradient: none (timestamps are integers).
+    Raises: DomainError for reference times that are not whole or do not increase, and for tau; ShapeError for
+      a trace of another size.
+    """
+    tau_s = check_tau(tau_s)
+    check_stream(stream)
+    check_dtype(dtype)
+    height = stream.height_px
+    width = stream.width_px
+    trace = torch.zeros(2 * height * width, dtype=torch.float64, device=stream.t_us.device)
+    before_us = None
+    if start is not None:
+        if not isinstance(start, tuple) or len(start) != 2 or not isinstance(start[0], Tensor):
+            raise DomainError(f"start is {shown(start)}; a trace and its time in microseconds are needed.")
+        earlier, before_us = start[0], check_whole(start[1], "the time of the trace")
+        check_layout(earlier, name="the trace to go on with")
+        if earlier.shape != (2, height, width):
+            raise ShapeError(
+                f"the trace to go on with has shape {list(earlier.shape)}; the sensor's is "
+                f"{[2, height, width]}."
+            )
+        trace += earlier.to(trace).flatten()
+    traces = []
+    for time_us, (cell, t_us) in segments(stream, at_us):
+        if before_us is not None:
+            if time_us < before_us:
+                raise DomainError(
+                    f"the trace is of {before_us} us, after the first time asked for, {time_us} us."
+                )
+            trace *= math.exp((time_us - before_us) / (-1e6 * tau_s))
+        trace.index_add_(0, cell, torch.exp((time_us - t_us).to(torch.float64) / (-1e6 * tau_s)))
+        before_us = time_us
+        traces.append(trace.to(dtype, copy=True).reshape(2, height, width))
+    return torch.stack(traces)
+
+
+def segments(stream, at_us):
+    """For every reference time: the time, and (cell, t_us) of the events after the one before, up to and
+    including it.
+
+    A cell is the place of (polarity, row, column) in a flattened [2, H, W]. Raises: DomainError for times
+    that are not whole or do not increase.
+    """
+    try:
+        times_us = torch.as_tensor(at_us)
+        check_whole(int(times_us.abs().max()) if len(times_us) else 0, "at_us")
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        times_us = torch.empty(0)
+    if (
+        times_us.ndim != 1
+        or not len(times_us)
+        or times_us.is_floating_point()
+        or times_us.is_complex()
+        or bool((times_us.diff() <= 0).any())
+    ):
+        raise DomainError(
+            f"at_us is {shown(at_us)}; a list of whole microseconds that increase strictly is needed."
+        )
+    ends = torch.searchsorted(stream.t_us, times_us.to(stream.t_us), right=True).tolist()
+    cell = ((stream.p < 0).long() * stream.height_px + stream.y) * stream.width_px + stream.x
+    for time_us, first, last in zip(times_us.tolist(), [0, *ends], ends, strict=False):
+        yield time_us, (cell[first:last], stream.t_us[first:last])
+
+
+def check_tau(tau_s):
+    """A fading time as a float; DomainError unless it is a finite number of seconds of at least a
+    nanosecond."""
+    return check_positive(tau_s, "tau_s", " s", NANOSECOND)

@@ -11,36 +11,20 @@ networks take them.
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError
+from codesign.errors import DomainError
 from codesign.events.entry import (
     Times,
     check_counts,
     check_dtype,
-    check_layout,
     check_room,
     check_times,
     check_whole,
     shown,
 )
-from codesign.events.stream import check_stream, ordered
+from codesign.events.stream import check_stream
 from codesign.types import EventStream, EventVolume
 
 MOST_BINS = 2**20
-
-
-def bin_shares(position: Tensor, bins: int) -> Tensor:
-    """Share of each bin in events at given places of the interval.
-
-    Args:
-      position: [N] place in the interval, 0 at its start, 1 at its end.
-      bins: number of bins, >= 1.
-    Returns: [N, bins] shares >= 0; each row sums to 1 and has at most two entries. One bin takes everything.
-    """
-    check_bins(bins)
-    if bins == 1:
-        return torch.ones_like(position)[:, None]
-    node = torch.arange(bins, dtype=position.dtype, device=position.device)
-    return (1 - (position[:, None] * (bins - 1) - node).abs()).clamp(min=0)
 
 
 def check_bins(bins: object) -> None:
@@ -78,7 +62,9 @@ def from_counts(counts: Tensor, t_s: Times, bins: int) -> EventVolume:
     check_bins(bins)
     times_s = check_times(t_s, counts.shape[0] + 1)
     middle_s = (times_s[1:] + times_s[:-1]) / 2 - times_s[0]
-    shares = bin_shares(middle_s / (times_s[-1] - times_s[0]), bins)
+    place = middle_s / (times_s[-1] - times_s[0]) * (bins - 1)
+    # of every interval in the bins, at most two of them each; one bin takes everything
+    shares = (1 - (place[:, None] - torch.arange(bins)).abs()).clamp(min=0)
     collected_s = shares.T @ times_s.diff()
     if bool((collected_s <= 0).any()):
         empty = (collected_s <= 0).nonzero().flatten().tolist()
@@ -185,39 +171,3 @@ def spikes_from_stream(
     spikes = torch.zeros(shape, dtype=dtype, device=stream.t_us.device)
     spikes[(stream.p[inside] < 0).long(), stream.x[inside], stream.y[inside], step[inside]] = 1
     return spikes
-
-
-def stream_from_spikes(spikes: Tensor, t0_us: int, step_us: int) -> EventStream:
-    """Stream with one event per spike, at the start of its step; ``spikes_from_stream`` of it gives the same
-    spikes.
-
-    Args:
-      spikes: [2, W, H, T] of 0 and 1, ON first. t0_us, step_us: as for ``spikes_from_stream``.
-    Raises: ShapeError for another shape; DomainError for values other than 0 and 1.
-    """
-    t0_us = check_whole(t0_us, "t0_us")
-    step_us = check_whole(step_us, "step_us", 1)
-    check_layout(spikes, 1, name="spikes")
-    if spikes.ndim != 4 or spikes.shape[0] != 2 or 0 in spikes.shape:
-        raise ShapeError(f"spikes have shape {list(spikes.shape)}; [2, W, H, T] is needed (ON first).")
-    if not bool(((spikes == 0) | (spikes == 1)).all()):
-        raise DomainError(
-            "spikes hold values other than 0 and 1; round soft spikes before making single events of them."
-        )
-    check_whole(t0_us + spikes.shape[3] * step_us, "the end of the stream")
-    off, x, y, step = spikes.nonzero(as_tuple=True)
-    return ordered(t0_us + step * step_us, x, y, 1 - 2 * off, spikes.shape[2], spikes.shape[1])
-
-
-def spikes_from_counts(counts: Tensor) -> Tensor:
-    """Spike tensor of counts per interval, one step per interval: min(count, 1).
-
-    Args: counts: [T, 2, H, W] hard or soft counts >= 0, ON first, of intervals of equal length.
-    Returns: [2, W, H, T]; binary for whole counts, shares of a spike between 0 and 1 for soft ones.
-    Gradient: counts up to and including 1; none above.
-    Raises: ShapeError for another shape; DomainError for counts that are negative or not finite.
-    """
-    check_counts(counts, non_negative=True)
-    if counts.ndim != 4:
-        raise ShapeError(f"counts have shape {list(counts.shape)}; [T, 2, H, W] is needed, without a batch.")
-    return counts.clamp(max=1).permute(1, 3, 2, 0).contiguous()

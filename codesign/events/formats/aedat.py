@@ -1,11 +1,17 @@
 """AEDAT 4.0: packets of 16-byte events with 64-bit microseconds, and the frames that DAVIS cameras record
-beside them.
+beside them. AEDAT 2.0 as jAER reads it for DAVIS cameras, written only.
 
-Layout: the line ``#!AER-DAT4.0``, an IOHeader (FlatBuffer: compression, position of the table, XML that names
+Layout of 4.0: the line ``#!AER-DAT4.0``, an IOHeader (FlatBuffer: compression, position of the table, XML that names
   the streams), packets of (stream, size) and a compressed FlatBuffer each, and a compressed FileDataTable
   that lists the packets once more. FlatBuffers are read without generated code, every offset checked.
 Source: iniVation documentation, "AEDAT file formats", AEDAT 4.0; FlatBuffers schemas of dv-processing;
   FlatBuffers documentation, "FlatBuffer Internals".
+
+Layout of 2.0: '#' lines, then big-endian pairs of 32-bit address and 32-bit microseconds. Bits of the address: 22 to
+  30 the row, counted from the bottom; 12 to 21 the column, counted from the right; 11 the polarity; 31 (frame sample)
+  and 10 (external) are zero for an event of a pixel.
+Source: iniVation documentation, "AEDAT file formats", AEDAT 2.0; jAER, DavisBaseCamera (mirrored columns); v2e,
+  aedat2_output.
 """
 
 import re
@@ -73,6 +79,12 @@ INFO = """<dv version="2.0">
     </node>
 </dv>
 """
+CHIPS = {(260, 346): "DAVIS346", (180, 240): "DAVIS240C"}
+EXTERNAL = 1 << 10
+HEADER = (
+    "#!AER-DAT2.0\r\n# Data format is int32 address, int32 timestamp (8 bytes total), repeated for each "
+    "event\r\n# Timestamps tick is 1 us\r\n# AEChip: {}\r\n#End Of ASCII Header\r\n"
+)
 # places in the schema
 TIMESTAMP = 0
 EXPOSURE_START = 3
@@ -87,65 +99,72 @@ EXPOSURE = 11
 GRAY = 0
 
 
+class Block:
+    """Bytes of a file, of which every place that is read is checked."""
+
+    def __init__(self, path, data):
+        self.path = path
+        self.data = data
+
+    def number(self, at, code):
+        """The number at a byte, by its ``struct`` code."""
+        if at < 0 or at + struct.calcsize(code) > len(self.data):
+            raise self.damaged(f"points to byte {at}, outside itself")
+        return struct.unpack_from(code, self.data, at)[0]
+
+    def root(self, identifier):
+        """The root table of a buffer that begins with its size; ``identifier`` is the four letters of its
+        schema."""
+        size = self.number(0, "<I")
+        if size + 4 != len(self.data) or self.data[8:12] != identifier:
+            raise self.damaged(
+                f"says {size} and {self.data[8:12]!r}; {len(self.data) - 4} and {identifier!r} are needed"
+            )
+        return Table(self, 4 + self.number(4, "<I"))
+
+    def damaged(self, what):
+        return damaged(self.path, f"a block of {len(self.data)} bytes {what}")
+
+
 class Table:
     """One table of a buffer; fields are asked for by their place in the schema (0, 1, …)."""
 
-    def __init__(self, path, data, at):
-        self.path = path
-        self.data = data
+    def __init__(self, block, at):
+        self.block = block
         self.at = at
-        self.slots = at - number(path, data, at, "<i")
-        self.slots_bytes = number(path, data, self.slots, "<H")
+        self.slots = at - block.number(at, "<i")
+        self.slots_bytes = block.number(self.slots, "<H")
 
     def _field(self, place):
         """Where a field lies, or 0 when it is absent."""
         slot = 4 + 2 * place
-        offset = number(self.path, self.data, self.slots + slot, "<H") if slot + 2 <= self.slots_bytes else 0
+        offset = self.block.number(self.slots + slot, "<H") if slot + 2 <= self.slots_bytes else 0
         return self.at + offset if offset else 0
 
     def scalar(self, place, code, default=0):
         """The number in a field, by its ``struct`` code."""
         at = self._field(place)
-        return number(self.path, self.data, at, code) if at else default
+        return self.block.number(at, code) if at else default
 
     def array(self, place, dtype) -> np.ndarray:
         """[N] numpy array of a vector of scalars or structs; empty when the field is absent. It shares the
         buffer's memory."""
         at = self._field(place)
+        dtype = np.dtype(dtype)
         if not at:
             return np.empty(0, dtype)
-        at += number(self.path, self.data, at, "<I")
-        count = number(self.path, self.data, at, "<I")
-        dtype = np.dtype(dtype)
-        if at + 4 + count * dtype.itemsize > len(self.data):
-            raise damaged(
-                self.path, f"a block of {len(self.data)} bytes points to {count} entries outside itself"
-            )
-        return np.frombuffer(self.data, dtype, count, at + 4)
+        at += self.block.number(at, "<I")
+        count = self.block.number(at, "<I")
+        if at + 4 + count * dtype.itemsize > len(self.block.data):
+            raise self.block.damaged(f"points to {count} entries outside itself")
+        return np.frombuffer(self.block.data, dtype, count, at + 4)
 
     def tables(self, place):
         """The tables of a vector of tables."""
         at = self._field(place)
-        first = at + number(self.path, self.data, at, "<I") + 4 if at else 0
+        first = at + self.block.number(at, "<I") + 4 if at else 0
         starts = self.array(place, "<u4").tolist()
-        return [Table(self.path, self.data, first + 4 * k + start) for k, start in enumerate(starts)]
-
-
-def root(path, data, identifier):
-    """The root table of a buffer that begins with its size; ``identifier`` is the four letters of its
-    schema."""
-    size = number(path, data, 0, "<I")
-    if size + 4 != len(data) or data[8:12] != identifier:
-        what = f"a block of {len(data)} bytes says {size} and {data[8:12]!r}"
-        raise damaged(path, f"{what}; {len(data) - 4} and {identifier!r} are needed")
-    return Table(path, data, 4 + number(path, data, 4, "<I"))
-
-
-def number(path, data, at, code):
-    """The number at a byte, by its ``struct`` code."""
-    if at < 0 or at + struct.calcsize(code) > len(data):
-        raise damaged(path, f"a block of {len(data)} bytes points to byte {at}, outside itself")
-    return struct.unpack_from(code, data, at)[0]
+        return [Table(self.block, first + 4 * k + start) for k, start in enumerate(starts)]
 
 
 def damaged(path, what):
@@ -154,7 +173,7 @@ def damaged(path, what):
 
 
 def read_container(path, kind):
-    """(FlatBuffers of the packets of the one stream of a kind, its sensor size (height_px, width_px) or
+    """(root tables of the packets of the one stream of a kind, its sensor size (height_px, width_px) or
     None).
 
     Args:
@@ -167,8 +186,9 @@ def read_container(path, kind):
         data = file.read()
     if not data.startswith(MAGIC):
         raise FileFormatError(f"{path} does not start with {MAGIC!r}; it is not an AEDAT 4.0 file.")
-    start = len(MAGIC) + 4 + number(path, data, len(MAGIC), "<I")
-    header = root(path, data[len(MAGIC) : start], b"IOHE")
+    whole = Block(path, data)
+    start = len(MAGIC) + 4 + whole.number(len(MAGIC), "<I")
+    header = Block(path, data[len(MAGIC) : start]).root(b"IOHE")
     compression = header.scalar(0, "<i")
     if compression not in range(5):
         raise FileFormatError(
@@ -180,13 +200,14 @@ def read_container(path, kind):
     wanted, size = _stream(path, header.array(2, "u1").tobytes(), kind)
     places = _places(path, data, start, len(data) if table_at == -1 else table_at)
     if table_at != -1:
-        table = root(path, unpacked(path, data[table_at:], compression), b"FTAB").tables(0)
+        table = Block(path, unpacked(path, data[table_at:], compression)).root(b"FTAB").tables(0)
         listed = [(entry.scalar(0, "<q"), entry.scalar(1, "<q")) for entry in table]
         # a packet is told by its stream and size, the eight bytes ahead of it
-        if listed != [(at, number(path, data, at - 8, "<q")) for _, at, _ in places]:
+        if listed != [(at, whole.number(at - 8, "<q")) for _, at, _ in places]:
             raise damaged(path, "the table at the end lists other packets than the file holds")
     mine = [data[at : at + count] for stream, at, count in places if stream == wanted]
-    return [unpacked(path, body, compression) for body in mine], size
+    name = kind.encode("ascii")
+    return [Block(path, unpacked(path, body, compression)).root(name) for body in mine], size
 
 
 def unpacked(path, data, compression):
@@ -266,7 +287,7 @@ def read_aedat4(path, asked):
       times go back (see arrival).
     """
     packets, size = read_container(path, "EVTS")
-    parts = [root(path, body, b"EVTS").array(0, EVENT) for body in packets]
+    parts = [packet.array(0, EVENT) for packet in packets]
     events = np.concatenate(parts) if parts else np.empty(0, EVENT)
     return arranged(path, asked, *(events[name] for name in ("t", "x", "y", "on")), size=size)
 
@@ -323,9 +344,8 @@ def _table(entries):
     """FlatBuffer: size, root at 32, FTAB, slots of the root at 12, slots shared by all entries at 18, root
     table, offsets of the entries, entries."""
     first = 44 + 4 * len(entries)
-    first += (
-        4 - first
-    ) % 8  # entries begin four bytes before a multiple of eight, where their 64-bit numbers begin
+    # entries begin four bytes before a multiple of eight, where their 64-bit numbers begin
+    first += (4 - first) % 8
     at = first + TABLE_ENTRY.itemsize * np.arange(len(entries))
     entries["slots"] = at - 18
     offsets = (at - (44 + 4 * np.arange(len(entries)))).astype("<u4").tobytes()
@@ -362,8 +382,7 @@ def read_frames(path: str | Path) -> RecordedFrames:
         raise FileFormatError(f"{path} holds no frame.")
     frames = []
     times_us = []
-    for nth, body in enumerate(packets):
-        table = root(path, body, b"FRME")
+    for nth, table in enumerate(packets):
         sides = table.scalar(HEIGHT, "<h"), table.scalar(WIDTH, "<h")
         pixels = table.array(PIXELS, "u1")
         shown = f"{sides[1]} x {sides[0]} pixels"
@@ -392,3 +411,36 @@ def _exposure_us(table):
     if start_us or end_us:
         return start_us, end_us
     return table.scalar(TIMESTAMP, "<q"), table.scalar(TIMESTAMP, "<q") + table.scalar(EXPOSURE, "<q")
+
+
+def write_aedat2(path, stream):
+    """Write events to ``path``.
+
+    Where the first event would begin with the byte of '#', which readers take for one more header line, an
+    external record at the same time (bit 10 set; no event of a pixel) goes ahead of it.
+    Raises: FileFormatError for other sensors than 346 x 260 and 240 x 180, and for times outside 0 to 2^31 -
+      1 us.
+    """
+    chip = CHIPS.get((stream.height_px, stream.width_px))
+    if chip is None:
+        sizes = " and ".join(f"{width} x {height}" for height, width in CHIPS)
+        raise FileFormatError(
+            f"AEDAT 2.0 is written for DAVIS sensors of {sizes} pixels, not {stream.width_px} x "
+            f"{stream.height_px}."
+        )
+    height_px = stream.height_px
+    width_px = stream.width_px
+    t_us, x, y, p = columns(stream, "AEDAT 2.0", 2**15, 0, 2**31 - 1)
+    records = np.stack(
+        ((height_px - 1 - y) << 22 | (width_px - 1 - x) << 12 | (p > 0).astype(np.int64) << 11, t_us), axis=1
+    )
+    if len(records) and records[0, 0] >> 24 == ord("#"):
+        records = np.concatenate(([[EXTERNAL, t_us[0]]], records))
+    path.write_bytes(HEADER.format(chip).encode("ascii") + records.astype(">i4").tobytes())
+
+
+def read_aedat2(path, _):
+    """Refuse: addresses depend on the camera, and the header does not reliably name it."""
+    raise FileFormatError(
+        f"{path}: AEDAT 2.0 is written, not read; convert the recording to .aedat4 or .raw."
+    )

@@ -1,17 +1,24 @@
-"""EVT 3.0: 16-bit words that each change one part of the state (time, row, column base) or emit events from
-it, one or up to twelve at once.
+"""The words of Prophesee's RAW files.
 
-Source: Prophesee Metavision documentation, "EVT 3.0 Format".
+EVT 2.0: 32 bits, one event each, with the low six bits of its time; time-high words carry the other 28. EVT 3.0: 16
+bits that each change one part of the state (time, row, column base) or emit events from it, one or up to twelve at
+once. Hardware clocks of few bits start again at zero, and values hold until the next word changes them.
+
+Source: Prophesee Metavision documentation, "EVT 2.0 Format", "EVT 3.0 Format".
 """
 
 import numpy as np
 
 from codesign.errors import FileFormatError
-from codesign.events.formats.prophesee import held, unwrapped
 
-WORD = np.dtype("<u2")
-LOOP_US = 2**24
-LIMIT_US = LOOP_US * 2**20  # loops are told, four words each: 8 MB at most
+OTHER_TYPES = (0x7, 0xA, 0xE, 0xF)  # triggers, counters and what continues them: no events of pixels
+EVT2_WORD = np.dtype("<u4")
+EVT2_LOOP_US = 2**34
+EVT2_HIGH = 0x8  # a word with the high bits of the time
+EVT2_TYPES = (0x0, 0x1, EVT2_HIGH, *OTHER_TYPES[1:])
+EVT3_WORD = np.dtype("<u2")
+EVT3_LOOP_US = 2**24
+EVT3_LIMIT_US = EVT3_LOOP_US * 2**20  # loops are told, four words each: 8 MB at most
 ADDR_Y = 0x0
 ADDR_X = 0x2
 BASE_X = 0x3
@@ -19,8 +26,7 @@ VECT_12 = 0x4
 VECT_8 = 0x5
 TIME_LOW = 0x6
 TIME_HIGH = 0x8
-OTHER_TYPES = (0x7, 0xA, 0xE, 0xF)  # triggers, counters and what continues them: no events of pixels
-KNOWN = np.isin(np.arange(16), (ADDR_Y, ADDR_X, BASE_X, VECT_12, VECT_8, TIME_LOW, TIME_HIGH, *OTHER_TYPES))
+EVT3_TYPES = (ADDR_Y, ADDR_X, BASE_X, VECT_12, VECT_8, TIME_LOW, TIME_HIGH, *OTHER_TYPES)
 STEP = np.array([12 if kind == VECT_12 else 8 if kind == VECT_8 else 0 for kind in range(16)])
 LOAD = np.array([0xFF if kind == VECT_8 else 0xFFF for kind in range(16)], np.uint16)
 BITS = [[bit for bit in range(12) if mask >> bit & 1] for mask in range(4096)]
@@ -29,23 +35,86 @@ BIT_START = np.cumsum(BIT_COUNT, dtype=np.int64) - BIT_COUNT
 BIT_LIST = np.array([bit for bits in BITS for bit in bits], np.int32)
 
 
-def decoded(path, words):
+def unwrapped(ticks, loop):
+    """Count the loops of a clock.
+
+    A fall by three quarters of the loop or more is a new loop; a smaller fall is time going back, which the
+    caller judges. (A single wrong bit changes a reading by at most half a loop, so it never passes for a new
+    one.)
+
+    Args: ticks: [N] int64 readings, 0 to loop - 1. loop: number of readings.
+    Returns: [N] int64 readings plus ``loop`` for each new loop so far.
+    """
+    falls = np.zeros(len(ticks), np.int64)
+    np.cumsum(ticks[1:] - ticks[:-1] <= -(loop // 4) * 3, out=falls[1:])
+    return ticks + falls * loop
+
+
+def held(starts, values, count):
+    """The last value given before each event; and how many events precede them all.
+
+    Args: starts: [M] rising numbers of the events that follow each value. values: [M]. count: number of
+      events.
+    """
+    first = int(starts[0]) if len(starts) else count
+    return np.repeat(values, np.diff(starts, append=count)), first
+
+
+def check_types(path, kind, known, name):
+    """Raise FileFormatError for words of a type that an encoding reserves."""
+    strange = ~np.isin(np.arange(16), known)[kind]
+    if bool(strange.any()):
+        at = int(np.argmax(strange))
+        raise FileFormatError(
+            f"{path}: word {at} has type {kind[at]:#x}, which {name} reserves; the file is damaged or not {name}."
+        )
+
+
+def evt2_decoded(path, words):
+    """Events of EVT 2.0: 32-bit words, one event each, with the low six bits of its time; time-high words carry the
+    other 28.
+
+    Args: path: for messages. words: [N] uint32.
+    Returns: t_us, x, y, p (0 or 1) in file order, and the number of events before the first time-high word,
+      which have no time and are left out.
+    Raises: FileFormatError for a word of a reserved type.
+    """
+    kind = (words >> 28).astype(np.uint8)
+    check_types(path, kind, EVT2_TYPES, "EVT 2.0")
+    is_event = kind <= 1
+    where = np.flatnonzero(is_event)
+    at = np.flatnonzero(kind == EVT2_HIGH)
+    starts = np.cumsum(is_event)[at]
+    high = unwrapped((words[at] & 0xFFFFFFF).astype(np.int64), 2**28)
+    t_us, untimed = held(starts, high << 6, len(where))
+    event = words[where[untimed:]].astype(np.int64)
+    return t_us + (event >> 22 & 0x3F), event >> 11 & 0x7FF, event & 0x7FF, event >> 28, untimed
+
+
+def evt2_encoded(t_us, x, y, p):
+    """EVT 2.0 words of ordered events.
+
+    The first word sets the clock to zero: Prophesee's reader takes the first time-high word off all times.
+    """
+    high = t_us >> 6
+    word = np.stack(
+        (EVT2_HIGH << 28 | high, (p > 0).astype(np.int64) << 28 | (t_us & 0x3F) << 22 | x << 11 | y), axis=1
+    )
+    present = np.stack((np.diff(high, prepend=0) != 0, np.ones_like(high, dtype=bool)), axis=1)
+    return np.insert(word[present], 0, [EVT2_HIGH << 28] * bool(len(t_us))).astype(EVT2_WORD)
+
+
+def evt3_decoded(path, words):
     """Events of EVT 3.0 words.
 
     Args: path: for messages. words: [N] uint16.
     Returns: t_us, x, y, p (0 or 1) in file order, and the number of events before the first word that gives
-      their time, row or column base; they are
-      left out.
+      their time, row or column base; they are left out.
     Raises: FileFormatError for a word of a reserved type, and for a vector that leaves the 11 bits of a
       column.
     """
     kind = (words >> 12).astype(np.uint8)
-    if not bool(KNOWN[kind].all()):
-        at = int(np.argmin(KNOWN[kind]))
-        raise FileFormatError(
-            f"{path}: word {at} has type {kind[at]:#x}, which EVT 3.0 reserves; the file is damaged or not "
-            "EVT 3.0."
-        )
+    check_types(path, kind, EVT3_TYPES, "EVT 3.0")
     load = words & 0xFFF
     is_vector = (kind == VECT_12) | (kind == VECT_8)
     emits = is_vector | (kind == ADDR_X)
@@ -112,7 +181,7 @@ def _columns(kind, load, is_vector, where, emitted):
     return column, mask, np.where(vector, on, load_there >> 11), lost
 
 
-def encoded(t_us, x, y, p):
+def evt3_encoded(t_us, x, y, p):
     """EVT 3.0 words of ordered events, one column word per event.
 
     The first word sets the clock to zero: Prophesee's reader takes the first time-high word off all times.
@@ -132,8 +201,15 @@ def encoded(t_us, x, y, p):
     )
     present = np.stack((high_moved, moved, np.diff(y, prepend=-1) != 0, np.ones_like(moved)), axis=1)
     count = present.sum(axis=1)
-    halves = np.diff(t_us // (LOOP_US // 2), prepend=0)
+    halves = np.diff(t_us // (EVT3_LOOP_US // 2), prepend=0)
     passed = 0x800 * np.arange(1, int(halves.sum()) + 1)  # high part at the start of each half
     told = TIME_HIGH << 12 | np.stack((passed - 1, passed), axis=1).ravel() & 0xFFF
     words = np.insert(word[present], np.repeat(np.cumsum(count) - count, 2 * halves), told)
-    return np.insert(words, 0, [TIME_HIGH << 12] * bool(len(t_us))).astype(WORD)
+    return np.insert(words, 0, [TIME_HIGH << 12] * bool(len(t_us))).astype(EVT3_WORD)
+
+
+# version -> type of a word, end of the times that are written, from words and to words
+ENCODINGS = {
+    2: (EVT2_WORD, EVT2_LOOP_US, evt2_decoded, evt2_encoded),
+    3: (EVT3_WORD, EVT3_LIMIT_US, evt3_decoded, evt3_encoded),
+}
