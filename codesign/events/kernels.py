@@ -59,7 +59,7 @@ class Lanes:
     def put(self, flat, value, row, active=True):
         self.dr.scatter(flat, value, self.place(row), active, mode=self.dr.ReduceMode.NoConflicts)
 
-    def loop(self, first, end, body, *carried):
+    def loop(self, first, end, body, *carried) -> Any:
         """body(index, *carried) -> carried, for index from ``first`` to ``end`` - 1."""
 
         def step(index, *carried):
@@ -68,7 +68,7 @@ class Lanes:
         start = first + self.dr.zeros(self.arr.UInt32, self.width)
         return self.dr.while_loop((start, *carried), lambda index, *_: index < end, step, mode="symbolic")[1:]
 
-    def loop_back(self, first, end, body, *carried):
+    def loop_back(self, first, end, body, *carried) -> Any:
         """The same from ``end`` - 1 down to ``first``."""
 
         def step(index, *carried):

@@ -31,6 +31,8 @@ youngest. Where a turn needs more, the pair with the least weight x distance is 
 threshold in use: mass is kept.
 """
 
+from typing import Any
+
 import torch
 
 from codesign.backend import frames_per_kernel
@@ -58,7 +60,7 @@ class Loop(Lanes):
         )
         self.values = self.load(frames)
 
-    def __call__(self, step, carried, target):
+    def __call__(self, step, carried, target) -> Any:
         """Carry values through step(index, value, *carried) for every frame; ``target`` is what the steps
         write to."""
         size = frames_per_kernel(self.width)
