@@ -68,20 +68,21 @@ def check_layout(frames: Tensor, minimum: int = 2, *, name: str = "frames") -> N
 def check_per_pixel(
     value: Tensor | float, name: str, frames: Tensor, dtype: torch.dtype | None = None
 ) -> Tensor:
-    """Return a contrast threshold or time constant as a tensor on the frames' device that broadcasts over one frame.
+    """Return a contrast threshold or time constant as a tensor on the frames' device that broadcasts over
+    one frame.
 
     Args:
-      value: number, 0-dim tensor, or tensor that broadcasts to the pixel shape ``frames.shape[1:]``; > 0, thresholds
-        in natural log units. dtype: None: of the frames.
-    Raises: DomainError when a value is no number from 1e-30 to 1e30, beyond which single precision ends; ShapeError
-      when it does not broadcast.
+      value: number, 0-dim tensor, or tensor that broadcasts to the pixel shape ``frames.shape[1:]``; > 0,
+        thresholds in natural log units. dtype: None: of the frames.
+    Raises: DomainError when a value is no number from 1e-30 to 1e30, beyond which single precision ends;
+      ShapeError when it does not broadcast.
     """
     if not isinstance(value, Tensor):
         value = as_number(value, name)
     elif value.dtype not in REAL or value.layout != torch.strided or value.is_meta:
         raise DomainError(
-            f"{name} is a tensor of {value.dtype} on {value.device}; give a real number, or a dense tensor of "
-            "them, > 0."
+            f"{name} is a tensor of {value.dtype} on {value.device}; give a real number, or a dense tensor "
+            "of them, > 0."
         )
     value = torch.as_tensor(value, dtype=torch.float64 if dtype is None else dtype, device=frames.device)
     pixels = frames.shape[1:]
@@ -205,8 +206,8 @@ def check_path(path: str | Path) -> Path:
 
 
 def check_counts(counts: Tensor, *, non_negative: bool = False) -> None:
-    """Raise unless ``counts`` are a float32 or float64 tensor [T-1, 2, ..., H, W] of finite numbers, 0 or more
-    where asked; ShapeError for the axes, DomainError for the rest."""
+    """Raise unless ``counts`` are a float32 or float64 tensor [T-1, 2, ..., H, W] of finite numbers, 0 or
+    more where asked; ShapeError for the axes, DomainError for the rest."""
     check_layout(counts, 0, name="counts")
     if counts.ndim < 4 or counts.shape[1] != 2 or 0 in counts.shape:
         raise ShapeError(
@@ -221,8 +222,8 @@ def check_counts(counts: Tensor, *, non_negative: bool = False) -> None:
 
 
 def check_level(state: Tensor, level: Tensor) -> Tensor:
-    """Return a level carried from an earlier chunk unchanged when it has the shape and type of one frame of ``level``,
-    finite; ShapeError, DomainError otherwise."""
+    """Return a level carried from an earlier chunk unchanged when it has the shape and type of one frame of
+    ``level``, finite; ShapeError, DomainError otherwise."""
     if not isinstance(state, Tensor) or (state.shape, state.dtype, state.device) != (
         level.shape[1:],
         level.dtype,
@@ -243,11 +244,12 @@ def check_state(state: object, kind: type) -> None:
 
 
 def check_chunk(frames: Tensor, shape: torch.Size, dtype: torch.dtype) -> None:
-    """Raise ShapeError for frames [T, ...] of another size or type than the frame [...] of the chunk before."""
+    """Raise ShapeError for frames [T, ...] of another size or type than the frame [...] of the chunk
+    before."""
     if (frames.shape[1:], frames.dtype) != (shape, dtype):
         raise ShapeError(
-            f"{frames.dtype} frames of {list(frames.shape[1:])} follow {dtype} frames of {list(shape)}; chunks of "
-            "time keep their size and type, a batch its samples."
+            f"{frames.dtype} frames of {list(frames.shape[1:])} follow {dtype} frames of {list(shape)}; chunks "
+            "of time keep their size and type, a batch its samples."
         )
 
 

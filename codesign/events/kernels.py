@@ -1,5 +1,5 @@
-"""Kernels over pixels: one lane per pixel, memory by rows of lanes, loops over time; and a recursion over time whose
-loop backward lets drjit differentiate one step after the other.
+"""Kernels over pixels: one lane per pixel, memory by rows of lanes, loops over time; and a recursion over
+time whose loop backward lets drjit differentiate one step after the other.
 """
 
 import math
@@ -38,8 +38,8 @@ class Lanes:
         return [self.load(row) for row in tensor]
 
     def fresh(self, rows):
-        """Rows to be filled by kernels. The memory is drjit's, which hands the same pages out again and again: new
-        pages from the system cost more than the kernel."""
+        """Rows to be filled by kernels. The memory is drjit's, which hands the same pages out again and
+        again: new pages from the system cost more than the kernel."""
         target = self.dr.empty(self.arr.Float, rows * self.width)
         self.dr.eval(target)
         return target
@@ -85,8 +85,8 @@ class Lanes:
 
 
 def beyond(dr, level, centre, theta_on, theta_off):
-    """How far a level lies above and below a play as wide as the mean threshold, >= 0 each: what the mean of hard
-    counts, and the play's centre, move by (docs/events.md)."""
+    """How far a level lies above and below a play as wide as the mean threshold, >= 0 each: what the mean of
+    hard counts, and the play's centre, move by (docs/events.md)."""
     half = (theta_on + theta_off) * 0.25
     above, below = level - centre - half, centre - half - level
     return dr.select(above > 0, above, 0), dr.select(below > 0, below, 0)
@@ -143,8 +143,8 @@ class _Recursion(Function):
 
 
 class _Steps(Lanes):
-    """The loops over time, in spans whose states all take as much memory as the values, or as few as there are
-    spans."""
+    """The loops over time, in spans whose states all take as much memory as the values, or as few as there
+    are spans."""
 
     def __init__(self, step, values, numbers, states):
         super().__init__(values, values.shape[1])

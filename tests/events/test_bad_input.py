@@ -1,5 +1,6 @@
 """Wrong calls of the event package, as somebody makes who meets it for the first time: each gets one sentence
-that names what was given. Plain types and signs of single arguments are the doors' (``tests/test_doors.py``)."""
+that names what was given. Plain types and signs of single arguments are the doors'
+(``tests/test_doors.py``)."""
 
 import math
 

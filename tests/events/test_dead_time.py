@@ -1,5 +1,5 @@
-"""Mean counts behind a dead time against the recursion written out in torch, in value and gradient, every phase
-written out, a closed form, and differences of the hard sensor."""
+"""Mean counts behind a dead time against the recursion written out in torch, in value and gradient, every
+phase written out, a closed form, and differences of the hard sensor."""
 
 import math
 
@@ -17,8 +17,8 @@ D = torch.float64
 
 
 def behind(signed, interval_s, dead_s):
-    """Kept counts [T, 2, P] of thresholds of 1 and a level whose play counts these [T, P], OFF negative; where
-    there is none, it rests in the middle of its play."""
+    """Kept counts [T, 2, P] of thresholds of 1 and a level whose play counts these [T, P], OFF negative;
+    where there is none, it rests in the middle of its play."""
     middle = torch.cat((torch.zeros_like(signed[:1]), signed)).cumsum(0)
     level = middle + torch.cat((torch.zeros_like(signed[:1]), signed.sign() / 2))
     return mean_counts(level, middle[0], (torch.ones((), dtype=D),) * 2, interval_s, dead_s)[0]
@@ -181,7 +181,8 @@ def hard_mean(level, t_s, sensor, beginnings=32):
     return total / beginnings
 
 
-# cosine and scale measured: dead time 1.00/0.89. A group mixes the phases of a third of a count, which takes up
+# cosine and scale measured: dead time 1.00/0.89. A group mixes the phases of a third of a count, which takes
+# up
 # to an eighth of the slope to the dead time; a threshold moved alone leaves the other behind, and the play's
 # width is then a long-run mean only. The bounds are below what was asked (0.97, 0.9).
 @pytest.mark.filterwarnings("ignore:rate x dead time is above 2")

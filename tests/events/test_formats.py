@@ -1,5 +1,5 @@
-"""Event files of every format: exact round trips, one file through both doors, damage and limits that end in a
-sentence. Bit layouts: test_formats_layouts.py; mutants of whole files: tests/hostile."""
+"""Event files of every format: exact round trips, one file through both doors, damage and limits that end in
+a sentence. Bit layouts: test_formats_layouts.py; mutants of whole files: tests/hostile."""
 
 import io
 import zipfile
@@ -164,8 +164,8 @@ def npz(**change):
 
 
 def short_blocks(packing, shorten):
-    """DSEC of blocks that unpack to too little: both end the process when HDF5 unpacks them, since the missing
-    bytes lie beyond its buffer."""
+    """DSEC of blocks that unpack to too little: both end the process when HDF5 unpacks them, since the
+    missing bytes lie beyond its buffer."""
 
     def fill(file):
         for name in "txyp":

@@ -1,4 +1,5 @@
-"""Event files against recordings that another program decoded, and against the published layouts, bit by bit."""
+"""Event files against recordings that another program decoded, and against the published layouts, bit by
+bit."""
 
 import struct
 import subprocess

@@ -1,6 +1,6 @@
 """Gradients of every event layer against the account that its docstring gives of itself, written out for one
-pixel of the worst clip (black, saturated, beyond the film, at the joint of the front end, still); those to the
-sensor against differences of hard counts; the two smooth baselines against closed forms and means."""
+pixel of the worst clip (black, saturated, beyond the film, at the joint of the front end, still); those to
+the sensor against differences of hard counts; the two smooth baselines against closed forms and means."""
 
 import math
 
@@ -45,7 +45,8 @@ def by_steps(of_pair):
 
 
 def by_memory(step):
-    """The account of a layer that memorises a level: step(way, thetas) gives two counts and the level's move."""
+    """The account of a layer that memorises a level: step(way, thetas) gives two counts and the level's
+    move."""
 
     def account(seen, on, off):
         memorised = seen[0]
@@ -86,8 +87,8 @@ def physical(seen, on, off):
 
 
 def srm(seen, on, off):
-    """The slopes of the memory layer for a level that leaves its play by a threshold per step at most; of equal
-    thresholds."""
+    """The slopes of the memory layer for a level that leaves its play by a threshold per step at most; of
+    equal thresholds."""
     half = (on + off) / 4
     centre = seen[0]
     held = [seen[0]]

@@ -1,5 +1,5 @@
-"""The memory layer against the definition in plain numbers, a plain autograd loop, and the mean of hard counts
-over a pixel's beginnings, enumerated; closed forms of its exact gradient for unequal thresholds."""
+"""The memory layer against the definition in plain numbers, a plain autograd loop, and the mean of hard
+counts over a pixel's beginnings, enumerated; closed forms of its exact gradient for unequal thresholds."""
 
 import math
 

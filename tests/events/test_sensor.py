@@ -1,5 +1,5 @@
-"""The hard sensor without noise: the definition in plain numbers, closed forms, the published ESIM, and a sensor
-that changes during a recording written out pixel by pixel."""
+"""The hard sensor without noise: the definition in plain numbers, closed forms, the published ESIM, and a
+sensor that changes during a recording written out pixel by pixel."""
 
 import math
 from dataclasses import replace
@@ -132,8 +132,8 @@ def slack_us(levels, t_s, t, x, y, theta):
     whole microseconds add half of one, and a whole one just behind a frame, where events are rounded up so
     that none falls into the interval before. With |L| <= M a unit in the last place is at most eps M, a
     rounding half of that. Each of the two has levels good to two units, has rounded the memorised level once
-    per event of the pixel so far and the threshold with it, and rounds what it divides (four times, numbers no
-    larger than the step and a threshold together).
+    per event of the pixel so far and the threshold with it, and rounds what it divides (four times, numbers
+    no larger than the step and a threshold together).
 
     Args: levels [T, H, W] float64. t_s: [T]. t, x, y: [N] of the reference. An event within 2 us of a frame
       may belong to the interval on either side: the flatter one counts.
@@ -189,8 +189,8 @@ CHANGES = [
 
 
 def written_out(levels, t_s, sensors, cut, pixel, state):
-    """Events (t_us, p) of one pixel: level and leak linear in time, another sensor from frame ``cut`` on; what
-    falls into the dead time is dropped, the memorised level moving on all the same."""
+    """Events (t_us, p) of one pixel: level and leak linear in time, another sensor from frame ``cut`` on;
+    what falls into the dead time is dropped, the memorised level moving on all the same."""
     memorised, last_s, found = levels[0], -1e6, []
     deviates = [float(one.flatten()[pixel]) for one in (state.deviate_on, state.deviate_off)]
     for k in range(1, len(t_s)):

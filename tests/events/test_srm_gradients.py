@@ -164,8 +164,8 @@ def test_pixels_of_a_batch_have_gradients_of_their_own():
 @pytest.mark.parametrize("kernel", ["exp", "slayer"])
 def test_the_mean_points_to_where_hard_spikes_go(kernel):
     """What a change of contrast does to sums over groups of like pixels and sixths of the time, from 32
-    beginnings: the last spike lies three time constants back on average. Measured: cosines of 0.995 and 0.994,
-    beside 0.990 and 0.963 of a surrogate; scales of 0.95 and 0.99."""
+    beginnings: the last spike lies three time constants back on average. Measured: cosines of 0.995 and
+    0.994, beside 0.990 and 0.963 of a surrogate; scales of 0.95 and 0.99."""
     turn, pace = torch.rand(2, 320, generator=seeded(), dtype=D)
     wave = 0.1 * (2 * math.pi * (turn + torch.arange(60, dtype=D)[:, None] / (20 + 20 * pace))).sin()
     group = torch.nn.functional.one_hot((turn * 8).long()).to(D)

@@ -1,5 +1,5 @@
-"""Event volumes, time surfaces, fading traces and spikes against their definitions event by event: conservation,
-centroids, agreement of the builders, and gradients."""
+"""Event volumes, time surfaces, fading traces and spikes against their definitions event by event:
+conservation, centroids, agreement of the builders, and gradients."""
 
 import math
 

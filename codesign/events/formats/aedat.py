@@ -1,17 +1,18 @@
 """AEDAT 4.0: packets of 16-byte events with 64-bit microseconds, and the frames that DAVIS cameras record
 beside them. AEDAT 2.0 as jAER reads it for DAVIS cameras, written only.
 
-Layout of 4.0: the line ``#!AER-DAT4.0``, an IOHeader (FlatBuffer: compression, position of the table, XML that names
-  the streams), packets of (stream, size) and a compressed FlatBuffer each, and a compressed FileDataTable
-  that lists the packets once more. FlatBuffers are read without generated code, every offset checked.
+Layout of 4.0: the line ``#!AER-DAT4.0``, an IOHeader (FlatBuffer: compression, position of the table, XML
+  that names the streams), packets of (stream, size) and a compressed FlatBuffer each, and a compressed
+  FileDataTable that lists the packets once more. FlatBuffers are read without generated code, every offset
+  checked.
 Source: iniVation documentation, "AEDAT file formats", AEDAT 4.0; FlatBuffers schemas of dv-processing;
   FlatBuffers documentation, "FlatBuffer Internals".
 
-Layout of 2.0: '#' lines, then big-endian pairs of 32-bit address and 32-bit microseconds. Bits of the address: 22 to
-  30 the row, counted from the bottom; 12 to 21 the column, counted from the right; 11 the polarity; 31 (frame sample)
-  and 10 (external) are zero for an event of a pixel.
-Source: iniVation documentation, "AEDAT file formats", AEDAT 2.0; jAER, DavisBaseCamera (mirrored columns); v2e,
-  aedat2_output.
+Layout of 2.0: '#' lines, then big-endian pairs of 32-bit address and 32-bit microseconds. Bits of the
+  address: 22 to 30 the row, counted from the bottom; 12 to 21 the column, counted from the right; 11 the
+  polarity; 31 (frame sample) and 10 (external) are zero for an event of a pixel.
+Source: iniVation documentation, "AEDAT file formats", AEDAT 2.0; jAER, DavisBaseCamera (mirrored columns);
+  v2e, aedat2_output.
 """
 
 import re

@@ -1,8 +1,9 @@
 """The words of Prophesee's RAW files.
 
-EVT 2.0: 32 bits, one event each, with the low six bits of its time; time-high words carry the other 28. EVT 3.0: 16
-bits that each change one part of the state (time, row, column base) or emit events from it, one or up to twelve at
-once. Hardware clocks of few bits start again at zero, and values hold until the next word changes them.
+EVT 2.0: 32 bits, one event each, with the low six bits of its time; time-high words carry the other 28. EVT
+3.0: 16 bits that each change one part of the state (time, row, column base) or emit events from it, one or
+up to twelve at once. Hardware clocks of few bits start again at zero, and values hold until the next word
+changes them.
 
 Source: Prophesee Metavision documentation, "EVT 2.0 Format", "EVT 3.0 Format".
 """
@@ -66,13 +67,14 @@ def check_types(path, kind, known, name):
     if bool(strange.any()):
         at = int(np.argmax(strange))
         raise FileFormatError(
-            f"{path}: word {at} has type {kind[at]:#x}, which {name} reserves; the file is damaged or not {name}."
+            f"{path}: word {at} has type {kind[at]:#x}, which {name} reserves; the file is damaged or not "
+            f"{name}."
         )
 
 
 def evt2_decoded(path, words):
-    """Events of EVT 2.0: 32-bit words, one event each, with the low six bits of its time; time-high words carry the
-    other 28.
+    """Events of EVT 2.0: 32-bit words, one event each, with the low six bits of its time; time-high words
+    carry the other 28.
 
     Args: path: for messages. words: [N] uint32.
     Returns: t_us, x, y, p (0 or 1) in file order, and the number of events before the first time-high word,

@@ -1,10 +1,10 @@
-"""Prophesee's files: an ASCII header of lines ``% keyword value``, then, little-endian, EVT 2.0 or EVT 3.0 words
-(.raw), or a byte each for event type and size and 8-byte events (.dat).
+"""Prophesee's files: an ASCII header of lines ``% keyword value``, then, little-endian, EVT 2.0 or EVT 3.0
+words (.raw), or a byte each for event type and size and 8-byte events (.dat).
 
-Hardware clocks have few bits and start again at zero: their loops are counted when reading. Prophesee's own readers
-count no loop of .dat, readers disagree on those of EVT 2.0, so none is written there; in EVT 3.0 they are told by
-time words, which every reader counts. The start time (``% t0``, ``% T0``) that faery and we write where asked to is
-added to all times.
+Hardware clocks have few bits and start again at zero: their loops are counted when reading. Prophesee's own
+readers count no loop of .dat, readers disagree on those of EVT 2.0, so none is written there; in EVT 3.0
+they are told by time words, which every reader counts. The start time (``% t0``, ``% T0``) that faery and we
+write where asked to is added to all times.
 Source: Prophesee Metavision documentation, "RAW File Format", "DAT File Format"; faery.
 """
 

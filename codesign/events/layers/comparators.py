@@ -1,8 +1,8 @@
 """Event layers by name, and their comparators: from what a pixel sees to counts, all called alike.
 
-A comparator is a small object with ``comparator(frames, theta_on, theta_off, state, log_input) -> counts, state``:
-frames [T, ...] on the 0-255 scale, or log levels with log_input, give counts [T-1, 2, ...], ON first, and with a
-state of an earlier call [T, 2, ...]. theta_on, theta_off: 0-dim or [...].
+A comparator is a small object with ``comparator(frames, theta_on, theta_off, state, log_input) -> counts,
+state``: frames [T, ...] on the 0-255 scale, or log levels with log_input, give counts [T-1, 2, ...], ON
+first, and with a state of an earlier call [T, 2, ...]. theta_on, theta_off: 0-dim or [...].
 ``mismatched`` says whether it takes the thresholds of every pixel, or the nominal ones. ``refines`` says
 whether it may be asked between frames, for the times of events: whether it counts the same events, or more of
 the sensor's, the more often it looks. Without it the events of an interval are spread evenly.
@@ -51,8 +51,8 @@ class LastDraw:
         """What ``draw()`` returns, and the generators as it leaves them.
 
         Args: asked: all that the draw depends on but its generators, to be compared by ==. generators: in the
-          order in which they are drawn from, also several times. draw: without arguments; what it returns, a tuple
-          of tensors or None, is not changed afterwards.
+          order in which they are drawn from, also several times. draw: without arguments; what it returns, a
+          tuple of tensors or None, is not changed afterwards.
         """
         own = list(dict.fromkeys(generators))
         place = {generator: number for number, generator in enumerate(own)}

@@ -1,9 +1,9 @@
 """What dead time lets pass of mean counts: the expectation over where events stand in a pixel's threshold, as
 a smooth function of the levels, the thresholds and the dead time.
 
-A pixel has an event whenever its mean signed count I (ON less OFF) passes i + u, up or down, with a phase u that is
-as good as random: on a way back those come first that came last. Event i is kept unless one kept before lies less
-than T back, and no two kept ones do:
+A pixel has an event whenever its mean signed count I (ON less OFF) passes i + u, up or down, with a phase u
+that is as good as random: on a way back those come first that came last. Event i is kept unless one kept
+before lies less than T back, and no two kept ones do:
 
     kept_i = 1 - sum over j < i with t_i - t_j < T of kept_j,
 
@@ -12,12 +12,12 @@ WIDTH of a count wide and mixed within; S(t) is what a group has kept until t, a
 during a step is kept by 1 - (S(its event before) - S(t - T)). The first event after a pause is never lost,
 and dead time reaches over frames, turns and polarities. What the mixing costs is in docs/events.md.
 
-It is a drjit loop over time per pixel. Intervals are cut into parts. A pixel carries the centre of its play, its
-mean count so far (position), where it heads, and of every group of phases what it had kept when its last event
-began, and what it had kept at the ends of the parts within a dead time (rows). Rows lie in memory local to the
-pixel's thread: ``reach`` before a block of parts, then those of the block. The forward loop stores the state at the
-beginning of every block; the adjoint goes from block to block backward, walks each forward once more, and then
-back.
+It is a drjit loop over time per pixel. Intervals are cut into parts. A pixel carries the centre of its play,
+its mean count so far (position), where it heads, and of every group of phases what it had kept when its last
+event began, and what it had kept at the ends of the parts within a dead time (rows). Rows lie in memory
+local to the pixel's thread: ``reach`` before a block of parts, then those of the block. The forward loop
+stores the state at the beginning of every block; the adjoint goes from block to block backward, walks each
+forward once more, and then back.
 """
 
 import warnings
@@ -146,8 +146,8 @@ class Parts:
 
 
 class _Run(Lanes):
-    """One call of a loop over parts, in either direction of time. A state is a list: the play's centre, position,
-    heading, and of every group what it had kept when its last event began."""
+    """One call of a loop over parts, in either direction of time. A state is a list: the play's centre,
+    position, heading, and of every group what it had kept when its last event began."""
 
     def __init__(self, cut, level, theta_on, theta_off):
         super().__init__(level, level[0].numel())
@@ -306,8 +306,8 @@ class _Run(Lanes):
         return kept, (centre, position, heading, torch.stack(begun), rows), stored
 
     def backward(self, stored, grad_kept, grad_centre, grad_position, _, grad_begun, grad_rows):
-        """Adjoint of ``forward``: gradients of the level; of theta_on, theta_off, dead time and the state but its
-        heading, a list of [...]; of the rows."""
+        """Adjoint of ``forward``: gradients of the level; of theta_on, theta_off, dead time and the state
+        but its heading, a list of [...]; of the rows."""
         dr = self.dr
         seed = self.load(grad_kept)
         target = self.zeros(self.shape[0])
@@ -356,8 +356,8 @@ class _Run(Lanes):
         return self.tensor(target, self.shape), [self.tensor(one, pixels) for one in pulls], of_rows
 
     def pull(self, seed, target, pulls, pull, rows, part, now, state):
-        """One part backward. pulls: gradients gathered so far of thresholds and dead time, then those of the state
-        after it; pull: of the rows. Returns those before it."""
+        """One part backward. pulls: gradients gathered so far of thresholds and dead time, then those of the
+        state after it; pull: of the rows. Returns those before it."""
         given = self.given(rows, part, now, state)
         ahead = self.dr.detach(self.step(state[2], *given)[0])
         seeds = [self.at(seed, self.row(part, ahead)), *pulls[3:5]]

@@ -86,8 +86,8 @@ def dense(
 
 
 def _memorised(frames, theta_on, theta_off, state, log_input, step):
-    """Counts and the memorised level after them; step(way from the memorised level, theta_on, theta_off) gives
-    both counts and what the memorised level moves by."""
+    """Counts and the memorised level after them; step(way from the memorised level, theta_on, theta_off)
+    gives both counts and what the memorised level moves by."""
     level = log_levels(frames, log_input, minimum=2 if state is None else 1)
     theta_on = check_per_pixel(theta_on, "theta_on", level)
     theta_off = check_per_pixel(theta_off, "theta_off", level)

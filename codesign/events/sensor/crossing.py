@@ -7,10 +7,10 @@ interval lie on one side. Noise events are a Poisson process in continuous time:
 that must still pass until its next one, so nothing depends on the frame rate or on chunks, and nothing is
 drawn in vain.
 
-A sink is where events go, sortable 64-bit keys or dense counts per frame interval, of a ``Lanes``. It gives ``tally``
-(what it carries through the events of one interval of a pixel), ``take`` (one event), ``close`` (the end of the
-interval) and ``arrays`` (what to evaluate). Random numbers are hashes of a key per pixel and a counter,
-without a state, so that chunks and threads change nothing.
+A sink is where events go, sortable 64-bit keys or dense counts per frame interval, of a ``Lanes``. It gives
+``tally`` (what it carries through the events of one interval of a pixel), ``take`` (one event), ``close``
+(the end of the interval) and ``arrays`` (what to evaluate). Random numbers are hashes of a key per pixel and
+a counter, without a state, so that chunks and threads change nothing.
 """
 
 import math
@@ -79,7 +79,8 @@ class EventKeys:
         self._Time = Float if length_us.max() <= 1e6 else dr.float64_array_t(Float)
         self._Key = dr.uint64_array_t(Float)
         self._lanes = lanes
-        # of every interval: its length, the fraction of a microsecond that it starts with, whole ones to its end
+        # of every interval: its length, the fraction of a microsecond that it starts with, whole ones to its
+        # end
         spans = length_us, start_s * 1e6 - start_us, (end_us - start_us).astype(np.float64)
         self._spans = [self._Time(span) for span in spans]
         first = (start_us - layout.origin_us).astype(np.uint64)
@@ -186,7 +187,8 @@ class DenseCounts:
 def run(lanes, frames, front_end, dt_s, interval_key, sensor, state, sink):
     """Run the sensor over a chunk.
 
-    Args: lanes: of a frame's pixels. frames: [T, ...] float32 or float64, not yet checked. front_end: FrontEnd.
+    Args: lanes: of a frame's pixels. frames: [T, ...] float32 or float64, not yet checked. front_end:
+      FrontEnd.
       dt_s: [T] length of the interval that ends with each frame.
       interval_key: [T] int32, random. sensor: SensorModel. state: SensorState (read only).
       sink: ``EventKeys`` or ``DenseCounts`` of the lanes; takes every event.

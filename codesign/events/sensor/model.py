@@ -265,8 +265,8 @@ def mismatched(theta: Tensor | float, sigma: Tensor | float, deviate: Tensor) ->
 
 
 def of_pixels(theta: Any, sigma: Any, deviate: Tensor | None, like: Tensor) -> Tensor:
-    """``mismatched`` in the type of another tensor; the nominal threshold where no number was drawn. Gradient: theta
-    and sigma."""
+    """``mismatched`` in the type of another tensor; the nominal threshold where no number was drawn.
+    Gradient: theta and sigma."""
     theta, sigma = (torch.as_tensor(x, dtype=like.dtype, device=like.device) for x in (theta, sigma))
     return theta if deviate is None else mismatched(theta, sigma, deviate.to(like))
 

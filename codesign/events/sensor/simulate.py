@@ -60,8 +60,9 @@ def simulate(
         (biases that change in a recording): its pixels keep the numbers drawn for them, and those that stand
         beyond their new thresholds fire at once. What the first sensor had not, and needs draws or a memory,
         is refused.
-      log_input: frames are natural-log levels, such as ln(I + eps) of linear frames of high dynamic range (ESIM:
-        eps 1e-3 with frames 0 to 1; of the 0-255 scale where the sensor's speed or noise depends on intensity).
+      log_input: frames are natural-log levels, such as ln(I + eps) of linear frames of high dynamic range
+        (ESIM: eps 1e-3 with frames 0 to 1; of the 0-255 scale where the sensor's speed or noise depends on
+        intensity).
     Returns: EventStream sorted by (t, y, x, p), int64 microseconds. The first frame gives no event. float32
       frames time events to the microsecond where the log level moves by 1 per second or more; slower ones to
       about 6e-8 |level| over its speed (float64 frames to the microsecond).

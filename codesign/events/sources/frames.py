@@ -1,5 +1,5 @@
-"""Frames to make events of, read in order, piece by piece: a video, a folder of pictures, a stack of arrays, or a raw
-recording, opened alike."""
+"""Frames to make events of, read in order, piece by piece: a video, a folder of pictures, a stack of arrays,
+or a raw recording, opened alike."""
 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass

@@ -1,21 +1,22 @@
-"""The gradients of mean spikes: of the spike response layer with resets that fade, and of the one that memorises a
-level.
+"""The gradients of mean spikes: of the spike response layer with resets that fade, and of the one that
+memorises a level.
 
-**Mean**, of resets that fade: that of the mean response of many noisy neurons, by the age of their last spike. All
-neurons of a pixel see one response v; a share P_k of them spiked last k steps ago, and carries the mean states of
-its resets. Where u = v + reset comes near theta a neuron spikes at the rate PACE / tau_r ln(1 + exp(x)), x = (u -
-theta) / (WIDTH theta): of each age the share F = 1 - exp(-dt rate) spikes in a step and goes to age 0; the others
-grow older, into a last age that holds all that are older still. The mean spikes, sum_k P_k F_k, are a smooth
-function of the response, and their gradient is exact. The equations are those of a population of neurons with
-escape noise: Gerstner and Kistler, Spiking Neuron Models, 2002, section 6.2, with the resets of earlier spikes as a
-mean per age. For dt = tau_r / PACE the share is a logistic function of x.
+**Mean**, of resets that fade: that of the mean response of many noisy neurons, by the age of their last
+spike. All neurons of a pixel see one response v; a share P_k of them spiked last k steps ago, and carries
+the mean states of its resets. Where u = v + reset comes near theta a neuron spikes at the rate PACE / tau_r
+ln(1 + exp(x)), x = (u - theta) / (WIDTH theta): of each age the share F = 1 - exp(-dt rate) spikes in a step
+and goes to age 0; the others grow older, into a last age that holds all that are older still. The mean
+spikes, sum_k P_k F_k, are a smooth function of the response, and their gradient is exact. The equations are
+those of a population of neurons with
+escape noise: Gerstner and Kistler, Spiking Neuron Models, 2002, section 6.2, with the resets of earlier
+spikes as a mean per age. For dt = tau_r / PACE the share is a logistic function of x.
 
-**Play**, of coupled polarities with step kernels: that of the mean count of ``events.memory``, for a level that runs
-no faster than one threshold per step. Such a layer fires at most once a step and polarity; what is left of a larger
-step fires in the steps after it. With the memorised level r spread evenly over one threshold C below the edge E of
-the last engaged step, all pixels fire once where the level exceeds E + C, and r then fills the C below E + C: as if
-the level itself had stopped there. For C_on = C_off the mean is exact; otherwise E is the edge of a play of their
-mean width.
+**Play**, of coupled polarities with step kernels: that of the mean count of ``events.memory``, for a level
+that runs no faster than one threshold per step. Such a layer fires at most once a step and polarity; what is
+left of a larger step fires in the steps after it. With the memorised level r spread evenly over one
+threshold C below the edge E of the last engaged step, all pixels fire once where the level exceeds E + C,
+and r then fills the C below E + C: as if the level itself had stopped there. For C_on = C_off the mean is
+exact; otherwise E is the edge of a play of their mean width.
 """
 
 import math
@@ -163,8 +164,8 @@ class PlayState:
 
 
 def check_play(drive, given, state):
-    """Raises: DomainError where a layer, given by its options, memorises no level, so that its mean count is not
-    that of a play, or a state comes from a layer with another gradient."""
+    """Raises: DomainError where a layer, given by its options, memorises no level, so that its mean count is
+    not that of a play, or a state comes from a layer with another gradient."""
     for name, needed in {"kernel": "step", "response": "step", "reset_scale": 1.0, "coupled": True}.items():
         if given[name] != needed:
             raise DomainError(
@@ -183,8 +184,8 @@ def check_same_gradient(name, state):
     """Raises: DomainError for a state of a layer with another gradient."""
     if state is not None and getattr(state, name, None) is None:
         raise DomainError(
-            f"the state comes from a layer without gradient={name!r}; begin with that gradient, or go on with "
-            "gradient='surrogate'."
+            f"the state comes from a layer without gradient={name!r}; begin with that gradient, or go on "
+            "with gradient='surrogate'."
         )
 
 

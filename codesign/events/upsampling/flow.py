@@ -143,7 +143,8 @@ def median_of_nine(field):
 def _iterate(flow, dual_x, dual_y, data, buffers):
     """One step of the data term, one of the smoothness, in place.
 
-    Args: data: of the brightness difference constant + gradient . flow, these two, the step along it, and its bounds.
+    Args: data: of the brightness difference constant + gradient . flow, these two, the step along it, and
+      its bounds.
       buffers: five tensors to work in; the last column and row of the last two stay 0.
     """
     constant, gradient, step, most, least = data

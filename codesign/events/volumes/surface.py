@@ -1,5 +1,5 @@
-"""What fades, per pixel and polarity. Time surfaces: how long ago the last event was, as exp(-(t_ref - t_last) / tau);
-0 where none was yet. Traces, which grow by one with every event and fade between them.
+"""What fades, per pixel and polarity. Time surfaces: how long ago the last event was, as exp(-(t_ref -
+t_last) / tau); 0 where none was yet. Traces, which grow by one with every event and fade between them.
 
 The gradient of the surface of hard counts is that of its mean over where pixels stand inside their
 thresholds. In the mean over places inside a threshold C it is (1/C) times the integral of exp(-age/tau) over
