@@ -19,7 +19,7 @@ from codesign.events.low_pass import low_pass, one_pole
 from codesign.events.sensor.model import PRESETS, SensorModel, draw_shot_counts, draw_thresholds
 from codesign.events.sensor.simulate import dense_counts, naive, simulate
 from codesign.events.sensor.state import SensorState
-from codesign.events.sources.frames import open_frames
+from codesign.events.sources.opening import open_frames
 from codesign.events.spiking.losses import count_loss, van_rossum
 from codesign.events.spiking.spike_esim import SpikeEsim, SpikeEsimState
 from codesign.events.spiking.srm import SrmState, alpha_response, drive_scale, srm

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from codesign.errors import FileFormatError
-from codesign.events.sources.frames import open_frames
+from codesign.events.sources.opening import open_frames
 
 # imageio leaves FFmpeg's pipes to the garbage collector
 IMAGEIO_LEAKS = pytest.mark.filterwarnings(
