@@ -33,7 +33,7 @@ MODULES = {NAMES.get(target, target.replace("-", "_")): target for target in STU
 COMMAND = re.compile(r"(?:\.venv/bin/)?python -m studies\.[a-z].*|make [a-z].*|codesign [a-z].*")
 INSTEAD = {"NAME_OR_FILE": "cooke-triplet", "--lens NAME": "--lens cooke-triplet"}
 # what else stands for something of the reader's own
-OWN = re.compile(r"\b[A-Z]{3,}\b|\w\.(mp4|npz|npy|txt|yaml|urdf)\b|frames/|runs/|--recording |--video$")
+OWN = re.compile(r"\b[A-Z]{3,}\b|\bmine:|\w\.(mp4|npz|npy|txt|yaml|urdf)\b|frames/|runs/|--recording |--video$")
 NEEDS = re.compile(r"\b(?:give|needs?|pass|with|required:)\b.*?(--[a-z][a-z-]*)")
 # what is no study is made short by what it is given last
 SHORT = {"fuzz": ["--minutes", "1"], "kill-test": ["--count", "1"]}
