@@ -113,6 +113,8 @@ def study(run: Run[Config]) -> None:
     bins = network.config["bins"]
     sets = judged(config, bins)
     who = estimators(network, config.models, config.clock)
+    # opened first: a wrong path ends the study before its windows are judged
+    packets = recordings.cases(config, run.say) if config.recording or not config.sets else []
     found = {}
     about = {}
     with run.progress(sum(number for _, number in sets.values()), "windows") as progress:
@@ -131,8 +133,8 @@ def study(run: Run[Config]) -> None:
     _tables(run, found, about, who)
     if "worlds" in found:
         _worlds(run, about["worlds"][1])
-    if config.recording or not config.sets:
-        recordings.show(run, who, bins)
+    if packets:
+        recordings.show(run, who, bins, packets)
     run.finish(
         "Quality of event flow",
         "Hard events with threshold mismatch and background noise; textures are photographs, unseen speckle "

@@ -144,11 +144,10 @@ def measured(case, who, bins):
     return rows
 
 
-def show(run, who, bins):
-    """Measure, record, and show on the page."""
+def show(run, who, bins, todo):
+    """Measure the cases, record, and show on the page."""
     found = {}
     cases_of = {}
-    todo = cases(run.config, run.say)
     with run.progress(len(todo), "packets") as progress:
         for case in todo:
             found.setdefault(case.kind, []).append(measured(case, who, bins))

@@ -127,6 +127,7 @@ def test_quick_form(tmp_path, monkeypatch):
         (["--windows", "1"], "at least 2 are needed"),
         (["--sets", "roads"], "--sets roads is unknown"),
         (["--models", "constant"], "affine is needed"),
+        (["--recording", "nowhere", "--packets", "1", "--packet-events", "400"], "nothing lies at nowhere"),
     ],
 )
 def test_unfit_options_are_refused(tmp_path, capsys, options, said):
