@@ -33,7 +33,9 @@ MODULES = {NAMES.get(target, target.replace("-", "_")): target for target in STU
 COMMAND = re.compile(r"(?:\.venv/bin/)?python -m studies\.[a-z].*|make [a-z].*|codesign [a-z].*")
 INSTEAD = {"NAME_OR_FILE": "cooke-triplet", "--lens NAME": "--lens cooke-triplet"}
 # what else stands for something of the reader's own
-OWN = re.compile(r"\b[A-Z]{3,}\b|\bmine:|\w\.(mp4|npz|npy|txt|yaml|urdf)\b|frames/|runs/|--recording |--video$")
+OWN = re.compile(
+    r"\b(?!ARGS\b)[A-Z]{3,}\b|\bmine:|\w\.(mp4|npz|npy|txt|yaml|urdf)\b|frames/|runs/|--recording |--video$"
+)
 NEEDS = re.compile(r"\b(?:give|needs?|pass|with|required:)\b.*?(--[a-z][a-z-]*)")
 # what is no study is made short by what it is given last
 SHORT = {"fuzz": ["--minutes", "1"], "kill-test": ["--count", "1"]}
@@ -116,11 +118,13 @@ def outcome(command: str, limit_s: float) -> tuple[bool, str, str]:
     code = re.findall(r"^make: \*\*\* .* Error (\d+)", errors, re.M) or [str(started.returncode)]
     traced = "Traceback (most" in errors
     lines = [line for line in errors.splitlines() if line.strip() and not line.startswith("make")] or [""]
-    # exit 2 is right only where the command names data of the reader's own, or asks for an option that it lacks
-    asked = NEEDS.search(lines[0])
+    # exit 2 is right only where the command names data of the reader's own, or asks for an option that it lacks;
+    # an option that is not there is refused without such a sentence
+    sentence = next((line for line in lines if line.startswith("error: ")), "")
+    asked = NEEDS.search(sentence)
     theirs = OWN.search(command) or (asked and asked[1] not in command)
-    right = code[0] == "0" or (code[0] == "2" and not traced and bool(theirs))
-    return right, code[0], "" if code[0] == "0" else lines[-1 if traced else 0][:160]
+    right = code[0] == "0" or (code[0] == "2" and bool(sentence and theirs))
+    return right, code[0], "" if code[0] == "0" else (lines[-1] if traced else sentence or lines[0])[:160]
 
 
 def cpu_s() -> float:
