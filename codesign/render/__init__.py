@@ -15,12 +15,12 @@ from codesign.render.truth import (
     FlowTruth,
     FramesTruth,
     View,
+    camera_velocity,
     flow_and_occlusion,
     true_flow,
     truth_of_frames,
     view,
 )
-from codesign.render.velocity import camera_velocity
 from codesign.render.wavefront import shade
 from codesign.render.world import MitsubaScene
 

@@ -64,13 +64,13 @@ def _edge_points(camera, samples):
     edge = _edge(camera)
     if edge is None:
         return None
-    low, high, corner, cell = edge
+    low, high, cell = edge
     pixels = camera.film.pixels()
     at = torch.quasirandom.SobolEngine(4, scramble=True, seed=camera.seed).draw(
         len(pixels) * samples, dtype=torch.float64
     )
     film_px = pixels.repeat_interleave(samples, 0) + at[:, :2] - 0.5
-    column, row = ((film_px - corner) / cell).floor().long().clamp(0, FIELDS - 1).unbind(1)
+    column, row = ((film_px + 0.5) / cell).floor().long().clamp(0, FIELDS - 1).unbind(1)
     sector = (at[:, 2] * ANGLES).long().clamp_max(ANGLES - 1)
     first, last = low[row, column, sector], high[row, column, sector]
     rows = torch.nonzero(last > first)[:, 0]
@@ -95,13 +95,10 @@ def _edge_points(camera, samples):
 
 def _edge(camera):
     """Least and largest radius [FIELDS, FIELDS, ANGLES] of the edge within each cell of the sensor and each
-    sector of the pupil, the cells' first corner [2] px and size [2] px; None where light falls and rises
-    again on the way out."""
+    sector of the pupil, and the size [2] px of a cell; None where light falls and rises again on the way out."""
     film = camera.film
-    size = torch.tensor([film.sensor_width_px, film.sensor_height_px], dtype=torch.float64)
     k = torch.arange(FIELDS + 1, dtype=torch.float64) / FIELDS
-    y, x = torch.meshgrid(k, k, indexing="ij")
-    fields = torch.stack([x, y], -1).reshape(-1, 2) * size - 0.5
+    fields = torch.cartesian_prod(k, k).flip(1) * film.sensor_px - 0.5
     turn = torch.arange(ANGLES, dtype=torch.float64) * (2 * math.pi / ANGLES)
     radius = torch.arange(RADII + 1, dtype=torch.float64) / RADII
     disc = (radius[:, None, None] * torch.stack([turn.cos(), turn.sin()], 1)).reshape(-1, 2)
@@ -121,7 +118,7 @@ def _edge(camera):
     some = ((most > 0).sum(2) + 1).clamp(0, RADII)
     whole = torch.where((least >= WHOLE).all(2), RADII, whole)
     low, high = (_over_cells(v, f) / RADII for v, f in ((whole, torch.minimum), (some, torch.maximum)))
-    return low, high, torch.full((2,), -0.5, dtype=torch.float64), size / FIELDS
+    return low, high, film.sensor_px / FIELDS
 
 
 def _over_cells(values, of):

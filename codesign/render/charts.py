@@ -13,8 +13,7 @@ from codesign import backend
 from codesign.errors import DomainError, ShapeError
 from codesign.exclusive import exclusive
 from codesign.render.atlas import Atlas, Nodes, atlas_of, cells_of, nodes_of
-from codesign.render.mitsuba_shapes import front_faces, is_mirrored, matrix_of
-from codesign.render.scene_checks import checked_mesh
+from codesign.render.mitsuba_shapes import checked_mesh, front_faces, is_mirrored, matrix_of
 from codesign.render.triangles import across
 from codesign.render.world import MitsubaScene
 

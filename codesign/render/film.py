@@ -69,10 +69,14 @@ class Film:
         )
 
     @property
+    def sensor_px(self) -> Tensor:
+        """Width and height of the sensor, [2] float64."""
+        return torch.tensor([self.sensor_width_px, self.sensor_height_px], dtype=torch.float64)
+
+    @property
     def middle_px(self) -> Tensor:
-        return torch.tensor(
-            [(self.sensor_width_px - 1) / 2, (self.sensor_height_px - 1) / 2], dtype=torch.float64
-        )
+        """Where the lens axis meets the sensor, [2] float64."""
+        return (self.sensor_px - 1) / 2
 
     def pixels(self) -> Tensor:
         """Coordinates (x, y) of all pixel centres on the full sensor, [P, 2] float64, in image order."""
@@ -88,6 +92,15 @@ class Film:
         """Coordinates (x, y) of these rows and columns of every window, [W x rows x columns, 2], in image
         order."""
         return (self.corners_px[:, None] + torch.cartesian_prod(rows, columns).flip(1)).reshape(-1, 2)
+
+
+def border_px(first_px: Tensor, size_px: Tensor, count: int) -> Tensor:
+    """Coordinates [4 count, 2] along the border of a window of ``size_px`` [2] behind its ``first_px`` [2],
+    half a pixel outside the outermost centres."""
+    share = torch.linspace(0, 1, count, dtype=torch.float64)
+    ends = [torch.full_like(share, end) for end in (0.0, 1.0)]
+    sides = [torch.stack(pair, 1) for end in ends for pair in ((share, end), (end, share))]
+    return first_px - 0.5 + torch.cat(sides) * size_px
 
 
 def check_memory(film: Film, samples_per_pixel: int) -> None:

@@ -1,5 +1,6 @@
 """What the shapes of Mitsuba do not tell by themselves: which side is the front, radiance between vertices,
-numbers, and the box around them.
+numbers, the box around them; and scenes that cannot be, refused where they are built, before Mitsuba renders
+them wrong or black, or ends the process.
 
 Mitsuba takes the front from the normals that a shape stores, and a mirrored ``to_world`` turns its faces
 inside out, but not those normals. At vertices it weighs corners in float32 by the square of a face's area,
@@ -7,13 +8,169 @@ which is noise on faces more than a thousand times as long as wide; here that is
 """
 
 import re
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from codesign.errors import DomainError, ShapeError
 from codesign.render.triangles import across
 
-ROOM = 1e-3  # of the diagonal
+FILES_UNCHECKED = ("ply", "serialized")  # Mitsuba itself follows their faces to vertices that are not there
+RADIANCE = ("value", "data", "scale")  # last part of the names of what an emitter shines with
+OWN = ("positions", "normals", "texcoords")  # of a mesh, beside the attributes its user has given it
+MOST_TEXELS = (
+    2.0**22
+)  # from the origin of texture coordinates: beyond, float32 knows a texel to a quarter at best
+THINNEST = (
+    1e-5  # squared sine of the angle at a face's corner, below which Mitsuba's weights of corners are noise
+)
+NAMED = 3  # shapes that a sentence names
+ROOM = 1e-3  # of a box's diagonal, around it
+
+
+def checked_mesh(name: str, vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] and faces [F, 3] of a mesh as arrays; ShapeError and DomainError, by its name, for a
+    mesh without faces, vertices that are not finite and faces of vertices that are not there."""
+    vertices = np.asarray(vertices)
+    faces = np.asarray(faces)
+    for label, array in (("vertices", vertices), ("faces", faces)):
+        if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0:
+            raise ShapeError(f"mesh '{name}': its {label} are {array.shape}; give at least one, [N, 3].")
+    finite = np.isfinite(vertices).all(1)
+    if not finite.all():
+        raise DomainError(
+            f"mesh '{name}': {int((~finite).sum())} of {len(finite)} vertices are NaN or infinite (first "
+            f"number {int(np.argmin(finite))}); repair or remove them."
+        )
+    low, high = int(faces.min()), int(faces.max())
+    if low < 0 or high >= len(vertices):
+        raise DomainError(
+            f"mesh '{name}': its faces name vertices {low} to {high}, but it has {len(vertices)}, counted "
+            "from 0; repair the faces."
+        )
+    return vertices, faces
+
+
+def check_description(mi: Any, description: Any) -> None:
+    """Raise DomainError or ShapeError for a description that is none, or that holds a mesh which would end
+    the process when Mitsuba builds the scene."""
+    if not isinstance(description, Mapping):
+        raise DomainError(
+            "a scene is described by a dictionary of shapes as Mitsuba has it, got a "
+            f"{type(description).__name__}; give one, or ask worlds.from_mitsuba for a file."
+        )
+    for name, entry in description.items():
+        if isinstance(entry, Mapping) and entry.get("type") in FILES_UNCHECKED:
+            try:
+                shape = mi.load_dict({**_file_of(entry), "face_normals": True})
+            except (
+                RuntimeError,
+                TypeError,
+                ValueError,
+            ):  # what cannot be read at all is told where the scene is built
+                continue
+            _check_shape(mi, name, shape)
+        elif isinstance(entry, mi.Mesh):
+            _check_shape(mi, name, entry)
+
+
+def check_scene(mi: Any, scene: Any, emissive: bool) -> None:
+    """Raise DomainError or ShapeError when a shape of a built scene is not finite, has no faces, or, where it
+    must be ``emissive``, has no emitter; or when an emitter's radiance is negative or not finite."""
+    black = []
+    for number, shape in enumerate(scene.shapes()):
+        name = shape.id() or f"number {number}"
+        _check_shape(mi, name, shape)
+        if not shape.is_emitter():
+            black.append(name)
+    if emissive and black:
+        more = f" and {len(black) - NAMED} more" if len(black) > NAMED else ""
+        raise DomainError(
+            f"shape {', '.join(map(repr, black[:NAMED]))}{more} has no emitter, so it would be black: give "
+            "it one of type 'area' (of radiance 0 where black is meant), or let light.bake or "
+            "light.PathScene work out "
+            "its light."
+        )
+    for emitter in scene.emitters():
+        shape = emitter.get_shape()
+        parameters = mi.traverse(emitter)
+        values = ((key, parameters[key]) for key, _ in parameters if key.rsplit(".", 1)[-1] in RADIANCE)
+        _check_radiance(emitter.id() if shape is None else shape.id(), values)
+        if shape is not None:
+            _check_attributes(shape, emitter)
+
+
+def _check_attributes(shape, emitter):
+    for name in re.findall(r'MeshAttribute\[\s*name = "(\w+)"', str(emitter)):
+        if not bool(shape.has_attribute(name)[0]):
+            raise DomainError(
+                f"radiance of '{shape.id()}': the mesh has no attribute '{name}', so it would be black; add "
+                "it (mesh.add_attribute), or name one that is there."
+            )
+
+
+def _file_of(entry):
+    return {key: value for key, value in entry.items() if key in ("type", "filename", "shape_index")}
+
+
+def _check_shape(mi, name, shape):
+    parameters = mi.traverse(shape)
+    _check_lookup(name, parameters)
+    if shape.is_mesh() and "vertex_positions" in parameters:
+        vertices, faces = checked_mesh(
+            name, *(np.array(parameters[key]).reshape(-1, 3) for key in ("vertex_positions", "faces"))
+        )
+        if vertex_attribute(shape.bsdf()):
+            _check_thick(name, vertices[faces])
+        attributes = (
+            key for key, _ in parameters if key.startswith(("vertex_", "face_")) and not key.endswith(OWN)
+        )
+        _check_radiance(name, ((key, parameters[key]) for key in attributes))
+        return
+    box = shape.bbox()
+    if not np.isfinite(np.array([box.min, box.max], dtype=float)).all():
+        raise DomainError(f"shape '{name}': its place or size is NaN or infinite; repair its to_world.")
+
+
+def _check_lookup(name, parameters):
+    """Texture coordinates times texels stay below what float32 can tell apart."""
+    uv = np.array(parameters["vertex_texcoords"]) if "vertex_texcoords" in parameters else np.ones(1)
+    for key in [key for key, _ in parameters if key.endswith(".data")]:
+        size = max(np.shape(parameters[key]))
+        to_uv = key.removesuffix("data") + "to_uv"
+        scale = np.abs(np.array(parameters[to_uv].matrix, dtype=float)).max() if to_uv in parameters else 1.0
+        reach = float(np.abs(uv).max(initial=0)) * scale * size
+        if not reach <= MOST_TEXELS:
+            raise DomainError(
+                f"shape '{name}': its texture coordinates reach {reach:.3g} texels away from 0, where "
+                f"float32 no longer tells texels apart (at most {MOST_TEXELS:.0f}); repeat the picture less "
+                "often, or make its texels larger."
+            )
+
+
+def _check_thick(name, corners):
+    u, v = corners[:, 1].astype(float) - corners[:, 0], corners[:, 2].astype(float) - corners[:, 0]
+    uu, vv, uv = (u * u).sum(1), (v * v).sum(1), (u * v).sum(1)
+    area = uu * vv - uv * uv
+    thin = int(((area > 0) & (area < THINNEST * uu * vv)).sum())
+    if thin:
+        raise DomainError(
+            f"mesh '{name}': {thin} of its faces are more than {THINNEST**-0.5:.0f} times as long as wide, "
+            "on which Mitsuba cannot tell albedo at vertices; remove them, or show the mesh at the level "
+            "'emissive'."
+        )
+
+
+def _check_radiance(name, values):
+    for key, value in values:
+        array = np.array(value, dtype=np.float32)
+        if array.size and not (array.min() >= 0 and array.max() < np.inf):
+            wrong = array[~(np.isfinite(array) & (array >= 0))]
+            raise DomainError(
+                f"radiance of '{name}': {key} holds {wrong.size} values that are negative, NaN or infinite "
+                f"(first {wrong.flat[0]:.3g}); make every one finite and at least 0."
+            )
 
 
 def is_mirrored(matrix: Any) -> bool:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from codesign.render.camera import Camera, lines, project
+from codesign.render.film import border_px
 
 FAR_M = 1e9  # at which a point is its direction
 DEGREES = (8, 12, 16, 20)
@@ -32,7 +33,9 @@ class ProjectionTable:
         """camera: Camera, whose lens is read as it is now."""
         self.camera = camera
         self.series = None
-        rays = camera.chief_rays(_border(camera.film))
+        film = camera.film
+        border = border_px(torch.zeros(2), film.sensor_px, 17)
+        rays = camera.chief_rays(torch.cat([border, film.middle_px[None]]))
         slope = lines(rays)[1].double()
         if not bool(slope.isfinite().all() & (rays.weight > 0).all()):
             return  # the film is larger than the field of the lens
@@ -136,14 +139,3 @@ def _chebyshev(at, count):
     for k in range(2, count):
         torch.sub(2 * at * terms[:, k - 1], terms[:, k - 2], out=terms[:, k])
     return terms
-
-
-def _border(film):
-    """Pixel coordinates along the border of the whole sensor, half a pixel outside the outermost centres, and
-    its middle."""
-    share = torch.linspace(0, 1, 17, dtype=torch.float64)
-    x = share * film.sensor_width_px - 0.5
-    y = share * film.sensor_height_px - 0.5
-    sides = [torch.stack([x, torch.full_like(x, v)], 1) for v in (-0.5, film.sensor_height_px - 0.5)]
-    sides += [torch.stack([torch.full_like(y, v), y], 1) for v in (-0.5, film.sensor_width_px - 0.5)]
-    return torch.cat([*sides, film.middle_px[None]])

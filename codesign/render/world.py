@@ -15,15 +15,16 @@ from codesign.reading import reading
 from codesign.render.mitsuba_shapes import (
     are_geometric,
     box_around,
+    check_description,
+    check_scene,
     interpolated,
     shape_numbers,
     vertex_attribute,
 )
-from codesign.render.scene_checks import check_description, check_scene
+from codesign.render.pixel_means import with_slopes
 from codesign.render.silhouettes import outlines
 from codesign.render.silhouettes.curves import Segments
 from codesign.render.silhouettes.shapes import Bodies, read
-from codesign.render.slopes import with_slopes
 
 
 class MitsubaScene:

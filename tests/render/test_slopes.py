@@ -6,7 +6,7 @@ import torch
 
 from codesign import pose, render
 from codesign.errors import GradientError
-from codesign.render import slopes
+from codesign.render import pixel_means
 from codesign.render.wavefront import look, shade
 from codesign.types import Rays
 
@@ -54,21 +54,21 @@ def test_what_memory_does_not_hold_is_worked_out_again_frame_by_frame(rays, moti
     inputs = (*rays, *motion)
     seed = torch.linspace(-1, 1, 2 * FRAMES, dtype=torch.float64).reshape(FRAMES, 2)
     kept = torch.autograd.grad(pictures(*inputs), inputs, seed)
-    monkeypatch.setattr(slopes, "KEPT", 0.0)
+    monkeypatch.setattr(pixel_means, "KEPT", 0.0)
     again = torch.autograd.grad(pictures(*inputs), inputs, seed)
     for a, b in zip(kept, again, strict=True):  # the frames' sums are added in another order
         torch.testing.assert_close(a, b, rtol=1e-13, atol=1e-13 * float(a.abs().max()))
 
 
 def test_room_is_given_back_with_the_graph(rays, motion):
-    before = slopes.ROOM.taken
+    before = pixel_means.ROOM.taken
     image = pictures(*rays, *motion)
-    assert slopes.ROOM.taken - before == 7 * 8 * 8 * FRAMES  # numbers, bytes, rays, frames
+    assert pixel_means.ROOM.taken - before == 7 * 8 * 8 * FRAMES  # numbers, bytes, rays, frames
     del image
-    assert slopes.ROOM.taken == before
+    assert pixel_means.ROOM.taken == before
     with torch.no_grad():
         pictures(*rays, *motion)
-    assert slopes.ROOM.taken == before
+    assert pixel_means.ROOM.taken == before
 
 
 def test_second_derivatives_are_refused(rays, motion):
@@ -104,7 +104,7 @@ def test_a_ray_without_a_slope_counts_none_and_leaves_the_others_theirs():
         return 2 * direction.y + dr.sqrt(origin.x) - dr.sqrt(origin.x), Array3f(0, 0, 1)
 
     with dr.suspend_grad():
-        light, _, to_origin, to_direction = slopes.with_slopes(shown)(
+        light, _, to_origin, to_direction = pixel_means.with_slopes(shown)(
             Array3f(Float([0, 1]), 0, 0), Array3f(0, Float([3, 4]), 1)
         )
     assert light.numpy().tolist() == [6, 8]

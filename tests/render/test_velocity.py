@@ -10,7 +10,7 @@ from scipy.linalg import logm
 
 from codesign.pose import se3_exp
 from codesign.render import camera_velocity
-from codesign.render.velocity import se3_log
+from codesign.render.truth import se3_log
 from scenes import trajectories
 
 D = torch.float64

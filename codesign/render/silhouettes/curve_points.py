@@ -14,7 +14,7 @@ from torch import Tensor
 
 from codesign.pose import apply, inverse
 from codesign.render.camera import Camera, lines
-from codesign.render.film import film_pupil_pattern
+from codesign.render.film import border_px, film_pupil_pattern
 from codesign.render.rows import Rows
 
 # length of a piece on the film, and its angle, at most: one that reaches behind the camera is left out
@@ -176,18 +176,8 @@ class FieldOfView:
         _, pupils = film_pupil_pattern(PUPILS, camera.seed)
         self.pupils = pupils * (self.aperture_m > 0)
         film = camera.film
-        sides = torch.linspace(-0.5, 0.5, 9, dtype=torch.float64)
-        border = torch.cat(
-            [
-                torch.stack([a, b], 1)
-                for e in (-0.5, 0.5)
-                for a, b in ((sides, 0 * sides + e), (0 * sides + e, sides))
-            ]
-        )
         size = torch.tensor([film.width_px, film.height_px], dtype=torch.float64)
-        boxes = []
-        for corner in film.corners_px:
-            boxes.append(self._box(camera, corner + (size - 1) / 2 + border * size))
+        boxes = [self._box(camera, border_px(corner, size, 9)) for corner in film.corners_px]
         self.low, self.high = (torch.stack(side) for side in zip(*boxes, strict=True))
         self.spread, self.shift = self._blur(camera)
 
@@ -234,8 +224,7 @@ class FieldOfView:
             return none, none
         angle = torch.arange(8, dtype=torch.float64) * (math.pi / 4)
         rim = torch.stack([angle.cos(), angle.sin()], 1)
-        size = torch.tensor([camera.film.sensor_width_px, camera.film.sensor_height_px], dtype=torch.float64)
-        fields = camera.film.middle_px + size * torch.tensor(
+        fields = camera.film.middle_px + camera.film.sensor_px * torch.tensor(
             [[0, 0], [0.25, 0.25], [-0.5, 0.5], [0.5, 0], [0, -0.5]], dtype=torch.float64
         )
         chief = camera.rays_through(fields, torch.zeros_like(fields))

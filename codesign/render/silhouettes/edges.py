@@ -195,13 +195,8 @@ def _cut_at_ends(edges, apart_m):
     half = edges.length_m / 2
     nearest, _ = tree.query(middle)
     doubtful = np.nonzero(nearest < half - apart_m)[0]
-    near = tree.query_ball_point(middle[doubtful], half[doubtful])
-    which = np.repeat(doubtful, [len(found) for found in near])
-    point = (
-        points[np.concatenate([np.array(found, dtype=np.int64) for found in near])]
-        if len(which)
-        else points[:0]
-    )
+    which, near = within_reach(tree, middle[doubtful], half[doubtful])
+    which, point = doubtful[which], points[near]
     along = (edges.end - edges.start)[which] / (2 * half[which])[:, None]
     at = ((point - edges.start[which]) * along).sum(1)
     off = np.linalg.norm(point - edges.start[which] - at[:, None] * along, axis=1)
@@ -221,6 +216,13 @@ def _cut_at_ends(edges, apart_m):
         replace(cut, start=cut.start + share[:, None] * along, end=cut.start + until[:, None] * along),
         widest[which],
     )
+
+
+def within_reach(tree: cKDTree, points: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs [n], [n] of the number of a point and of what in a tree is nearer to it than its reach."""
+    near = tree.query_ball_point(points, reach)
+    numbers = [np.zeros(0, dtype=np.int64), *(np.array(found, dtype=np.int64) for found in near)]
+    return np.repeat(np.arange(len(points)), [len(found) for found in near]), np.concatenate(numbers)
 
 
 def _from_line(points, edges):

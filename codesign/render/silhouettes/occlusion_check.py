@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -25,6 +24,7 @@ from codesign.render.moving import parts, says_distance
 from codesign.render.rows import Rows
 from codesign.render.silhouettes.certified_views import MOST, Looked, looked_at, nearest_m
 from codesign.render.silhouettes.curve_points import CurvePoints, FieldOfView, known_beside, piece_rad
+from codesign.render.silhouettes.edges import within_reach
 from codesign.render.silhouettes.jumps import SAFETY, jumps
 from codesign.render.wavefront import look
 
@@ -311,16 +311,15 @@ def _look(camera, scene, cameras, frame, at, pupil):
 def _near(curve, index, bounds, eye, origin, direction, distance, near_rad):
     """Pairs (ray, piece) of which the chord of the piece passes near where the ray [n, 3] meets something at
     a distance [n]."""
-    if not (index.numel() and len(origin)):
-        return index[:0], index[:0]
+    if not index.numel():
+        return index, index
     a, b = (curve.points(index, s, eye) for s in bounds.unbind(1))
     middle = (a + b) / 2
     half = (b - a).norm(dim=1) / 2
     share = float((half / (middle - eye).norm(dim=1).clamp_min(1e-9)).max()) + DEPTH
     at = origin + distance[:, None] * direction
-    near = cKDTree(middle.numpy()).query_ball_point(at.numpy(), (distance * share * (1 + share)).numpy())
-    ray = torch.arange(len(at)).repeat_interleave(torch.tensor([len(pieces) for pieces in near]))
-    piece = torch.tensor(np.concatenate(near).astype(np.int64))
+    near = within_reach(cKDTree(middle.numpy()), at.numpy(), (distance * share * (1 + share)).numpy())
+    ray, piece = map(torch.tensor, near)
     # in the plane across the ray
     p, q = (_across(v[piece] - origin[ray], direction[ray]) for v in (a, b))
     v = q - p
