@@ -63,8 +63,6 @@ class MovingScene:
                 "moving scene: objects are a dictionary {name: (scene, T_world_object [T, 4, 4])}; give a "
                 "scene and poses for each name."
             )
-        for part in (static, *(scene for scene, _ in objects.values())):
-            check_kind(part.static if isinstance(part, MovingScene) else part)
         self.static = static
         self.names = tuple(objects)
         self.scenes = (static, *(scene for scene, _ in objects.values()))
@@ -74,6 +72,7 @@ class MovingScene:
                     f"moving scene: part '{name}' is itself a moving scene; give its objects one by one, "
                     "with poses in the world."
                 )
+            check_kind(scene)
             if not says_distance(type(scene)):
                 raise DomainError(
                     f"moving scene: part '{name}', a {type(scene).__name__}, does not say how far away its "

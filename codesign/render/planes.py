@@ -68,15 +68,8 @@ class TexturedPlane:
         def opaque(tensor):
             return [dr.opaque(arr.Float, v) for v in tensor.reshape(-1).tolist()]
 
-        waves = list(
-            zip(
-                opaque(self.frequency[:, 0]),
-                opaque(self.frequency[:, 1]),
-                opaque(self.amplitude),
-                opaque(self.phase),
-                strict=True,
-            )
-        )
+        columns = (*self.frequency.unbind(1), self.amplitude, self.phase)
+        waves = list(zip(*map(opaque, columns), strict=True))
         return opaque(self.T_world_plane[:3]), waves, dr.opaque(arr.Float, self.mean)
 
     def outline(self) -> list[Any]:

@@ -2,6 +2,8 @@
 cameras with aimed pupils, spectrum and falloff, windows on the film and batches of trajectories. Differences
 with common random numbers are the judge."""
 
+import functools
+
 import pytest
 import torch
 
@@ -17,10 +19,6 @@ SIZE_PX = 24
 STEP = 2e-3
 WEIGHT = smooth_weights(SIZE_PX)
 START = pose.look_at((0.05, -1.2, 1.0), (0.0, 1.0, 0.7))
-
-
-def triplet():
-    return lens.load("cooke-triplet").scaled(0.22).freeze()
 
 
 def judged(loss, many=512, seeds=(11, 12), per_px=12.0):
@@ -44,77 +42,59 @@ def judged(loss, many=512, seeds=(11, 12), per_px=12.0):
     return error("boundary"), error("interior"), noise
 
 
-def frames_loss(optics, scene, path=START, film=None, **options):
-    def loss(twist, samples, seed, way, per_px):
-        size = (SIZE_PX, SIZE_PX) if film is None else (film.width_px, film.height_px)
-        camera = render.Camera(optics, *size, 8.0 / SIZE_PX, samples, seed, film=film, **options)
-        frames = render.frames(camera, scene, path[None] @ pose.se3_exp(twist[None]), way, per_px)
-        return (WEIGHT[: size[1], : size[0]] * frames).double().mean()
+scene, robot = functools.cache(silhouette_scenes.build), functools.cache(silhouette_scenes.robot)
 
-    return loss
+
+def aside(twist):
+    """Cubes before a camera that moves."""
+    return scene("cubes"), START[None] @ pose.se3_exp(twist[None])
+
+
+def mounted(twist):
+    """The robot stands in the world with the camera on it; what moves is the mount, under which the world
+    moves and the robot's own body too."""
+    T_world_robot = pose.se3_exp(torch.tensor([[0.05, -1.2, 1.0, 0.0, 0.0, 0.1]], dtype=F64))
+    T_robot_cam = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, -0.15))
+    world = render.MovingScene(scene("cubes"), {"robot": (robot(), T_world_robot)})
+    return world, T_world_robot @ (T_robot_cam @ pose.se3_exp(twist[None]))
+
+
+def turned(twist):
+    """An object that moves about its own axes, before a camera that rests."""
+    place = pose.se3_exp(torch.tensor([[-0.1, -0.1, 0.95, 0.6, 0.2, 0.5]], dtype=F64))
+    moved = robot(), place @ pose.se3_exp(twist[None])
+    return render.MovingScene(scene("wall"), {"robot": moved}), START[None]
+
+
+PINHOLE, TRACED = lens.Pinhole(11.0), lens.load("cooke-triplet").scaled(0.22).freeze()
+COLOURS = lens.Spectrum.visible_FdC((1.0, 2.0, 1.0))
+# two windows that overlap, off the middle of a sensor: the edges of each count in each
+WINDOWS = render.Film(48, 36, 16, 14, 8.0 / SIZE_PX, ((6, 8), (14, 12)))
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("of_twist", "optics", "options", "how"),
     [
-        {"aim": True},
-        {"falloff": True},
-        {"spectrum": lens.Spectrum.visible_FdC((1.0, 2.0, 1.0))},
+        (aside, TRACED, {"aim": True}, {"many": 192}),  # each ray is aimed by several traces
+        (aside, TRACED, {"falloff": True}, {"many": 384}),
+        (aside, TRACED, {"spectrum": COLOURS}, {"many": 384}),
+        (aside, TRACED, {"film": WINDOWS}, {}),
+        (mounted, PINHOLE, {}, {}),
+        (mounted, TRACED, {}, {}),
+        (turned, TRACED, {}, {"seeds": (11, 12, 13, 14)}),
     ],
-    ids=["aim", "falloff", "spectrum"],
+    ids=["aim", "falloff", "spectrum", "windows", "mount, pinhole", "mount, traced", "object"],
 )
-def test_cameras_with_more_than_one_colour_and_a_real_pupil(options):
-    many = (
-        192 if "aim" in options else 384
-    )  # each ray is aimed by several traces; a multiple of three colours
-    whole, plain, noise = judged(frames_loss(triplet(), silhouette_scenes.build("cubes"), **options), many)
-    assert noise < 0.02
-    assert whole < 0.05
-    assert plain > 0.2
-
-
-def test_windows_on_the_film_each_have_their_own_edges():
-    """Two windows that overlap, off the middle of a sensor: the edges of each count in each."""
-    film = render.Film(48, 36, 16, 14, 8.0 / SIZE_PX, ((6, 8), (14, 12)))
-    whole, plain, noise = judged(frames_loss(triplet(), silhouette_scenes.build("cubes"), film=film))
-    assert noise < 0.02
-    assert whole < 0.05
-    assert plain > 0.2
-
-
-@pytest.mark.parametrize("optics", [lens.Pinhole(11.0), triplet()], ids=["pinhole", "traced"])
-def test_the_mount_of_a_camera_that_sees_its_robot(optics):
-    """The robot stands in the world with the camera on it; what is asked for is the pose of the mount, under
-    which the world moves and the robot's own body too."""
-    scene, robot = silhouette_scenes.build("cubes"), silhouette_scenes.robot()
-    T_world_robot = pose.se3_exp(torch.tensor([[0.05, -1.2, 1.0, 0.0, 0.0, 0.1]], dtype=F64))
-    T_robot_cam = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, -0.15))
-
+def test_the_gradient_to_what_moves_has_its_edges(of_twist, optics, options, how):
     def loss(twist, samples, seed, way, per_px):
-        camera = render.Camera(optics, SIZE_PX, SIZE_PX, 8.0 / SIZE_PX, samples, seed)
-        world = render.MovingScene(scene, {"robot": (robot, T_world_robot)})
-        mounted = T_world_robot @ (T_robot_cam @ pose.se3_exp(twist[None]))
-        return (WEIGHT * render.frames(camera, world, mounted, way, per_px)[0]).double().mean()
+        film = options.get("film") or render.Film(SIZE_PX, SIZE_PX, SIZE_PX, SIZE_PX, 8.0 / SIZE_PX)
+        size = film.width_px, film.height_px
+        camera = render.Camera(optics, *size, 8.0 / SIZE_PX, samples, seed, **{"film": film, **options})
+        frames = render.frames(camera, *of_twist(twist), way, per_px)
+        return (WEIGHT[: size[1], : size[0]] * frames).double().mean()
 
-    whole, plain, noise = judged(loss)
-    assert noise < 0.02
-    assert whole < 0.05
-    assert plain > 0.2
-
-
-def test_the_pose_of_an_object_that_moves():
-    """Twist of the object about its own axes, before a camera that rests."""
-    wall, robot = silhouette_scenes.build("wall"), silhouette_scenes.robot()
-    optics = triplet()
-
-    def loss(twist, samples, seed, way, per_px):
-        camera = render.Camera(optics, SIZE_PX, SIZE_PX, 8.0 / SIZE_PX, samples, seed)
-        place = pose.se3_exp(torch.tensor([[-0.1, -0.1, 0.95, 0.6, 0.2, 0.5]], dtype=F64))
-        world = render.MovingScene(wall, {"robot": (robot, place @ pose.se3_exp(twist[None]))})
-        return (WEIGHT * render.frames(camera, world, START[None], way, per_px)[0]).double().mean()
-
-    whole, plain, noise = judged(loss, seeds=(11, 12, 13, 14))
-    assert noise < 0.03
+    whole, plain, noise = judged(loss, **how)
+    assert noise < (0.03 if of_twist is turned else 0.02)
     assert whole < 0.05
     assert plain > 0.2
 
