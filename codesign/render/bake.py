@@ -19,7 +19,7 @@ from scipy.ndimage import distance_transform_edt, zoom
 from codesign.errors import DomainError
 from codesign.exclusive import exclusive
 from codesign.render.atlas import Nodes
-from codesign.render.charts import Chart, Surface, placed, surfaces_of
+from codesign.render.charts import FINE, Chart, Surface, placed, surfaces_of
 from codesign.render.placed import Placement, SidedScene
 from codesign.render.world import MitsubaScene
 
@@ -34,6 +34,7 @@ SIZES = (
 DARK = 1e-4  # an albedo below this shows no light worth measuring
 SHINE = 0.2  # least albedo that light is divided by where part of it is not coloured by the albedo
 GRAZING = 0.05  # cosine of the flattest direction that shiny surfaces are looked at from
+LEAST_SIDE, MOST_SIDE = 4, 512  # texels of a light map along each side of a shape
 MAX_FINE = 1 << 24  # texels of a finished texture
 
 
@@ -46,8 +47,6 @@ def bake(
     samples: int = 64,
     seed: int = 0,
     max_depth: int = 8,
-    max_texels: int = 512,
-    fine: int = 10,
     towards_m: Sequence[float] | None = None,
     matte: bool = False,
     integrator: Any = None,
@@ -60,11 +59,9 @@ def bake(
       description: Mitsuba scene dictionary, or an mi.Scene, of rectangles, disks, spheres, cylinders and
         meshes, area emitters where they glow, and lamps of any kind. Environment maps stay in the scene, seen
         and lighting.
-      texel_m: size of light-map texels, from 4 to max_texels along each side of a shape; larger on a mesh
-        that would
-        need more than two million. samples: paths per texel; seed: of all of them.
-      max_depth: longest path. integrator: a Mitsuba SamplingIntegrator instead. fine: texels of a finished
-        texture per light-map texel along each side, unless its picture is coarser than that.
+      texel_m: size of light-map texels, from LEAST_SIDE to MOST_SIDE along each side of a shape; larger on a
+        mesh that would need more than two million. samples: paths per texel; seed: of all of them.
+      max_depth: longest path. integrator: a Mitsuba SamplingIntegrator instead.
       towards_m: place from which shiny surfaces look as they are; None shows the mean over directions.
       matte: whether mirrors, glass and masks are shown as if they were matte, in their mean radiance.
       lit: whether there is light at all; without it what glows shows its emission, anything else its albedo.
@@ -76,10 +73,9 @@ def bake(
     Raises: DomainError for mirrors, glass and masks unless ``matte``; media; shapes without known charts; of
       a dictionary, shapes of which nothing can be seen from their front.
     """
-    if not (0 < texel_m < np.inf and samples >= 1 and max_texels >= 4 and fine >= 1):
+    if not (0 < texel_m < np.inf and samples >= 1):
         raise DomainError(
-            f"bake: texel_m = {texel_m}, samples = {samples}, max_texels = {max_texels}, fine = {fine}: "
-            "sizes must be positive, samples and fine at least 1, max_texels at least 4."
+            f"bake: texel_m = {texel_m}, samples = {samples}: a size must be positive, samples at least 1."
         )
     world = MitsubaScene(description, device, merge=False, emissive=False)  # every shape keeps its name
     mi = world.mi
@@ -93,11 +89,9 @@ def bake(
         np.random.default_rng(seed),
         int(samples),
         texel_m / place.unit_m,
-        int(max_texels),
-        int(fine),
         None if towards_m is None else (np.array(towards_m) @ place.R_world_scene.numpy()) / place.unit_m,
     )
-    surfaces = surfaces_of(mi, world.scene, work.texel, work.fine, matte)
+    surfaces = surfaces_of(mi, world.scene, work.texel, matte)
     light = work.radiance(surfaces, strict=isinstance(description, Mapping))
     return shown(world, surfaces, light, place, device)
 
@@ -137,8 +131,6 @@ class Bake:
     random: np.random.Generator
     samples: int
     texel: float
-    max_texels: int
-    fine: int
     towards: np.ndarray | None = None
 
     def radiance(self, surfaces: Sequence[Surface], strict: bool) -> list[list[np.ndarray]]:
@@ -264,11 +256,11 @@ class Bake:
         if chart.atlas is not None:
             return chart.atlas.texels
         wanted = np.ceil(np.array(chart.size)[::-1] / self.texel)
-        return tuple(int(n) for n in np.clip(wanted, 4, self.max_texels))
+        return tuple(int(n) for n in np.clip(wanted, LEAST_SIDE, MOST_SIDE))
 
     def _fine(self, surface):
         """Texels (rows, columns) of the finished texture: those of the pictures on the shape, but no more
-        than ``fine`` per light-map texel."""
+        than FINE per light-map texel."""
         chart = surface.chart
         coarse = np.array(self._coarse(chart))
         pictures = np.array(surface.texels_per_uv)
@@ -277,9 +269,9 @@ class Bake:
             per_texel = (
                 per_uv * chart.uv_per_unit * chart.size[0] / coarse[1] if np.isfinite(per_uv) else per_uv
             )
-            wanted = max(1, np.ceil(min(per_texel, self.fine))) * coarse
+            wanted = max(1, np.ceil(min(per_texel, FINE))) * coarse
         else:
-            wanted = np.minimum(np.maximum(2 * coarse, np.ceil(pictures)), max(self.fine, 2) * coarse)
+            wanted = np.minimum(np.maximum(2 * coarse, np.ceil(pictures)), FINE * coarse)
         most = np.sqrt(MAX_FINE / np.prod(wanted))
         return tuple(int(n) for n in np.maximum(coarse, wanted * min(1.0, most)))
 

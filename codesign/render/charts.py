@@ -17,6 +17,8 @@ from codesign.render.mitsuba_shapes import checked_mesh, front_faces, is_mirrore
 from codesign.render.triangles import across
 from codesign.render.world import MitsubaScene
 
+# texels of a finished texture per light-map texel along each side, unless its picture is coarser than that
+FINE = 10
 FINE_MESH = 0.5  # of a texel: meshes whose pieces are smaller on the average have their light at vertices
 MAX_FACES = 400_000  # of a mesh that is cut into cells
 LAMBERTIAN = ("DiffuseReflection", "FrontSide", "BackSide", "SpatiallyVarying")
@@ -239,7 +241,7 @@ class Surface:
     texels_per_uv: tuple[float, float]
 
 
-def surfaces_of(mi: Any, scene: Any, texel: float, fine: int, matte: bool) -> list[Surface]:
+def surfaces_of(mi: Any, scene: Any, texel: float, matte: bool) -> list[Surface]:
     """The surfaces of a Mitsuba scene whose light is kept in texels of this size, and pictures in finer ones.
 
     Raises: DomainError for surfaces that no texture can stand for: mirrors, glass and masks unless ``matte``,
@@ -250,11 +252,11 @@ def surfaces_of(mi: Any, scene: Any, texel: float, fine: int, matte: bool) -> li
         name = shape.id() or shape.class_name()  # those of files need no id
         if name in found:
             name = next(other for k in itertools.count(2) if (other := f"{name}-{k}") not in found)
-        found[name] = _surface(mi, name, shape, texel, fine, matte)
+        found[name] = _surface(mi, name, shape, texel, matte)
     return list(found.values())
 
 
-def _surface(mi, name, shape, texel, fine, matte):
+def _surface(mi, name, shape, texel, matte):
     bsdf = shape.bsdf()
     flags = 0 if bsdf is None else int(bsdf.flags())
     if shape.interior_medium() is not None or shape.exterior_medium() is not None:
@@ -277,7 +279,7 @@ def _surface(mi, name, shape, texel, fine, matte):
     pictures = _pictures(mi.traverse(shape))
     if not pictures and has("SpatiallyVarying"):
         pictures = [(np.inf, np.inf)]
-    detail = texel / fine if pictures else None
+    detail = texel / FINE if pictures else None
     chart = chart_of(mi, shape, texel, detail)
     finest = tuple(max((row[k] for row in pictures), default=0.0) for k in (0, 1))
     return Surface(name, shape, chart, 2 if has("BackSide") else 1, shiny, finest)

@@ -99,7 +99,7 @@ def test_squares_exchange_light_by_their_form_factor(centre, normal, up, form_fa
     truth = 0.5 * 100 * form_factor  # mean irradiance is pi L F for equal areas
     # direct light has a relative spread below 1: 65,536 paths; near the common edge it is largest, and texels
     # of 5 cm sum it exactly
-    baked = light.bake(scene, samples=256, texel_m=1 / 32, fine=1)
+    baked = light.bake(scene, samples=256, texel_m=1 / 32)
     for made, points in ((light.PathScene(scene, samples=64), grid()), (baked, grid(64))):
         found = radiance_at(made, points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), 1e-4)
         assert float(found.mean()) == pytest.approx(truth, rel=0.02)
