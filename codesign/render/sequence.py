@@ -30,11 +30,16 @@ WAYS: tuple[Way, ...] = ("interior", "boundary", "difference", "auto")
 PROVEN: tuple[Way, ...] = ("interior", "boundary")  # those that differences judge
 POSE_STEP = 2e-3  # metres and radians, but never more than STEP_PX on the film
 STEP_PX = 0.3
+# of the numbers of a lens; None where differences know none
 LENS_STEP = {
     "curvature_per_mm": 2e-5,
     "thickness_mm": 5e-3,
     "conic": 1e-2,
+    "asphere": None,
     "index_offset": 1e-4,
+    "phase": None,
+    "decentre_mm": None,
+    "tilt_rad": None,
     "efl_mm": 1e-2,
     "image_distance_mm": 2e-3,
 }
@@ -133,21 +138,12 @@ def by_differences(rays: Rays, camera: Camera, views: Views) -> Tensor:
             "use 'boundary'."
         )
     with torch.no_grad():
-        found = first = image(rays, camera, views)
-    if views.cameras.requires_grad:
-        twist = _twist(views.T_world_cam).reshape(*views.batch, 6)
-        steps = pose_steps(camera, views)
-        for k in range(6):
-            slope = pose_difference(rays, camera, views, k, steps[k])
-            weight = twist[..., k].to(first)
-            found = found + slope * weight.reshape(*views.batch, *[1] * len(camera.film.shape))
-    known = lens_tensors(camera.lens)
-    _check_known(camera.lens, known)
-    for name, tensor in known.items():
-        for i in range(tensor.numel()):
-            slope = lens_difference(camera, views, name, i)
-            value = tensor.reshape(-1)[i]
-            found = found + slope * (value - value.detach()).to(first)
+        found = image(rays, camera, views)
+    for at, size, number in (*_pose_numbers(rays, camera, views), *_lens_numbers(camera, views)):
+        with torch.no_grad():
+            ahead, behind = (at(sign * size).reshape(found.shape) for sign in (1, -1))
+            slope = (ahead - behind) / (2 * size)
+        found = found + slope * number.to(found)
     return found
 
 
@@ -173,34 +169,24 @@ def pose_steps(camera: Camera, views: Views) -> list[float]:
     return 3 * [min(POSE_STEP, move)] + 3 * [min(POSE_STEP, turn)]
 
 
-def pose_difference(rays: Rays, camera: Camera, views: Views, k: int, size: float) -> Tensor:
-    """Change of the frames per unit of the k-th component of the twist of every pose, by central
-    differences over ``size`` either way."""
-    step = torch.zeros(6, dtype=torch.float64)
-    step[k] = size
-    with torch.no_grad():
-        ahead, behind = (
-            image(rays, camera, views_of(views.scene, views.T_world_cam @ se3_exp(sign * step[None])))
-            for sign in (1, -1)
-        )
-    return ((ahead - behind) / (2 * size)).reshape(*views.batch, *camera.film.shape)
+def _pose_numbers(rays, camera, views):
+    """For every component of the twist of all poses: frames as a function of its change, the step, and the
+    zero-valued component of each frame."""
+    if not views.cameras.requires_grad:
+        return
+    twist = _twist(views.T_world_cam).reshape(*views.batch, *[1] * len(camera.film.shape), 6)
+    for k, size in enumerate(pose_steps(camera, views)):
+        way = torch.eye(6, dtype=torch.float64)[k : k + 1]
+
+        def at(change, way=way):
+            return image(rays, camera, views_of(views.scene, views.T_world_cam @ se3_exp(change * way)))
+
+        yield at, size, twist[..., k]
 
 
 def lens_tensors(lens: Any) -> dict[str, Tensor]:
     """Tensors of a lens that ask for gradients, by name."""
-    names = (
-        "curvature_per_mm",
-        "thickness_mm",
-        "conic",
-        "asphere",
-        "index_offset",
-        "phase",
-        "decentre_mm",
-        "tilt_rad",
-        "efl_mm",
-        "image_distance_mm",
-    )
-    found = {name: getattr(lens, name, None) for name in names}
+    found = {name: getattr(lens, name, None) for name in LENS_STEP}
     return {name: t for name, t in found.items() if torch.is_tensor(t) and t.requires_grad and t.numel()}
 
 
@@ -217,20 +203,24 @@ def _check_known(lens, known):
             )
 
 
-def lens_difference(camera: Camera, views: Views, name: str, i: int) -> Tensor:
-    """Change of the frames per unit of one number of the lens, by central differences."""
-    if name not in LENS_STEP:
-        raise DomainError(
-            f"differences to the lens's {name} have no step; freeze it, or use gradient 'boundary'."
-        )
-    step = LENS_STEP[name]
-    value = getattr(camera.lens, name).detach()
-    shift = torch.zeros_like(value).reshape(-1)
-    shift[i] = step
-    with torch.no_grad():
-        moved = (camera.lens.replace(**{name: value + sign * shift.reshape(value.shape)}) for sign in (1, -1))
-        ahead, behind = (image(camera.with_lens(lens).rays(), camera, views) for lens in moved)
-    return (ahead - behind) / (2 * step)
+def _lens_numbers(camera, views):
+    """As above, for every number of the lens that asks for a gradient."""
+    known = lens_tensors(camera.lens)
+    _check_known(camera.lens, known)
+    for name, tensor in known.items():
+        if (size := LENS_STEP[name]) is None:
+            raise DomainError(
+                f"differences to the lens's {name} have no step; freeze it, or use gradient 'boundary'."
+            )
+        held = tensor.detach()
+        for i, number in enumerate(tensor.reshape(-1)):
+            way = torch.zeros_like(held).reshape(-1).index_fill(0, torch.tensor(i), 1.0).reshape(held.shape)
+
+            def at(change, name=name, held=held, way=way):
+                lens = camera.lens.replace(**{name: held + change * way})
+                return image(camera.with_lens(lens).rays(), camera, views)
+
+            yield at, size, number - number.detach()
 
 
 def cheapest(camera: Camera, views: Views) -> Way:
