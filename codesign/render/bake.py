@@ -158,7 +158,8 @@ class Bake:
             ]
             count = [np.ones_like(part) for part in total]
         there = [False] * len(jobs)
-        for (k, texel), light, albedo, _, seen in self._stream(self._coarse_points(jobs, coarse), True):
+        arriving = self._texels(jobs, coarse, self.samples) if self.integrator else ()
+        for (k, texel, _), light, albedo, _, seen in self._stream(arriving, True):
             there[k] |= bool(seen.any())
             seen &= albedo > DARK
             total[k] += np.bincount(texel, np.where(seen, light, 0), len(total[k]))
@@ -170,7 +171,8 @@ class Bake:
                     "covers it, or its normals point inwards."
                 )
         values = None
-        for (k, texel, last), _, albedo, emission, seen in self._stream(self._fine_points(jobs, fine), False):
+        finished = self._texels(jobs, fine, 0)
+        for (k, texel, last), _, albedo, emission, seen in self._stream(finished, False):
             size = fine[k][0] * fine[k][1]
             values = np.zeros((3, size)) if values is None else values
             values[:, texel[seen]] = np.stack([albedo, emission, seen])[:, seen]
@@ -183,31 +185,19 @@ class Bake:
                 yield (emission + albedo * _resized(light, fine[k])).astype(np.float32)
                 values = None
 
-    def _coarse_points(self, jobs, sizes):
-        """Random points within light-map texels: points, normals, shiny, (job, texel), in blocks."""
-        if self.integrator is None:
-            return
-        block = max(1, SIZES[-1] // self.samples)
+    def _texels(self, jobs, sizes, samples):
+        """Random points within texels, ``samples`` each, or their centres for 0: points, normals, shiny,
+        (job, texel, whether the last), in blocks."""
+        block = max(1, SIZES[-1] // max(samples, 1))
         for k, ((surface, side), (rows, columns)) in enumerate(zip(jobs, sizes, strict=True)):
             for start in range(0, rows * columns, block):
-                texel = np.repeat(np.arange(start, min(start + block, rows * columns)), self.samples)
-                shift = self.random.random((2, texel.size))
-                points, normals, inside = surface.chart.at(
-                    (texel % columns + shift[0]) / columns, (texel // columns + shift[1]) / rows
-                )
-                if inside.any():
-                    yield points[inside], side * normals[inside], surface.shiny, (k, texel[inside])
-
-    def _fine_points(self, jobs, sizes):
-        """Centres of the texels of finished textures: points, normals, shiny, (job, texel, whether the
-        last)."""
-        for k, ((surface, side), (rows, columns)) in enumerate(zip(jobs, sizes, strict=True)):
-            for start in range(0, rows * columns, SIZES[-1]):
-                end = min(start + SIZES[-1], rows * columns)
-                v, u = np.divmod(np.arange(start, end), columns)
-                points, normals, inside = surface.chart.at((u + 0.5) / columns, (v + 0.5) / rows)
-                texel = np.arange(start, end)[inside]
-                yield points[inside], side * normals[inside], surface.shiny, (k, texel, end == rows * columns)
+                end = min(start + block, rows * columns)
+                texel = np.arange(start, end).repeat(max(samples, 1))
+                x, y = self.random.random((2, texel.size)) if samples else (0.5, 0.5)
+                at = (texel % columns + x) / columns, (texel // columns + y) / rows
+                points, normals, inside = surface.chart.at(*at)
+                last = end == rows * columns
+                yield points[inside], side * normals[inside], surface.shiny, (k, texel[inside], last)
 
     def _stream(self, requests, paths):
         """Answers of ``_look`` to (points, normals, shiny, tag), as (tag, *answers) in order; small requests

@@ -3,10 +3,8 @@ the whole."""
 
 import math
 
-import numpy as np
 import pytest
 import torch
-from scipy.special import iv
 
 from codesign import lens, render
 from codesign.errors import DomainError
@@ -68,26 +66,6 @@ def shifting(x_m, ground, **description):
 def middles(samples):
     """Of equal shares of an exposure, as shares of it from its middle."""
     return (torch.arange(samples, dtype=D) + 0.5) / samples - 0.5
-
-
-def test_a_moving_grating_is_blurred_as_its_harmonics_are():
-    # exp(a cos u) = I0(a) + 2 sum I_k(a) cos(k u) (Abramowitz and Stegun 9.6.34); a motion by d during the
-    # exposure takes each by sinc(k d / period).
-    # Midpoints miss by h^2/24 of the change of slope over the exposure: (1/64)^2 / 24 of 2 pi x 0.5 x (1 + a)
-    # e^a x 2 = 2e-4 or so
-    # half a period
-    period = 9.0
-    speed = 300.0
-    exposure = 0.015
-    contrast = 0.8
-    t_s = torch.tensor([0.0, 0.004, 0.011], dtype=D)
-    found = render.exposed_frames(camera(), grating(period, contrast), sliding(speed), t_s, exposure, 64)
-    x = torch.arange(24, dtype=D) - 11.5 + speed * t_s[:, None]
-    phase = (2 * math.pi * x / period + 0.3).numpy()
-    shares = [
-        2 * iv(k, contrast) * np.sinc(k * speed * exposure / period) * np.cos(k * phase) for k in range(1, 16)
-    ]
-    np.testing.assert_allclose(found[:, 0].numpy(), 100 * (iv(0, contrast) + sum(shares)), rtol=4e-4)
 
 
 def sweeping(speed_px_s):
