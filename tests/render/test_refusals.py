@@ -443,7 +443,7 @@ test_point_spread_functions_that_cannot_be = refusals(
     (lambda: psf().energy(torch.tensor([2.0]), size_px=3), DomainError, "3 x 3 pixels .* odd number"),
     (lambda: psf().energy(2.0), ShapeError, r"distances must be a list \[D\]"),
     (
-        lambda: render.psf_frames(THIN, PLANE, look_at((0, 0, 0.5), (0, 0, 0), down=(0, 1, 0))[None], psf),
+        lambda: render.psf_frames(THIN, PLANE, look_at((0, 0, 0.5), (0, 0, 0), down=(0, 1, 0))[None], psf()),
         DomainError,
         "0.5 m away, nearer than the 1 m of the map",
     ),
