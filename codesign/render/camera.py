@@ -359,7 +359,6 @@ def images(
         m_per_px[rows] = per_px
         slope[rows] = slopes[0, passes]
         step_px[rows] = change.abs().amax(1)
-        step_px[lost] = torch.inf
         rows = rows[step_px[rows] >= within_px]
         if shrink:
             at[lost] = middle + shrink * (at[lost] - middle)
