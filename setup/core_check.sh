@@ -22,5 +22,5 @@ grep -q "needs imageio-ffmpeg; install it with" optimised/report.html
 cd -- "$checkout"
 "$python" -m pip install --disable-pip-version-check --quiet pytest pytest-xdist --constraint constraints.txt
 "$python" -m pytest -q -n auto --maxprocesses 8 -p no:cacheprovider tests/events/test_formats.py tests/events/test_formats_layouts.py \
-    tests/scenes/test_from_mesh.py tests/test_optional.py tests/lens/test_import_real.py tests/studies/test_run.py
+    tests/scenes/test_from_mesh.py tests/test_optional.py tests/lens/test_import_real.py
 echo "core check: imports, renders, optimises, skips what it lacks"

@@ -206,7 +206,6 @@ ranks.leave()
 """
 
 
-@pytest.mark.bits
 def test_two_processes_interrupted_and_resumed_learn_what_one_does(tmp_path):
     """One of them is asked to stop, both do, after the same step. Halves of a batch are averaged in another
     order: float32 sums of 1024 terms differ by 1e-5 at most, and Adam takes steps of at most 1e-2 times the
