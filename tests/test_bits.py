@@ -7,12 +7,7 @@ from pathlib import Path
 TESTS = Path(__file__).parent
 PROMISE = re.compile("bit_for_bit|last_bit|chunks?_|chunking|_batch|resumed|repeats?_|the_whole")
 # equal by construction on every processor: files and copies
-BY_CONSTRUCTION = {
-    "test_lossless_folders_come_back_bit_for_bit_in_natural_order",
-    "test_stacks_come_back_bit_for_bit_with_their_times",
-    "test_bad_frames_in_a_later_chunk_leave_the_state_as_it_was",
-    "test_two_processes_interrupted_and_resumed_learn_what_one_does",
-}
+BY_CONSTRUCTION = {"test_two_processes_interrupted_and_resumed_learn_what_one_does"}
 
 
 def unmarked(source):
