@@ -190,6 +190,11 @@ MAPS = {"x_flow_dist": np.ones((11, 26, 34)), "y_flow_dist": np.ones((11, 26, 34
             lambda at: rewritten(at / FLOW / "forward_timestamps.txt", "1310000, 14", "9310000, 94"),
             "the events of",
         ),
+        (
+            dsec,
+            lambda at: rewritten(at / FLOW / "forward_timestamps.txt", "1310000, 141", "1310000, 142"),
+            "all must last alike",
+        ),
         (dsec, lambda at: (at / FLOW / "forward" / "000004.png").write_bytes(b"no"), "is not a PNG file"),
         (dsec, lambda at: gone(at / FLOW), "holds no sequence of DSEC"),
         (dsec, lambda at: gone(at / LEFT), "is missing; download the events"),

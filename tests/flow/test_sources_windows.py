@@ -11,7 +11,7 @@ from codesign import events
 from codesign.errors import CodesignError, ShapeError
 from codesign.events.stream import ordered
 from codesign.flow.export import evenly_timed
-from codesign.flow.sources import DatasetWindows, RecordingWindows, open_windows
+from codesign.flow.sources import DatasetWindows, PacketOptions, RecordingWindows, open_windows
 from codesign.flow.sources.windows import bin_times
 from codesign.render import flow_and_occlusion
 from scenes import worlds
@@ -156,6 +156,10 @@ def test_a_recording_is_a_source_of_windows(tmp_path):
     inside = (t_us <= 100_000).sum() + sum((t_us == k * 25_000).sum() for k in (1, 2, 3))
     assert float(windows.volume.counts.sum()) == pytest.approx(inside)
     assert not bool(windows.truth.valid.any())
+    first, middle, last = columns[0][0] + np.array([10_000, 30_000, 80_000])
+    np.savez(place / "flow.npz", flow=np.ones((2, 2, 180, 240)), t0=[first, middle], t1=[middle, last])
+    with pytest.raises(CodesignError, match="must last alike"):
+        RecordingWindows(place, options=PacketOptions())
 
 
 RADIAL = "sequence_001_radial"
