@@ -97,26 +97,10 @@ def undraw(replace=setattr):
         replace(watch, name, lambda *_: plt.figure(figsize=(1, 1)))
 
 
-BASE = [
-    "--network",
-    "linear",
-    "--mix",
-    "made",
-    "--bins",
-    "2",
-    "--height-px",
-    "16",
-    "--width-px",
-    "16",
-    "--batch",
-    "4",
-    "--final-windows",
-    "8",
-    "--validation-windows",
-    "4",
-    "--device",
-    "cpu",
-]
+BASE = (
+    "--network linear --mix made --bins 2 --height-px 16 --width-px 16 --batch 4 --final-windows 8 "
+    "--validation-windows 4 --device cpu"
+).split()
 
 
 def train(folder, options=""):

@@ -21,12 +21,12 @@ from codesign.optional import require
 from codesign.types import EventVolume
 
 
-def evenly_timed(counts: Tensor, interval_s: float = 1.0) -> EventVolume:
+def evenly_timed(counts: Tensor) -> EventVolume:
     """EventVolume of counts [B, 2, bins, H, W] whose bins are those of codesign.events.from_stream: equally
-    spaced nodes, the two at the ends collecting half."""
+    spaced nodes, the two at the ends collecting half, in an interval of 1 s."""
     if check_real(counts, "the counts").ndim != 5 or counts.shape[1] != 2 or counts.shape[2] < 2:
         raise ShapeError(f"the counts are {list(counts.shape)}; [B, 2, bins >= 2, H, W] is needed.")
-    return EventVolume(counts, *bin_times(counts.shape[2], interval_s))
+    return EventVolume(counts, *bin_times(counts.shape[2], 1.0))
 
 
 def export(network: nn.Module, path: str | Path, height_px: int, width_px: int, batch: int = 1) -> None:

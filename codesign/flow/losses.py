@@ -126,18 +126,13 @@ def relative_unit(truth: FlowField) -> Tensor:
     return (squared + SLOWEST_PX**2).rsqrt()
 
 
-def contrast_loss(
-    volume: EventVolume,
-    flow_px: Tensor,
-    carry_steps: int = 1,
-) -> Tensor:
+def contrast_loss(volume: EventVolume, flow_px: Tensor) -> Tensor:
     """Contrast maximisation without event collapse: zero-flow sharpness of the events over their sharpness
     when warped.
 
     Args:
       volume: EventVolume, counts [B, 2, bins, H, W].
       flow_px: [B, 2, H, W] pixels per window.
-      carry_steps: as in contrast.volume_tracks.
     Returns: scalar mean over the batch of the weighted mean of the ratios at the times of REFERENCES; 1
       for zero flow, less for flow that explains the events; 1 for a sample without events.
     Guard: an event counts as much as the warp stretches the area around it (from 0 where it folds or turns
@@ -150,7 +145,7 @@ def contrast_loss(
     Source: Shiba, Aoki, Gallego, Secrets of event-based optical flow, ECCV 2022, sec. 3.2; area change: Shiba
       et al., Sensors 2022, sec. 3.4.2, here as a weight.
     """
-    tracks = volume_tracks(volume, flow_px, carry_steps)
+    tracks = volume_tracks(volume, flow_px, carry_steps=1)
     still = sharpness(still_image(volume.counts)) + _FAINT
     total = torch.zeros_like(still)
     for at, share in REFERENCES:
