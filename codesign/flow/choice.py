@@ -17,9 +17,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from codesign.flow.lk.estimate import check_slopes, check_start, descended, field
-from codesign.flow.lk.hot_pixels import weighed_down
 from codesign.flow.lk.lanes import Grid
-from codesign.flow.lk.level import along_path, blurred_to
+from codesign.flow.lk.level import along_path, blurred_to, weighed_down
 from codesign.flow.lk.path import Path
 from codesign.flow.warp import pixel_grid, read_at
 from codesign.types import EventVolume, FlowField

@@ -6,7 +6,7 @@ import torch
 
 from codesign.flow import estimate_lk
 from codesign.flow.export import evenly_timed
-from codesign.flow.lk.hot_pixels import weighed_down
+from codesign.flow.lk.level import weighed_down
 from tests.certain_case import certain
 
 D = torch.float64

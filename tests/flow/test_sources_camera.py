@@ -22,7 +22,7 @@ from codesign.flow.sources.camera import (
     read_poses,
     signed_axes,
 )
-from codesign.flow.sources.camera_fit import CameraFit
+from codesign.flow.sources.rendered import CameraFit
 from tests.recording_case import DAVIS, ETH_CALIBRATION, eth_text, gyroscope, made, poses, recording
 
 

@@ -25,7 +25,21 @@ from tests.recording_case import eth_text, gone, halved, made, rewritten, stores
 def dataset(tmp_path_factory):
     threads = torch.get_num_threads()
     folder = tmp_path_factory.mktemp("data") / "set"
-    options = "--trajectories 2 --frames 13 --size 40 --samples 2 --chunk 5 --rate-hz 90 --out".split()
+    options = [
+        "--trajectories",
+        "2",
+        "--frames",
+        "13",
+        "--size",
+        "40",
+        "--samples",
+        "2",
+        "--chunk",
+        "5",
+        "--rate-hz",
+        "90",
+        "--out",
+    ]
     assert main(study.study, study.Config, [*options, str(folder)]) == 0
     torch.set_num_threads(threads)
     return folder

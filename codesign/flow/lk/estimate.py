@@ -46,7 +46,7 @@ def estimate_lk(
 
     Args:
       volume: EventVolume, counts [B, 2, bins >= 2, H >= 2, W >= 2]. Hot pixels are weighed down
-        (hot_pixels).
+        (level.weighed_down).
       model: "constant", "affine" or "quadratic" field over the image, or "local": a quadratic one and
         values on cells of 8 px, as smooth as the data ask, for layers and depth.
       prior_px: standard deviation expected of each component of the flow at the image centre, px per
