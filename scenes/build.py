@@ -90,16 +90,10 @@ def lit(world, device="cpu", two_sided=False):
         if isinstance(geometry, bodies.Body):
             shapes[name] = _lit_body(mi, name, geometry, paint, two_sided)
             continue
-        _check_albedo(name, paint.albedo * float(np.max(paint.picture)) / 255)
-        shapes[name] = {
-            **geometry,
-            "bsdf": {"type": "diffuse", "reflectance": _bitmap(mi, paint, paint.albedo / 255)},
-        }
+        shapes[name] = {**geometry, "bsdf": {"type": "diffuse", "reflectance": _reflectance(mi, name, paint)}}
         if paint.glow:
-            shapes[name]["emitter"] = {
-                "type": "area",
-                "radiance": {"type": "rgb", "value": float(paint.glow)},
-            }
+            radiance = {"type": "rgb", "value": float(paint.glow)}
+            shapes[name]["emitter"] = {"type": "area", "radiance": radiance}
     return {**shapes, **world.background, **world.lamps}
 
 
@@ -126,8 +120,7 @@ def _glowing(mi, name, body, paint):
 
 def _lit_body(mi, name, body, paint, two_sided):
     if body.uv is not None:
-        _check_albedo(name, paint.albedo * float(np.max(paint.picture)) / 255)
-        reflectance = _bitmap(mi, paint, paint.albedo / 255)
+        reflectance = _reflectance(mi, name, paint)
     else:
         albedo = paint.albedo * _level(name, paint) / 255 * body.tint
         _check_albedo(name, float(np.max(albedo)))
@@ -143,6 +136,12 @@ def _lit_body(mi, name, body, paint, two_sided):
     if body.uv is None and np.ndim(albedo):
         mesh.add_attribute(attribute, 1, np.float32(albedo))
     return mesh
+
+
+def _reflectance(mi, name, paint):
+    """Albedo of a painted surface."""
+    _check_albedo(name, paint.albedo * float(np.max(paint.picture)) / 255)
+    return _bitmap(mi, paint, paint.albedo / 255)
 
 
 def _level(name, paint):
@@ -181,6 +180,25 @@ def rectangle(mi, centre, normal_to, width_m, height_m, up=(0, 0, 1)):
         origin=list(centre), target=list(normal_to), up=list(up)
     ) @ mi.ScalarTransform4f().scale([width_m / 2, height_m / 2, 1])
     return {"type": "rectangle", "to_world": frame}
+
+
+def sides(mi, size_m, y=0.0):
+    """Six inner sides, by name, of a box of three sizes that stands on z = 0 over (0, y)."""
+    width, length, height = size_m
+    half, up = height / 2, (0, 1, 0)
+    around = {
+        "north": ((0, y + length / 2, half), width),
+        "south": ((0, y - length / 2, half), width),
+        "east": ((width / 2, y, half), length),
+        "west": ((-width / 2, y, half), length),
+    }
+    walls = {name: rectangle(mi, at, (0, y, half), wide, height) for name, (at, wide) in around.items()}
+    floor = rectangle(mi, (0, y, 0), (0, y, half), width, length, up)
+    return {
+        **walls,
+        "floor": floor,
+        "ceiling": rectangle(mi, (0, y, height), (0, y, half), width, length, up),
+    }
 
 
 def block(mi, x, y, bottom_m, half_m, turn_deg=0.0):

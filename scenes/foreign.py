@@ -21,7 +21,7 @@ from codesign import backend, lens
 from codesign.errors import DomainError, FileFormatError, check_whole
 from codesign.exclusive import exclusive
 from codesign.reading import building, reading
-from codesign.render import Camera, Film
+from codesign.render import Camera
 from codesign.render.light import PathScene, bake
 from codesign.render.placed import PlacedScene, Placement
 from scenes import trial_load, units
@@ -54,7 +54,6 @@ def from_mitsuba(
     gain: float = 1.0,
     samples: int | None = None,
     seed: int = 0,
-    max_depth: int | None = None,
     texel_m: float | None = None,
     towards_m: Sequence[float] | None = None,
     matte: bool = False,
@@ -71,8 +70,8 @@ def from_mitsuba(
         "auto", emissive where every surface is an emitter, otherwise baked.
       unit_m: metres per unit of the scene's lengths. up: the axis that points up in it; worlds have z up.
       gain: factor on its radiance; 255 brings pictures made for a white of 1 to the scale of the other worlds.
-      samples: paths per camera ray, or per texel (64); seed: of their random numbers. max_depth: longest path; None
-        takes the integrator of the scene itself where it samples camera rays, and any length where there is none.
+      samples: paths per camera ray, or per texel (64); seed: of their random numbers. Paths are as long as the
+        integrator of the scene has them where it samples camera rays, and of any length where there is none.
       texel_m: size of the texels of baked light, None for as large as makes TEXELS of them. towards_m, matte: of
         surfaces that shine, mirror or let light through, as in ``light.bake``.
       parameters: values of $parameters in an .xml file.
@@ -102,7 +101,7 @@ def from_mitsuba(
     units.hint(
         *([unit_m * v for v in corner] for corner in (scene.bbox().min, scene.bbox().max)), name, unit_m
     )
-    integrator = _integrator(mi, scene, max_depth)
+    integrator = _integrator(mi, scene)
     if light == "path":
         return PlacedScene(
             PathScene(scene, device, samples=samples or 16, seed=seed, integrator=integrator), place
@@ -130,42 +129,34 @@ def _area(shape):
         return 0.0
 
 
-def _integrator(mi, scene, max_depth):
-    """The scene's own where it gives radiance along camera rays and its length is not asked for; otherwise paths,
-    through media where there are any."""
+def _integrator(mi, scene):
+    """The scene's own where it gives radiance along camera rays; otherwise paths, through media where there are
+    any."""
     own = scene.integrator()
-    if max_depth is None and isinstance(own, mi.SamplingIntegrator) and own.class_name() in INTEGRATORS:
+    if isinstance(own, mi.SamplingIntegrator) and own.class_name() in INTEGRATORS:
         return own
     media = any(s.interior_medium() is not None or s.exterior_medium() is not None for s in scene.shapes())
-    depth = -1 if max_depth is None else int(max_depth)
-    return mi.load_dict({"type": "volpath" if media else "path", "max_depth": depth})
+    return mi.load_dict({"type": "volpath" if media else "path", "max_depth": -1})
 
 
 @dataclass(frozen=True)
 class FileView:
     """A perspective sensor of a scene: T_world_cam [4, 4] (x right, y down, z forward, metres), its horizontal
-    field of view in radians, and its film: size in pixels, and the window (left, top, width, height) of it that is
-    rendered."""
+    field of view in radians, and the size of its film in pixels."""
 
     T_world_cam: Tensor
     field_of_view_rad: float
     width_px: int
     height_px: int
-    crop_px: tuple[int, int, int, int]
 
     def camera(self, samples_per_pixel: int = 16, width_px: int | None = None, seed: int = 0) -> Camera:
         """A pinhole of this field of view before a film of this size, or of ``width_px`` columns and as many rows
-        as keep its proportions. A sensor that renders a window of its film has a film with one window, so frames
-        are [T, 1, H, W]."""
+        as keep its proportions."""
         columns = self.width_px if width_px is None else width_px
         rows = max(1, round(self.height_px * columns / self.width_px))
         focal_mm = 8.0
         pitch_mm = 2 * focal_mm * math.tan(self.field_of_view_rad / 2) / columns
-        film = None
-        if self.crop_px != (0, 0, self.width_px, self.height_px):
-            left, top, wide, high = (round(v * columns / self.width_px) for v in self.crop_px)
-            film = Film(columns, rows, max(1, wide), max(1, high), pitch_mm, ((left, top),))
-        return Camera(lens.Pinhole(focal_mm), columns, rows, pitch_mm, samples_per_pixel, seed, film)
+        return Camera(lens.Pinhole(focal_mm), columns, rows, pitch_mm, samples_per_pixel, seed)
 
 
 @exclusive
@@ -180,7 +171,7 @@ def view_of(
     """The sensor of a Mitsuba scene as a pose and a field of view to start from.
 
     Args: source, unit_m, up, parameters: as for ``from_mitsuba``. number: which of its sensors.
-    Returns: FileView. Near and far clipping, an aperture and the reconstruction filter are left out.
+    Returns: FileView. Near and far clipping, an aperture, the film's window and filter are left out.
     Raises: as ``from_mitsuba``; DomainError when there is no such sensor, or it is not a perspective one, mirrors,
       or has its principal point off the film's middle.
     """
@@ -217,8 +208,7 @@ def view_of(
         )
     film = sensor.film()
     width_px, height_px = (int(v) for v in film.size())
-    crop = (*(int(v) for v in film.crop_offset()), *(int(v) for v in film.crop_size()))
-    return FileView(T, math.radians(float(values["x_fov"][0])), width_px, height_px, crop)
+    return FileView(T, math.radians(float(values["x_fov"][0])), width_px, height_px)
 
 
 def _axes(up, unit_m):

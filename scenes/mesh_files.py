@@ -225,52 +225,49 @@ def _parts(path, scene, told, axes, surfaces, materials) -> Iterator[Part]:
         vertices = vertices @ turn.T + axes @ frame[:3, 3]
         if np.linalg.det(turn) < 0:  # a mirrored instance: keep its outside outside
             faces = faces[:, ::-1]
-        yield from _coloured(path, str(name), vertices, faces, mesh.visual, surfaces, materials)
+        corners = vertices[faces]
+        whole = (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) ** 2).sum(1) > 0
+        if whole.any():
+            where = f"mesh '{path}', '{name}'"
+            visual = mesh.visual if materials else None
+            yield _merged(_coloured(where, str(name), vertices, faces, whole, visual, surfaces))
 
 
-def _coloured(path, name, vertices, faces, visual, surfaces, materials):
-    corners = vertices[faces]
-    whole = (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) ** 2).sum(1) > 0
+def _coloured(where, name, vertices, faces, whole, visual, surfaces):
+    """The part of those faces that are ``whole``, with its colour."""
     faces = faces[whole]
-    if not len(faces):
-        return
     plain = np.full(len(faces), UNCOLOURED)
-    kind = visual.kind if materials else None
+    kind = None if visual is None else visual.kind
     if kind == "face":
-        of_face = textures.linear(np.asarray(visual.face_colors)[whole][:, None, :3])[:, 0]
-        yield _merged(Part(name, vertices, faces, of_face))
-    elif kind == "vertex":
+        return Part(name, vertices, faces, _vertex_colour(np.asarray(visual.face_colors)[whole], False))
+    if kind == "vertex":
         of_vertex = _vertex_colour(visual.vertex_colors, surfaces is not None)
-        yield _merged(Part(name, vertices, faces, of_vertex, smooth=True))
-    elif kind == "texture":
-        surface = surfaces[visual.material.name] if surfaces else _surface(visual.material)
-        tint = visual.vertex_attributes.get("color") if surfaces is not None else None
-        if surface.picture is None and tint is not None:
-            of_vertex = surface.factor * _vertex_colour(tint, True)
-            yield _merged(Part(name, vertices, faces, of_vertex, smooth=True))
-        elif surface.picture is None:
-            yield _merged(Part(name, vertices, faces, plain * 0 + surface.factor))
-        else:
-            uv = visual.uv
-            if uv is None or len(uv) != len(vertices) or not np.isfinite(uv).all():
-                raise FileFormatError(
-                    f"mesh '{path}', '{name}': it has a picture but no texture coordinates for every vertex; unwrap it, "
-                    "or give radiance= and no picture is read."
-                )
-            if tint is not None and not np.allclose(_vertex_colour(tint, True), 1, atol=0.01):
-                raise FileFormatError(
-                    f"mesh '{path}', '{name}': its picture is tinted by vertex colours, which is not read; bake them "
-                    "into the picture."
-                )
-            picture = surface.factor * surface.picture
-            uv = np.asarray(uv, dtype=np.float64)
-            yield _merged(Part(name, vertices, faces, picture, uv, wrap=surface.wrap))
-    else:
-        yield _merged(Part(name, vertices, faces, plain, coloured=False))
+        return Part(name, vertices, faces, of_vertex, smooth=True)
+    if kind != "texture":
+        return Part(name, vertices, faces, plain, coloured=False)
+    surface = surfaces[visual.material.name] if surfaces else _surface(visual.material)
+    tint = visual.vertex_attributes.get("color") if surfaces is not None else None
+    tint = None if tint is None else _vertex_colour(tint, True)
+    if surface.picture is None:
+        if tint is None:
+            return Part(name, vertices, faces, plain * 0 + surface.factor)
+        return Part(name, vertices, faces, surface.factor * tint, smooth=True)
+    uv = visual.uv
+    if uv is None or len(uv) != len(vertices) or not np.isfinite(uv).all():
+        raise FileFormatError(
+            f"{where}: it has a picture but no texture coordinates for every vertex; unwrap it, or give radiance= and no "
+            "picture is read."
+        )
+    if tint is not None and not np.allclose(tint, 1, atol=0.01):
+        raise FileFormatError(
+            f"{where}: its picture is tinted by vertex colours, which is not read; bake them into the picture."
+        )
+    uv = np.asarray(uv, dtype=np.float64)
+    return Part(name, vertices, faces, surface.factor * surface.picture, uv, wrap=surface.wrap)
 
 
 def _vertex_colour(values, is_linear):
-    """Luminance [V] of colours [V, 3 or 4], of whole numbers of 8 or 16 bits or of 0..1."""
+    """Luminance [V] of colours [V, 3 or 4] of vertices or faces, of whole numbers of 8 or 16 bits or of 0..1."""
     values = np.asarray(values)[:, :3]
     if not is_linear:
         return textures.linear(values[:, None])[:, 0]

@@ -70,7 +70,11 @@ def _pixels(data, at, height, width):
                 line, at = _line(data, at, width)
                 out[row, :, channel] = line
         else:
-            out[row], at = _old_row(data, at, width)
+            whole = np.frombuffer(data[at : at + 4 * width], np.uint8).reshape(width, 4)
+            if (whole[:, :3] == 1).all(1).any():
+                raise ValueError("it has run lengths of the older kind; save it anew")
+            out[row] = whole
+            at += 4 * width
     return out
 
 
@@ -86,23 +90,3 @@ def _line(data, at, width):
     if len(line) > width:
         raise ValueError("a run is longer than its row")
     return np.frombuffer(line, np.uint8), at
-
-
-def _old_row(data, at, width):
-    """One row [W, 4] of whole pixels, of which (1, 1, 1, n) repeats the one before, and where the next begins."""
-    row = bytearray()
-    shift = 0
-    while len(row) < 4 * width:
-        pixel = data[at : at + 4]
-        at += 4
-        if len(pixel) < 4:
-            raise ValueError("it ends early")
-        repeats = pixel[:3] == b"\1\1\1"
-        if repeats and not row:
-            raise ValueError("a row begins with a repetition")
-        times = pixel[3] << shift if repeats else 1
-        if len(row) + 4 * times > 4 * width:
-            raise ValueError("a run is longer than its row")
-        row += (row[-4:] if repeats else pixel) * times
-        shift = shift + 8 if repeats else 0
-    return np.frombuffer(row, np.uint8).reshape(width, 4), at

@@ -21,84 +21,66 @@ def smooth(seed, size=64, cycles=4, darkest=20.0, brightest=220.0, rows_only=Fal
     return (darkest + (brightest - darkest) / (1 + np.exp(-1.5 * field))).astype(np.float32)[..., None]
 
 
+def _light(mi, seed, **options):
+    """An emitter of a random texture."""
+    radiance = {"type": "bitmap", "bitmap": mi.Bitmap(smooth(seed, **options)), "raw": True}
+    return {"type": "area", "radiance": radiance}
+
+
+def _cubes(mi, first, second):
+    """Two leaning cubes that touch nothing, with their emitters."""
+    T = mi.ScalarTransform4f
+    near = T().translate([-0.5, 0.6, 0.95]).rotate([1, 1, 0], 50).scale(0.3)
+    far = T().translate([0.6, 0.9, 0.6]).rotate([0, 1, 1], 50).scale([0.3, 0.5, 0.3])
+    return [
+        {"type": "cube", "to_world": to_world, "emitter": emitter}
+        for to_world, emitter in ((near, first), (far, second))
+    ]
+
+
+def _post(mi, k):
+    T = mi.ScalarTransform4f
+    # an edge along a column of pixels would have a kink wherever it passes from one to the next
+    lean_deg = 7 + 2 * k
+    upright = T().translate([-1.05 + 0.35 * k, 0.7, 0.8]).rotate([0, 1, 0], lean_deg)
+    grey = {"type": "rgb", "value": 30.0 + 25.0 * k}
+    return {
+        "type": "cube",
+        "to_world": upright.rotate([0, 0, 1], 12 * k).scale([0.04, 0.04, 0.9]),
+        "emitter": {"type": "area", "radiance": grey},
+    }
+
+
+def _pole(mi, k):
+    return {
+        "type": "cylinder",
+        "p0": [-1.2 + 0.55 * k, 0.5 + 0.2 * k, -1.5],
+        "p1": [-0.3 + 0.4 * k, 0.7, 2.6],
+        "radius": 0.05,
+        "emitter": _light(mi, 4 + k, cycles=3, rows_only=True, darkest=5 + 60 * k, brightest=40 + 60 * k),
+    }
+
+
 def build(name, device="cpu"):
     """One of NAMES: a wall 2.5 m ahead of the origin with occluders between, for a camera near (0, -1.2, 1)
     that looks along +y."""
     mi = backend.mitsuba(device)
-    T = mi.ScalarTransform4f
-
-    def light(seed, **options):
-        return {
-            "type": "area",
-            "radiance": {
-                "type": "bitmap",
-                "bitmap": mi.Bitmap(smooth(seed, **options)),
-                "raw": True,
-                "wrap_mode": "repeat",
-            },
-        }
-
-    shapes: dict = {
-        "back": {
-            "type": "cube",
-            "to_world": T().translate([0, 2.5, 0.5]).scale([4, 0.1, 4]),
-            "emitter": light(1, cycles=6),
-        }
-    }
+    wall = mi.ScalarTransform4f().translate([0, 2.5, 0.5]).scale([4, 0.1, 4])
+    shapes: dict = {"back": {"type": "cube", "to_world": wall, "emitter": _light(mi, 1, cycles=6)}}
     if name == "cubes":
-        shapes["a"] = {
-            "type": "cube",
-            "to_world": T().translate([-0.5, 0.6, 0.95]).rotate([1, 1, 0], 50).scale(0.3),
-            "emitter": light(2, cycles=2),
-        }
-        shapes["b"] = {
-            "type": "cube",
-            "to_world": T().translate([0.6, 0.9, 0.6]).rotate([0, 1, 1], 50).scale([0.3, 0.5, 0.3]),
-            "emitter": light(3, cycles=2),
-        }
+        shapes["a"], shapes["b"] = _cubes(mi, _light(mi, 2, cycles=2), _light(mi, 3, cycles=2))
     if name == "spheres":
-        shapes["a"] = {
-            "type": "sphere",
-            "center": [-0.5, 0.6, 0.9],
-            "radius": 0.35,
-            "emitter": light(2, cycles=1, darkest=10, brightest=90),
-        }
-        shapes["b"] = {
-            "type": "sphere",
-            "center": [0.5, 1.0, 0.5],
-            "radius": 0.45,
-            "emitter": light(3, cycles=1, darkest=120, brightest=240),
-        }
+        dark, bright = {"darkest": 10, "brightest": 90}, {"darkest": 120, "brightest": 240}
+        for key, seed, at, radius, levels in (
+            ("a", 2, [-0.5, 0.6, 0.9], 0.35, dark),
+            ("b", 3, [0.5, 1.0, 0.5], 0.45, bright),
+        ):
+            emitter = _light(mi, seed, cycles=1, **levels)
+            shapes[key] = {"type": "sphere", "center": at, "radius": radius, "emitter": emitter}
     if name == "poles":
-        for k in range(4):
-            low = [-1.2 + 0.55 * k, 0.5 + 0.2 * k, -1.5]
-            high = [-0.3 + 0.4 * k, 0.7, 2.6]
-            shapes[f"pole{k}"] = {
-                "type": "cylinder",
-                "p0": low,
-                "p1": high,
-                "radius": 0.05,
-                "emitter": light(4 + k, cycles=3, rows_only=True, darkest=5 + 60 * k, brightest=40 + 60 * k),
-            }
+        shapes |= {f"pole{k}": _pole(mi, k) for k in range(4)}
     if name == "fence":
-        for k in range(7):
-            lean = (
-                7 + 2 * k
-                # degrees; an edge along a column of pixels would have a kink wherever it passes from one to the
-                # next
-            )
-            post = (
-                T()
-                .translate([-1.05 + 0.35 * k, 0.7, 0.8])
-                .rotate([0, 1, 0], lean)
-                .rotate([0, 0, 1], 12 * k)
-                .scale([0.04, 0.04, 0.9])
-            )
-            shapes[f"post{k}"] = {
-                "type": "cube",
-                "to_world": post,
-                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 30.0 + 25.0 * k}},
-            }
+        shapes |= {f"post{k}": _post(mi, k) for k in range(7)}
     return MitsubaScene(shapes, device)
 
 
@@ -106,60 +88,42 @@ def room(seed=0, device="cpu"):
     """A room of 5 x 6 x 3 m with two leaning boxes that touch nothing, for a camera near (0, -1.2, 1) that looks
     along +y."""
     mi = backend.mitsuba(device)
-    T = mi.ScalarTransform4f
-
-    def light(number, **options):
-        bitmap = mi.Bitmap(smooth(3 * seed + number, **options))
-        return {
-            "type": "area",
-            "radiance": {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "repeat"},
-        }
-
-    shapes: dict = {
-        "walls": {
-            "type": "cube",
-            "flip_normals": True,
-            "to_world": T().translate([0, 0, 1]).scale([2.5, 3.0, 1.5]),
-            "emitter": light(1000, cycles=6, darkest=50, brightest=200),
-        },
-        "near": {
-            "type": "cube",
-            "to_world": T().translate([-0.5, 0.6, 0.95]).rotate([1, 1, 0], 50).scale(0.3),
-            "emitter": light(1001, cycles=2, darkest=40, brightest=110),
-        },
-        "far": {
-            "type": "cube",
-            "to_world": T().translate([0.6, 0.9, 0.6]).rotate([0, 1, 1], 50).scale([0.3, 0.5, 0.3]),
-            "emitter": light(1002, cycles=2, darkest=110, brightest=240),
-        },
+    first = 3 * seed + 1000
+    walls = {
+        "type": "cube",
+        "flip_normals": True,
+        "to_world": mi.ScalarTransform4f().translate([0, 0, 1]).scale([2.5, 3.0, 1.5]),
+        "emitter": _light(mi, first, cycles=6, darkest=50, brightest=200),
     }
-    return MitsubaScene(shapes, device)
+    near, far = _cubes(
+        mi,
+        _light(mi, first + 1, cycles=2, darkest=40, brightest=110),
+        _light(mi, first + 2, cycles=2, darkest=110, brightest=240),
+    )
+    return MitsubaScene({"walls": walls, "near": near, "far": far}, device)
 
 
 def ball(device="cpu"):
     """A ball of 0.35 m about the origin, to be moved before another scene."""
-    mi = backend.mitsuba(device)
-    radiance = {"type": "bitmap", "bitmap": mi.Bitmap(smooth(5, cycles=8)), "raw": True}
-    shape = {"type": "sphere", "radius": 0.35, "emitter": {"type": "area", "radiance": radiance}}
-    return MitsubaScene({"ball": shape}, device)
+    emitter = _light(backend.mitsuba(device), 5, cycles=8)
+    return MitsubaScene({"ball": {"type": "sphere", "radius": 0.35, "emitter": emitter}}, device)
 
 
 def robot(device="cpu"):
     """A robot's deck and mast in the axes of the camera's mount (x right, y ahead, z up), so near that they cross the
     border of its view."""
     mi = backend.mitsuba(device)
-    T = mi.ScalarTransform4f
-
-    def light(seed, **options):
-        picture = mi.Bitmap(smooth(seed, cycles=2, **options))
-        return {"type": "area", "radiance": {"type": "bitmap", "bitmap": picture, "raw": True}}
-
-    deck = T().translate([0.0, 0.15, -0.12]).rotate([1, 0.3, 0.2], 9).scale([0.11, 0.22, 0.03])
+    deck = (
+        mi.ScalarTransform4f()
+        .translate([0.0, 0.15, -0.12])
+        .rotate([1, 0.3, 0.2], 9)
+        .scale([0.11, 0.22, 0.03])
+    )
     mast = {"type": "cylinder", "p0": [0.08, 0.5, -0.06], "p1": [0.1, 0.47, 0.25], "radius": 0.015}
     return MitsubaScene(
         {
-            "deck": {"type": "cube", "to_world": deck, "emitter": light(7, darkest=120)},
-            "mast": {**mast, "emitter": light(8, brightest=90)},
+            "deck": {"type": "cube", "to_world": deck, "emitter": _light(mi, 7, cycles=2, darkest=120)},
+            "mast": {**mast, "emitter": _light(mi, 8, cycles=2, brightest=90)},
         },
         device,
     )

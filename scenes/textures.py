@@ -3,7 +3,6 @@
 import io
 import math
 import warnings
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from codesign.errors import DomainError, FileFormatError
-from codesign.events.sources.video import open_video
 from codesign.reading import read_bytes, reading
 from scenes import rgbe
 
@@ -30,6 +28,7 @@ PHOTOS = (
 LIFT = 2.0  # the darkest radiance of a photograph: no real wall is perfectly black
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear red, green and blue: ITU-R BT.709
 MOST_PIXELS = 32_000_000
+ZENITH, HORIZON, BELOW = 90.0, 190.0, 40.0  # radiance of the procedural sky
 HDR = (".hdr", ".exr")
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "GIF", "PPM", "TGA", "WEBP")
 MOST_BYTES = 1 << 30
@@ -254,9 +253,6 @@ def picture(source, blur_texels=2.0, encoding=None):
 def sky(
     seed=0,
     height_px=256,
-    zenith=90.0,
-    horizon=190.0,
-    ground=40.0,
     sun_elevation_deg=40.0,
     sun_azimuth_deg=200.0,
 ):
@@ -272,34 +268,13 @@ def sky(
     )
     clouds = 25 * np.tanh(1.5 * noise / noise.std()) * np.clip(2 * elevation, 0, 1)
     up = np.clip(elevation / (np.pi / 2), 0, 1)
-    clear = horizon + (zenith - horizon) * up**0.6 + clouds
+    clear = HORIZON + (ZENITH - HORIZON) * up**0.6 + clouds
     e = np.radians(sun_elevation_deg)
     a = np.radians(sun_azimuth_deg)
     cosine = np.sin(elevation) * np.sin(e) + np.cos(elevation) * np.cos(e) * np.cos(azimuth - a)
     bright = clear + (250 - clear) * np.exp(20 * (cosine - 1))
     below = 1 / (1 + np.exp(elevation / 0.02))  # no jump at the horizon
-    return check_texture(np.clip(bright + (ground - bright) * below, 0, 255), "of the procedural sky")
-
-
-def video_frame(path: str | Path, time_s: float, size_px: int = 512) -> np.ndarray:
-    """The frame that a video shows at a time since its first one, as ``photo`` gives a picture: [H, W] float32.
-
-    Raises: FileFormatError when it is no video or its clock is damaged, DomainError for a time outside it,
-      MissingPackageError without the extra ``video``.
-    """
-    source = open_video(Path(path))
-    if source.t_s is None:
-        raise FileFormatError(
-            f"{path}: its times do not grow, so no frame is known by its time; convert it anew."
-        )
-    last = float(source.t_s[-1])
-    if not 0 <= time_s <= last:
-        raise DomainError(
-            f"{path}: time_s = {time_s} lies outside the video, which has frames from 0 to {last:g} s."
-        )
-    index = int((source.t_s <= time_s).sum()) - 1
-    with closing(source.read(index)) as frames:
-        return _radiance(reduced(linear(next(frames)), size_px), str(path))
+    return check_texture(np.clip(bright + (BELOW - bright) * below, 0, 255), "of the procedural sky")
 
 
 def environment(path, mean=80.0):

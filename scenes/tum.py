@@ -18,10 +18,12 @@ from scipy.spatial.transform import Rotation
 from codesign.atomic import replacing
 from codesign.errors import DomainError, FileFormatError, ShapeError, check_finite
 from codesign.pose import check_poses, inverse, se3_exp
+from codesign.reading import read_text
 from scenes.trajectories.trajectory import Trajectory
 
 MOST_BYTES = 64_000_000
 MOST_POSES = 1_000_000
+BOM = "\ufeff"  # that some editors put before a text
 LONGEST_LINE = 400
 UNIT_TOLERANCE = 1e-3  # of a quaternion's length: files with four digits stay within 1e-4
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,4})?")
@@ -55,7 +57,7 @@ def read_tum(path):
     path = Path(path)
     rows = []
     numbers = []
-    for number, line in enumerate(_text(path).split("\n"), start=1):
+    for number, line in enumerate(read_text(path, MOST_BYTES).removeprefix(BOM).split("\n"), start=1):
         line = line.strip(" \t\r")
         if not line or line.startswith("#"):
             continue
@@ -95,22 +97,6 @@ def read_tum(path):
 
 def _words(line):
     return [word.strip() for word in line.split(",")] if "," in line else line.split()
-
-
-def _text(path):
-    try:
-        if not path.is_file():
-            raise FileFormatError(f"there is no trajectory file at {path}; check the path.")
-        with path.open("rb") as file:
-            content = file.read(MOST_BYTES + 1)
-    except OSError as error:
-        raise FileFormatError(f"cannot read {path}: {error.strerror}.") from error
-    if len(content) > MOST_BYTES:
-        raise FileFormatError(f"{path} is larger than {MOST_BYTES} bytes; split the trajectory.")
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{path} is not a text file (byte {error.start}).") from error
 
 
 class Recorded(Trajectory):

@@ -16,12 +16,30 @@ import numpy as np
 from codesign import backend
 from codesign.render import MitsubaScene, TexturedPlane
 from scenes import bodies, textures
-from scenes.build import GAP_M, Paint, World, ball, block, check_sizes, emissive, pole, rectangle, sky, sun
+from scenes.build import (
+    GAP_M,
+    Paint,
+    World,
+    ball,
+    block,
+    check_sizes,
+    emissive,
+    pole,
+    rectangle,
+    sides,
+    sky,
+    sun,
+)
 from scenes.foreign import from_mitsuba, view_of
 from scenes.from_mesh import from_mesh
 from scenes.tabletop import tabletop
 
 PAINT = 60.0  # the wall colour that pictures fade to
+ROOM_M = (4.0, 4.0, 2.6)
+CORRIDOR_M = (14.0, 2.2, 2.6)  # length, width, height
+GROUND_M = 14.0  # half width of the outdoor world
+SPOTS = 10  # of light in the dark room
+DARK, BRIGHT = 1.5, 255.0  # radiance there
 SUN_ELEVATION_DEG = 40.0
 SUN_AZIMUTH_DEG = 200.0
 
@@ -73,22 +91,15 @@ def _plane(name, texture, texel_m, half_width_m, towards, up, wrap, device):
 
 
 def _walls(mi, paints, size_m):
-    """Six inner sides of a box that stands on z = 0: north, south, east, west, floor, ceiling."""
-    x, y, z = (s / 2 for s in size_m)
-    sides = [
-        ("north", (0, y, z), (0, -y, z), 2 * x, 2 * z, (0, 0, 1)),
-        ("south", (0, -y, z), (0, y, z), 2 * x, 2 * z, (0, 0, 1)),
-        ("east", (x, 0, z), (-x, 0, z), 2 * y, 2 * z, (0, 0, 1)),
-        ("west", (-x, 0, z), (x, 0, z), 2 * y, 2 * z, (0, 0, 1)),
-        ("floor", (0, 0, 0), (0, 0, 1), 2 * x, 2 * y, (0, 1, 0)),
-        ("ceiling", (0, 0, 2 * z), (0, 0, 0), 2 * x, 2 * y, (0, 1, 0)),
-    ]
-    return {name: (rectangle(mi, *rest), paint) for (name, *rest), paint in zip(sides, paints, strict=True)}
+    """Six inner sides of a box, each with its paint."""
+    return {
+        name: (side, paint) for (name, side), paint in zip(sides(mi, size_m).items(), paints, strict=True)
+    }
 
 
 def room(
     photos=("brick", "gravel", "grass", "camera", "coffee", "astronaut"),
-    size_m=(4.0, 4.0, 2.6),
+    size_m=ROOM_M,
     objects=True,
     device="cpu",
     light=emissive,
@@ -111,7 +122,7 @@ def room(
     return light(World(shapes), device)
 
 
-def blank_room(level=PAINT, size_m=(4.0, 4.0, 2.6), device="cpu", light=emissive):
+def blank_room(level=PAINT, size_m=ROOM_M, device="cpu", light=emissive):
     """A closed room whose every surface has one radiance: the negative control, in which no motion makes an
     event.
 
@@ -126,58 +137,21 @@ def blank_room(level=PAINT, size_m=(4.0, 4.0, 2.6), device="cpu", light=emissive
     return light(World(_walls(backend.mitsuba(device), [even] * 6, size_m)), device)
 
 
-def corridor(
-    photos=("brick", "gravel", "speckle-4"),
-    length_m=14.0,
-    width_m=2.2,
-    height_m=2.6,
-    device="cpu",
-    light=emissive,
-):
-    """A corridor along +y, entered at y = 0, with pillars on both sides; pictures for walls, floor and
-    pillars. Luminous ceiling where it is lit."""
+def corridor(device="cpu", light=emissive):
+    """A corridor along +y, entered at y = 0, with pillars on both sides. Luminous ceiling where it is lit."""
     mi = backend.mitsuba(device)
-    side, floor, column = (textures.picture(p) for p in photos)
+    length_m, width_m, height_m = CORRIDOR_M
+    side, floor, column = (textures.picture(p) for p in ("brick", "gravel", "speckle-4"))
     bright = textures.softened(textures.speckle(9, finest_px=24.0, contrast=0.1), 4.0)
-    along = length_m / height_m
-    tile = height_m
+    along, across = length_m / height_m, width_m / height_m
+    walls = sides(mi, (width_m, length_m, height_m), length_m / 2)
     shapes = {
-        "west": (
-            rectangle(
-                mi,
-                (-width_m / 2, length_m / 2, height_m / 2),
-                (0, length_m / 2, height_m / 2),
-                length_m,
-                height_m,
-            ),
-            Paint(side, (along, 1)),
-        ),
-        "east": (
-            rectangle(
-                mi,
-                (width_m / 2, length_m / 2, height_m / 2),
-                (0, length_m / 2, height_m / 2),
-                length_m,
-                height_m,
-            ),
-            Paint(side, (along, 1)),
-        ),
-        "floor": (
-            rectangle(mi, (0, length_m / 2, 0), (0, length_m / 2, 1), width_m, length_m, (0, 1, 0)),
-            Paint(floor, (width_m / tile, along)),
-        ),
-        "ceiling": (
-            rectangle(mi, (0, length_m / 2, height_m), (0, length_m / 2, 0), width_m, length_m, (0, 1, 0)),
-            Paint(bright, (width_m / tile, along), glow=250.0),
-        ),
-        "end": (
-            rectangle(mi, (0, length_m, height_m / 2), (0, 0, height_m / 2), width_m, height_m),
-            Paint(column),
-        ),
-        "start": (
-            rectangle(mi, (0, 0, height_m / 2), (0, length_m, height_m / 2), width_m, height_m),
-            Paint(column),
-        ),
+        "west": (walls["west"], Paint(side, (along, 1))),
+        "east": (walls["east"], Paint(side, (along, 1))),
+        "floor": (walls["floor"], Paint(floor, (across, along))),
+        "ceiling": (walls["ceiling"], Paint(bright, (across, along), glow=250.0)),
+        "end": (walls["north"], Paint(column)),
+        "start": (walls["south"], Paint(column)),
     }
     for k, y in enumerate(np.arange(2.0, length_m - 0.5, 2.0)):
         for x in (-1, 1):
@@ -192,8 +166,6 @@ def corridor(
 def outdoor(
     seed=0,
     clutter=48,
-    half_width_m=14.0,
-    photo="gravel",
     environment=None,
     meshes=(),
     device="cpu",
@@ -201,7 +173,7 @@ def outdoor(
 ):
     """Open ground with crates, balls and posts under a sky; a clear lane along x = 0 to drive or fly in.
 
-    Args: photo: picture of the ground. environment: path of an equirectangular .hdr or .exr map; None is a
+    Args: clutter: how many things. environment: path of an equirectangular .hdr or .exr map; None is a
       procedural sky with a sun.
       meshes: robot bodies as (path, x, y, turn_deg) or (path, x, y, turn_deg, scale), each resting on the
         ground. Where it is lit, the sky lights it, with a sun of its own when the sky is procedural. The sky
@@ -212,8 +184,8 @@ def outdoor(
     tile = 512 * 0.012
     shapes: dict = {
         "ground": (
-            rectangle(mi, (0, 0, 0), (0, 0, 1), 2 * half_width_m, 2 * half_width_m, (0, 1, 0)),
-            Paint(textures.picture(photo), (2 * half_width_m / tile, 2 * half_width_m / tile)),
+            rectangle(mi, (0, 0, 0), (0, 0, 1), 2 * GROUND_M, 2 * GROUND_M, (0, 1, 0)),
+            Paint(textures.picture("gravel"), (2 * GROUND_M / tile, 2 * GROUND_M / tile)),
         )
     }
     pictures = [textures.picture(p) for p in ("brick", "speckle-1", "speckle-2", "grass")]
@@ -224,7 +196,7 @@ def outdoor(
             Paint(np.full((4, 4), 120.0)),
         )
     while len(places) < clutter + len(meshes):
-        x, y = random.uniform(-0.5, 0.5, 2) * half_width_m
+        x, y = random.uniform(-0.5, 0.5, 2) * GROUND_M
         size = float(random.uniform(0.15, 0.5))
         if abs(x) < 0.7 + 1.5 * size or any(
             math.hypot(x - px, y - py) < 1.8 * (size + other) for px, py, other in places
@@ -256,8 +228,8 @@ def outdoor(
     return light(World(shapes, {"sky": sky(mi, above)}, lamps, texel_m=0.08), device)
 
 
-def dark_room(seed=0, spots=10, dark=1.5, bright=255.0, size_m=(4.0, 4.0, 2.6), device="cpu", light=emissive):
-    """A room near darkness (mean radiance ``dark``) with a few small bright balls in the air, placed at
+def dark_room(seed=0, device="cpu", light=emissive):
+    """A room near darkness (mean radiance DARK) with a few small bright balls in the air, placed at
     random without touching."""
     mi = backend.mitsuba(device)
     random = np.random.default_rng(seed)
@@ -265,14 +237,13 @@ def dark_room(seed=0, spots=10, dark=1.5, bright=255.0, size_m=(4.0, 4.0, 2.6), 
         textures.faded_to(
             textures.softened(textures.speckle(seed + k, finest_px=16.0, contrast=0.35), 2.0), PAINT
         )
-        * (dark / PAINT)
+        * (DARK / PAINT)
         for k in range(6)
     ]
-    shapes = _walls(mi, [Paint(picture, albedo=0.25 * 255 / float(picture.max())) for picture in dim], size_m)
-    low = np.array([-size_m[0] / 2, -size_m[1] / 2, 0]) + 0.4
-    high = np.array([size_m[0] / 2, size_m[1] / 2, size_m[2]]) - 0.4
+    shapes = _walls(mi, [Paint(picture, albedo=0.25 * 255 / float(picture.max())) for picture in dim], ROOM_M)
+    low, high = np.array([-1.6, -1.6, 0.4]), np.array([1.6, 1.6, ROOM_M[2] - 0.4])
     places = []
-    while len(places) < spots:
+    while len(places) < SPOTS:
         place = random.uniform(low, high)
         if (
             all(np.linalg.norm(place - other) > 0.4 for other in places)
@@ -281,8 +252,8 @@ def dark_room(seed=0, spots=10, dark=1.5, bright=255.0, size_m=(4.0, 4.0, 2.6), 
             places.append(place)
             radius = float(random.uniform(0.015, 0.04))
             shapes[f"spot-{len(places)}"] = (
-                ball(mi, float(place[0]), float(place[1]), float(place[2]), radius),
-                Paint(np.full((4, 4), bright, dtype=np.float32), albedo=0.0, glow=bright),
+                ball(mi, *map(float, place), radius),
+                Paint(np.full((4, 4), BRIGHT, dtype=np.float32), albedo=0.0, glow=BRIGHT),
             )
     return light(World(shapes), device)
 

@@ -2,7 +2,7 @@
 
 Where it sits and what it has to keep: ``Mount``, ``MountRanges``, the requirements. What flow tells of the
   body's
-velocity: ``body_flow``, ``information``, ``sight_table``. Reading it, as a stage of a system:
+velocity: ``body_flow``, ``Surroundings``, ``sight_table``. Reading it, as a stage of a system:
   ``EgoVelocity``.
 Read first: pose.py, then ego_velocity.py.
 """
@@ -13,14 +13,7 @@ from codesign.mount.depth import ground_depth, scene_depth
 from codesign.mount.ego_velocity import EgoVelocity, Motion, Readings
 from codesign.mount.errors import Expected, FlowErrors, VelocityErrors, expected_errors, velocity_errors
 from codesign.mount.head import Evidence, VelocityHead
-from codesign.mount.observability import (
-    FREE,
-    PLANAR,
-    body_flow,
-    flow_precision,
-    information,
-    velocity_from_flow,
-)
+from codesign.mount.observability import FREE, PLANAR, body_flow, flow_precision
 from codesign.mount.pose import Mount, MountRanges, yaw_pitch_roll_rad
 from codesign.mount.requirements import (
     CableSide,
@@ -80,7 +73,6 @@ __all__ = [
     "expected_errors",
     "flow_precision",
     "ground_depth",
-    "information",
     "judge",
     "penalty",
     "scene_depth",
@@ -90,7 +82,6 @@ __all__ = [
     "sight_units",
     "starts",
     "velocity_errors",
-    "velocity_from_flow",
     "yaw_pitch_roll_rad",
 ]
 

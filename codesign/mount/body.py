@@ -129,10 +129,6 @@ class Body:
             found = torch.stack([_of_segments(start, end, solid) for solid in self.solids], -1)
         return (found - housing.radius_m).reshape(*T_body_cam.shape[:-2], len(self.solids))
 
-    def hidden(self, origin_m: Tensor, direction: Tensor) -> Tensor:
-        """Whether the body stands before rays [N, 3] in its axes: [N] bool."""
-        return first_crossings(origin_m.double(), direction.double(), self.triangles).isfinite()
-
 
 def _signed(points, triangles):
     """Signed distance [N] of points to one solid, with its gradient."""

@@ -114,6 +114,7 @@ def expected_errors(
     return Expected((inverse @ pulled)[..., 0], inverse @ scatter @ inverse)
 
 
+UNIT_M_S, UNIT_SHARE, UNIT_RAD_S = 0.05, 0.1, 0.15  # errors that count 1
 PERCENTILES = (5, 10, 25, 50, 75, 90, 95)
 
 
@@ -126,18 +127,19 @@ class VelocityErrors:
     speed_m_s: Tensor
     axes: tuple[int, ...]
 
-    def unit(self, m_s: float = 0.05, share: float = 0.1, rad_s: float = 0.15) -> Tensor:
-        """[N, K]: the error that counts 1: ``m_s`` plus a share of the speed, and ``rad_s``."""
-        linear = (m_s + share * self.speed_m_s)[:, None].expand(self.error.shape)
-        return torch.where(torch.tensor(self.axes) < LINEAR, linear, rad_s)
+    @property
+    def unit(self) -> Tensor:
+        """[N, K]: the error that counts 1: 0.05 m/s plus a tenth of the speed, and 0.15 rad/s."""
+        linear = (UNIT_M_S + UNIT_SHARE * self.speed_m_s)[:, None].expand(self.error.shape)
+        return torch.where(torch.tensor(self.axes) < LINEAR, linear, UNIT_RAD_S)
 
-    def squared(self, **unit: float) -> Tensor:
+    def squared(self) -> Tensor:
         """[N]: mean over the velocities of the squared error in units of ``unit``."""
-        return (self.error / self.unit(**unit)).square().mean(1)
+        return (self.error / self.unit).square().mean(1)
 
-    def bounded(self, **unit: float) -> Tensor:
+    def bounded(self) -> Tensor:
         """[N] in 0..1: q / (1 + q) of ``squared``, in which a lost sample counts 1 and no more."""
-        squared = self.squared(**unit)
+        squared = self.squared()
         return squared / (1 + squared)
 
     def table(self) -> dict[str, dict[str, float]]:

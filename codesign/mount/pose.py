@@ -187,10 +187,6 @@ class Mount(nn.Module):
         motion = flow_of_points(velocity, slope, base_step + slope_step * depth[..., None])
         return motion.square().sum(1).mean(0).sqrt()
 
-    def in_world(self, T_world_body: Tensor, numbers: Tensor | None = None) -> Tensor:
-        """T_world_cam = T_world_body T_body_cam for body poses [..., 4, 4]; gradient to both."""
-        return T_world_body @ self(numbers)
-
 
 def attitude(yaw_rad: float | Tensor, pitch_rad: float | Tensor, roll_rad: float | Tensor) -> Tensor:
     """Rotations [..., 3, 3] float64 from camera to body axes: Rz(yaw) Ry(pitch) Rx(roll) after the axes of a

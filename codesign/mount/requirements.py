@@ -7,7 +7,7 @@ a count of pixels decides. ``penalty`` makes one smooth number of the slacks, to
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol
@@ -121,25 +121,20 @@ class LookAhead:
     """A share of the picture sees farther than ``distance_m``.
 
     A pixel sees beyond the distance when its chief ray goes ahead and meets the ground, if at all, beyond the
-    line across at that distance; with ``depth``, when what it sees lies there.
+    line across at that distance.
 
     Args:
-      distance_m: from the body's origin, along ``ahead``, > 0.
+      distance_m: from the body's origin, forward, > 0.
       share: of the film's pixels, above 0, at most 1.
-      ahead: direction in body axes, level.
       ground_z_m: height of the ground in body axes (0 for a body whose origin is on the ground, as
         base_footprint of REP 105).
-      depth: (camera, pixels [P, 2], T_body_cam [4, 4]) -> [P] m along the camera's z axis, not finite where
-        nothing is seen; None is flat ground.
       smooth: share of the pixels over which the slack at the wanted rank is averaged.
     Raises: DomainError for numbers out of range.
     """
 
     distance_m: float
     share: float
-    ahead: tuple[float, float, float] = (1.0, 0.0, 0.0)
     ground_z_m: float = 0.0
-    depth: Callable[[ChiefRayCamera, Tensor, Tensor], Tensor] | None = None
     smooth: float = 0.02
     step: float = 0.05
     name: str = "look-ahead"
@@ -153,8 +148,6 @@ class LookAhead:
                 raise DomainError(
                     f"look-ahead: {label} is {getattr(self, label)}; a share above 0, at most 1, is needed."
                 )
-        if not abs(float(_direction(self.ahead, "look-ahead: ahead")[2])) < 1e-9:
-            raise DomainError(f"look-ahead: ahead is {self.ahead}; give a level direction, z = 0.")
 
     def slack(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
         """[..., 1]: the mean of ``angles`` at the ranks around the one that ``exact`` looks at, so that a row
@@ -174,9 +167,9 @@ class LookAhead:
         return max(math.ceil(self.share * angles.shape[-1] - 1e-9) - 1, 0)
 
     def angles(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
-        """By how much each pixel [..., P] looks beyond the distance: over ground the sine of the angle
-        between its ray and the plane through the line at that distance and the camera, or the vertical plane
-        across, whichever is smaller; before a scene (x - d) / hypot(x, d) of what it sees x metres ahead."""
+        """By how much each pixel [..., P] looks beyond the distance: the sine of the angle between its ray and
+        the plane through the line at that distance and the camera, or the vertical plane across, whichever is
+        smaller."""
         if not hasattr(camera, "chief_rays"):
             raise DomainError(
                 "look-ahead: it looks through the camera; give one with chief rays, as render.Camera."
@@ -187,26 +180,12 @@ class LookAhead:
         rays = camera.chief_rays(pixels)
         pose = T_body_cam.double()
         direction = rays.direction.double() @ pose[..., :3, :3].mT
-        ahead = _direction(self.ahead, "ahead").to(pose)
-        forward = (direction * ahead).sum(-1)
+        forward = direction[..., 0]
         origin = pose[..., None, :3, 3] + rays.origin_m.double() @ pose[..., :3, :3].mT
-        before = self.distance_m - (origin * ahead).sum(-1)
-        if self.depth is not None:
-            depth = torch.stack([self.depth(camera, pixels, one) for one in pose.reshape(-1, 4, 4)])
-            return self._of_scene(depth.reshape(direction.shape[:-1]), rays, direction, origin)
+        before = self.distance_m - origin[..., 0]
         height = origin[..., 2] - self.ground_z_m
         over = (height * forward + before * direction[..., 2]) / torch.hypot(height, before).clamp_min(1e-9)
         return torch.minimum(over, forward)
-
-    def _of_scene(self, depth, rays, direction, origin):
-        ahead = _direction(self.ahead, "ahead").to(direction)
-        seen = depth.detach().isfinite()
-        length = (torch.where(seen, depth, 0.0) - rays.origin_m[:, 2].double()) / rays.direction[
-            :, 2
-        ].double()
-        away = ((origin + length[..., None] * direction) * ahead).sum(-1)
-        found = (away - self.distance_m) / torch.hypot(away, away.new_tensor(self.distance_m))
-        return torch.where(seen, found, torch.sign((direction * ahead).sum(-1)))
 
 
 def penalty(requirements: Sequence[Requirement], T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
@@ -248,6 +227,15 @@ def judge(requirements: Sequence[Requirement], T_body_cam: Tensor, camera: Chief
         slack = float(each.exact(T_body_cam, camera).min())
         found.append(Verdict(each.name, slack, each.unit, slack >= 0))
     return found
+
+
+@torch.no_grad()
+def first_missed(requirements: Sequence[Requirement], T_body_cam: Tensor, camera: Any) -> Requirement | None:
+    """The first requirement that one mount [4, 4] does not keep, by the hard answer; None where all are kept."""
+    for each in requirements:
+        if float(each.exact(T_body_cam, camera).min()) < 0:
+            return each
+    return None
 
 
 def _direction(vector, name):

@@ -27,7 +27,7 @@ def expected_error(
     leaves.
 
     Args:
-      information: [..., K, K] as of ``mount.information`` without prior, or of an estimator: the inverse of
+      information: [..., K, K] as of ``Surroundings.information``, or of an estimator: the inverse of
         ``mount.Motion.covariance`` less the prior's.
       unit: [K] errors that count 1.
       prior: [K] standard deviations of the velocities around zero, by which what no flow shows counts.
@@ -136,8 +136,8 @@ ATTITUDES = {
     "sideways": (90.0, 0.0),
     "sideways oblique": (90.0, 45.0),
 }
-UNIT = (0.1, 0.1, 0.1, 0.1, 0.1, 0.1)  # m/s and rad/s that count 1
-PRIOR = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+UNIT = 0.1  # m/s and rad/s that count 1
+PRIOR = 1.0
 VELOCITIES = tuple(f"{name}_{'m_s' if axis < LINEAR else 'rad_s'}" for axis, name in enumerate(NAMES))
 MOST_PIXELS = 1024  # of a film, spread over it, that are looked at
 Depth = Callable[[ChiefRayCamera, Tensor, Tensor, Any], Tensor]
@@ -195,8 +195,8 @@ class Surroundings:
 
 
 def sight_units(around: Surroundings) -> list[float]:
-    """[K] errors that count 1 by default: 0.1 m/s and 0.1 rad/s."""
-    return [UNIT[axis] for axis in around.axes]
+    """[K] errors that count 1: 0.1 m/s and 0.1 rad/s."""
+    return [UNIT] * len(around.axes)
 
 
 @torch.no_grad()
@@ -204,14 +204,12 @@ def sight_table(
     camera: ChiefRayCamera,
     around: Surroundings,
     attitudes: Mapping[str, tuple[float, float]] = ATTITUDES,
-    unit: Sequence[float] | None = None,
 ) -> dict[str, dict[str, Any]]:
     """What forward, downward, sideways and oblique cameras see of the body's motion, and what they are blind
     to.
 
     Args:
       attitudes: name -> yaw and pitch in degrees.
-      unit: [K] errors that count 1; 0.1 m/s and 0.1 rad/s when None.
     Returns: name -> "seen" (share of the picture), "sight" (mount.Sight), a column for each velocity
       (standard deviation in m/s or rad/s, all unknown), "blind" (names of velocities worse than one unit),
       "weakest" (the motion that shows least, in words) and "weakest_units" (its deviation). No gradient.
@@ -223,12 +221,11 @@ def sight_table(
     >>> table["downward"]["blind"], table["forward"]["blind"]
     ([], ['forward', 'left'])
     """
-    unit = sight_units(around) if unit is None else unit
     table = {}
     for name, (yaw_deg, pitch_deg) in attitudes.items():
         pose = around.mount(math.radians(yaw_deg), math.radians(pitch_deg))
         information, seen = around.information(camera, pose)
-        found = sight(information, unit, around.axes)
+        found = sight(information, sight_units(around), around.axes)
         table[name] = {"seen": float(seen), "sight": found}
         for axis, deviation in zip(around.axes, found.deviation.tolist(), strict=True):
             table[name][VELOCITIES[axis]] = deviation
@@ -246,28 +243,22 @@ def sight_map(
     around: Surroundings,
     rows: int = 19,
     columns: int = 36,
-    unit: Sequence[float] | None = None,
-    prior: Sequence[float] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Expected error over all directions that a camera at one place may look in.
 
     Args:
       rows: from straight up to straight down;
       columns: all around, both at least 2.
-      unit, prior: [K] as of ``mount.expected_error``; 0.1 and 1 when None.
     Returns: yaw [columns], pitch [rows] rad at the middle of the cells, and the error [rows, columns] in
       units. For ``report.mount_sphere``. No gradient.
     """
     if check_whole(rows, "rows") < 2 or check_whole(columns, "columns") < 2:
         raise DomainError(f"sight_map: {rows} rows and {columns} columns; at least 2 of each are needed.")
-    unit = sight_units(around) if unit is None else unit
-    prior = [PRIOR[axis] for axis in around.axes] if prior is None else prior
-    if not len(unit) == len(prior) == len(around.axes):
-        raise ShapeError(f"sight_map: unit and prior need {len(around.axes)} numbers each, one per velocity.")
     yaw = (torch.arange(columns, dtype=torch.float64) + 0.5) / columns * 2 * math.pi - math.pi
     pitch = (torch.arange(rows, dtype=torch.float64) + 0.5) / rows * math.pi - math.pi / 2
     found = []
     for tilt in pitch.tolist():
         poses = torch.stack([around.mount(turn, tilt) for turn in yaw.tolist()])
-        found.append(expected_error(around.information(camera, poses)[0], unit, prior))
+        information, _ = around.information(camera, poses)
+        found.append(expected_error(information, sight_units(around), [PRIOR] * len(around.axes)))
     return yaw, pitch, torch.stack(found)

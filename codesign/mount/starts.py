@@ -1,101 +1,67 @@
-"""Where searches begin: mounts spread evenly over what is allowed; and what makes a search hopeless, said
+"""Where searches begin: mounts spread at random over what is allowed; and what makes a search hopeless, said
 before it."""
 
-import math
+from collections import Counter
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-from codesign.errors import DomainError, as_number, check_seed, check_whole
-from codesign.mount.pose import Mount
-from codesign.mount.requirements import Clearance, Requirement, judge
+from codesign.errors import DomainError, check_seed, check_whole
+from codesign.mount.pose import Mount, MountRanges
+from codesign.mount.requirements import Clearance, Requirement, first_missed, judge
 from codesign.mount.triangles import closest_points
-from codesign.pose import se3_exp
 from codesign.types import ChiefRayCamera
 
-INNER = 0.9  # of the box, in which searches begin: at its walls the map of the mount is flat
-DRAWS = 64  # looked at together
-MOST_DRAWS = 64  # times DRAWS
+EDGE = 0.05  # of the bounds at either end, in which no search begins
+TRIES = 2048
 PLACES = 256  # of a box, in which room is looked for
 NEAREST = 8  # places of the box from which the way to the body is followed
 WAYS = 50  # steps of it, to and fro between box and body
 
 
+@torch.no_grad()
 def starts(
-    mount: Mount,
+    ranges: MountRanges,
     count: int,
     requirements: Sequence[Requirement] = (),
     camera: ChiefRayCamera | None = None,
     *,
-    reach_rad: float = math.pi / 4,
-    roll_rad: float = 0.0,
     seed: int = 0,
 ) -> Tensor:
-    """Numbers of mounts from which to search: quasi-random in the box and in the directions around the
-    mount's start attitude, as far as they keep the requirements.
+    """Mounts from which to search: at random within the bounds, as far as they keep the requirements.
 
     Args:
+      ranges: their bounds; mounts begin in the inner nine tenths of each.
       count: how many.
-      camera: for requirements that look through it.
-      reach_rad: largest angle of the view from that of the start attitude, up to pi (all directions).
-      roll_rad: largest turn about the view either way.
-      seed: of the scrambling.
-    Returns: [count, 6] for ``Mount.forward`` or ``mount.numbers.copy_``; the same for the same seed.
-      Gradient: none.
-    Raises: DomainError when hardly any draw keeps the requirements, naming the one at which most fail; they
-      are asked in their order, so the cheap ones stand first.
-    Source: Sobol, USSR Comput. Math. 7, 1967, scrambled (torch.quasirandom).
+      requirements: looked at through ``camera``, in their order, so the cheap ones stand first.
+    Returns: shares [count, 6] float64 of the bounds; no gradient. The same seed gives the same.
+    Raises: DomainError where too few of TRIES mounts keep the requirements; it names the one at which most
+      fail.
 
-    >>> mount = Mount((0.2, 0.0, 0.4), (0.1, 0.0, 0.2), pitch_rad=1.0)
-    >>> found = starts(mount, 5, reach_rad=0.5)
-    >>> mount(found)[:, 1, 3].tolist()  # this axis is held
+    >>> ranges = MountRanges((0.1, 0.0, 0.2, 0.0, 0.5, 0.0), (0.3, 0.0, 0.6, 0.0, 1.5, 0.0))
+    >>> ranges.pose(starts(ranges, 5))[:, 1, 3].tolist()  # this axis is held
     [0.0, 0.0, 0.0, 0.0, 0.0]
     """
     count = check_whole(count, "starts: count")
-    for name, value in (("reach_rad", reach_rad), ("roll_rad", roll_rad)):
-        if not 0 <= as_number(value, name) <= math.pi:
-            raise DomainError(f"starts: {name} is {value}; an angle from 0 to pi is needed.")
-    engine = SobolEngine(6, scramble=True, seed=check_seed(seed, "starts: seed"))
+    random = torch.Generator().manual_seed(check_seed(seed, "starts: seed"))
     found: list[Tensor] = []
-    failed = torch.zeros(len(requirements))
-    for _ in range(MOST_DRAWS):
-        poses = _drawn(mount, engine.draw(DRAWS, dtype=torch.float64), reach_rad, roll_rad)
-        for k, each in enumerate(requirements):
-            kept = (_exact(each, poses, camera) >= 0).all(-1)
-            failed[k] += int((~kept).sum())
-            poses = poses[kept]
-            if not len(poses):
-                break
+    failed: Counter[str] = Counter()
+    for _ in range(TRIES):
+        share = EDGE + (1 - 2 * EDGE) * torch.rand(6, generator=random, dtype=torch.float64)
+        missed = first_missed(requirements, ranges.pose(share), camera)
+        if missed is None:
+            found.append(share)
         else:
-            found.append(mount.numbers_at(poses))
-        if sum(map(len, found)) >= count:
-            return torch.cat(found)[:count]
-    worst = int(failed.argmax())
+            failed[missed.name] += 1
+        if len(found) == count:
+            return torch.stack(found)
+    [(worst, often)] = failed.most_common(1) or [("none", 0)]
     raise DomainError(
-        f"starts: of {DRAWS * MOST_DRAWS} mounts {sum(map(len, found))} keep the requirements, {count} are asked for; "
-        f"most, {float(failed[worst]) / (DRAWS * MOST_DRAWS):.0%}, fail first at '{requirements[worst].name}': move or widen "
-        "the box, turn the start attitude, or ask for less."
+        f"starts: of {TRIES} mounts within the bounds {len(found)} keep what is required, {count} are needed; most, "
+        f"{often / TRIES:.0%}, fail first at '{worst}': widen the bounds, or ask for less."
     )
-
-
-@torch.no_grad()
-def _exact(requirement, poses, camera):
-    return requirement.exact(poses, camera)
-
-
-def _drawn(mount, draw, reach_rad, roll_rad):
-    """Poses [N, 4, 4] of numbers [N, 6] in 0..1, spread evenly over the cap of directions."""
-    tilt = torch.acos(1 - draw[:, 3] * (1 - math.cos(reach_rad)))
-    around = 2 * math.pi * draw[:, 4]
-    zero = torch.zeros_like(tilt)
-    towards = torch.stack([zero, zero, zero, -tilt * around.sin(), tilt * around.cos(), zero], 1)
-    roll = torch.stack([zero, zero, zero, zero, zero, roll_rad * (2 * draw[:, 5] - 1)], 1)
-    poses = se3_exp(towards) @ se3_exp(roll)
-    poses[:, :3, :3] = mount.start_attitude @ poses[:, :3, :3]
-    poses[:, :3, 3] = mount.nominal_m + INNER * mount.half_range_m * (2 * draw[:, :3] - 1)
-    return poses
 
 
 @torch.no_grad()

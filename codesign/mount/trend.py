@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.flow.checks import check_number
 from codesign.mount.ego_velocity import Readings
 
 LEAST_PX = 0.5  # flow below which a length says no more
@@ -29,15 +28,9 @@ class PrecisionTrend:
     order), nearness, and the share of the window that the body covers (second).
 
     >>> trend = PrecisionTrend()
-
-    forget: share of what was seen before that each ``add`` leaves out, 0 for none. Raises: DomainError for no
-      share.
     """
 
-    def __init__(self, forget: float = 0.0) -> None:
-        self.forget = check_number(forget, "forget", least=0.0)
-        if self.forget > 1:
-            raise DomainError(f"forget is {forget:g}; a share from 0 to 1 is needed.")
+    def __init__(self) -> None:
         self._normal: Tensor | None = None
         self._right: Tensor | None = None
 
@@ -52,9 +45,8 @@ class PrecisionTrend:
         terms = _terms(read, flow_px, covered)[seen]
         wanted = torch.stack([_log_precision(read), _log_odds(read.confidence)], -1)[seen]
         normal, right = terms.mT @ terms, terms.mT @ wanted
-        kept = 1 - self.forget
-        self._normal = normal if self._normal is None else kept * self._normal + normal
-        self._right = right if self._right is None else kept * self._right + right
+        self._normal = normal if self._normal is None else self._normal + normal
+        self._right = right if self._right is None else self._right + right
         return self
 
     def followed(self, read: Readings, flow_px: Tensor, covered: Tensor | None = None) -> Readings:

@@ -10,9 +10,9 @@ from codesign import backend
 from codesign.mount import PLANAR
 from codesign.render import MitsubaScene
 from scenes.bodies import box, cylinder
-from scenes.build import GAP_M, World, block, emissive, rectangle
+from scenes.build import GAP_M, World, block, emissive, sides
 from scenes.robots import pair as robot_pair
-from scenes.robots.pair import RATE_RAD_S, Design, RobotPair, speeds_and_deviates
+from scenes.robots.pair import Design, RobotPair, speeds_and_deviates
 
 LENGTH_M = 14.0
 HEIGHT_M = 2.5
@@ -56,17 +56,15 @@ def world(number: int) -> MitsubaScene:
     mi = backend.mitsuba("cpu")
     random, _, covered = robot_pair.variant(number)
     half = half_width_m(number)
-    along, up = LENGTH_M / 2, HEIGHT_M / 2
-    shapes: dict = {}
-    for name, x in (("west", -half), ("east", half)):
-        side = rectangle(mi, (x, along, up), (0, along, up), LENGTH_M, HEIGHT_M)
-        shapes[name] = (side, covered(LENGTH_M, HEIGHT_M))
-    for name, z in (("floor", 0.0), ("ceiling", HEIGHT_M)):
-        lying = rectangle(mi, (0, along, z), (0, along, up), 2 * half, LENGTH_M, (0, 1, 0))
-        shapes[name] = (lying, covered(2 * half, LENGTH_M))
-    for name, y in (("start", 0.0), ("end", LENGTH_M)):
-        across = rectangle(mi, (0, y, up), (0, along, up), 2 * half, HEIGHT_M)
-        shapes[name] = (across, covered(2 * half, HEIGHT_M))
+    walls = sides(mi, (2 * half, LENGTH_M, HEIGHT_M), LENGTH_M / 2)
+    shapes: dict = {
+        "west": (walls["west"], covered(LENGTH_M, HEIGHT_M)),
+        "east": (walls["east"], covered(LENGTH_M, HEIGHT_M)),
+        "floor": (walls["floor"], covered(2 * half, LENGTH_M)),
+        "ceiling": (walls["ceiling"], covered(2 * half, LENGTH_M)),
+        "start": (walls["south"], covered(2 * half, HEIGHT_M)),
+        "end": (walls["north"], covered(2 * half, HEIGHT_M)),
+    }
     column = covered(2 * PILLAR_M[1], HEIGHT_M)
     stations = np.arange(EVERY_M, LENGTH_M - 0.5, EVERY_M)
     for k, y in enumerate(stations):
@@ -90,8 +88,7 @@ def half_width_m(number: int) -> float:
 def drive(number: int, motions: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Drives along the corridor, either way: T_world_body [M, T, 4, 4], twist [M, 6]."""
     speed, deviates = speeds_and_deviates(number, motions, 5)
-    slide = [SLIP * speed * deviates[:, 0], HEAVE_M_S * deviates[:, 1]]
-    twist = torch.stack([speed, *slide, *(RATE_RAD_S * deviates[:, 2:]).unbind(1)], 1)
+    twist = robot_pair.rolling(speed, deviates, SLIP, HEAVE_M_S)
     random = np.random.default_rng([number, 4])
     aside = random.uniform(-ASIDE_M, ASIDE_M, motions)
     along = random.uniform(1.0, LENGTH_M - 1.0, motions)

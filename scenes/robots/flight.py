@@ -11,7 +11,7 @@ from codesign.mount import FREE
 from codesign.pose import se3_exp
 from codesign.render import MitsubaScene
 from scenes.bodies import box, cylinder
-from scenes.build import World, ball, block, emissive, rectangle
+from scenes.build import World, ball, block, emissive, sides
 from scenes.robots import pair as robot_pair
 from scenes.robots.pair import RATE_RAD_S, Design, RobotPair, speeds_and_deviates
 
@@ -58,14 +58,9 @@ def world(number: int) -> MitsubaScene:
     """A room whose six sides have pictures, with crates and balls along its walls."""
     mi = backend.mitsuba("cpu")
     random, _, covered = robot_pair.variant(number)
-    side, up = SIDE_M / 2, HEIGHT_M / 2
     shapes: dict = {}
-    for name, x, y in (("north", 0, side), ("south", 0, -side), ("east", side, 0), ("west", -side, 0)):
-        standing = rectangle(mi, (x, y, up), (0, 0, up), SIDE_M, HEIGHT_M)
-        shapes[name] = (standing, covered(SIDE_M, HEIGHT_M))
-    for name, z in (("floor", 0.0), ("ceiling", HEIGHT_M)):
-        lying = rectangle(mi, (0, 0, z), (0, 0, up), SIDE_M, SIDE_M, (0, 1, 0))
-        shapes[name] = (lying, covered(SIDE_M, SIDE_M))
+    for name, side in sides(mi, (SIDE_M, SIDE_M, HEIGHT_M)).items():
+        shapes[name] = (side, covered(SIDE_M, SIDE_M if name in ("floor", "ceiling") else HEIGHT_M))
     for k in range(THINGS):
         around = 2 * math.pi * (k + random.uniform(-0.2, 0.2)) / THINGS
         x, y = (CLEAR_M + 0.45) * math.cos(around), (CLEAR_M + 0.45) * math.sin(around)

@@ -14,7 +14,7 @@ from scenes import textures
 from scenes.bodies import box, cylinder
 from scenes.build import GAP_M, Paint, World, ball, block, emissive, pole, rectangle, sky
 from scenes.robots import pair as robot_pair
-from scenes.robots.pair import RATE_RAD_S, Design, RobotPair, speeds_and_deviates
+from scenes.robots.pair import Design, RobotPair, speeds_and_deviates
 
 HALF_M = 12.0  # of the ground
 THINGS = 28
@@ -89,15 +89,7 @@ def places(number: int) -> list[tuple[float, float, float]]:
 def drive(number: int, motions: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Drives over the ground, clear of all things: T_world_body [M, T, 4, 4], twist [M, 6]."""
     speed, deviates = speeds_and_deviates(number, motions, 5)
-    twist = torch.stack(
-        [
-            speed,
-            SLIP * speed * deviates[:, 0],
-            HEAVE_M_S * deviates[:, 1],
-            *(RATE_RAD_S * deviates[:, 2:]).unbind(1),
-        ],
-        1,
-    )
+    twist = robot_pair.rolling(speed, deviates, SLIP, HEAVE_M_S)
     random = np.random.default_rng([number, 4])
     things = np.array(places(number))
     starts = []

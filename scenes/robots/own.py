@@ -3,11 +3,9 @@
 
 import contextlib
 import math
-import os
 import re
 from collections.abc import Callable
 from pathlib import Path
-from urllib.parse import unquote
 
 import numpy as np
 import torch
@@ -33,11 +31,6 @@ TRAINING = 2 / 3  # of a trajectory; the rest is for judging
 STILL = 1e-3  # metres and radians within which a trajectory stands still
 MOST_TILT_RAD = math.radians(60)  # of a robot that drives
 LEAST_PRIOR = 0.05  # m/s and rad/s
-# a file's name in quotes, or between tags or blanks
-NAMED = re.compile(
-    rb"""["']([^"'\r\n]{1,200}\.[A-Za-z][A-Za-z0-9]{1,4})["']|(?<=[\s>])([^\s"'<>]{1,200}\.[A-Za-z][A-Za-z0-9]{1,4})(?=[\s<]|\Z)"""
-)
-
 Drive = Callable[[int, int], tuple[Tensor, Tensor]]
 
 
@@ -93,29 +86,9 @@ def own_pair(settings: OwnRobot | str | Path) -> RobotPair:
         ground_z_m=-float(middle[:, 2, 3].mean()),
         frame=frame,
         one_world=own.world not in PAIRS,
-        files=tuple(
-            each
-            for name in (own.robot, own.world, own.motion)
-            if name and name not in PAIRS
-            for each in with_named(Path(name))
-        ),
+        files=tuple(Path(name) for name in (own.robot, own.world, own.motion) if name and name not in PAIRS),
         page=repr(own),
     )
-
-
-def with_named(path: Path) -> list[Path]:
-    """A file and those that it names, and they in turn: materials, pictures, meshes. A name with a blank in
-    it is found in quotes alone."""
-    found: list[Path] = []
-    left = [path]
-    while left:
-        here = left.pop()
-        found.append(here)
-        named = NAMED.findall(here.read_bytes())
-        plain = {(quoted or bare).decode(errors="replace") for quoted, bare in named}
-        beside = {here.parent / name for name in plain | {unquote(name) for name in plain}}
-        left += sorted(each for each in beside - {*found, *left} if os.path.isfile(each))
-    return found
 
 
 def recorded_drives(path: Path) -> tuple[Drive, tuple[float, ...]]:

@@ -294,6 +294,13 @@ def speeds_and_deviates(number: int, motions: int, columns: int) -> tuple[Tensor
     return (slowest + (fastest - slowest) * share[:, 0]).exp(), deviates
 
 
+def rolling(speed: Tensor, deviates: Tensor, slip: float, heave_m_s: float) -> Tensor:
+    """Twists [M, 6] of bodies that roll at speeds [M]: they slip sideways by a share of it, heave and turn, all by
+    standard normal numbers [M, 5]."""
+    slide = [slip * speed * deviates[:, 0], heave_m_s * deviates[:, 1]]
+    return torch.stack([speed, *slide, *(RATE_RAD_S * deviates[:, 2:]).unbind(1)], 1)
+
+
 def picture(random: np.random.Generator, unseen: bool, level: float) -> np.ndarray:
     """A photograph or a random pattern of many scales as radiance [H, W] of a mean level, at CONTRAST."""
     if random.random() < 0.5:

@@ -115,25 +115,30 @@ def from_urdf(
     materials = {material.name: material for material in model.robot.materials}
     finder = _Finder(path, dict(packages or {}))
     parts = []
+    _check_places(path, frames.values())
     for link in model.robot.links:
         shapes = link.collisions if collision and link.collisions else link.visuals or link.collisions
         for shape in shapes:
             placed = frames[link.name] @ (np.eye(4) if shape.origin is None else shape.origin)
+            _check_places(path, [placed])
             colour = _colour(getattr(shape, "material", None), materials)
             parts += [
                 _moved(part, placed, link.name, colour) for part in _parts(shape.geometry, finder, link.name)
             ]
     finder.check()
     robot = Robot(path, frames, tuple(parts), root)
-    corners = [part.vertices_m for part in parts]
-    if not all(np.isfinite(each).all() for each in (*corners, *frames.values())):
+    if parts:
+        corners = np.concatenate([part.vertices_m for part in parts])
+        _check_places(path, [corners])
+        units.hint(corners.min(0), corners.max(0), f"robot '{path}'")
+    return robot
+
+
+def _check_places(path, places):
+    if not all(np.isfinite(each).all() for each in places):
         raise FileFormatError(
             f"robot '{path}' has places that are not finite; look for an origin, an axis or a size that is too large."
         )
-    if parts:
-        corners = np.concatenate(corners)
-        units.hint(corners.min(0), corners.max(0), f"robot '{path}'")
-    return robot
 
 
 def _model(path):
@@ -148,7 +153,7 @@ def _model(path):
             raise ValueError(f"its first element is <{tree.tag}> instead of <robot>")
         with np.errstate(all="ignore"):  # what is not finite, or has no axis, is refused below
             model = yourdfpy.URDF.load(io.BytesIO(data), load_meshes=False)
-        wrong = _no_tree(model) or _wrong_joint(model.robot.joints) or _wrong_shape(model.robot.links)
+        wrong = _no_tree(model) or _wrong_joint(model.robot.joints)
     if wrong:
         raise FileFormatError(f"robot '{path}' cannot be built: {wrong[:300]}; correct it.")
     return model
@@ -177,25 +182,14 @@ def _wrong_joint(joints):
     """What is wrong with a joint of the file, or an empty text."""
     leaders = {joint.name for joint in joints if joint.type in MOVES and joint.mimic is None}
     for joint in joints:
-        numbers = [joint.origin, joint.axis]
         if joint.type not in KINDS:
             return f"joint '{joint.name}' is of the type '{joint.type}', which is none of {', '.join(KINDS)}"
-        if joint.mimic is not None:
-            numbers += [joint.mimic.multiplier, joint.mimic.offset]
-            if joint.mimic.joint not in leaders:
-                return f"joint '{joint.name}' mimics '{joint.mimic.joint}', which is no joint that moves by itself"
-        if not all(np.isfinite(np.asarray(each, dtype=float)).all() for each in numbers if each is not None):
-            return f"joint '{joint.name}' has an origin, axis or mimic that is not finite"
+        if joint.mimic is not None and joint.mimic.joint not in leaders:
+            return (
+                f"joint '{joint.name}' mimics '{joint.mimic.joint}', which is no joint that moves by itself"
+            )
         if joint.type in MOVES and not 1e-9 < np.linalg.norm(joint.axis) < 1e9:
             return f"joint '{joint.name}' has the axis {' '.join(f'{v:g}' for v in joint.axis)}, which has no direction"
-    return ""
-
-
-def _wrong_shape(links):
-    for link in links:
-        origins = [shape.origin for shape in (*link.visuals, *link.collisions) if shape.origin is not None]
-        if not all(np.isfinite(origin).all() for origin in origins):
-            return f"a shape of link '{link.name}' has an origin that is not finite"
     return ""
 
 
@@ -211,10 +205,7 @@ def _checked_angles(path, model, angles):
     for name, joint in free.items():
         low, high = -math.inf, math.inf
         if joint.type != "continuous" and joint.limit is not None:
-            low, high = (
-                missing if said is None else float(said)
-                for said, missing in ((joint.limit.lower, 0.0), (joint.limit.upper, 0.0))
-            )
+            low, high = (float(said or 0.0) for said in (joint.limit.lower, joint.limit.upper))
         value = float(angles.get(name, min(max(0.0, low), high)))
         if not low <= value <= high or not math.isfinite(value):
             raise DomainError(
@@ -229,11 +220,9 @@ def _colour(material, known):
     if material is None:
         return None
     colour = material.color or getattr(known.get(material.name), "color", None)
-    return (
-        None
-        if colour is None
-        else textures.linear(np.asarray(colour.rgba, dtype=float)[None, None, :3]).item()
-    )
+    if colour is None:
+        return None
+    return textures.linear(np.asarray(colour.rgba, dtype=float)[None, None, :3]).item()
 
 
 def _parts(geometry, finder, link):

@@ -1,16 +1,81 @@
-"""A ground robot with differential drive: turns, wheel slip and the shake of its suspension."""
+"""A ground robot with differential drive: turns, wheel slip and the shake of its suspension, all of them smooth
+random functions of time whose integrals and products are known in closed form (Waves)."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError
 from scenes.trajectories.trajectory import Trajectory, positive, rigid
-from scenes.trajectories.waves import Waves
 
 STEP_S = 0.02  # between points of the table of positions
 NODES = 8  # of Gauss and Legendre on such a step: exact to rounding for the slow waves below
+
+
+@dataclass(frozen=True)
+class Waves:
+    """mean + sum of amplitude cos(rate t + phase); amplitude, rate_rad_s, phase_rad: [K] float64."""
+
+    mean: float
+    amplitude: Tensor
+    rate_rad_s: Tensor
+    phase_rad: Tensor
+
+    @staticmethod
+    def random(generator, mean, bound, lowest_hz, highest_hz, count=3):
+        """``count`` waves with frequencies drawn between two, which never lead further than ``bound`` from
+        the mean."""
+        draw = torch.rand(3, count, generator=generator, dtype=torch.float64)
+        share = 0.5 + draw[0]
+        frequency = lowest_hz * (highest_hz / lowest_hz) ** draw[1]
+        return Waves(float(mean), bound * share / share.sum(), 2 * math.pi * frequency, 2 * math.pi * draw[2])
+
+    def __call__(self, t_s):
+        """Values at times of any shape."""
+        return self.mean + (self.amplitude * (self.rate_rad_s * t_s[..., None] + self.phase_rad).cos()).sum(
+            -1
+        )
+
+    def integral(self, t_s):
+        """Integral from 0 to each time."""
+        half = self.rate_rad_s * t_s[..., None] / 2
+        return t_s * (
+            self.mean + (self.amplitude * (half + self.phase_rad).cos() * torch.sinc(half / math.pi)).sum(-1)
+        )
+
+    def scaled(self, factor):
+        """factor times this."""
+        return Waves(self.mean * factor, self.amplitude * factor, self.rate_rad_s, self.phase_rad)
+
+    def plus(self, other):
+        """The sum of two."""
+        return Waves(
+            self.mean + other.mean,
+            *(
+                torch.cat([getattr(self, k), getattr(other, k)])
+                for k in ("amplitude", "rate_rad_s", "phase_rad")
+            ),
+        )
+
+    def times(self, other):
+        """The product of two: cos a cos b is half of cos(a - b) + cos(a + b)."""
+        amplitude = (self.amplitude[:, None] * other.amplitude / 2).reshape(-1)
+
+        def pairs(name, sign):
+            return (getattr(self, name)[:, None] + sign * getattr(other, name)).reshape(-1)
+
+        mixed = (
+            Waves(0.0, amplitude, pairs("rate_rad_s", sign), pairs("phase_rad", sign)) for sign in (-1, 1)
+        )
+        total = self.scaled(other.mean).plus(
+            Waves(0.0, other.amplitude * self.mean, other.rate_rad_s, other.phase_rad)
+        )
+        for part in mixed:
+            total = total.plus(part)
+        return total
 
 
 class Driving(Trajectory):
@@ -82,24 +147,11 @@ class Driving(Trajectory):
         moved = self._moved(knots[:-1], torch.full_like(knots[:-1], STEP_S))
         self._table = torch.cat([torch.zeros(1, 2, dtype=torch.float64), moved.cumsum(0)])
 
-    def wheel_speeds(self, t_s):
-        """What the wheels count, left and right: [n, 2] m/s."""
-        t = self._times(t_s)
-        return torch.stack([wheel(t) for wheel in self._wheels], 1)
-
-    def ground_velocity(self, t_s):
-        """Forward m/s, sideways m/s (left) and turn rate rad/s of the undercarriage, slip included and shake
-        left out: [n, 3]."""
-        return self._ground(self._times(t_s))
-
-    def heading_rad(self, t_s):
-        """Yaw of the undercarriage, [n]."""
-        return self._yaw(self._times(t_s))
-
     def _yaw(self, t_s):
         return self.start[2] + self._turn.integral(t_s)
 
     def _ground(self, t_s):
+        """Forward m/s, sideways m/s (left) and turn rate rad/s without shake, [..., 3]."""
         forward = (self._rolled[0](t_s) + self._rolled[1](t_s)) / 2
         turn = self._turn(t_s)
         return torch.stack([forward, -self.side_slip_s * forward * turn, turn], -1)

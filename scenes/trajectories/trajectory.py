@@ -1,10 +1,11 @@
-"""What a trajectory is: a smooth function from time to the pose of a body, with its velocity; and a camera
-mounted on one.
+"""What a trajectory is: a smooth function from time to the pose of a body, with its velocity; a camera mounted on
+one; and the simplest, as poses T_world_cam [T, 4, 4] at given times.
 
 Body axes: x forward, y left, z up. A velocity is a twist in body axes: [n, 6], metres per second, then
 radians per second, so that T(t + dt) is T(t) exp(dt velocity(t)) to first order.
 """
 
+import math
 from abc import ABC, abstractmethod
 
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.mount.pose import AXES_BODY_CAM
-from codesign.pose import check_pose, look_at
+from codesign.pose import check_pose, look_at, se3_exp
 
 
 class Trajectory(ABC):
@@ -118,3 +119,23 @@ def positive(name, value, least=0.0, most=float("inf"), inclusive=False):
             f"below {most:g}."
         )
     return float(value)
+
+
+def times(count, rate_hz):
+    """Frame times [count] in seconds, starting at 0."""
+    if count < 2:
+        raise DomainError(f"a trajectory needs at least 2 frames, got {count}.")
+    if not 0 < rate_hz < math.inf:
+        raise DomainError(f"a trajectory's rate_hz = {rate_hz} must be positive and finite.")
+    return torch.arange(count, dtype=torch.float64) / rate_hz
+
+
+def body_twist(start, twist_per_s, t_s):
+    """Constant velocity in the camera's own axes: start [4, 4], twist_per_s [..., 6] (m/s, rad/s), t_s [T] ->
+    [..., T, 4, 4]."""
+    return start @ se3_exp(t_s[:, None] * twist_per_s[..., None, :])
+
+
+def translation(start, velocity_m_s, t_s):
+    """Straight motion along camera axes: velocity_m_s three numbers."""
+    return body_twist(start, torch.tensor([*velocity_m_s, 0.0, 0.0, 0.0], dtype=torch.float64), t_s)

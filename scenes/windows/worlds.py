@@ -6,8 +6,7 @@ import torch
 from codesign import events, lens, render
 from codesign.errors import DomainError
 from scenes import worlds
-from scenes.dataset_motion import FAMILIES, LEAD_S, motion
-from scenes.stages import make_world
+from scenes.dataset_motion import FAMILIES, LEAD_S, make_world, motion
 from scenes.windows.rendered import LEAD, Windows
 
 PATH_S = 1.0  # length of the path a window is taken from

@@ -29,8 +29,7 @@ from codesign.render import Camera, shade
 from codesign.render.moving import at_frames
 from codesign.render.projection import ProjectionTable
 from codesign.render.truth import truth_of_frames
-from scenes.dataset_motion import FAMILIES, LEAD_S, motion
-from scenes.stages import make_world
+from scenes.dataset_motion import FAMILIES, LEAD_S, make_world, motion
 from scenes.trajectories import times
 from scenes.tum import write_tum
 from studies.frame.bench import resident_mb as resident_mb_now

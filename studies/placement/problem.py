@@ -3,7 +3,7 @@ and the requirements of the mount. A mount is six shares of the pair's ranges.""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 
 import torch
@@ -13,7 +13,6 @@ from codesign import lens, mount, render
 from codesign.errors import DomainError
 from codesign.mount import (
     Body,
-    FlowErrors,
     OwnBody,
     PrecisionTrend,
     Readings,
@@ -59,14 +58,12 @@ class Seen:
 @dataclass
 class Problem:
     """pair: robot and worlds. numbers: of the worlds that draws are made from. per_world: drives in each of
-    ``spread`` worlds of a draw. errors: of flow beyond the estimator's covariance, for what is expected.
-    camera: in place of the pair's own."""
+    ``spread`` worlds of a draw. camera: in place of the pair's own."""
 
     pair: RobotPair
     numbers: Sequence[int]
     spread: int = 12
     per_world: int = 2
-    errors: FlowErrors = field(default_factory=FlowErrors)
     camera: render.Camera | None = None
 
     def __post_init__(self):
@@ -214,9 +211,9 @@ class Problem:
 
     def _bounded(self, read, seen, twist):
         """Bounded error [N] to be expected of readings."""
-        expected = expected_errors(self._system.estimate, read, twist, seen.true_rows, self.errors)
+        expected = expected_errors(self._system.estimate, read, twist, seen.true_rows)
         squared = expected.squared[:, list(self.pair.axes)]
-        unit = velocity_errors(torch.zeros_like(squared), twist, self.pair.axes).unit()
+        unit = velocity_errors(torch.zeros_like(squared), twist, self.pair.axes).unit
         squared = (squared / unit**2).mean(1)
         return squared / (1 + squared)
 

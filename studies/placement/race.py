@@ -2,18 +2,16 @@
 worlds that none saw; all of it kept in the run's state."""
 
 import hashlib
-import json
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.mount import PrecisionTrend
+from codesign.mount import PrecisionTrend, starts
+from codesign.mount.requirements import first_missed
 from scenes.robots.pair import RobotPair
-from studies.frame.config import StudyConfig, to_json
 from studies.frame.run import Run
 from studies.placement.problem import Problem
 from studies.placement.searches import SEARCHES, Trail, descend
@@ -21,69 +19,35 @@ from studies.placement.searches import SEARCHES, Trail, descend
 GRADIENT = "gradient"
 # of the cube: the gradient's differences of geometry
 STEP = 0.12
-TRIES = 2048
 # that choose among answers
 FINAL_DRAWS = 12
 # of bounded errors
 WORST = 1.0
-# of a pair, on which results depend
-SETTINGS = (
-    "low",
-    "high",
-    "design",
-    "axes",
-    "prior",
-    "depth",
-    "look_ahead",
-    "housing_radius_m",
-    "margin_m",
-    "own_body_share",
-    "cable",
-    "ground_z_m",
-    "page",
-)
-# options on which no result depends
-ELSEWHERE = ("study", "out", "device", "resume")
 
 
 def feasible(problem: Problem, count: int, seed: int, first: Sequence[Tensor] = ()) -> list[Tensor]:
     """Mounts [6] to start from: those given, and others spread at random over what is allowed."""
     if bool(problem.ranges.held.all()):
         raise DomainError("equal bounds hold all six numbers of the mount; widen what is to be searched.")
-    random = torch.Generator().manual_seed(seed)
     found = list(first)[:count]
-    for _ in range(TRIES):
-        if len(found) == count:
-            break
-        share = 0.05 + 0.9 * torch.rand(6, generator=random, dtype=torch.float64)
-        if kept(problem, share):
-            found.append(share)
-    if len(found) < count:
-        raise DomainError(
-            f"of {TRIES} mounts within the bounds {len(found) - len(first)} keep what is required, {count - len(first)} are "
-            "needed; widen the bounds, or ask for less."
-        )
-    return found
+    more = count - len(found)
+    return [
+        *found,
+        *(starts(problem.ranges, more, problem.requirements, problem.camera, seed=seed) if more else ()),
+    ]
 
 
 def kept(problem: Problem, share: Tensor) -> bool:
     """Whether a mount keeps every requirement, by the hard answer; the cheap ones are asked first."""
-    pose = problem.ranges.pose(share)
-    with torch.no_grad():
-        return all(float(each.exact(pose, problem.camera).min()) >= 0 for each in problem.requirements)
+    return first_missed(problem.requirements, problem.ranges.pose(share), problem.camera) is None
 
 
-def fingerprints(config: StudyConfig, pair: RobotPair) -> dict[str, Any]:
-    """What results depend on: options, the pair's settings, meshes and first drive (to a millionth), and the
-    user's files."""
-    options = json.loads(to_json("", config))
-    found = {f"--{name.replace('_', '-')}": options[name] for name in options if name not in ELSEWHERE}
-    found |= {f"the robot's {name}": repr(getattr(pair, name)) for name in SETTINGS}
-    meshes = [part for body in pair.bodies.values() for part in (body.vertices_m, body.faces)]
-    for name, arrays in (("shape", meshes), ("drives", [pair.drive(0, 1)[0]])):
-        rounded = [(np.round(np.asarray(each, dtype=np.float64), 6) + 0.0).tobytes() for each in arrays]
-        found[f"the robot's {name}"] = hashlib.sha256(b"".join(rounded)).hexdigest()[:12]
-    return found | {f"'{path}'": hashlib.sha256(path.read_bytes()).hexdigest()[:12] for path in pair.files}
+def fingerprints(pair: RobotPair) -> dict[str, str]:
+    """What a user may have changed since a run was begun: the robot's page, and the files of which it was made."""
+    contents = {"the robot's page": pair.page.encode()} | {
+        f"'{path}'": path.read_bytes() for path in pair.files
+    }
+    return {name: hashlib.sha256(content).hexdigest()[:12] for name, content in contents.items()}
 
 
 def check_same(stored: dict[str, Any], now: dict[str, Any]) -> None:
@@ -103,7 +67,7 @@ class Race:
     def __init__(self, run: Run[Any], problem: Problem):
         self.run = run
         self.problem = problem
-        self.fingerprints = fingerprints(run.config, problem.pair)
+        self.fingerprints = fingerprints(problem.pair)
         stored = run.load_state()
         self.tensors: dict[str, Tensor] = dict(stored.tensors) if stored else {}
         if stored:

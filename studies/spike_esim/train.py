@@ -10,8 +10,7 @@ from torch import Tensor
 
 from codesign import events, render
 from codesign.events import SensorModel, SpikeEsim, TwoBranchSpikes
-from scenes.dataset_motion import LEAD_S, motion
-from scenes.stages import make_world
+from scenes.dataset_motion import LEAD_S, make_world, motion
 from studies.make_dataset import __main__ as make_dataset
 from studies.spike_esim.judge import TAU_S, distance
 

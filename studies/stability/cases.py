@@ -188,7 +188,7 @@ def turning_point():
     whole multiples of 1/C per log level (all pixels are above 20), and not with a common brightening."""
     theta = 0.05
     t_s = trajectories.times(21, 200.0)
-    path = trajectories.vertical(torch.eye(4, dtype=torch.float64), 0.05, 10.0, t_s)
+    path = trajectories.Swinging(torch.eye(4, dtype=torch.float64), (0.0, 1.0, 0.0), 0.05, 10.0)(t_s)
     camera = render.Camera(lens.Pinhole(20.0), 8, 8, 0.5, 4, 0)
     images = render.frames(camera, _plane(), path).requires_grad_()
     counts, level = events.memory(images, theta, theta)

@@ -181,24 +181,16 @@ def test_what_the_body_covers_is_found_through_the_texture():
     assert float(slope.sum()) == pytest.approx(-4.0, rel=0.05)
 
 
-def test_points_without_a_surface_and_what_is_forgotten():
+def test_points_without_a_surface_are_left_out():
     read, flow = lawful()
     half = torch.ones_like(read.share)
     half[:, ::2] = 0
-    blind = replace(
-        read, share=half, precision=torch.where(half[..., None, None] > 0, read.precision, 1e6 * UNIT)
+    wild = torch.where(half[..., None, None] > 0, read.precision, 1e6 * UNIT)
+    seen = {name: getattr(read, name)[:, 1::2] for name in (*READ, "flow_px")}
+    torch.testing.assert_close(
+        PrecisionTrend().add(replace(read, share=half, precision=wild), flow)._coefficients(),
+        PrecisionTrend().add(replace(read, **seen), flow[:, 1::2])._coefficients(),
     )
-    assert torch.allclose(
-        PrecisionTrend().add(blind, flow)._coefficients(),
-        PrecisionTrend().add(part(read), flow[:, 1::2])._coefficients(),
-    )
-    fresh = PrecisionTrend(forget=1.0).add(part(read), flow[:, 1::2]).add(read, flow)
-    assert torch.allclose(fresh._coefficients(), PrecisionTrend().add(read, flow)._coefficients())
-
-
-def part(read):
-    names = (*READ, "flow_px")
-    return replace(read, **{name: getattr(read, name)[:, 1::2] for name in names})
 
 
 def test_the_share_covered_is_told_by_window():

@@ -26,19 +26,18 @@ from codesign.mount import (
     Surroundings,
     UnknownDepth,
     VelocityHead,
+    body_flow,
     check_mount,
     expected_error,
     expected_errors,
     flow_precision,
-    information,
     judge,
     sight,
     sight_map,
     starts,
     velocity_errors,
-    velocity_from_flow,
 )
-from scenes import robots
+from scenes import bodies, robots
 
 D = torch.float64
 NAN, INF = math.nan, math.inf
@@ -47,14 +46,9 @@ AT, HALF, STILL = (0.2, -0.1, 0.4), (0.1, 0.05, 0.2), (0.0, 0.0, 0.0)
 CAMERA = render.Camera(lens.Pinhole(3.4), 24, 16, 0.2, 1)
 SMALL = render.Camera(lens.load("cooke-triplet"), 60, 60, 2.0, 1)
 DOWN = Mount((0.0, 0.0, 0.4), STILL, pitch_rad=math.pi / 2)().detach()
-UP = Mount((0.0, 0.0, 0.4), STILL, pitch_rad=-1.0)().detach()
 FLAT = torch.full((384,), 0.4, dtype=D)
-SKY = torch.full((384,), NAN, dtype=D)
-ONE = torch.where(torch.arange(384) == 5, FLAT, SKY)  # one pixel: two equations for three unknowns
-SADDLE = torch.tensor([[1.0, 2.0], [2.0, 1.0]], dtype=D).repeat(384, 1, 1)
-BOX = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-SIDES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-FACES = np.array([(a, b, c) for a, b, c, _ in SIDES] + [(a, c, d) for a, _, c, d in SIDES])
+BOX = bodies.box((1.0, 1.0, 1.0), (0.5, 0.5, 0.5))
+TURNED = np.concatenate([BOX.faces[:-1], BOX.faces[-1:, ::-1]])
 PARTS = robots.from_urdf(robots.ROVER).parts
 ROVER = Body.of(PARTS, without=["camera_link"])
 NEAR = Clearance(ROVER, Housing(0.03))
@@ -92,11 +86,8 @@ WRONG = [
     (lambda: Mount(AT, HALF).variables(CAMERA, 1.0, step_px=0), "step_px is 0"),
     (lambda: ranges(2, 0.5, 0.4), r"z_m goes from 0\.5 to 0\.4; give the lower bound first"),
     (lambda: ranges(4, 0.0, math.pi / 2), r"pitch_rad goes from 0 to 1\.57.*strictly between"),
-    (lambda: ranges(4, -2.0, 0.0), r"pitch_rad .*strictly between"),
     (lambda: ranges(3, -3.2, 3.2), r"yaw_rad .* more than a turn"),
-    (lambda: ranges(5, 0.0, 7.0), r"roll_rad .* more than a turn"),
     (lambda: ranges(0, NAN, 1.0), "NaN or infinite"),
-    (lambda: ranges(1, 0.0, INF), "NaN or infinite"),
     (lambda: MountRanges(LOW[:3], HIGH), r"low needs six numbers \(x_m, .*got shape \(3,\)"),
     (lambda: MountRanges(LOW, HIGH).pose(torch.zeros(5)), r"shares are \[\.\.\., 6\].*got \(5,\)"),
     (lambda: MountRanges(LOW, HIGH).pose(torch.full((6,), NAN)), "shares: 6 of 6 values"),
@@ -106,7 +97,7 @@ WRONG = [
     (lambda: Body([([(0, 0, NAN)] * 3, [(0, 1, 2)])]), "vertices"),
     (lambda: Body([([(0, 0, 0)] * 3, [(0, 1, 3)])]), "vertex 3; there are those from 0 to 2"),
     (lambda: Body([([(0, 0)] * 3, [(0, 1, 2)])]), r"\[V, 3\]"),
-    (lambda: Body([(BOX, np.concatenate([FACES[:-1], FACES[-1:, ::-1]]))]), "turn different ways"),
+    (lambda: Body([(BOX.vertices_m, TURNED)]), "turn different ways"),
     (lambda: Body.of(PARTS, without=["arm"]), "'arm'; there are"),
     (lambda: Housing(0.0), "radius_m is 0"),
     (lambda: Housing(0.1, -1.0), "behind_m is -1"),
@@ -114,12 +105,10 @@ WRONG = [
     (lambda: CableSide((0, 0, 1), 4.0), "between 0 and pi"),
     (lambda: LookAhead(-1.0, 0.3), "distance_m is -1"),
     (lambda: LookAhead(1.0, 1.3), "share is 1.3"),
-    (lambda: LookAhead(1.0, 0.3, ahead=(1, 0, 1)), "level"),
     (lambda: LookAhead(1.0, 0.3).slack(DOWN, NOTHING), "looks through the camera"),
     (lambda: Clearance(NOTHING, Housing(0.1), margin_m=-1), "margin_m is -1"),
     (lambda: Clearance(NOTHING, Housing(0.1), step=0), "step is 0"),
     (lambda: OwnBody(ROVER, 2.0), "largest_share is 2"),
-    (lambda: OwnBody(ROVER, 0.2, step=0.0), "step is 0"),
     (lambda: judge([], DOWN[None], NOTHING), r"one mount \[4, 4\]"),
     # what makes a search hopeless: inside the chassis; beside a wheel, hypot(1.62, 0.07, 0.1); millimetres;
     # on the mast
@@ -140,29 +129,18 @@ WRONG = [
     ),
     (lambda: check_mount(rover_mount(), [NEAR], SMALL), "image circle"),
     (
-        lambda: starts(rover_mount(), 3, [NEAR, CableSide((-1, 0, 0.4), 1.5)], CAMERA, reach_rad=0.2),
-        r"most, \d+%, fail first at 'cable side'",
+        lambda: starts(MountRanges(LOW, HIGH), 3, [NEAR, LookAhead(3.0, share=0.99)], CAMERA),
+        r"most, \d+%, fail first at 'look-ahead'",
     ),
-    (lambda: starts(rover_mount(), 3, reach_rad=4.0), "reach_rad is 4"),
-    # velocity from flow
-    (lambda: information(CAMERA, SKY, UP), "no pixel sees the ground"),
-    (lambda: information(CAMERA, ONE, DOWN), "not observable"),
-    (lambda: information(CAMERA, FLAT, DOWN, -torch.ones(384, dtype=D)), "negative"),
-    (lambda: information(CAMERA, FLAT, DOWN, SADDLE), "not symmetric and positive"),
-    (lambda: information(CAMERA, FLAT, DOWN, 0 * SADDLE), "positive weight"),
-    (lambda: information(CAMERA, FLAT, DOWN, prior=(1.0, 0.0, 1.0)), "prior"),
-    (lambda: information(CAMERA, FLAT, DOWN, prior=(1.0,) * 3, axes=FREE), "6 finite standard deviations"),
-    (lambda: information(CAMERA, FLAT, DOWN, axes=(0, 6)), "axes = "),
-    (lambda: information(CAMERA, FLAT[:7], DOWN), "one per pixel"),
-    (lambda: velocity_from_flow(torch.full((1, 2, 16, 24), NAN), CAMERA, FLAT, DOWN), "flow"),
-    (lambda: velocity_from_flow(torch.zeros(2, 16, 24), CAMERA, FLAT, DOWN), r"\[B, 2, H, W\]"),
+    # flow and what it tells
+    (lambda: body_flow(CAMERA, FLAT[:7], DOWN), "one per pixel"),
+    (lambda: body_flow(CAMERA, FLAT, NAN * DOWN), "T_body_cam"),
     (lambda: flow_precision(torch.zeros(4, 2)), "xx, xy, yy"),
     (lambda: flow_precision(torch.tensor([1.0, 2.0, 1.0])), "not positive"),
     (lambda: expected_error(torch.eye(3), (1.0, 1.0), (1.0, 1.0, 1.0)), "unit has 2 numbers"),
     (lambda: expected_error(torch.eye(2), (1.0, 1.0), (1.0, 0.0)), "prior is"),
     (lambda: sight(torch.eye(3).repeat(2, 1, 1), (1.0, 1.0, 1.0), PLANAR), "one information"),
     (lambda: sight_map(CAMERA, Surroundings(STILL), rows=1), "1 rows"),
-    (lambda: sight_map(CAMERA, Surroundings(STILL), unit=(1.0,)), "unit and prior need 6 numbers"),
     (lambda: Surroundings(STILL, deviation_px_s=0.0), "deviation_px_s"),
     # as a stage of a system
     (lambda: EgoVelocity(depth="guess"), "depth is 'guess'"),
@@ -170,10 +148,8 @@ WRONG = [
     (lambda: EgoVelocity(outlier=NAN), "outlier"),
     (lambda: velocity_errors(torch.zeros(2, 3), torch.zeros(2, 3), PLANAR), "velocities are"),
     (lambda: PrecisionTrend().followed(read(), torch.zeros(1, 4, 2, dtype=D)), "has seen no readings"),
-    (lambda: PrecisionTrend(1.5), "from 0 to 1"),
     (lambda: UnknownDepth(0.0, 1.0), "nearest"),
     (lambda: UnknownDepth(1.0, 1.0), "nearest"),
-    (lambda: UnknownDepth(NAN, 1.0), "nearest"),
     (lambda: UNKNOWN.solve(read()), "know their depth"),
     (lambda: expected_errors(UNKNOWN, read(torch.zeros(1, 4, 2, 6)), torch.zeros(1, 6)), "depth is known"),
     (lambda: VelocityHead(UNKNOWN), "head"),

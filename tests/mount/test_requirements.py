@@ -1,19 +1,17 @@
 """What a mount has to keep, against trigonometry and counting, and slopes against differences."""
 
 import math
-from typing import Any
 
 import pytest
 import torch
 
 from codesign import lens, render
-from codesign.mount import Body, CableSide, Clearance, Housing, LookAhead, Mount, judge, penalty, scene_depth
-from scenes import worlds
+from codesign.mount import Body, CableSide, Clearance, Housing, LookAhead, Mount, penalty
+from scenes import bodies
 
 D = torch.float64
 HEIGHT = 0.4
 STILL = (0.0, 0.0, 0.0)
-NOTHING: Any = None
 
 
 def mount_at(pitch_rad, position=(0.0, 0.0, HEIGHT), **angles):
@@ -31,9 +29,8 @@ def camera():
 
 @pytest.fixture(scope="module")
 def cube():
-    corners = torch.cartesian_prod(*[torch.tensor([-0.1, 0.1], dtype=D)] * 3)
-    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    return Body([(corners, [(a, b, c) for a, b, c, _ in sides] + [(a, c, d) for a, _, c, d in sides])])
+    box = bodies.box((0.2, 0.2, 0.2), (0.0, 0.0, 0.0))
+    return Body([(box.vertices_m, box.faces)])
 
 
 def test_clearance_is_that_of_the_housing_less_the_margin(cube, camera):
@@ -78,7 +75,6 @@ def test_what_looks_ahead_is_counted(camera, pitch_rad, angles):
     counted = beyond(camera, pose, 2.0)
     ahead = LookAhead(2.0, share=0.25)
     assert torch.equal(ahead.angles(pose, camera) >= 0, counted)
-    assert (float(ahead.exact(pose, camera)) >= 0) == (float(counted.double().mean()) >= 0.25)
 
 
 @pytest.mark.parametrize("share", [0.001, 0.1, 0.5, 0.77, 1.0])
@@ -91,27 +87,7 @@ def test_the_exact_answer_changes_with_the_last_pixel(camera, share):
         assert (float(ahead.exact(pose, camera)) >= 0) == (counted >= share * 384 - 1e-9)
 
 
-def test_before_a_scene_as_over_its_plane(camera):
-    """The ground as a scene: what is counted beyond the distance is the same."""
-    plane = worlds.smooth_plane()
-
-    def depth(camera, pixels, T_body_cam):
-        return scene_depth(camera, pixels[None], T_body_cam[None], plane)[0]
-
-    for pitch in (0.2, 0.5, 0.9):
-        pose = mount_at(pitch, roll_rad=0.2)
-        flat = LookAhead(1.5, share=0.3)
-        seen = LookAhead(1.5, share=0.3, depth=depth)
-        assert torch.equal(flat.angles(pose, camera) >= 0, seen.angles(pose, camera) >= 0)
-        found = seen.angles(pose, camera)
-        met = found < 1
-        # x metres ahead on the ground by the depth of the plane, (x - d) / hypot(x, d)
-        assert float(found[met].max()) < 1
-    up = LookAhead(1.5, share=0.3, depth=depth).angles(mount_at(-0.9), camera)
-    assert torch.equal(up, torch.ones_like(up))
-
-
-def requirements(cube, depth=None):
+def requirements(cube):
     return (
         Clearance(cube, Housing(0.03, behind_m=0.06), margin_m=0.2),
         CableSide((-1.0, 0.0, 0.2), 1.0, step=0.5),
@@ -159,17 +135,3 @@ def test_penalty_pushes_before_the_limit_and_is_smooth(cube, camera):
     (slope,) = torch.autograd.grad(found.sum(), height)
     torch.testing.assert_close(slope, -2 * over / 0.05, rtol=0, atol=1e-9)
     assert float(penalty([], poses, camera).abs().max()) == 0
-
-
-def test_a_search_by_penalty_ends_where_all_is_kept(cube, camera):
-    mount = Mount((0.0, 0.0, 0.2), (0.3, 0.3, 0.3), pitch_rad=1.4)
-    wanted = [Clearance(cube, Housing(0.1), margin_m=0.05), LookAhead(2.0, share=0.4)]
-    assert [verdict.kept for verdict in judge(wanted, mount(), camera)] == [False, False]
-    optimiser = torch.optim.Adam(mount.parameters(), lr=0.03)
-    for _ in range(100):
-        optimiser.zero_grad()
-        penalty(wanted, mount(), camera).backward()
-        optimiser.step()
-    verdicts = judge(wanted, mount().detach(), camera)
-    assert [verdict.kept for verdict in verdicts] == [True, True]
-    assert str(verdicts[0]).startswith("clearance: kept with 0.")

@@ -1,4 +1,4 @@
-"""What cameras are blind to, against closed forms of pinholes over ground and symmetries."""
+"""What cameras are blind to, against closed forms of pinholes over ground, symmetries, and errors of drawn estimates."""
 
 import math
 
@@ -8,7 +8,19 @@ import pytest
 import torch
 
 from codesign import lens, render
-from codesign.mount import ATTITUDES, VELOCITIES, Surroundings, sight_map, sight_table
+from codesign.mount import (
+    ATTITUDES,
+    PLANAR,
+    VELOCITIES,
+    Mount,
+    Surroundings,
+    expected_error,
+    flow_precision,
+    sight,
+    sight_map,
+    sight_table,
+    sight_units,
+)
 from codesign.report.mount_sphere import mount_sphere
 
 D = torch.float64
@@ -107,3 +119,66 @@ def test_the_picture_shows_the_map(camera, over_ground):
     line = figure.axes[0].lines[-1]
     assert np.asarray(line.get_xydata()).tolist() == [[-0.3, -1.0]]
     plt.close(figure)
+
+
+def test_precision_is_the_inverse(generator):
+    root = torch.randn(20, 2, 2, generator=generator, dtype=D)
+    full = root @ root.mT + 0.1 * torch.eye(2, dtype=D)
+    packed = torch.stack([full[:, 0, 0], full[:, 0, 1], full[:, 1, 1]], -1)
+    torch.testing.assert_close(flow_precision(packed), torch.linalg.inv(full), rtol=1e-12, atol=0)
+    floored = torch.linalg.inv(full + 0.09 * torch.eye(2, dtype=D))
+    torch.testing.assert_close(flow_precision(packed, 0.3), floored, rtol=1e-12, atol=0)
+
+
+def test_expected_error_is_what_estimates_miss_on_average(generator):
+    """Velocities drawn from the prior, measured with noise, estimated by the mean of what they can be."""
+    rows = torch.randn(7, 3, generator=generator, dtype=D)
+    prior = torch.tensor([0.5, 1.0, 2.0], dtype=D)
+    unit = torch.tensor([0.1, 0.1, 0.3], dtype=D)
+    draws = 20000
+    velocity = prior * torch.randn(draws, 3, generator=generator, dtype=D)
+    measured = velocity @ rows.T + torch.randn(draws, 7, generator=generator, dtype=D)
+    information = rows.T @ rows
+    estimate = measured @ rows @ torch.linalg.inv(information + torch.diag(prior**-2))
+    rms = ((estimate - velocity) / unit).square().mean().sqrt()
+    # three squared errors a draw: relative error 1 / sqrt(2 * draws) of one alone, five of them
+    assert float(expected_error(information, unit, prior)) == pytest.approx(float(rms), rel=5 / 200)
+
+
+def test_gradient_of_the_criterion_to_mount_and_lens(generator):
+    mount = Mount((0.1, 0.05, 0.4), (0.1, 0.1, 0.1), pitch_rad=0.9)
+    around = Surroundings((0.0, 0.0, 0.0), deviation_px_s=20.0)
+
+    def error(numbers, focal):
+        camera = render.Camera(lens.Pinhole(focal), 12, 8, 0.4, 1)
+        information, _ = around.information(camera, mount(numbers))
+        return expected_error(information, sight_units(around), (1.0,) * 6)
+
+    numbers = (0.2 * torch.randn(6, generator=generator, dtype=D)).requires_grad_()
+    focal = torch.tensor(4.0, dtype=D, requires_grad=True)
+    # rows are differences of chief rays, good to 1e-9 over steps of 1e-6
+    assert torch.autograd.gradcheck(error, (numbers, focal), eps=1e-5, atol=1e-5, rtol=1e-4)
+
+
+def test_sight_of_independent_velocities():
+    found = sight(torch.diag(torch.tensor([400.0, 25.0, 0.0], dtype=D)), (0.1, 0.2, 0.1), PLANAR)
+    assert found.deviation.tolist() == [0.05, 0.2, math.inf]
+    assert found.alone.tolist() == [0.05, 0.2, math.inf]
+    assert found.weakest_deviation == math.inf
+    assert found.weakest_named() == "+1.00 yaw"
+    assert (found.blind(), found.blind(0.6), found.blind(0.1)) == (
+        ["yaw"],
+        ["left", "yaw"],
+        ["forward", "left", "yaw"],
+    )
+
+
+def test_sight_of_two_that_look_alike():
+    """Forward and pitch seen by their sum alone, each measured a little: the difference shows least."""
+    together = torch.tensor([[1.0, 1.0], [1.0, 1.0]], dtype=D) * 100 + torch.eye(2, dtype=D)
+    found = sight(together, (1.0, 1.0), (0, 4))
+    inverse = torch.linalg.inv(together)
+    torch.testing.assert_close(found.deviation, inverse.diagonal().sqrt())
+    torch.testing.assert_close(found.alone, torch.full((2,), 101.0, dtype=D).rsqrt())
+    assert found.weakest_named() in ("+0.71 forward -0.71 pitch", "-0.71 forward +0.71 pitch")
+    assert found.weakest_deviation == pytest.approx(1.0)

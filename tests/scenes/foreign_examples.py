@@ -167,25 +167,15 @@ def _sheet(mi, centre, normal, size, bsdf):
     return {"type": "rectangle", "to_world": frame @ mi.ScalarTransform4f().scale(size / 2), "bsdf": bsdf}
 
 
-def _turned(mi, foot, bsdf, around=24):
+def _turned(mi, foot, bsdf):
     """A closed vase of triangles, its axis along y, 0.3 high."""
-    radius = np.array([0.06, 0.09, 0.1, 0.08, 0.05, 0.04, 0.06])
-    height = np.linspace(0, 0.3, len(radius))
-    turn = np.arange(around) * 2 * np.pi / around
-    rings = [
-        np.stack([r * np.sin(turn), 0 * turn + h, r * np.cos(turn)], 1)
-        for r, h in zip(radius, height, strict=True)
-    ]
-    vertices = np.concatenate([*rings, [[0, 0, 0], [0, 0.3, 0]]]) + foot
-    k = np.arange(around)
-    after = (k + 1) % around
-    low, high = around * len(radius), around * len(radius) + 1
-    faces = [np.stack([low + 0 * k, after, k], 1)]
-    for ring in range(len(radius) - 1):
-        a, b = ring * around, (ring + 1) * around
-        faces += [np.stack([a + k, a + after, b + after], 1), np.stack([a + k, b + after, b + k], 1)]
-    faces.append(np.stack([high + 0 * k, b + k, b + after], 1))
-    return emissive_mesh(mi, vertices, np.concatenate(faces), None, bsdf=bsdf)
+    import trimesh
+
+    radius = [0, 0.06, 0.09, 0.1, 0.08, 0.05, 0.04, 0.06, 0]
+    height = [0, *np.linspace(0, 0.3, 7), 0.3]
+    vase = trimesh.creation.revolve(np.stack([radius, height], 1), sections=24)
+    upright = vase.vertices[:, [1, 2, 0]] + foot
+    return emissive_mesh(mi, upright, vase.faces, None, bsdf=bsdf)
 
 
 def _sensor(mi, origin, target, fov):

@@ -34,7 +34,6 @@ def references(scene, view, camera):
     mi = backend.mitsuba()
     film = camera.film
     own = mi.traverse(scene.sensors()[0])
-    x, y = (film.windows_px or ((0, 0),))[0]
     sensor = mi.load_dict(
         {
             "type": "perspective",
@@ -47,10 +46,6 @@ def references(scene, view, camera):
                 "type": "hdrfilm",
                 "width": film.sensor_width_px,
                 "height": film.sensor_height_px,
-                "crop_width": film.width_px,
-                "crop_height": film.height_px,
-                "crop_offset_x": x,
-                "crop_offset_y": y,
                 "pixel_format": "luminance",
                 "rfilter": {"type": "box"},
             },

@@ -1,16 +1,16 @@
 """Robots from URDF: joint by joint against closed forms, bodies by volume, and what a mounted camera sees."""
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from codesign import lens, render
-from codesign.errors import DomainError, FileFormatError
+from codesign.errors import CodesignError, DomainError, FileFormatError
 from codesign.pose import inverse, look_at
 from scenes import robots, worlds
+from tests.scenes.solids import volume_m3
 
 CAMERA = render.Camera(lens.Pinhole(4.0), 32, 24, 0.2, samples_per_pixel=4)
 ARM = """<robot name="arm">
@@ -77,11 +77,6 @@ def test_a_joint_that_mimics_another_follows_it(tmp_path):
         robots.from_urdf(arm(tmp_path, more=more), {"follower": 0.1})
 
 
-def volume(part):
-    corners = part.vertices_m[part.faces]
-    return np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
-
-
 @pytest.mark.parametrize(
     ("geometry", "expected", "share"),
     [
@@ -93,7 +88,7 @@ def volume(part):
 )
 def test_bodies_have_their_volume(tmp_path, geometry, expected, share):
     [part] = robots.from_urdf(arm(tmp_path, geometry), {"shoulder": 1.0}).parts
-    assert volume(part) == pytest.approx(expected, rel=share)
+    assert volume_m3(part) == pytest.approx(expected, rel=share)
     assert part.colour[0] == pytest.approx(((0.5 + 0.055) / 1.055) ** 2.4)  # sRGB grey of one half
 
 
@@ -114,20 +109,20 @@ def test_meshes_are_found_by_package_and_path_at_their_scale(tmp_path):
     ):
         path = arm(tmp_path / "my_robot" / "urdf", f'<mesh filename="{name}" scale="0.1 -0.2 0.3"/>')
         [part] = robots.from_urdf(path).parts
-        assert volume(part) == pytest.approx(0.006, rel=1e-6)  # mirrored, and still outwards
+        assert volume_m3(part) == pytest.approx(0.006, rel=1e-6)  # mirrored, and still outwards
     mesh_of(tmp_path / "elsewhere" / "meshes", size=2.0)
     path = arm(tmp_path / "my_robot" / "urdf", '<mesh filename="package://my_robot/meshes/t.stl"/>')
     [part] = robots.from_urdf(path, packages={"my_robot": tmp_path / "elsewhere"}).parts
-    assert volume(part) == pytest.approx(8, rel=1e-6)
+    assert volume_m3(part) == pytest.approx(8, rel=1e-6)
 
 
 def test_collision_shapes_stand_in_and_are_shown_on_request():
     seen = robots.from_urdf(robots.ROVER)
     solid = robots.from_urdf(robots.ROVER, collision=True)
-    assert sum(volume(p) for p in seen.parts if p.name == "chassis") == pytest.approx(
+    assert sum(volume_m3(p) for p in seen.parts if p.name == "chassis") == pytest.approx(
         0.5 * 0.32 * 0.12 + 0.2 * 0.2 * 0.08
     )
-    assert sum(volume(p) for p in solid.parts if p.name == "chassis") == pytest.approx(0.5 * 0.32 * 0.2)
+    assert sum(volume_m3(p) for p in solid.parts if p.name == "chassis") == pytest.approx(0.5 * 0.32 * 0.2)
     assert {p.name for p in solid.parts} == {p.name for p in seen.parts}  # wheels have visual shapes alone
 
 
@@ -188,56 +183,64 @@ def test_a_jackal_of_shared_meshes_has_its_size(tmp_path, shared):
     assert len(robot.scene().scene.shapes()) >= 2
 
 
-def test_robots_that_cannot_be_are_refused(tmp_path):
-    path = arm(tmp_path)
-    cases: list[tuple[dict[str, Any], str]] = [
+MANY = '<mesh filename="package://lost/a.stl"/></geometry></visual><visual><geometry><mesh filename="b.dae"/>'
+SHAPES = [
+    (MANY, r"2 of its meshes.*lost/a.stl' is missing; 'b.dae' is missing"),
+    ('<mesh filename="http://127.0.0.1:9/a.stl"/>', "no path of this machine"),
+    (
+        '<box size="0.6 -0.4 1"/>',
+        r"the box of link '.*' has the size \[0.6, -0.4, 1.0\]; positive metres .* 3 of them",
+    ),
+    ('<cylinder radius="-0.1" length="1"/>', r"the cylinder of link .* needed, 2 of them"),
+    ('<sphere radius="-0.1"/>', r"the sphere of link .* needed, 1 of them"),
+    ('<mesh filename="t.stl" scale="1 0 1"/>', "has the scale .* leaves nothing of it"),
+]
+
+
+@pytest.mark.parametrize(("geometry", "sentence"), SHAPES)
+def test_shapes_that_cannot_be_are_refused(tmp_path, geometry, sentence):
+    mesh_of(tmp_path)
+    with pytest.raises(CodesignError, match=sentence):
+        robots.from_urdf(arm(tmp_path, geometry))
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
         ({"joint_angles": {"hip": 0.1}}, "no joint 'hip' that can be set; it has shoulder, elbow, slide"),
         ({"joint_angles": {"shoulder": 2.5}}, "'shoulder' at 2.5 lies outside its limits, -2 to 2"),
         ({"joint_angles": {"shoulder": math.nan}}, "'shoulder' at nan lies outside"),
         ({"base": "leg"}, "no frame 'leg'; it has base, upper"),
-    ]
-    for options, sentence in cases:
-        with pytest.raises(DomainError, match=sentence):
-            robots.from_urdf(path, **options)
+    ],
+)
+def test_joints_and_frames_that_are_not_there_are_refused(tmp_path, options, sentence):
+    with pytest.raises(DomainError, match=sentence):
+        robots.from_urdf(arm(tmp_path), **options)
+
+
+def test_files_that_are_no_robots_are_refused(tmp_path):
     with pytest.raises(DomainError, match="no frame 'hand'; it has base, upper, lower, finger, tip"):
-        robots.from_urdf(path).frame("hand")
-    two = '<mesh filename="package://lost/a.stl"/></geometry></visual><visual><geometry><mesh filename="b.dae"/>'
-    with pytest.raises(FileFormatError, match=r"2 of its meshes.*lost/a.stl' is missing; 'b.dae' is missing"):
-        robots.from_urdf(arm(tmp_path, two))
-    with pytest.raises(FileFormatError, match="no path of this machine"):
-        robots.from_urdf(arm(tmp_path, '<mesh filename="http://127.0.0.1:9/a.stl"/>'))
-    for geometry, sentence in (
+        robots.from_urdf(arm(tmp_path)).frame("hand")
+    (tmp_path / "bare.urdf").write_text('<robot name="a"><link name="b"/></robot>')
+    with pytest.raises(DomainError, match="nothing to see"):
+        robots.from_urdf(tmp_path / "bare.urdf").scene()
+    lost = '<joint name="j" type="fixed"><parent link="b"/><child link="c"/></joint>'
+    for name, content, sentence in (
+        ("nowhere.urdf", None, "is not a file"),
+        ("a.xacro", "<robot/>", "expand it first"),
+        ("half.urdf", ARM[:300], "no whole URDF"),
+        ("other.urdf", "<sdf/>", "instead of <robot>"),
         (
-            '<box size="0.6 -0.4 1"/>',
-            r"the box of link '.*' has the size \[0.6, -0.4, 1.0\]; positive metres are needed, 3",
-        ),
-        ('<cylinder radius="-0.1" length="1"/>', r"the cylinder of link .* needed, 2 of them"),
-        ('<sphere radius="-0.1"/>', r"the sphere of link .* needed, 1 of them"),
-    ):
-        with pytest.raises(DomainError, match=sentence):
-            robots.from_urdf(arm(tmp_path, geometry))
-    mesh_of(tmp_path)
-    with pytest.raises(DomainError, match=r"has the scale .* leaves nothing of it"):
-        robots.from_urdf(arm(tmp_path, '<mesh filename="t.stl" scale="1 0 1"/>'))
-    files = {
-        "nowhere.urdf": (None, "is not a file"),
-        "a.xacro": ("<robot/>", "expand it first"),
-        "half.urdf": (ARM[:300], "no whole URDF"),
-        "other.urdf": ("<sdf/>", "instead of <robot>"),
-        "lost.urdf": (
-            '<robot name="a"><link name="b"/><joint name="j" type="fixed"><parent link="b"/><child link="c"/></joint></robot>',
+            "lost.urdf",
+            f'<robot name="a"><link name="b"/>{lost}</robot>',
             "cannot be read|links that are not there: c",
         ),
-    }
-    for name, (content, sentence) in files.items():
+    ):
         if content is not None:
             (tmp_path / name).write_text(content)
         with pytest.raises(FileFormatError, match=sentence) as told:
             robots.from_urdf(tmp_path / name)
         assert "\n" not in str(told.value)
-    (tmp_path / "bare.urdf").write_text('<robot name="a"><link name="b"/></robot>')
-    with pytest.raises(DomainError, match="nothing to see"):
-        robots.from_urdf(tmp_path / "bare.urdf").scene()
 
 
 LIMIT = '<limit lower="-1" upper="1" effort="1" velocity="1"/>'
@@ -248,10 +251,14 @@ SECOND = '<link name="c"/><joint name="{}" type="continuous"><parent link="{}"/>
     ("kind", "inside", "more", "sentence"),
     [
         ("revolute", LIMIT + '<axis xyz="0 0 0"/>', "", "joint 'j' has the axis 0 0 0"),
-        ("prismatic", LIMIT + '<axis xyz="0 0 0"/>', "", "joint 'j' has the axis 0 0 0"),
-        ("continuous", '<axis xyz="0 nan 1"/>', "", "joint 'j' .* not finite"),
-        ("fixed", '<origin xyz="nan 0 0"/>', "", "joint 'j' .* not finite"),
-        ("fixed", '<origin rpy="0 inf 0"/>', "", "joint 'j' .* not finite"),
+        ("continuous", '<axis xyz="0 nan 1"/>', "", "joint 'j' has the axis 0 nan 1"),
+        ("fixed", '<origin rpy="0 inf 0"/>', "", "places that are not finite"),
+        (
+            "continuous",
+            '<mimic joint="k" offset="nan"/>',
+            SECOND.format("k", "a", ""),
+            "places that are not finite",
+        ),
         ("fixed", "", SECOND.format("j", "a", ""), "several joints are called j"),
         ("fixed", "", '<link name="b"/>', "several links are called b"),
         ("bendy", "", "", "of the type 'bendy', which is none of revolute"),
@@ -259,7 +266,6 @@ SECOND = '<link name="c"/><joint name="{}" type="continuous"><parent link="{}"/>
         ("fixed", "", '<link name="c"/>', "2 root links instead of 1: a, c"),
         ("continuous", '<mimic joint="zz"/>', "", "'j' mimics 'zz', which is no joint that moves by itself"),
         ("continuous", '<mimic joint="k"/>', SECOND.format("k", "a", '<mimic joint="j"/>'), "'j' mimics 'k'"),
-        ("fixed", '<mimic joint="k" offset="nan"/>', SECOND.format("k", "a", ""), "joint 'j' .* not finite"),
     ],
 )
 def test_joints_that_make_no_robot_are_one_sentence(tmp_path, kind, inside, more, sentence):
@@ -276,7 +282,7 @@ def test_joints_that_make_no_robot_are_one_sentence(tmp_path, kind, inside, more
 def test_a_shape_without_a_place_is_refused(tmp_path):
     box = '<visual><origin xyz="0 nan 0"/><geometry><box size="1 1 1"/></geometry></visual>'
     (tmp_path / "r.urdf").write_text(f'<robot name="r"><link name="a">{box}</link></robot>')
-    with pytest.raises(FileFormatError, match="a shape of link 'a' has an origin that is not finite"):
+    with pytest.raises(FileFormatError, match="places that are not finite"):
         robots.from_urdf(tmp_path / "r.urdf")
 
 

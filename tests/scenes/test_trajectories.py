@@ -65,42 +65,15 @@ def test_times_and_body_twists_are_even_steps_in_the_cameras_own_axes():
     t = trajectories.times(9, 200.0)
     assert_close(t, 0.005 * torch.arange(9, dtype=D), rtol=0, atol=1e-17)
     twists = torch.tensor([[0.3, 0.0, 0.1, 0.0, 0.5, 0.2], [0.0, 0.1, 0.0, 0.3, 0.0, 0.0]], dtype=D)
-    paths = trajectories.body_twist(START, twists, t)
-    assert_close(paths[:, 0], START.expand(2, 4, 4), rtol=0, atol=0)
-    steps = inverse(paths[:, :-1].flatten(0, 1)) @ paths[:, 1:].flatten(0, 1)
-    matrix = torch.zeros(4, 4, dtype=D)
-    for twist, part in zip(twists, steps.unflatten(0, (2, 8)), strict=True):
-        rate = twist[3:]
-        matrix[:3, :3] = torch.linalg.cross(rate.expand(3, 3), torch.eye(3, dtype=D)).mT
-        matrix[:3, 3] = twist[:3]
-        assert_close(part, torch.linalg.matrix_exp(0.005 * matrix).expand(8, 4, 4), rtol=0, atol=1e-14)
+    rates = torch.zeros(2, 4, 4, dtype=D)
+    rates[:, :3, :3] = torch.linalg.cross(twists[:, None, 3:], torch.eye(3, dtype=D)[None]).mT
+    rates[:, :3, 3] = twists[:, :3]
+    expected = START @ torch.linalg.matrix_exp(t[:, None, None] * rates[:, None])
+    assert_close(trajectories.body_twist(START, twists, t), expected, rtol=0, atol=1e-14)
     path = trajectories.translation(START, (0.5, -0.2, 0.1), t)
     assert_close(path[:, :3, :3], START[:3, :3].expand(9, 3, 3), rtol=0, atol=1e-15)
     expected = 0.5 * START[:3, 0] - 0.2 * START[:3, 1] + 0.1 * START[:3, 2]
     assert_close(path[:, :3, 3] - START[:3, 3], t[:, None] * expected, rtol=0, atol=1e-14)
-
-
-def test_an_orbit_keeps_its_distance_and_looks_at_the_centre():
-    t = trajectories.times(25, 20.0)
-    path = trajectories.orbit((0.5, -0.2, 1.0), 2.0, 0.7, 3.0, t, phase_rad=0.4)
-    check_poses(path)
-    bearing = 0.4 + 3.0 * t
-    away = torch.stack([2 * bearing.cos(), 2 * bearing.sin(), torch.full_like(t, 0.7)], 1)
-    assert_close(path[:, :3, 3], torch.tensor([0.5, -0.2, 1.0], dtype=D) + away, rtol=0, atol=1e-14)
-    assert_close(path[:, :3, 2], -away / math.hypot(2.0, 0.7), rtol=0, atol=1e-14)
-
-
-def test_oscillations_move_along_their_axis_of_any_length():
-    t = trajectories.times(201, 1000.0)
-    shift = 0.05 * (2 * pi * 4.0 * t).sin()
-    for path, axis in (
-        (trajectories.radial(START, 0.05, 4.0, t), (0, 0, 1)),
-        (trajectories.vertical(START, 0.05, 4.0, t), (0, 1, 0)),
-        (trajectories.oscillation(START, (3, 0, 4), 0.05, 4.0, t), (0.6, 0, 0.8)),
-    ):
-        expected = shift[:, None] * (START[:3, :3] @ torch.tensor(axis, dtype=D))
-        assert_close(path[:, :3, 3] - START[:3, 3], expected, rtol=0, atol=1e-15)
-        assert_close(path[:, :3, :3], START[:3, :3].expand(201, 3, 3), rtol=0, atol=1e-15)
 
 
 def test_orbits_have_their_radius_rate_and_view():
@@ -164,7 +137,7 @@ def test_a_robot_without_slip_obeys_its_wheels():
     still = {"heave_m": 0, "pitch_rad": 0, "roll_rad": 0, "slip": 0.0, "side_slip_s": 0.0}
     robot = driving(track_m=0.25, y_m=-0.1, **still)
     t = torch.linspace(0, 5, 501, dtype=D)
-    left, right = robot.wheel_speeds(t).unbind(1)
+    left, right = (wheel(t) for wheel in robot._wheels)
     twist = robot.velocity(t)
     assert_close(twist[:, 0], (left + right) / 2, rtol=0, atol=1e-12)
     assert_close(twist[:, 5], (right - left) / 0.25, rtol=0, atol=1e-12)
@@ -172,8 +145,8 @@ def test_a_robot_without_slip_obeys_its_wheels():
     assert float(twist[:, 1:5].abs().max()) < 1e-12
     # the path by integrating the wheels alone
     nodes, weights = gauss(64)
-    yaw = robot.heading_rad(5 * nodes)
-    step = 5 * weights * robot.wheel_speeds(5 * nodes).mean(1)
+    yaw = robot._yaw(5 * nodes)
+    step = 5 * weights * sum(wheel(5 * nodes) for wheel in robot._wheels) / 2
     end = torch.tensor([0.3, -0.1], dtype=D) + torch.stack([step @ yaw.cos(), step @ yaw.sin()])
     poses = robot(t)
     assert_close(poses[-1, :2, 3], end, rtol=0, atol=1e-12)
@@ -184,8 +157,8 @@ def test_slip_slows_and_slides_outwards_and_the_shake_stays_in_its_bounds():
     shake = {"heave_m": 0.004, "pitch_rad": 0.01, "roll_rad": 0.02}
     robot = driving(slip=0.1, side_slip_s=0.05, turn_swing_rad_s=0.2, **shake)
     t = torch.linspace(0, 5, 2001, dtype=D)
-    forward, left, turn = robot.ground_velocity(t).unbind(1)
-    share = forward / robot.wheel_speeds(t).mean(1)
+    forward, left, turn = robot._ground(t).unbind(1)
+    share = forward / (sum(wheel(t) for wheel in robot._wheels) / 2)
     assert 0.9 - 1e-15 <= float(share.min()) < 0.97
     assert 0.93 < float(share.max()) <= 1 + 1e-15
     assert_close(left, -0.05 * forward * turn, rtol=0, atol=1e-15)
@@ -200,16 +173,11 @@ def test_slip_slows_and_slides_outwards_and_the_shake_stays_in_its_bounds():
         assert 0.5 * bound < float(swing.abs().max()) <= bound + 1e-12
 
 
-@pytest.fixture(scope="module")
-def snap():
-    points = torch.randn(6, 3, generator=seeded(7), dtype=D)
-    return points, minimum_snap(points, torch.tensor([0.0, 0.8, 2.1, 2.9, 4.4, 5.0], dtype=D))
-
-
-def test_minimum_snap_obeys_euler_and_lagrange(snap):
+def test_minimum_snap_obeys_euler_and_lagrange():
     """Degree 7 through the points, rest at both ends and six continuous derivatives: these conditions have one
     solution, and it is the one of least snap."""
-    points, path = snap
+    points = torch.randn(6, 3, generator=seeded(7), dtype=D)
+    path = minimum_snap(points, torch.tensor([0.0, 0.8, 2.1, 2.9, 4.4, 5.0], dtype=D))
     t = path.knots_s
     assert_close(path(t), points, rtol=0, atol=1e-11)
     for order in (1, 2, 3):
@@ -230,32 +198,13 @@ def test_minimum_snap_obeys_euler_and_lagrange(snap):
     assert_close(line(t)[:, 0], rest_to_rest, rtol=0, atol=1e-13)
 
 
-def test_the_snap_of_a_path_is_its_cost_and_a_detour_has_more(snap):
-    points, path = snap
-    nodes, weights = gauss(8)
-    at = path.knots_s[:-1, None] + path.knots_s.diff()[:, None] * nodes
-    squared = path(at.flatten(), 4).square().sum(1).reshape(at.shape)
-    cost = float(path.cost())
-    assert cost == pytest.approx(float((squared @ weights) @ path.knots_s.diff()), rel=1e-11)
-    middle = torch.tensor([2.5], dtype=D)
-    t = torch.cat([path.knots_s, middle]).sort().values
-
-    def through(shift):
-        return float(minimum_snap(torch.cat([points[:3], path(middle) + shift, points[3:]]), t).cost())
-
-    # a point of the path changes nothing
-    assert through(0.0) == pytest.approx(cost, rel=1e-9)
-    assert through(0.01) > cost
-    assert through(-0.01) > cost
-
-
 def test_a_flight_obeys_newton_and_its_rates_are_those_of_differential_flatness():
     flight = flying()
     t = torch.linspace(0.01, 4.7, 301, dtype=D)
     pose = flight(t)
     acceleration, jerk = (flight.path(t, order)[:, :3] for order in (2, 3))
     forward, left, up = pose[:, :3, :3].unbind(2)
-    thrust = flight.thrust_m_s2(t)
+    thrust = flight._thrust(t).norm(dim=1)
     gravity = torch.tensor([0.0, 0.0, 9.81], dtype=D)
     assert_close(thrust[:, None] * up, acceleration + gravity, rtol=0, atol=1e-12)
     # Mellinger and Kumar, eq. 7 and below: the change of thrust direction gives roll and pitch rate
@@ -289,15 +238,9 @@ def test_a_mounted_camera_passes_gradients_to_its_mount():
 DROP = [[0, 0, 0], [0, 0, 8.0], [0, 0, 0]]
 REFUSED = [
     (DomainError, "at least 2 frames", lambda: trajectories.times(1, 100.0)),
-    *(
-        (DomainError, f"rate_hz = {rate}", lambda rate=rate: trajectories.times(5, rate))
-        for rate in (0.0, math.nan)
-    ),
-    (DomainError, "axis", lambda: trajectories.oscillation(START, (0, 0, 0), 0.1, 3.0, torch.arange(5.0))),
+    (DomainError, "rate_hz = nan", lambda: trajectories.times(5, math.nan)),
     (DomainError, "finite seconds", lambda: driving()([0.0, math.nan])),
     (DomainError, "from 0 to 5 s", lambda: driving()([5.1])),
-    (DomainError, "from 0 to 5 s", lambda: driving()([-0.1])),
-    (ShapeError, "list of times", lambda: driving()([])),
     (ShapeError, "list of times", lambda: driving()([[0.0]])),
     (DomainError, "slip = 1", lambda: driving(slip=1.0)),
     (DomainError, "finite numbers", lambda: driving(height_m=math.inf)),

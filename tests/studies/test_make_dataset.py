@@ -28,7 +28,7 @@ from codesign.render.projection import TOLERANCE_PX, ProjectionTable
 from codesign.render.truth import flow_and_occlusion, truth_of_frames, view
 from scenes import dataset_motion as motions
 from scenes import worlds
-from scenes.stages import Stage, make_world
+from scenes.dataset_motion import Stage, make_world
 from scenes.tum import read_tum
 from studies.frame.run import main
 from studies.make_dataset import __main__ as study
