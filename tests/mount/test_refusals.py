@@ -129,7 +129,7 @@ WRONG = [
     ),
     (lambda: check_mount(rover_mount(), [NEAR], SMALL), "image circle"),
     (
-        lambda: starts(MountRanges(LOW, HIGH), 3, [NEAR, LookAhead(3.0, share=0.99)], CAMERA),
+        lambda: starts(ranges(4, 0.9, 1.5), 3, [NEAR, LookAhead(3.0, share=0.9)], CAMERA),
         r"most, \d+%, fail first at 'look-ahead'",
     ),
     # flow and what it tells
