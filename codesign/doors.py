@@ -19,7 +19,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, NoReturn, ParamSpec, TypeVar
 
-from codesign.errors import CodesignError, DomainError, ShapeError
+from codesign.errors import CodesignError, DomainError, ShapeError, shown
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -226,14 +226,3 @@ def _within(values, hint, kind):
     needs = (mismatch(each, hint) for each in values)
     needed = next(filter(None, needs), "")
     return f"a {kind.__name__} of which each is {needed}" if needed else ""
-
-
-def shown(value: Any) -> str:
-    """A value in a few words: the shape and type of what has them."""
-    shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
-    if shape is not None and dtype is not None:
-        where = "" if str(getattr(value, "device", "cpu")) == "cpu" else f" on {value.device}"
-        return f"{type(value).__name__} {list(shape)} {str(dtype).removeprefix('torch.')}{where}"
-    if isinstance(value, (str, int, float, complex, list, tuple, types.NoneType)):
-        return " ".join(repr(value).split())[:60]
-    return f"a {type(value).__name__}"

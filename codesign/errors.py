@@ -1,9 +1,7 @@
 """One small family of exceptions. Every message says what was given, what is allowed, and what to do."""
 
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:  # sentences cost no import of torch
-    from torch import Tensor
+from pathlib import PurePath
+from typing import Any
 
 
 class CodesignError(Exception):
@@ -39,48 +37,10 @@ class NonFiniteError(CodesignError, ArithmeticError):
 
 
 def shown(value: Any) -> str:
-    """A wrong value in one short line of a message."""
-    return " ".join(repr(value).split())[:80]
-
-
-def as_number(value: Any, name: str) -> float:
-    """A real number as a float, NaN and infinity too; DomainError for text, lists, complex numbers, None."""
-    try:
-        if isinstance(value, str):
-            raise TypeError
-        return float(value)
-    except (TypeError, ValueError, RuntimeError, OverflowError):
-        raise DomainError(f"{name} = {shown(value)} is no number; give one.") from None
-
-
-def check_whole(value: Any, name: str) -> int:
-    """A whole number of at least 1 as an int; DomainError for anything else."""
-    number = as_number(value, name)
-    if not (1 <= number < float("inf") and number % 1 == 0):
-        raise DomainError(f"{name} = {value} must be a whole number of at least 1.")
-    return int(value)
-
-
-def check_seed(value: Any, name: str, bits: int = 63) -> int:
-    """A seed as an int, whole and below 2 ** bits in size; DomainError for anything else."""
-    number = as_number(value, name)
-    if not (abs(number) < 2**bits and number % 1 == 0):
-        raise DomainError(f"{name} = {value} must be a whole number between -2^{bits} and 2^{bits}.")
-    return int(value)
-
-
-def check_finite(
-    tensor: "Tensor", name: str, remedy: str = "remove or repair the non-finite entries"
-) -> "Tensor":
-    """Raise DomainError when ``tensor`` holds NaN or infinity; return it unchanged otherwise."""
-    if bool(tensor.detach().sum().isfinite()):  # one pass, and no finite entry can hide another that is not
-        return tensor
-    finite = tensor.detach().isfinite()
-    if not bool(finite.all()):
-        bad = int((~finite).sum())
-        first = (~finite).nonzero()[0].tolist()
-        raise DomainError(
-            f"{name}: {bad} of {finite.numel()} values are NaN or infinite (first at index {first}); "
-            f"{remedy}."
-        )
-    return tensor
+    """A wrong value in one short line of a message: shape and type of what has them, the kind of what is long."""
+    shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
+    if shape is not None and dtype is not None:
+        where = "" if str(getattr(value, "device", "cpu")) == "cpu" else f" on {value.device}"
+        return f"{type(value).__name__} {list(shape)} {str(dtype).removeprefix('torch.')}{where}"
+    plain = value is None or isinstance(value, (str, bytes, int, float, complex, list, tuple, dict, PurePath))
+    return " ".join(repr(value).split())[:80] if plain else f"a {type(value).__name__}"

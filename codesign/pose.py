@@ -9,8 +9,9 @@ import torch
 from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
+from codesign.checks import check_finite
 from codesign.doors import explain
-from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.errors import DomainError, ShapeError
 
 # [..., T, 4, 4], or [4, 4] where one pose is asked for; numbers other than tensors are taken in float64
 Poses: TypeAlias = Tensor | np.ndarray | Sequence[Any]

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from codesign import backend
-from codesign.errors import DomainError, as_number
+from codesign.checks import check_positive
+from codesign.errors import DomainError
 from codesign.render import MitsubaScene, light
 from codesign.render.charts import emissive_mesh
 from scenes import bodies, textures
@@ -169,8 +170,7 @@ def _bitmap(mi, paint, scale):
 def check_sizes(what, **sizes):
     """Raise DomainError unless every size is positive and finite."""
     for name, value in sizes.items():
-        if not 0 < as_number(value, f"{what}: {name}") < math.inf:
-            raise DomainError(f"{what}: {name} = {value} must be positive and finite.")
+        check_positive(value, f"{what}: {name}")
 
 
 def rectangle(mi, centre, normal_to, width_m, height_m, up=(0, 0, 1)):

@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from codesign import backend, lens
-from codesign.errors import DomainError, FileFormatError, check_whole
+from codesign.checks import check_choice, check_whole
+from codesign.errors import DomainError, FileFormatError
 from codesign.exclusive import exclusive
 from codesign.reading import building, reading
 from codesign.render import Camera
@@ -82,8 +83,7 @@ def from_mitsuba(
       picture); DomainError for a dictionary it cannot load, a scene without shapes or light, what cannot be baked
       (light.bake), an unknown level, unit or axis.
     """
-    if light not in LEVELS:
-        raise DomainError(f"light = {light!r} is not known; choose one of {', '.join(LEVELS)}.")
+    check_choice(light, "light", LEVELS)
     if samples is not None:
         samples = check_whole(samples, "samples")
     mi = backend.mitsuba(device)
@@ -213,10 +213,7 @@ def view_of(
 
 def _axes(up, unit_m):
     """R_world_file [3, 3]."""
-    if up not in UP:
-        raise DomainError(
-            f"up = {up!r} is not known; choose 'y' or 'z', the axis that points up in the file."
-        )
+    check_choice(up, "up", UP)
     if not 0 < unit_m < float("inf"):
         raise DomainError(
             f"unit_m = {unit_m} must be positive and finite: metres per unit of the file, 0.01 for centimetres."

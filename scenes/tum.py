@@ -16,7 +16,8 @@ from kornia.geometry.liegroup import Se3, So3
 from scipy.spatial.transform import Rotation
 
 from codesign.atomic import replacing
-from codesign.errors import DomainError, FileFormatError, ShapeError, check_finite
+from codesign.checks import check_finite
+from codesign.errors import DomainError, FileFormatError, ShapeError
 from codesign.pose import check_poses, inverse, se3_exp
 from codesign.reading import read_text
 from scenes.trajectories.trajectory import Trajectory

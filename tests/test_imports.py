@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     {"errors"},
-    {"doors"},
+    {"doors", "checks"},
     {"types", "optional", "reading", "exclusive", "atomic"},
     {"pose", "arrays", "backend", "plain_yaml", "interrupt", "grad"},
     {"state"},

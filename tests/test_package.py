@@ -15,6 +15,7 @@ PRIVATE = {
     "__init__",
     "__main__",
     "atomic",
+    "checks",
     "doctor",
     "doors",
     "interrupt",

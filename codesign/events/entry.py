@@ -1,20 +1,17 @@
 """What may enter an event layer: frames, thresholds, times. Everything else is refused with a sentence."""
 
-import math
-from collections.abc import Iterable, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, FileFormatError, ShapeError, as_number, check_finite, shown
+from codesign.checks import FLOATS, LEAST, MOST, check, check_finite, check_kind, check_positive
+from codesign.errors import DomainError, ShapeError, shown
 
 Times = Tensor | Sequence[float] | np.ndarray  # seconds
 REAL = (torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.int32, torch.int16)
-LEAST = 1e-30  # of thresholds and time constants; its inverse is the largest
-MOST_WHOLE = 2**62
 MOST_VALUES = 2**32  # that are made in one call: 16 GB in single precision
 
 
@@ -30,39 +27,10 @@ def check_frames(
     Raises: ShapeError for too few frames or no pixels; DomainError for other types, NaN, infinite or negative
       values.
     """
-    check_layout(frames, minimum, name=name)
-    low, high = (float(bound) for bound in frames.detach().aminmax())
-    if not (math.isfinite(low) and math.isfinite(high)):
-        check_finite(frames, name)
-    if non_negative and low < 0:
-        first = (frames.detach() < 0).nonzero()[0].tolist()
-        raise DomainError(
-            f"{name} reach down to {low:g} (first negative at index {first}); intensities are 0 or more: "
-            "subtract the black level first."
-        )
-    return frames
-
-
-def check_layout(frames: Tensor, minimum: int = 2, *, name: str = "frames") -> None:
-    """The part of ``check_frames`` that reads no value: type, number of frames, pixels. For kernels that look
-    at the values themselves."""
-    if not isinstance(frames, Tensor) or frames.dtype not in (torch.float32, torch.float64):
-        given = frames.dtype if isinstance(frames, Tensor) else type(frames).__name__
-        raise DomainError(
-            f"{name} are {given}; a torch tensor of float32 or float64 is needed: convert with "
-            "torch.as_tensor(frames).float()."
-        )
-    if frames.layout != torch.strided or frames.is_meta:
-        given = "meta tensors without values" if frames.is_meta else f"stored as {frames.layout}"
-        raise DomainError(f"{name} are {given}; a dense tensor is needed (sparse ones: frames.to_dense()).")
-    if minimum and (frames.ndim == 0 or frames.shape[0] < minimum):
-        count = frames.shape[0] if frames.ndim else "no time axis, so 0"
-        raise ShapeError(
-            f"{name} hold {count} frame(s) (shape {list(frames.shape)}); at least {minimum} are needed, "
-            "time on the first axis."
-        )
-    if frames.numel() == 0:
-        raise ShapeError(f"{name} have shape {list(frames.shape)}, which holds no pixel; give at least one.")
+    axes = f"T>={minimum} ..."
+    least = 0.0 if non_negative else None
+    remedy = "intensities are 0 or more: subtract the black level first" if non_negative else ""
+    return check(frames, axes, name, FLOATS, least=least, finite=True, remedy=remedy)
 
 
 def check_per_pixel(
@@ -78,7 +46,7 @@ def check_per_pixel(
       ShapeError when it does not broadcast.
     """
     if not isinstance(value, Tensor):
-        value = as_number(value, name)
+        value = check_positive(value, name)
     elif value.dtype not in REAL or value.layout != torch.strided or value.is_meta:
         raise DomainError(
             f"{name} is a tensor of {value.dtype} on {value.device}; give a real number, or a dense tensor "
@@ -95,9 +63,9 @@ def check_per_pixel(
             f"{list(pixels)}."
         )
     low, high = (float(bound) for bound in value.detach().aminmax())
-    if not (low >= LEAST and high <= 1 / LEAST):
+    if not (low >= LEAST and high <= MOST):
         raise DomainError(
-            f"{name} spans {low:g} to {high:g}; every value must be a number > 0, from {LEAST:g} to {1 / LEAST:g}."
+            f"{name} spans {low:g} to {high:g}; every value must be a number > 0, from {LEAST:g} to {MOST:g}."
         )
     return value.to(frames.dtype if dtype is None else dtype)
 
@@ -143,45 +111,6 @@ def check_times(t_s: Times, count: int | None = None) -> Tensor:
     return times_s
 
 
-def check_positive(value: float, name: str, unit: str = "", least: float = LEAST) -> float:
-    """A number of at least ``least`` and at most 1e30 as a float; DomainError for anything else."""
-    number = as_number(value, name)
-    if not least <= number <= 1 / LEAST:
-        raise DomainError(
-            f"{name} is {shown(value)}; a finite number above 0{unit}, at least {least:g}, is needed."
-        )
-    return number
-
-
-def check_whole(value: int, name: str, least: int | None = None, most: int = MOST_WHOLE) -> int:
-    """A whole number as an int, at least ``least`` and at most ``most``; DomainError for anything else."""
-    number = math.nan if isinstance(value, bool) else as_number(value, name)
-    if (
-        not math.isfinite(number)
-        or int(value) != value
-        or not (-most if least is None else least) <= value <= most
-    ):
-        bounds = "" if least is None else f" >= {least}"
-        if number > most or (least is None and number < -most):
-            bounds += f" up to {most}"
-        raise DomainError(f"{name} is {shown(value)}; a whole number{bounds} is needed.")
-    return int(value)
-
-
-def check_flag(value: bool, name: str, meaning: str = "") -> bool:
-    """True or False; DomainError for anything else."""
-    if not isinstance(value, bool):
-        raise DomainError(f"{name} is {shown(value)}; True{meaning} or False is needed.")
-    return value
-
-
-def check_choice(value: str, name: str, allowed: Iterable[str]) -> str:
-    """One of several names; DomainError for anything else."""
-    if not isinstance(value, str) or value not in allowed:
-        raise DomainError(f"{name} is {shown(value)}; choose one of {', '.join(map(repr, allowed))}.")
-    return value
-
-
 def check_dtype(dtype: torch.dtype) -> None:
     """Raise DomainError for what is no real type of tensors."""
     if not any(dtype is one for one in REAL):
@@ -196,29 +125,10 @@ def check_room(values: float, what: str) -> None:
         )
 
 
-def check_path(path: str | Path) -> Path:
-    """A path of a file; FileFormatError for what is none."""
-    if not isinstance(path, (str, Path)) or not str(path) or "\0" in str(path):
-        raise FileFormatError(
-            f"the path is {shown(path)} ({type(path).__name__}); a str or pathlib.Path is needed."
-        )
-    return Path(path)
-
-
 def check_counts(counts: Tensor, *, non_negative: bool = False) -> None:
     """Raise unless ``counts`` are a float32 or float64 tensor [T-1, 2, ..., H, W] of finite numbers, 0 or
     more where asked; ShapeError for the axes, DomainError for the rest."""
-    check_layout(counts, 0, name="counts")
-    if counts.ndim < 4 or counts.shape[1] != 2 or 0 in counts.shape:
-        raise ShapeError(
-            f"counts have shape {list(counts.shape)}; [T-1, 2, H, W] or [T-1, 2, K, H, W] is needed, ON first "
-            "on axis 1, no axis empty."
-        )
-    check_finite(counts, "counts")
-    if non_negative and bool((counts < 0).any()):
-        raise DomainError(
-            f"counts reach down to {float(counts.detach().min()):g}; numbers of events are 0 or more."
-        )
+    check(counts, "T-1 2 ... H W", "counts", FLOATS, least=0.0 if non_negative else None, finite=True)
 
 
 def check_level(state: Tensor, level: Tensor) -> Tensor:
@@ -239,8 +149,8 @@ def check_level(state: Tensor, level: Tensor) -> Tensor:
 
 def check_state(state: object, kind: type) -> None:
     """Raise DomainError for a state that is neither None nor of its kind."""
-    if state is not None and not isinstance(state, kind):
-        raise DomainError(f"the state is a {type(state).__name__}; pass what the call before returned.")
+    if state is not None:
+        check_kind(state, kind, "the state", "pass what the call before returned")
 
 
 def check_chunk(frames: Tensor, shape: torch.Size, dtype: torch.dtype) -> None:

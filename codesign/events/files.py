@@ -5,9 +5,9 @@
 from pathlib import Path
 
 from codesign.atomic import replacing
+from codesign.checks import check_path, check_whole
 from codesign.errors import FileFormatError
 from codesign.events.columns import LIMIT_PX, EventColumns
-from codesign.events.entry import check_path, check_whole
 from codesign.events.formats.aedat import read_aedat2, read_aedat4, write_aedat2, write_aedat4
 from codesign.events.formats.arrays import read_arrays, write_npz
 from codesign.events.formats.arrival import Asked, check_asked

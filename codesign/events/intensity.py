@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from codesign import backend
-from codesign.events.entry import check_flag, check_frames
+from codesign.checks import check_flag
+from codesign.events.entry import check_frames
 from codesign.exclusive import exclusive
 
 JOINT = 20.0  # intensity on the 0-255 scale where the linear part meets the logarithm
@@ -61,7 +62,7 @@ class FrontEnd:
     log_input: bool = False
 
     def __post_init__(self):
-        check_flag(self.log_input, "log_input", " (frames are log levels)")
+        check_flag(self.log_input, "log_input")
 
     def level(self, frames):
         """Log level of a tensor of frames; gradient: frames."""

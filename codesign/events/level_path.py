@@ -6,11 +6,13 @@ Frames of a moving scene are samples of smooth curves. A straight line between t
 |L'''|/62.
 """
 
+import math
+
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, as_number
-from codesign.events.entry import Times, check_layout, check_room, check_times
+from codesign.checks import FLOATS, check, check_positive
+from codesign.events.entry import Times, check_room, check_times
 from codesign.events.intensity import FrontEnd, log_levels
 
 ROUNDING = 1e-3  # of a part: what rounding of times (float32, or seconds since 1970) adds makes no part more
@@ -39,7 +41,7 @@ def finer(frames: Tensor, t_s: Times, longest_s: float, *, log_input: bool = Fal
     >>> times_s.tolist(), found.flatten().tolist()  # the parabola through three frames
     ([0.0, 0.5, 1.0, 1.5, 2.0], [0.0, 0.75, 1.0, 0.75, 0.0])
     """
-    check_layout(frames)
+    check(frames, "T>=2 ...", "frames", FLOATS)
     given_s = check_times(t_s, len(frames))
     interval, share, times_s = parts(given_s, longest_s, max(frames[0].numel(), len(frames)))
     if len(times_s) == len(frames):
@@ -62,9 +64,7 @@ def parts(times_s: Tensor, longest_s: float, values: int = 1) -> tuple[Tensor, T
       times [K + 1] float64 of all ends, the given ones among them exactly.
     Raises: DomainError for a length that is not positive, or so short that the parts would fill the memory.
     """
-    longest = as_number(longest_s, "longest_s")
-    if not longest > 0:
-        raise DomainError(f"the longest interval is {longest_s!r} s; a length > 0 s is needed.")
+    longest = longest_s if longest_s == math.inf else check_positive(longest_s, "longest_s")
     duration_s = times_s.diff()
     count = (duration_s / longest - ROUNDING).ceil().clamp(min=1)
     check_room(float(count.sum()) * values, f"intervals of at most {longest:g} s")

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from codesign.backend import run_kernel
-from codesign.errors import DomainError, ShapeError, as_number, check_finite
-from codesign.events.entry import check_layout, check_level
+from codesign.checks import FLOATS, check, check_positive
+from codesign.errors import ShapeError
+from codesign.events.entry import check_level
 from codesign.events.intensity import light_share
 
 SERIES = 0.05  # below it (1 - e^-a)/a comes from a series: its first term left out is below 5e-10
@@ -56,9 +57,8 @@ def one_pole(level: Tensor, pace: Tensor, start: Tensor | None = None) -> Tensor
     Gradient: level, pace, start; exact.
     Raises: ShapeError when there are not as many paces as intervals; DomainError for levels of another type.
     """
-    check_layout(level, name="levels")
-    check_layout(pace, 1, name="paces")
-    check_finite(level, "levels")
+    check(level, "T>=2 ...", "levels", FLOATS, finite=True)
+    check(pace, "T-1 ...", "paces", FLOATS)
     if start is not None:
         check_level(start, level)
     if not 1 <= pace.ndim <= level.ndim or len(pace) != len(level) - 1:
@@ -93,12 +93,9 @@ def low_pass(
     Raises: ShapeError, DomainError as ``one_pole``; DomainError for a bandwidth that is not one number above
       0.
     """
-    check_layout(level, name="levels")
-    number = cutoff_hz.detach() if isinstance(cutoff_hz, Tensor) else cutoff_hz
-    if not 0 < as_number(number, "cutoff_hz") < math.inf:
-        raise DomainError(f"cutoff_hz is {number!r}; a finite number above 0 is needed.")
-    check_layout(intensity, name="intensity")
-    check_finite(intensity, "intensity")
+    check(level, "T>=2 ...", "levels", FLOATS)
+    check_positive(cutoff_hz, "cutoff_hz")
+    check(intensity, "T>=2 ...", "intensity", FLOATS, finite=True)
     if (
         not isinstance(interval_s, Tensor)
         or intensity.shape != level.shape

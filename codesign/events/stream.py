@@ -6,6 +6,7 @@ from numbers import Integral
 import torch
 from torch import Tensor
 
+from codesign.checks import check_kind
 from codesign.errors import DomainError, ShapeError
 from codesign.events.entry import Times, check_dtype, check_room, check_times
 from codesign.types import EventStream
@@ -37,11 +38,7 @@ def ordered(t_us: Tensor, x: Tensor, y: Tensor, p: Tensor, height_px: int, width
 def check_stream(stream: EventStream, part: slice = slice(None)) -> EventStream:
     """Return ``stream`` when it is one: lists of int64 of equal length and, in ``part``, times that do not go
     back, pixels of the sensor, polarities +1 and -1; DomainError, ShapeError otherwise."""
-    if not isinstance(stream, EventStream):
-        raise DomainError(
-            f"the events are a {type(stream).__name__}; an EventStream is needed, as events.read, "
-            "events.simulate and codesign.events.stream.ordered give it."
-        )
+    check_kind(stream, EventStream, "the events", "events.read and events.simulate give an EventStream")
     for side, name in ((stream.height_px, "height_px"), (stream.width_px, "width_px")):
         if isinstance(side, bool) or not isinstance(side, Integral) or not 0 <= side < 2**31:
             raise DomainError(

@@ -19,8 +19,8 @@ from safetensors import safe_open
 from torch import Tensor, nn
 
 from codesign.atomic import replacing
+from codesign.checks import check_choice, check_kind, check_path
 from codesign.errors import DomainError, FileFormatError
-from codesign.flow.checks import check_kind, check_path
 from codesign.reading import building, check_regular, reading
 
 if TYPE_CHECKING:
@@ -57,8 +57,7 @@ def network_class(name: str) -> type[Any]:
     """
     if ":" in name:
         raise DomainError(f"'{name}' is a class of your own; hand it over: flow.load(path, kind=...).")
-    if name not in NETWORKS:
-        raise DomainError(f"network '{name}' is unknown; choose one of {', '.join(sorted(NETWORKS))}.")
+    check_choice(name, "the network", sorted(NETWORKS))
     module, kind = NETWORKS[name].split(":")
     return getattr(importlib.import_module(module), kind)
 
@@ -97,8 +96,8 @@ def save(network: nn.Module, path: str | Path, metadata: Mapping[str, Any] | Non
     {'note': 'as delivered'}
     """
     path = check_path(path, "the path of a network file")
-    if metadata is not None and not isinstance(metadata, Mapping):
-        raise DomainError(f"the metadata are a {type(metadata).__name__}; a dictionary is needed.")
+    if metadata is not None:
+        check_kind(metadata, Mapping, "the metadata")
     weights = check_kind(network, nn.Module, "the network").state_dict()
     bad = [name for name, tensor in weights.items() if not bool(tensor.isfinite().all())]
     if bad:

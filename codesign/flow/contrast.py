@@ -14,18 +14,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from codesign.checks import check, check_kind, check_number, check_whole
 from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import check_whole
 from codesign.events.stream import check_stream
-from codesign.flow.checks import (
-    MOST_SIDE_PX,
-    check_count,
-    check_flow,
-    check_kind,
-    check_number,
-    check_real,
-    check_volume,
-)
+from codesign.flow.checks import MOST_SIDE_PX, MOST_STEPS, check_flow, check_volume
 from codesign.flow.warp import pixel_grid, read_at
 from codesign.types import EventStream, EventVolume
 
@@ -52,9 +44,9 @@ class EventTracks:
     def __post_init__(self) -> None:
         """Raises: DomainError, ShapeError unless the parts fit each other."""
         for name in ("height_px", "width_px"):
-            check_count(check_kind(getattr(self, name), int, name), name, 1, MOST_SIDE_PX)
+            check_whole(check_kind(getattr(self, name), int, name), name, 1, MOST_SIDE_PX)
         for name in ("x_px", "y_px", "time", "count", "flow_px"):
-            check_real(getattr(self, name), f"{name} of the tracks")
+            check(getattr(self, name), "...>=0", f"{name} of the tracks")
         flow = self.flow_px
         lone = [self.x_px.shape, self.y_px.shape, self.time.shape]
         fits = flow.ndim == 3 and flow.shape[1] == 2 and self.count.shape == flow.shape
@@ -116,11 +108,12 @@ def stream_tracks(
     """
     check_stream(stream)
     t0_us, t1_us = (
-        check_whole(end, f"{name} (whole microseconds)") for end, name in ((t0_us, "t0_us"), (t1_us, "t1_us"))
+        check_whole(end, f"{name} (whole microseconds)", None)
+        for end, name in ((t0_us, "t0_us"), (t1_us, "t1_us"))
     )
     if not -LATEST_US < t0_us < t1_us < LATEST_US:
         raise DomainError(f"the interval is {t0_us} to {t1_us} us; t1 > t0, both within 2^60 us, are needed.")
-    check_real(flow_px, "the flow of these events")
+    check(flow_px, "...>=0", "the flow of these events")
     flow = _entered(
         flow_px if flow_px.ndim == 4 else flow_px[None], (1, 2, stream.height_px, stream.width_px)
     )
@@ -275,7 +268,7 @@ def _entered(flow_px, shape):
 
 def _carried(flow, own, x, y, time, steps):
     """Flow [B, 2, N] of the tracks that pass (x, y) at a time."""
-    steps = check_count(steps, "carry_steps")
+    steps = check_whole(steps, "carry_steps", 0, MOST_STEPS)
     found = own
     for _ in range(steps):
         start = torch.stack([x, y]) - time * found

@@ -9,6 +9,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 from torch import Tensor, nn
 from torch.nn.functional import pad, silu
 
+from codesign.checks import check_kind, check_number, check_whole
 from codesign.errors import DomainError, shown
 from codesign.flow.checks import check_volume
 from codesign.types import EventVolume, FlowField
@@ -37,21 +38,14 @@ class Layer(nn.Module):
 
 def check_bins(bins: int, even: bool = False) -> None:
     """Raise DomainError unless a network can be built for this many bins."""
-    if (
-        isinstance(bins, bool)
-        or not isinstance(bins, int)
-        or not 2 <= bins <= MOST_BINS
-        or (even and bins % 2)
-    ):
-        raise DomainError(
-            f"bins is {shown(bins)}; {'an even' if even else 'a'} whole number >= 2, at most {MOST_BINS}, is needed."
-        )
+    check_whole(check_kind(bins, int, "bins"), "bins", 2, MOST_BINS)
+    if even and bins % 2:
+        raise DomainError(f"bins is {bins}; an even number is needed.")
 
 
 def check_sizes(width: float, hidden: int | None) -> None:
     """Raise DomainError unless layers can have these widths."""
-    if isinstance(width, bool) or not isinstance(width, (int, float)) or not 0 < width <= WIDEST:
-        raise DomainError(f"width is {shown(width)}; a number > 0 of channels, at most {WIDEST}, is needed.")
+    check_number(width, "width", above=0.0, most=WIDEST)
     if hidden is not None and (not isinstance(hidden, int) or not 4 <= hidden <= 8 * WIDEST or hidden % 4):
         raise DomainError(
             f"hidden is {shown(hidden)}; a multiple of 4, or None for 8 times the width, is needed."

@@ -13,8 +13,9 @@ from torch import Tensor, nn
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from codesign.atomic import replacing
-from codesign.errors import DomainError, ShapeError
-from codesign.flow.checks import MOST_SIDE_PX, check_count, check_kind, check_path, check_real
+from codesign.checks import check, check_kind, check_path, check_whole
+from codesign.errors import DomainError
+from codesign.flow.checks import MOST_SIDE_PX
 from codesign.flow.lk.lanes import plain_operations
 from codesign.flow.sources.windows import bin_times
 from codesign.optional import require
@@ -24,8 +25,7 @@ from codesign.types import EventVolume
 def evenly_timed(counts: Tensor) -> EventVolume:
     """EventVolume of counts [B, 2, bins, H, W] whose bins are those of codesign.events.from_stream: equally
     spaced nodes, the two at the ends collecting half, in an interval of 1 s."""
-    if check_real(counts, "the counts").ndim != 5 or counts.shape[1] != 2 or counts.shape[2] < 2:
-        raise ShapeError(f"the counts are {list(counts.shape)}; [B, 2, bins >= 2, H, W] is needed.")
+    check(counts, "B>=0 2 bins>=2 H>=0 W>=0", "the counts")
     return EventVolume(counts, *bin_times(counts.shape[2], 1.0))
 
 
@@ -81,7 +81,7 @@ def trace(network: nn.Module, height_px: int, width_px: int, batch: int = 1) -> 
         return field.flow_px, field.valid.to(field.flow_px) if field.confidence is None else field.confidence
 
     height_px, width_px, batch = (
-        check_count(value, name, 1, MOST_SIDE_PX)
+        check_whole(value, name, 1, MOST_SIDE_PX)
         for value, name in ((height_px, "height_px"), (width_px, "width_px"), (batch, "batch"))
     )
     config: dict[str, Any] = getattr(check_kind(network, nn.Module, "the network"), "config", {})

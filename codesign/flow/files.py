@@ -18,8 +18,8 @@ import torch
 from PIL import Image
 
 from codesign.atomic import replacing
-from codesign.errors import DomainError, FileFormatError, ShapeError
-from codesign.flow.checks import check_mask, check_path, check_real
+from codesign.checks import check, check_path
+from codesign.errors import DomainError, FileFormatError
 from codesign.reading import read_bytes, reading
 
 SCALE = 128.0
@@ -59,13 +59,12 @@ def write_flow(path: str | Path, flow_px: torch.Tensor, valid: torch.Tensor | No
     encode = _choose({".png": _to_png, ".flo": _to_flo}, path, "written")
     if isinstance(flow_px, np.ndarray) and np.asarray(flow_px).dtype.kind in "fiu":
         flow_px = torch.from_numpy(np.array(flow_px, np.float64))
-    flow = check_real(flow_px, "the flow to write").detach().cpu().double().numpy()
-    if flow.ndim != 3 or flow.shape[0] != 2 or 0 in flow.shape:
-        raise ShapeError(f"a flow to write must be [2, H, W], got {list(flow.shape)}.")
+    flow = check(flow_px, "2 H W", "the flow to write").detach().cpu().double().numpy()
     if isinstance(valid, np.ndarray) and valid.dtype == np.bool_:
         valid = torch.from_numpy(valid.copy())
     everything = torch.ones(flow.shape[1:], dtype=torch.bool)
-    seen = check_mask(everything if valid is None else valid, "the valid mask", flow.shape[1:]).cpu().numpy()
+    given = everything if valid is None else valid
+    seen = check(given, flow.shape[1:], "the valid mask", (torch.bool,)).cpu().numpy()
     if not np.isfinite(flow[:, seen]).all():
         raise DomainError("a flow marked as valid is NaN or infinite; mark it as not valid.")
     content = encode(flow, seen)

@@ -11,8 +11,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from codesign.checks import check, check_kind, check_number, check_positive
 from codesign.errors import DomainError, ShapeError
-from codesign.flow.checks import check_field, check_kind, check_number, check_real
+from codesign.flow.checks import check_field
 from codesign.flow.contrast import (
     area_change,
     sharpness,
@@ -44,7 +45,7 @@ _MOST = 2.5
 def charbonnier(squared: Tensor, epsilon: float, exponent: float = 0.5) -> Tensor:
     """(s + epsilon^2)^exponent - epsilon^(2 exponent) of squared lengths s: 0 at 0 to rounding, smooth,
     s^exponent far away. Source: Charbonnier et al., ICIP 1994; Sun et al., IJCV 2014."""
-    epsilon = check_number(epsilon, "epsilon", above=0.0)
+    epsilon = check_positive(epsilon, "epsilon")
     return (squared + epsilon**2) ** exponent - epsilon ** (2 * exponent)
 
 
@@ -169,13 +170,7 @@ def photometric_loss(frames: Tensor | None, flow_px: Tensor) -> Tensor:
       Spike-FlowNet, ECCV 2020.
     """
     flow_px = _full(flow_px)
-    if frames is not None:
-        check_real(frames, "the frames")
-    if frames is None or frames.shape != flow_px.shape:
-        raise ShapeError(
-            f"frames must be {list(flow_px.shape)}, start and end, for this flow; got "
-            f"{None if frames is None else list(frames.shape)}."
-        )
+    check(frames, tuple(flow_px.shape), "frames at start and end")
     height, width = flow_px.shape[2:]
     at = pixel_grid(height, width, flow_px) + flow_px
     last = flow_px.new_tensor([width - 1, height - 1])[:, None, None]
@@ -207,19 +202,15 @@ def smoothness_loss(flow_px: Tensor) -> Tensor:
 
 
 def _over_predictions(predictions, truth, gamma, per_pixel):
-    check_number(gamma, "gamma", above=0.0)
+    check_positive(gamma, "gamma")
     if not isinstance(predictions, Sequence) or not predictions:
         raise ShapeError("no prediction was given; a list of at least one FlowField is needed.")
     target = _known(truth)
     weights = 0.0
     total = target.new_zeros(())
     for field in predictions:
-        check_real(check_kind(field, FlowField, "a prediction").flow_px, "the flow of a prediction")
-        if field.flow_px.shape != target.shape:
-            raise ShapeError(
-                f"predictions must be {list(target.shape)} like the truth, at full resolution; got "
-                f"{list(field.flow_px.shape)}."
-            )
+        check_kind(field, FlowField, "a prediction")
+        check(field.flow_px, tuple(target.shape), "the flow of a prediction")
         total = gamma * total + _valid_mean(per_pixel(field, _full(field.flow_px) - target), truth.valid)
         weights = gamma * weights + 1
     return total / weights
@@ -239,7 +230,7 @@ def _per_sample(unit, flow):
     """[B, 1, 1], or [1, 1, 1] of a number."""
     if not isinstance(unit, torch.Tensor):
         unit = torch.tensor(check_number(unit, "unit_per_px", 0.0))
-    if check_real(unit, "unit_per_px").shape not in ((), flow.shape[:1]):
+    if check(unit, "...>=0", "unit_per_px").shape not in ((), flow.shape[:1]):
         raise ShapeError(
             f"unit_per_px must be a number or [B] for a flow {list(flow.shape)}; got {list(unit.shape)}."
         )
@@ -269,10 +260,7 @@ def _covariance(field):
     name, wanted = ("covariance_px2", (batch, 3, height, width))
     if field.covariance_px2 is None:
         name, wanted = ("confidence", (batch, height, width))
-    if check_real(getattr(field, name), f"{name} of a prediction").shape != wanted:
-        raise ShapeError(
-            f"{name} of a prediction must be {list(wanted)}, got {list(getattr(field, name).shape)}."
-        )
+    check(getattr(field, name), wanted, f"{name} of a prediction")
     if field.covariance_px2 is None:
         if not bool(((field.confidence >= 0) & (field.confidence <= 1)).all()):
             raise DomainError(
@@ -307,7 +295,5 @@ def _rise(value):
 
 def _full(flow_px):
     """The flow in at least single precision: places and squares in half precision would be far off."""
-    check_real(flow_px, "the flow")
-    if flow_px.ndim != 4 or flow_px.shape[1] != 2 or 0 in flow_px.shape:
-        raise ShapeError(f"the flow must be [B, 2, H, W], got {list(flow_px.shape)}.")
+    check(flow_px, "B 2 H W", "the flow")
     return flow_px.to(torch.promote_types(flow_px.dtype, torch.float32))

@@ -8,14 +8,9 @@ all samples together.
 import torch
 from torch import Tensor
 
+from codesign.checks import check, check_number
 from codesign.errors import DomainError, ShapeError
-from codesign.flow.checks import (
-    check_field,
-    check_mask,
-    check_number,
-    check_real,
-    check_volume,
-)
+from codesign.flow.checks import check_field, check_volume
 from codesign.flow.contrast import nearest_images, stream_tracks
 from codesign.types import EventStream, EventVolume, FlowField
 
@@ -28,7 +23,7 @@ def endpoint_error(flow: Tensor, truth: Tensor) -> Tensor:
 
 def _check(flow, truth):
     for value, name in ((flow, "the flow"), (truth, "the truth")):
-        check_real(value, name)
+        check(value, "...>=0", name)
     if flow.shape != truth.shape or flow.ndim < 3 or flow.shape[-3] != 2 or not flow.numel():
         raise ShapeError(
             f"flows must both be [..., 2, H, W]; got {tuple(flow.shape)} and {tuple(truth.shape)}."
@@ -40,7 +35,7 @@ def _check(flow, truth):
 def _masked(values, mask):
     """The values under the mask, flat; a non-finite one would count as no outlier, so it is refused."""
     if mask is not None:
-        check_mask(mask, "the mask", values.shape)
+        check(mask, tuple(values.shape), "the mask", (torch.bool,))
         if not bool(mask.any()):
             raise DomainError(
                 "the mask selects no pixel, so the error is undefined; check the valid and event masks."
@@ -68,7 +63,7 @@ def aee(flow: Tensor, truth: Tensor, mask: Tensor | None = None) -> Tensor:
 def zero_flow_error(truth: Tensor, mask: Tensor | None = None) -> Tensor:
     """Average endpoint error of the estimate "nothing moves", px: the mean true length, which every error
     should be compared with."""
-    return aee(torch.zeros_like(check_real(truth, "the truth")), truth, mask)
+    return aee(torch.zeros_like(check(truth, "...>=0", "the truth")), truth, mask)
 
 
 def outlier_percent(
@@ -151,7 +146,7 @@ def fwl(
     Gradient: none. Raises: DomainError for an interval without events, or with equally many events on every
       pixel. Source: Stoffregen et al., ECCV 2020, sec. 4.1.
     """
-    tracks = stream_tracks(stream, check_real(flow_px, "the flow").detach(), t0_us, t1_us, carry_steps)
+    tracks = stream_tracks(stream, check(flow_px, "...>=0", "the flow").detach(), t0_us, t1_us, carry_steps)
     still, moved = (
         nearest_images(tracks, time)[0].double().sum(1).var(correction=0) for time in (tracks.time, at)
     )
@@ -173,7 +168,7 @@ def rsat(stream: EventStream, flow_px: Tensor, t0_us: int, t1_us: int, carry_ste
     Gradient: none. Raises: DomainError for an interval without events, or when all leave the image, or lie at
       t0. Source: Hagenaars et al., NeurIPS 2021.
     """
-    tracks = stream_tracks(stream, check_real(flow_px, "the flow").detach(), t0_us, t1_us, carry_steps)
+    tracks = stream_tracks(stream, check(flow_px, "...>=0", "the flow").detach(), t0_us, t1_us, carry_steps)
     squares = []
     for time in (tracks.time, 1.0):
         counts, mean_time = (image.double() for image in nearest_images(tracks, time))

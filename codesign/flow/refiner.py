@@ -8,8 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, pad, pixel_shuffle, silu, unfold
 
+from codesign.checks import check_whole
 from codesign.errors import DomainError
-from codesign.flow.checks import check_count
+from codesign.flow.checks import MOST_STEPS
 from codesign.flow.entry import Layer, check_bins, pad_to, presence, takes_volume
 from codesign.flow.lk import estimate_lk
 from codesign.flow.refiner_evidence import AROUND, CELL, FEW, SOLVED, TOLD, TRIED, Evidence, larger
@@ -60,8 +61,8 @@ class Refiner(nn.Module):
     def __init__(self, bins: int = 8, width: int = 48, steps: int = 2) -> None:
         super().__init__()
         check_bins(bins)
-        check_count(steps, "steps", 1)
-        width = check_count(width, "width", 1)
+        check_whole(steps, "steps", 1, MOST_STEPS)
+        width = check_whole(width, "width", 1, MOST_STEPS)
         if width % 16:
             raise DomainError(f"width is {width}; a multiple of 16 is needed.")
         self.config: dict[str, Any] = {"bins": bins, "width": width, "steps": steps}

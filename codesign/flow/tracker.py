@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from codesign.checks import check, check_number, check_whole
 from codesign.errors import DomainError, ShapeError, shown
-from codesign.events.entry import check_whole
 from codesign.events.formats.arrival import BACKWARDS, OFF_SENSOR
 from codesign.events.stream import check_stream
 from codesign.events.volumes.volume import check_bins, from_stream
-from codesign.flow.checks import check_dense, check_field, check_number, check_size
+from codesign.flow.checks import check_field, check_size
 from codesign.flow.sources.packet import EMPTY
 from codesign.flow.warp import pixel_grid, read_at
 from codesign.types import EventStream, FlowField
@@ -294,7 +294,7 @@ def _rows_of(chunk):
     columns = []
     for name, given in zip(("t_us", "x", "y", "p"), chunk, strict=True):
         if isinstance(given, Tensor):
-            given = check_dense(given, name).detach().cpu().numpy()
+            given = check(given, "...>=0", name, (given.dtype,)).detach().cpu().numpy()
         values = np.asarray(given)
         whole = values.dtype.kind in "iub" or not values.size
         if values.dtype.kind == "f":

@@ -3,10 +3,10 @@ they fail."""
 
 from codesign.doors import explain
 from codesign.grad.certify import certify, worst
-from codesign.grad.differences import Difference, central, plateau
+from codesign.grad.differences import Difference, central
 from codesign.grad.fallback import Choice, choose, gradient
 from codesign.grad.row import Row
 
-__all__ = ["Choice", "Difference", "Row", "central", "certify", "choose", "gradient", "plateau", "worst"]
+__all__ = ["Choice", "Difference", "Row", "central", "certify", "choose", "gradient", "worst"]
 
 explain(globals())

@@ -8,6 +8,7 @@ from itertools import product
 
 import torch
 
+from codesign.checks import check_positive, check_whole
 from codesign.errors import DomainError
 from codesign.grad.differences import Ladder, rounding_noise
 from codesign.grad.groups import Loss, check_groups, components, gradients, random_lines, repeated
@@ -148,7 +149,6 @@ class _Group:
 def _check(steps, tolerance, directions):
     if not steps or not all(math.isfinite(h) and h > 0 for h in steps) or len(set(steps)) < len(steps):
         raise DomainError(f"ladder = {steps}: give one or more different, positive, finite steps.")
-    if not (math.isfinite(tolerance) and tolerance > 0):
-        raise DomainError(f"tolerance = {tolerance} must be positive and finite.")
-    if directions is not None and directions < 1:
-        raise DomainError(f"directions = {directions} must be at least 1, or None for every component.")
+    check_positive(tolerance, "tolerance")
+    if directions is not None:
+        check_whole(directions, "directions", remedy="None is every component")

@@ -2,7 +2,7 @@
 
 A difference over a step h is wrong by truncation, which falls with h^2, and by rounding, which grows with
 1/h. ``Ladder`` weighs both: rounding is measured (``rounding_noise``), truncation read off the rungs by
-extrapolation. ``plateau`` is the textbook rule without a measurement, for functions known to many digits.
+extrapolation.
 """
 
 import math
@@ -28,8 +28,8 @@ NEIGHBOURS = 5.0  # standard deviations by which neighbouring rungs may differ b
 class Difference:
     """A derivative by differences.
 
-    value: the derivative. step: the (smaller) rung it was taken from. noise: its standard deviation (of
-      ``plateau``: half the distance of two rungs). ladder: (step, difference) of every rung, large to small.
+    value: the derivative. step: the (smaller) rung it was taken from. noise: its standard deviation. ladder: (step,
+      difference) of every rung, large to small.
     left_out: steps where the function was not finite, or its argument did not move.
     """
 
@@ -45,23 +45,6 @@ def central(fn: Scalar, point: torch.Tensor, direction: torch.Tensor, step: floa
     both ends."""
     with torch.no_grad():
         return (float(fn(point + step * direction)) - float(fn(point - step * direction))) / (2 * step)
-
-
-def plateau(fn: Scalar, point: torch.Tensor, direction: torch.Tensor, steps: Sequence[float]) -> Difference:
-    """Differences over the ladder ``steps``; the plateau is the pair of neighbouring rungs that agree best.
-
-    Too small a step drowns in rounding, too large a one bends; between them neighbouring rungs agree. The
-    value is the mean of that pair and the noise half their distance (with one rung none is known, and it is
-    0). Two differences that are exactly zero agree because nothing moved: they count only where all are zero.
-    """
-    ladder = tuple((h, central(fn, point, direction, h)) for h in steps)
-    if len(ladder) == 1:
-        return Difference(ladder[0][1], ladder[0][0], 0.0, ladder)
-    moved = any(value for _, value in ladder)
-    gaps = [math.inf if moved and a[1] == b[1] == 0 else abs(a[1] - b[1]) for a, b in pairwise(ladder)]
-    best = min(range(len(gaps)), key=gaps.__getitem__)
-    value = (ladder[best][1] + ladder[best + 1][1]) / 2
-    return Difference(value, (ladder[best][0] * ladder[best + 1][0]) ** 0.5, gaps[best] / 2, ladder)
 
 
 def rounding_noise(

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, GradientError, NonFiniteError, as_number, check_seed, check_whole
+from codesign.checks import check_positive, check_seed, check_whole
+from codesign.errors import DomainError, GradientError, NonFiniteError
 from codesign.grad.differences import Difference, central
 from codesign.grad.groups import check_groups, components, gradients, loss_at, random_lines, repeated
 from codesign.grad.row import SIGMAS, make_row
@@ -87,8 +88,7 @@ def choose(
     """
     _check(params, scales, draws)
     for name, value in (("relative_l2", relative_l2), ("cosine", cosine)):
-        if not 0 < as_number(value, name) < math.inf:
-            raise DomainError(f"{name} = {value} must be positive and finite.")
+        check_positive(value, name)
     judged = judge or loss
     generator = generator or torch.Generator().manual_seed(0)
     count = check_whole(directions, "directions")

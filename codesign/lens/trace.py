@@ -10,7 +10,8 @@ from torch.nn.functional import pad
 from torch.utils.checkpoint import checkpoint
 
 from codesign.backend import run_kernel
-from codesign.errors import DomainError, ShapeError, check_finite, check_whole
+from codesign.checks import check_finite, check_whole
+from codesign.errors import DomainError, ShapeError
 from codesign.lens.kernel import FORWARD, GRAZING, Kernel, Status, Works
 
 

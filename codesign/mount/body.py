@@ -10,7 +10,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, as_number, check_finite
+from codesign.checks import check_finite, check_number, check_positive
+from codesign.errors import DomainError, ShapeError
 from codesign.mount.triangles import closest_points, first_crossings, nearest_to_edges, winding_numbers
 
 DEPTHS = 17  # points of a capsule's axis at which its depth inside a solid is looked for
@@ -42,10 +43,8 @@ class Housing:
     behind_m: float = 0.0
 
     def __post_init__(self):
-        if not 0 < as_number(self.radius_m, "radius_m") < float("inf"):
-            raise DomainError(f"housing: radius_m is {self.radius_m}; metres > 0 are needed.")
-        if not 0 <= as_number(self.behind_m, "behind_m") < float("inf"):
-            raise DomainError(f"housing: behind_m is {self.behind_m}; metres of at least 0 are needed.")
+        check_positive(self.radius_m, "housing: radius_m")
+        check_number(self.behind_m, "housing: behind_m", 0.0)
 
 
 class Body:

@@ -15,8 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, check_finite, check_whole
-from codesign.flow.checks import check_number
+from codesign.checks import check_finite, check_positive, check_whole
+from codesign.errors import DomainError
 from codesign.mount import unknown_depth
 from codesign.mount.depth import ground_depth, scene_depth
 from codesign.mount.observability import PLANAR, body_flow, flow_precision
@@ -121,8 +121,8 @@ class EgoVelocity:
         self.prior = tuple(float(value) for value in prior)
         self.depth = DEPTHS[depth] if isinstance(depth, str) else depth
         self.every_px = check_whole(every_px, "every_px")
-        self.floor_px = check_number(floor_px, "floor_px", above=0.0)
-        self.outlier = None if outlier is None else check_number(outlier, "outlier", above=0.0)
+        self.floor_px = check_positive(floor_px, "floor_px")
+        self.outlier = None if outlier is None else check_positive(outlier, "outlier")
         self.steps = check_whole(steps, "steps")
 
     def __call__(

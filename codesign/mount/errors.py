@@ -22,8 +22,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from codesign.checks import check_number, check_positive
 from codesign.errors import DomainError, ShapeError
-from codesign.flow.checks import check_number
 from codesign.mount.ego_velocity import EgoVelocity, Readings
 from codesign.mount.sight import LINEAR, NAMES
 
@@ -45,7 +45,7 @@ class FlowErrors:
         for name in ("claimed", "share"):
             check_number(getattr(self, name), name, least=0.0)
         for name in ("reach_px", "width_px"):
-            check_number(getattr(self, name), name, above=0.0)
+            check_positive(getattr(self, name), name)
 
     def covariance(self, read: Readings, flow_px: Tensor) -> Tensor:
         """[N, P, 2, 2] px^2 of the errors at readings whose true flow is [N, P, 2] px. Gradient: both."""

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import silu
 
-from codesign.errors import DomainError, FileFormatError, check_whole
+from codesign.checks import check_kind, check_whole
+from codesign.errors import DomainError, FileFormatError
 from codesign.flow import checkpoint
-from codesign.flow.checks import check_kind
 from codesign.mount.ego_velocity import EgoVelocity, Motion, Readings
 from codesign.mount.observability import FREE, chief_lines
 from codesign.mount.unknown_depth import UnknownDepth

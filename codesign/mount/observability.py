@@ -10,7 +10,8 @@ plane has three of these six: forward, lateral, yaw rate.
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.checks import check_finite
+from codesign.errors import DomainError, ShapeError
 from codesign.types import ChiefRayCamera
 
 # central differences of chief rays: exact for a pinhole, 1e-6 of the third derivative otherwise

@@ -13,7 +13,8 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.checks import check_finite, check_positive
+from codesign.errors import DomainError, ShapeError
 from codesign.mount.observability import chief_lines, flow_of_points
 from codesign.pose import check_poses, se3_exp
 from codesign.types import ChiefRayCamera
@@ -148,10 +149,7 @@ class Mount(nn.Module):
         Returns: [numbers], the mount's one Parameter, for torch.optim.
         Raises: DomainError when no pixel sees a surface, or the step is not positive and finite; ShapeError.
         """
-        if not 0 < step_px < math.inf:
-            raise DomainError(
-                f"mount: step_px is {step_px}; a natural step is positive and finite, such as 1."
-            )
+        check_positive(step_px, "mount: step_px")
         numbers = self.numbers.detach()
         with torch.no_grad():
             per_unit = self._image_motion(camera, depth_m)

@@ -15,7 +15,8 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, as_number, check_finite
+from codesign.checks import check_finite, check_number, check_positive
+from codesign.errors import DomainError, ShapeError
 from codesign.mount.body import Body, Housing
 from codesign.render import Camera, MitsubaScene, frames
 from codesign.render.charts import glowing
@@ -66,10 +67,7 @@ class Clearance:
     unit: str = "m"
 
     def __post_init__(self):
-        if not 0 <= as_number(self.margin_m, "clearance: margin_m") < math.inf:
-            raise DomainError(
-                f"clearance: margin_m is {self.margin_m}; finite metres of at least 0 are needed."
-            )
+        check_number(self.margin_m, "clearance: margin_m", 0.0)
         check_positive(self.step, "clearance: step")
 
     def slack(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
@@ -95,10 +93,7 @@ class CableSide:
     unit: str = "rad"
 
     def __post_init__(self):
-        if not 0 < as_number(self.half_angle_rad, "half_angle_rad") < math.pi:
-            raise DomainError(
-                f"cable side: half_angle_rad is {self.half_angle_rad}; give one between 0 and pi."
-            )
+        check_number(self.half_angle_rad, "cable side: half_angle_rad", above=0.0, below=math.pi)
         _direction(self.forbidden, "cable side: forbidden")
         check_positive(self.step, "cable side: step")
 
@@ -144,10 +139,7 @@ class LookAhead:
         check_positive(self.distance_m, "look-ahead: distance_m")
         check_positive(self.step, "look-ahead: step")
         for label in ("share", "smooth"):
-            if not 0 < as_number(getattr(self, label), label) <= 1:
-                raise DomainError(
-                    f"look-ahead: {label} is {getattr(self, label)}; a share above 0, at most 1, is needed."
-                )
+            check_number(getattr(self, label), f"look-ahead: {label}", above=0.0, most=1.0)
 
     def slack(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
         """[..., 1]: the mean of ``angles`` at the ranks around the one that ``exact`` looks at, so that a row
@@ -245,12 +237,6 @@ def _direction(vector, name):
     return given / given.norm()
 
 
-def check_positive(value: float, name: str) -> None:
-    """Raise DomainError unless it is a finite number > 0."""
-    if not 0 < as_number(value, name) < math.inf:
-        raise DomainError(f"{name} is {value}; a finite number > 0 is needed.")
-
-
 @dataclass(frozen=True)
 class OwnBody:
     """The body covers at most ``largest_share`` of the picture, one of the requirements of a mount (see
@@ -285,10 +271,7 @@ class OwnBody:
     unit: str = "of the picture"
 
     def __post_init__(self):
-        if not 0 <= as_number(self.largest_share, "largest_share") <= 1:
-            raise DomainError(
-                f"own body: largest_share is {self.largest_share}; a share from 0 to 1 is needed."
-            )
+        check_number(self.largest_share, "own body: largest_share", 0.0, 1.0)
         check_positive(self.step, "own body: step")
 
     @cached_property

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, check_whole
-from codesign.flow.checks import check_number
+from codesign.checks import check_positive, check_whole
+from codesign.errors import DomainError, ShapeError
 from codesign.mount.depth import ground_depth
 from codesign.mount.observability import FREE, body_flow
 from codesign.mount.pose import attitude
@@ -166,7 +166,7 @@ class Surroundings:
 
     def __post_init__(self):
         for name in ("deviation_px_s", "points", "farthest_m"):
-            check_number(getattr(self, name), name, above=0.0)
+            check_positive(getattr(self, name), name)
 
     def information(self, camera: ChiefRayCamera, T_body_cam: Tensor) -> tuple[Tensor, Tensor]:
         """Information [..., K, K] without prior of mounts [..., 4, 4], and the share [...] of the picture
@@ -252,8 +252,8 @@ def sight_map(
     Returns: yaw [columns], pitch [rows] rad at the middle of the cells, and the error [rows, columns] in
       units. For ``report.mount_sphere``. No gradient.
     """
-    if check_whole(rows, "rows") < 2 or check_whole(columns, "columns") < 2:
-        raise DomainError(f"sight_map: {rows} rows and {columns} columns; at least 2 of each are needed.")
+    check_whole(rows, "rows", 2)
+    check_whole(columns, "columns", 2)
     yaw = (torch.arange(columns, dtype=torch.float64) + 0.5) / columns * 2 * math.pi - math.pi
     pitch = (torch.arange(rows, dtype=torch.float64) + 0.5) / rows * math.pi - math.pi / 2
     found = []

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-from codesign.errors import DomainError, check_seed, check_whole
+from codesign.checks import check_seed, check_whole
+from codesign.errors import DomainError
 from codesign.mount.pose import Mount, MountRanges
 from codesign.mount.requirements import Clearance, Requirement, first_missed, judge
 from codesign.mount.triangles import closest_points

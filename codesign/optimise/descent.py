@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from codesign.errors import DomainError
+from codesign.checks import check_number, check_positive
 
 # parameters stay on a grid of 1/GRAIN: parallel sums in a backward pass differ in their last bits, and a run
 # must repeat to the same numbers
@@ -45,11 +45,10 @@ class Descent(torch.optim.Optimizer):
         normalised: bool = False,
         grain: int = GRAIN,
     ) -> None:
-        if not (0 < lr < math.inf and 0 <= momentum < 1 and pull >= 0 and grain >= 0):
-            raise DomainError(
-                f"descent: lr {lr} must be positive and finite, momentum {momentum} in [0, 1), pull {pull} and "
-                f"grain {grain} at least 0."
-            )
+        check_positive(lr, "descent: lr")
+        check_number(momentum, "descent: momentum", 0.0, below=1.0)
+        check_number(pull, "descent: pull", 0.0)
+        check_number(grain, "descent: grain", 0.0)
         super().__init__(
             params, {"lr": lr, "momentum": momentum, "pull": pull, "normalised": normalised, "grain": grain}
         )

@@ -2,7 +2,6 @@
 long."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -10,22 +9,14 @@ from torch import Tensor
 from codesign.errors import DomainError, GradientError, ShapeError
 
 
-@dataclass(frozen=True)
-class SampleGradients:
-    """Losses [S] of samples, and their gradients [S, V] to the parameters' numbers in order."""
-
-    values: Tensor
-    gradients: Tensor
-
-
-def sample_gradients(losses: Iterable[Tensor], parameters: Sequence[Tensor]) -> SampleGradients:
+def sample_gradients(losses: Iterable[Tensor], parameters: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     """Values and gradients of sample losses, each taken as soon as it is made, so that one graph lives at a
     time.
 
     Args:
       losses: scalars, S of them; a generator makes each when it is needed.
       parameters: leaves that ask for gradients, of any shapes.
-    Returns: SampleGradients, float64.
+    Returns: values [S] and gradients [S, V] to the parameters' numbers in order, float64.
     Raises: GradientError when a loss does not depend on any of the parameters, or shares its graph with
       another; DomainError, ShapeError for samples that are no scalar tensors, or none.
     """
@@ -56,7 +47,7 @@ def sample_gradients(losses: Iterable[Tensor], parameters: Sequence[Tensor]) -> 
         rows.append(torch.cat([_flat(g, p) for g, p in zip(grads, parameters, strict=True)]))
     if not rows:
         raise DomainError("there are no samples in this step; give at least one loss.")
-    return SampleGradients(torch.tensor(values, dtype=torch.float64), torch.stack(rows))
+    return torch.tensor(values, dtype=torch.float64), torch.stack(rows)
 
 
 def clipped_mean(gradients: Tensor, limit: float | None) -> Tensor:

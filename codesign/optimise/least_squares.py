@@ -21,15 +21,15 @@ More, The Levenberg-Marquardt algorithm, LNM 630 (1978) (scaling).
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any, Self
 
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.checks import check, check_finite, check_positive
+from codesign.errors import DomainError, ShapeError
 from codesign.grad.jacobian import Jacobian, by_autograd, finite
-from codesign.optimise.history import Entry, History, check_start
 
 __all__ = ["DampedLeastSquares", "StopRules"]
 
@@ -59,6 +59,18 @@ class StopRules:
     trials: int = 30
 
 
+@dataclass(frozen=True)
+class Entry:
+    """One step: the loss before it, the norm of its gradient, the length of the trial step, damping, whether it was
+    accepted."""
+
+    loss: float
+    gradient: float
+    step: float
+    damping: float
+    accepted: bool
+
+
 class DampedLeastSquares:
     """Minimises loss = sum of squares / 2 of ``residuals(variables [V]) -> [M]``.
 
@@ -70,7 +82,7 @@ class DampedLeastSquares:
       lower, upper: [V] bounds, or None. A variable on a bound that wants to leave is held; steps are cut at
         bounds.
       damping: first damping, relative to D^2.
-    variables, loss: where it stands. history: History. stopped: why the last run ended: a name of StopRules
+    variables, loss: where it stands. history: list of Entry. stopped: why the last run ended: a name of StopRules
       ("stall": it did not converge), "" while it has not.
     Raises: ShapeError, DomainError for a start that is not finite, outside its bounds, or has residuals that
       are not finite.
@@ -94,16 +106,15 @@ class DampedLeastSquares:
         self.residuals = residuals
         self.jacobian = jacobian
         self.stop = stop or StopRules()
-        self.variables = check_start(start)
+        self.variables = check(start.detach().clone(), "V", "start", finite=True)
         self.lower, self.upper = _bounds(self.variables, lower, upper)
-        if not 0 < damping < math.inf:
-            raise DomainError(f"damping {damping} must be positive and finite; 1e-3 suits most starts.")
+        check_positive(damping, "damping", remedy="1e-3 suits most starts")
         self.damping = float(damping)
         self.growth = 2.0
         self.floor = 0.0
         self.scale = torch.zeros_like(self.variables)
         self.promises: list[tuple[float, float]] = []
-        self.history = History()
+        self.history: list[Entry] = []
         self.stopped = ""
         self._value = check_finite(
             self._residuals(self.variables), "residuals at the start", "start where they are finite"
@@ -160,7 +171,7 @@ class DampedLeastSquares:
                 self.floor = FLOOR
                 self.damping = entry.damping / 2.0 ** (REJECTED * (REJECTED - 1) // 2)
                 self.growth = 2.0
-        self.history.add(entry)
+        self.history.append(entry)
         self.stopped = self._why(steepest, moved, size, before, after, accepted)
         return entry
 
@@ -186,7 +197,7 @@ class DampedLeastSquares:
             "growth": self.growth,
             "floor": self.floor,
             "promises": self.promises,
-            "history": self.history.rows(),
+            "history": [list(astuple(entry)) for entry in self.history],
         }
 
     def resume(self, state: dict[str, Any]) -> Self:
@@ -204,7 +215,7 @@ class DampedLeastSquares:
         self.growth = float(state["growth"])
         self.floor = float(state["floor"])
         self.promises = [(float(gain), float(promise)) for gain, promise in state["promises"]]
-        self.history = History.of(state["history"])
+        self.history = [Entry(*row) for row in state["history"]]
         self._value = self._residuals(found)
         self._slopes = None
         return self
@@ -212,22 +223,13 @@ class DampedLeastSquares:
     def _residuals(self, variables):
         with torch.no_grad():
             value = self.residuals(variables)
-        if value.ndim != 1:
-            raise ShapeError(f"residuals must be a vector [M], got {tuple(value.shape)}; flatten them.")
-        return value
+        return check(value, "M>=0", "residuals")
 
     def _jacobian(self):
         slopes = self.jacobian(self.residuals, self.variables, self._value)
-        if slopes.shape != (self._value.numel(), self.variables.numel()):
-            raise ShapeError(
-                f"the Jacobian has shape {tuple(slopes.shape)}, but there are {self._value.numel()} "
-                f"residuals and {self.variables.numel()} variables."
-            )
-        return check_finite(
-            slopes,
-            "Jacobian",
-            "the residuals have no derivative here; start elsewhere, or bound the variables",
-        )
+        remedy = "the residuals have no derivative here; start elsewhere, or bound the variables"
+        shape = (self._value.numel(), self.variables.numel())
+        return check(slopes, shape, "Jacobian", finite=True, remedy=remedy)
 
     def _why(self, steepest, moved, size, before, after, accepted):
         stop = self.stop
@@ -259,11 +261,8 @@ def _cosine(J, r, gradient, free):
 def _bounds(start, lower, upper):
     low = torch.full_like(start, -math.inf) if lower is None else lower.to(start)
     high = torch.full_like(start, math.inf) if upper is None else upper.to(start)
-    if low.shape != start.shape or high.shape != start.shape:
-        raise ShapeError(
-            f"bounds must have the shape of the variables {tuple(start.shape)}, got {tuple(low.shape)} and "
-            f"{tuple(high.shape)}."
-        )
+    for bound in (low, high):
+        check(bound, tuple(start.shape), "a bound of the variables")
     if not bool(((low <= start) & (start <= high)).all()):
         raise DomainError(
             "the start lies outside its bounds, or a lower bound above its upper; move the start inside."

@@ -8,8 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from codesign.checks import check_positive, check_whole
 from codesign.errors import DomainError, GradientError, NonFiniteError, ShapeError
-from codesign.optimise.gradients import SampleGradients, assign, clipped_mean, sample_gradients
+from codesign.optimise.gradients import assign, clipped_mean, sample_gradients
+
+SHRINK = 0.5  # of the step sizes, after a judgement that is worse than the best
 
 
 @dataclass
@@ -31,15 +34,12 @@ class Loop:
 
     Args:
       optimiser: torch.optim.Optimizer over what is optimised.
-      samples: step number -> the samples' scalar losses, best as a generator; or their SampleGradients.
+      samples: step number -> the samples' scalar losses, best as a generator.
       clip: longest gradient of a sample within a parameter group; None clips to the median length of the
         samples.
-      judge: () -> score, the lower the better, at the parameters as they are; without one the last point is
-        the best.
+      judge: () -> score, the lower the better, at the parameters as they are; where it is worse than the best, the loop
+        goes back to that point with half the step sizes. Without one the last point is the best.
       judge_every: steps between judgements; the start and the end are judged too.
-      patience: worse judgements borne in a row before the loop goes back to the best point with its step
-        sizes times ``shrink``; None never goes back.
-      schedule: step number -> factor of the first step sizes (warm-up, decay).
     record: Record. best, best_score: clones of the parameters at the best judgement, and its score.
     Raises: DomainError for numbers that make no sense; GradientError for a frozen parameter.
 
@@ -53,25 +53,15 @@ class Loop:
     def __init__(
         self,
         optimiser: torch.optim.Optimizer,
-        samples: Callable[[int], Iterable[Tensor] | SampleGradients],
+        samples: Callable[[int], Iterable[Tensor]],
         *,
         clip: float | None = 1.5,
         judge: Callable[[], float] | None = None,
         judge_every: int = 5,
-        patience: int | None = 0,
-        shrink: float = 0.5,
-        schedule: Callable[[int], float] | None = None,
     ) -> None:
-        if (
-            (clip is not None and not clip > 0)
-            or judge_every < 1
-            or not 0 < shrink <= 1
-            or (patience or 0) < 0
-        ):
-            raise DomainError(
-                f"loop: clip {clip} must be above 0 (or None), judge_every {judge_every} at least 1, shrink "
-                f"{shrink} above 0 and at most 1, patience {patience} at least 0 (or None)."
-            )
+        if clip is not None:
+            check_positive(clip, "loop: clip")
+        check_whole(judge_every, "loop: judge_every")
         if not callable(samples):
             raise DomainError(
                 f"loop: samples is a {type(samples).__name__}; give a function of the step's number."
@@ -81,9 +71,6 @@ class Loop:
         self.clip = clip
         self.judge = judge
         self.judge_every = judge_every
-        self.patience = patience
-        self.shrink = shrink
-        self.schedule = schedule
         if isinstance(optimiser, torch.optim.LBFGS):
             raise DomainError(
                 "loop: LBFGS asks for the loss several times a step; choose an optimiser that asks once."
@@ -95,7 +82,6 @@ class Loop:
         self.best_score = math.inf
         self._first_lr = [float(group["lr"]) for group in optimiser.param_groups]
         self._shrunk = 1.0
-        self._worse = 0
 
     @property
     def step_number(self) -> int:
@@ -140,24 +126,15 @@ class Loop:
         return self.best
 
     def _step(self) -> None:
-        found = self.samples(self.step_number)
-        if not isinstance(found, SampleGradients):
-            found = sample_gradients(found, self.parameters)
-        count = sum(p.numel() for p in self.parameters)
-        if found.gradients.shape != (found.values.numel(), count) or not len(found.gradients):
-            raise ShapeError(
-                f"the samples have gradients of shape {tuple(found.gradients.shape)}; [S, {count}] is needed, S of them "
-                f"for {found.values.numel()} values, at least one."
-            )
-        if not bool(found.values.isfinite().all() and found.gradients.isfinite().all()):
+        values, gradients = sample_gradients(self.samples(self.step_number), self.parameters)
+        if not bool(values.isfinite().all() and gradients.isfinite().all()):
             raise NonFiniteError("a sample's loss or its gradient is infinite or NaN.")
-        assign(self.parameters, self._clipped(found.gradients))
-        factor = self._shrunk * (1.0 if self.schedule is None else self.schedule(self.step_number))
+        assign(self.parameters, self._clipped(gradients))
         for group, lr in zip(self.optimiser.param_groups, self._first_lr, strict=True):
-            group["lr"] = lr * factor
+            group["lr"] = lr * self._shrunk
         self.optimiser.step()
-        self.record.loss.append(float(found.values.mean()))
-        self.record.gradient.append(float(found.gradients.norm(dim=1).mean()))
+        self.record.loss.append(float(values.mean()))
+        self.record.gradient.append(float(gradients.norm(dim=1).mean()))
 
     def _clipped(self, gradients: Tensor) -> Tensor:
         """Mean of the samples' gradients, clipped group by group: weights and lenses have no common unit."""
@@ -179,14 +156,10 @@ class Loop:
         if kept:
             self.best = self._now()
             self.best_score = score
-            self._worse = 0
         else:
-            self._worse += 1
-            if self.patience is not None and self._worse > self.patience:
-                self._go(self.best)
-                self.optimiser.state.clear()
-                self._shrunk *= self.shrink
-                self._worse = 0
+            self._go(self.best)
+            self.optimiser.state.clear()
+            self._shrunk *= SHRINK
         if save is not None:
             save()
 
@@ -205,7 +178,6 @@ class Loop:
         numbers: dict[str, Any] = {
             "best_score": self.best_score if math.isfinite(self.best_score) else None,
             "shrunk": self._shrunk,
-            "worse": self._worse,
             "record": vars(self.record),
             "optimiser": type(self.optimiser).__name__,
         }
@@ -243,7 +215,6 @@ class Loop:
         self.best = [tensors[f"best_{i}"].to(p).clone() for i, p in enumerate(self.parameters)]
         self.best_score = math.inf if numbers["best_score"] is None else numbers["best_score"]
         self._shrunk = numbers["shrunk"]
-        self._worse = numbers["worse"]
         self.record = Record(**numbers["record"])
         self.optimiser.state.clear()
         for name, value in tensors.items():

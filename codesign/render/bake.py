@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt, zoom
 
+from codesign.checks import check_positive, check_whole
 from codesign.errors import DomainError
 from codesign.exclusive import exclusive
 from codesign.render.atlas import Nodes
@@ -73,10 +74,8 @@ def bake(
     Raises: DomainError for mirrors, glass and masks unless ``matte``; media; shapes without known charts; of
       a dictionary, shapes of which nothing can be seen from their front.
     """
-    if not (0 < texel_m < np.inf and samples >= 1):
-        raise DomainError(
-            f"bake: texel_m = {texel_m}, samples = {samples}: a size must be positive, samples at least 1."
-        )
+    check_positive(texel_m, "bake: texel_m")
+    check_whole(samples, "bake: samples")
     world = MitsubaScene(description, device, merge=False, emissive=False)  # every shape keeps its name
     mi = world.mi
     if lit and integrator is None:

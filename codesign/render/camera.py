@@ -9,7 +9,8 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, check_finite, check_seed, check_whole
+from codesign.checks import check_finite, check_kind, check_seed, check_whole
+from codesign.errors import DomainError, ShapeError
 from codesign.render.film import Film, check_memory, coarse_pixels, film_pupil_pattern
 from codesign.types import Rays
 
@@ -81,8 +82,8 @@ class Camera:
                 "ThinLens, Pinhole, or an object of your own with camera_rays as GeoLens has it."
             )
         self.lens: Any = lens
-        if film is not None and not isinstance(film, Film):
-            raise DomainError(f"camera: a {type(film).__name__} is no film; give a render.Film, or None.")
+        if film is not None:
+            check_kind(film, Film, "camera: the film")
         self.samples_per_pixel = samples_per_pixel
         self.seed = check_seed(seed, "camera: seed")
         self.film = (film or Film(width_px, height_px, width_px, height_px, pixel_pitch_mm)).check()
@@ -178,10 +179,7 @@ class Camera:
         if rays is None:
             return self.rays()
         count = math.prod(self.film.shape) * self.samples_per_pixel
-        if not isinstance(rays, Rays):
-            raise DomainError(
-                f"a {type(rays).__name__} was given as rays; give those of this camera, camera.rays()."
-            )
+        check_kind(rays, Rays, "the rays", "give those of this camera, camera.rays()")
         if rays.weight.numel() != count:
             raise ShapeError(
                 f"{rays.weight.numel()} rays for a camera of {math.prod(self.film.shape)} pixels with "

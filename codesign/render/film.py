@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from codesign.backend import memory_bytes
-from codesign.errors import DomainError, as_number, check_whole
+from codesign.checks import check_number, check_positive, check_whole
+from codesign.errors import DomainError
 
 # origin, direction and weight of a ray in float64, and its film and pupil position; tracing takes more
 BYTES_PER_RAY = 88
@@ -34,8 +35,7 @@ class Film:
         """Raise DomainError unless there are pixels and every window lies on the sensor; returns the film."""
         for label in ("sensor_width_px", "sensor_height_px", "width_px", "height_px"):
             check_whole(getattr(self, label), f"camera: {label}")
-        if not 0 < as_number(self.pixel_pitch_mm, "camera: pixel_pitch_mm") < float("inf"):
-            raise DomainError(f"camera: pixel_pitch_mm = {self.pixel_pitch_mm} must be positive and finite.")
+        check_positive(self.pixel_pitch_mm, "camera: pixel_pitch_mm")
         if self.windows_px is not None and len(self.windows_px) == 0:
             raise DomainError(
                 "camera: there is no window on the film; give at least one, or None for the whole sensor."
@@ -47,7 +47,7 @@ class Film:
                 )
             left, top = window
             for edge in window:
-                as_number(edge, "camera: the edge of a window")
+                check_number(edge, "camera: the edge of a window")
             if not (
                 0 <= left <= self.sensor_width_px - self.width_px
                 and 0 <= top <= self.sensor_height_px - self.height_px

@@ -15,7 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, GradientError, as_number, check_seed, check_whole
+from codesign.checks import check_positive, check_seed, check_whole
+from codesign.errors import DomainError, GradientError
 from codesign.exclusive import exclusive
 from codesign.render.bake import bake
 from codesign.render.camera import Camera
@@ -55,10 +56,8 @@ class PathScene(MitsubaScene):
         integrator: Any = None,
     ):
         samples = check_whole(samples, "path light: samples per ray")
-        if max_depth != -1 and not as_number(max_depth, "path light: max_depth") >= 1:
-            raise DomainError(
-                f"path light: max_depth = {max_depth} must be at least 1, or -1 for any length."
-            )
+        if max_depth != -1:
+            check_whole(max_depth, "path light: max_depth", remedy="or give -1 for any length")
         super().__init__(description, device, emissive=False)
         self.samples = samples
         self.seed = _path_seed(seed)
@@ -213,10 +212,7 @@ def choose(
     """
     if not levels:
         raise DomainError("light.choose: there is no level to choose from; give at least one.")
-    if not 0 < as_number(tolerance, "light.choose: tolerance") < float("inf"):
-        raise DomainError(
-            f"light.choose: tolerance = {tolerance} must be positive and finite, such as 0.05 for 5 %."
-        )
+    check_positive(tolerance, "light.choose: tolerance", remedy="such as 0.05 for 5 %")
     *_, last = levels
     cpu_s = {}
     with torch.no_grad():

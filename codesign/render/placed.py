@@ -9,7 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, GradientError, check_finite
+from codesign.checks import check_finite, check_positive
+from codesign.errors import DomainError, GradientError
 from codesign.render.world import MitsubaScene
 
 
@@ -34,8 +35,7 @@ class Placement:
         ):
             raise DomainError(f"placement: R_world_scene must be a rotation [3, 3], got {R.tolist()}.")
         for name in ("unit_m", "gain"):
-            if not 0 < getattr(self, name) < float("inf"):
-                raise DomainError(f"placement: {name} = {getattr(self, name)} must be positive and finite.")
+            check_positive(getattr(self, name), f"placement: {name}")
 
     def in_scene(self, direction: Any) -> Any:
         """World directions (drjit arrays) in the scene's axes."""

@@ -6,7 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, as_number
+from codesign.checks import check_number
+from codesign.errors import DomainError
 from codesign.pose import Poses, check_pose
 
 
@@ -41,11 +42,7 @@ class TexturedPlane:
                 raise DomainError(f"textured plane: {label} holds no numbers; give one per wave.") from None
             if not bool(found.isfinite().all()):
                 raise DomainError(f"textured plane: {label} holds NaN or infinite entries; remove them.")
-        if not 0 <= as_number(mean, "textured plane: mean") < float("inf"):
-            raise DomainError(
-                f"textured plane: mean = {mean} must be finite and at least 0; give a radiance on the "
-                "0..255 scale."
-            )
+        check_number(mean, "textured plane: mean", 0.0, remedy="give a radiance on the 0..255 scale")
         self.dtype = dtype
         self.mean = float(mean)
         self.frequency = torch.as_tensor(frequency_per_m, dtype=torch.float64).reshape(-1, 2)

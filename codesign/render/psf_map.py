@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from codesign.checks import check_number, check_positive
 from codesign.errors import DomainError, ShapeError
 from codesign.render.camera import Camera, lines
 from codesign.render.film import coarse_pixels, concentric_disc
@@ -153,10 +154,8 @@ def psf_map(camera: Camera, nearest_m: float = 0.3, cell_px: int = 64, rays_per_
     Gradient: to the lens. To be made anew for every state of the lens.
     Raises: DomainError when the blur is wider than LARGEST_PX, or no light reaches the film.
     """
-    if not 0 < nearest_m < math.inf:
-        raise DomainError(f"psf map: nearest_m = {nearest_m} must be a positive, finite distance in metres.")
-    if not 2 <= cell_px < math.inf:
-        raise DomainError(f"psf map: cell_px = {cell_px} must be a finite number of at least 2 pixels.")
+    check_positive(nearest_m, "psf map: nearest_m")
+    check_number(cell_px, "psf map: cell_px", 2.0)
     fine = math.isqrt(max(0, rays_per_px)) // SIDE if isinstance(rays_per_px, int) else 0
     if fine < 1 or (SIDE * fine) ** 2 != rays_per_px:
         raise DomainError(

@@ -7,7 +7,6 @@ difference: central differences with common random numbers, twelve renders for t
 auto: the cheapest of the three that is right for the frames at hand.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
@@ -15,7 +14,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, as_number
+from codesign.checks import check_choice, check_kind, check_positive
+from codesign.errors import DomainError
 from codesign.pose import Poses, inverse, se3_exp
 from codesign.render.aperture_edges import aperture_edge_term
 from codesign.render.camera import Camera
@@ -80,22 +80,14 @@ def frames(
     Raises: DomainError for an unknown way, rays that it cannot use, or a scene whose silhouettes are not
       known; ShapeError for rays of another camera, or numbers of scenes and poses that differ.
     """
-    if gradient not in WAYS:
-        raise DomainError(f"gradient = {gradient!r} is not known; choose one of {', '.join(WAYS)}.")
+    check_choice(gradient, "gradient", WAYS)
     if rays is not None and gradient not in PROVEN:
         raise DomainError(
             f"gradient {gradient!r} traces the lens at other values than the given rays have; leave rays "
             "out, or choose 'interior' or 'boundary'."
         )
-    if not 0 < as_number(per_px, "per_px") < math.inf:
-        raise DomainError(
-            f"per_px = {per_px} samples per pixel length of silhouettes must be positive and finite, such as "
-            "2.5."
-        )
-    if not isinstance(camera, Camera):
-        raise DomainError(
-            f"the camera is a {type(camera).__name__}; give a render.Camera, which has a lens and a film."
-        )
+    check_positive(per_px, "per_px", remedy="samples per pixel length of silhouettes, such as 2.5")
+    check_kind(camera, Camera, "the camera", "a render.Camera has a lens and a film")
     if pairs := scenes_and_poses(scene, T_world_cam):
         rays = camera.given(rays) if gradient in PROVEN else None
         return torch.stack([frames(camera, s, poses, gradient, per_px, rays=rays) for s, poses in pairs])

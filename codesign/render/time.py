@@ -15,7 +15,8 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, as_number, check_finite, check_whole
+from codesign.checks import check_finite, check_number, check_positive, check_whole
+from codesign.errors import DomainError
 from codesign.pose import Poses, check_poses
 from codesign.render.camera import Camera
 from codesign.render.film import coarse_pixels
@@ -74,12 +75,8 @@ def exposed_frames(
       that are not rigid, or a gradient that ``frames`` refuses.
     """
     t_s = check_finite(torch.as_tensor(t_s, dtype=torch.float64).reshape(-1), "times of the frames")
-    if not 0 <= as_number(exposure_s, "exposure_s") < math.inf:
-        raise DomainError(f"exposure_s = {exposure_s} must be finite and at least 0 seconds.")
-    if not math.isfinite(as_number(line_s, "line_s")):
-        raise DomainError(
-            f"line_s = {line_s} must be finite: the seconds from one row of the sensor to the next."
-        )
+    check_number(exposure_s, "exposure_s", 0.0)
+    check_number(line_s, "line_s", remedy="the seconds from one row of the sensor to the next")
     samples = check_whole(samples, "time samples of an exposure")
     nodes_s = [((k + 0.5) / samples - 0.5) * exposure_s for k in range(samples)]
     if not line_s:
@@ -171,14 +168,9 @@ def adaptive_times(
     Source: Rebecq, Gehrig and Scaramuzza, ESIM: an open event camera simulator, CoRL 2018 (adaptive sampling
       by the largest displacement).
     """
-    start_s, end_s = as_number(start_s, "start_s"), as_number(end_s, "end_s")
-    if not (math.isfinite(start_s) and math.isfinite(end_s) and start_s < end_s):
-        raise DomainError(
-            f"adaptive times: from {start_s} to {end_s} s is no interval; give finite times, the end after "
-            "the start."
-        )
-    if not 0 < as_number(largest_px, "largest_px") < math.inf:
-        raise DomainError(f"adaptive times: largest_px = {largest_px} must be positive and finite.")
+    start_s = check_number(start_s, "adaptive times: start_s")
+    end_s = check_number(end_s, "adaptive times: end_s", above=start_s)
+    check_positive(largest_px, "adaptive times: largest_px")
     every_px = check_whole(every_px, "adaptive times: every_px")
     shortest = SMALLEST_STEP * (end_s - start_s)
     with torch.no_grad():

@@ -13,7 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, as_number, check_finite
+from codesign.checks import check_finite, check_whole
+from codesign.errors import DomainError, ShapeError
 from codesign.pose import Poses, check_poses, inverse, se3_exp
 from codesign.render.camera import Camera, project
 from codesign.render.hits import Hits, carried, dot, first_hits, of_part, turned
@@ -87,8 +88,7 @@ def view(camera: Camera, scene: Scene | MovingScene, T_world_cam: Poses, frame: 
     rays = camera.chief_rays(camera.film.pixels())
     views = views_of(scene, T_world_cam, rays)
     *batch, count = views.batch
-    if not -count <= as_number(frame, "view: frame") < count:
-        raise ShapeError(f"view: frame {frame} of a sequence of {count}; give a number below that.")
+    check_whole(frame, "view: frame", -count, count - 1)
     rows = torch.arange(frame % count, views.cameras.shape[1], count)
     hits = hits_of(rays, views.scene, views.cameras[:, rows])
     valid = hits.part >= 0
@@ -299,11 +299,7 @@ def _flow_truth(camera, scene, T_world_cam, stride, occlusion):
     views = views_of(scene, T_world_cam, rays)
     scene, cameras = views.scene, views.cameras
     *batch, length = views.batch
-    if not (1 <= as_number(stride, "stride") < length and stride % 1 == 0):
-        raise ShapeError(
-            f"true flow over {stride} pose(s) ahead needs a whole stride of at least 1 and more poses than "
-            f"that, got {length}; give more poses."
-        )
+    check_whole(stride, "stride", 1, length - 1, "true flow over a stride needs more poses than it")
     starts = torch.arange(cameras.shape[1]).reshape(-1, length)[:, : length - stride].reshape(-1)
     flows = []
     for some in starts.split(max(1, TOGETHER // len(pixels))):

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from codesign.backend import arrays, load, memory_bytes, run_kernel
-from codesign.errors import DomainError, ShapeError, check_whole
+from codesign.checks import check_whole
+from codesign.errors import DomainError, ShapeError
 from codesign.exclusive import exclusive
 from codesign.pose import Poses
 from codesign.render.moving import MovingScene, Scene, Views, check_device, parts, says_distance, views_of

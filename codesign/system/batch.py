@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor
 
+from codesign.checks import check
 from codesign.errors import DomainError, ShapeError
 from codesign.types import FlowField
 
@@ -43,16 +43,7 @@ def check_batch(batch: Any, scene: Any, has_trajectory: bool) -> None:
                 "System(trajectory=...)."
             )
         return
-    if not torch.is_tensor(poses):
-        raise ShapeError(f"the batch's poses are a {type(poses).__name__}; give a tensor [..., T, 4, 4].")
-    if poses.ndim < 3 or poses.shape[-2:] != (4, 4):
-        raise ShapeError(f"the batch's poses must be [..., T, 4, 4], got {tuple(poses.shape)}.")
-    times = torch.as_tensor(batch.t_s)
-    if times.ndim != 1 or poses.shape[-3] != times.numel():
-        raise ShapeError(
-            f"the batch has poses at {poses.shape[-3]} times (shape {tuple(poses.shape)}) and t_s of shape "
-            f"{tuple(times.shape)}; give one time per pose."
-        )
+    check(poses, "... T 4 4", "the batch's poses", sizes={"T": len(batch.t_s)})
 
 
 def scenes_of(scene: Any, poses: Tensor) -> list[tuple[Any, Tensor]]:

@@ -6,60 +6,43 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError
+from codesign.checks import check, check_kind
+from codesign.errors import DomainError
 from codesign.types import EventVolume, FlowField, Rays
 
-LAYOUT: dict[type, dict[str, tuple[str | int, ...]]] = {
-    Rays: {"direction": ("rays", 3), "origin_m": ("rays", 3), "weight": ("rays",)},
-    EventVolume: {"counts": ("N", 2, "bins", "H", "W"), "centroid_s": ("bins",), "collected_s": ("bins",)},
+LAYOUT = {
+    Rays: {"direction": "rays 3", "origin_m": "rays 3", "weight": "rays"},
+    EventVolume: {"counts": "N 2 bins H W", "centroid_s": "bins", "collected_s": "bins"},
     FlowField: {
-        "flow_px": ("N", 2, "H", "W"),
-        "valid": ("N", "H", "W"),
-        "confidence": ("N", "H", "W"),
-        "covariance_px2": ("N", 3, "H", "W"),
+        "flow_px": "N 2 H W",
+        "valid": "N H W",
+        "confidence": "N H W",
+        "covariance_px2": "N 3 H W",
     },
 }
+OPTIONAL = ("confidence", "covariance_px2")
 PICTURE = 256  # values from which on the scale of frames can be judged
 LONGEST_S = 2.0  # a window of flow that lasts longer is in milliseconds
 
 
-def check_layout(by: str, value: Any, kind: type, shape: tuple[str | int, ...] = (), **sizes: int) -> None:
+def check_layout(by: str, value: Any, kind: type, shape: str | tuple[int, ...] = "", **sizes: int) -> None:
     """Raise unless a value is of a kind and its tensors have their layouts, with the sizes that letters stand for.
 
-    Args: by: subject and verb of the sentence, such as "stage 'flow' returned", with the noun for a plain tensor.
-      shape: of a plain tensor, "..." first where any axes may come before.
+    Args: by: subject and verb of the sentence, such as "stage 'flow' returned". shape: of a plain tensor, as ``check``
+      takes it.
     Raises: DomainError for kinds, dtypes and devices; ShapeError for shapes.
     """
-    if not isinstance(value, kind):
-        as_ = " as" if shape else ""
-        raise DomainError(f"{by}{as_} a {type(value).__name__}; a {kind.__name__} is needed.")
-    first = None
+    check_kind(value, kind, f"what {by}")
+    devices = []
     for name, axes in LAYOUT.get(kind, {"": shape}).items():
         tensor = getattr(value, name) if name else value
-        if tensor is None and name in ("confidence", "covariance_px2"):
+        if tensor is None and name in OPTIONAL:
             continue
-        if not isinstance(tensor, Tensor):
-            raise DomainError(f"{by} {name} as a {type(tensor).__name__}; a tensor is needed.")
-        behind = axes[1:] if axes[0] == "..." else axes
-        given = tensor.shape[max(tensor.ndim - len(behind), 0) :] if behind is not axes else tensor.shape
-        named = f"{by} {name}" if name else by
-        wanted = [
-            sizes.setdefault(w, g) if isinstance(w, str) else w for w, g in zip(behind, given, strict=False)
-        ]
-        if len(given) != len(behind) or wanted != list(given):
-            known = ", ".join(f"{axis} = {sizes[axis]}" for axis in axes if axis in sizes)
-            raise ShapeError(
-                f"{named} of shape {tuple(tensor.shape)}; [{', '.join(map(str, axes))}] is needed"
-                f"{f' with {known}' if known else ''}."
-            )
-        if (tensor.dtype != torch.bool) if name == "valid" else not tensor.is_floating_point():
-            kinds = "bool" if name == "valid" else "floating point"
-            raise DomainError(f"{named} of {tensor.dtype}; {kinds} is needed.")
-        if tensor.is_meta:
-            raise DomainError(f"{named} on the device meta, without values; make it on cpu or cuda.")
-        first = tensor if first is None else first
-        if tensor.device != first.device:
-            raise DomainError(f"{by} tensors on {first.device} and on {tensor.device}; use one device.")
+        what = f"{name} of what {by}" if name else f"what {by}"
+        check(tensor, axes, what, (torch.bool,) if name == "valid" else (), sizes=sizes)
+        devices.append(tensor.device)
+    if len(set(devices)) > 1:
+        raise DomainError(f"{by} tensors on {' and '.join(sorted(map(str, set(devices))))}; use one device.")
 
 
 def look_at(by: str, value: Any) -> None:

@@ -145,7 +145,7 @@ class Pass(Mapping[str, Any]):
         if self.system.mount is None:
             return torch.eye(4, dtype=torch.float64)
         pose = self._call("mount", self.system.mount)
-        check_layout("stage 'mount' returned poses", pose, Tensor, ("...", 4, 4))
+        check_layout("stage 'mount' returned", pose, Tensor, "...>=0 4 4")
         return pose
 
     def _T_world_body(self):
@@ -154,9 +154,7 @@ class Pass(Mapping[str, Any]):
         poses = self["batch"].T_world_body
         if poses is None:
             poses = self._call("trajectory", trajectory)
-            check_layout(
-                "stage 'trajectory' returned", poses, Tensor, ("...", "T", 4, 4), T=self["t_s"].numel()
-            )
+            check_layout("stage 'trajectory' returned", poses, Tensor, "... T 4 4", T=self["t_s"].numel())
         return poses
 
     def _T_world_cam(self):
@@ -184,14 +182,12 @@ class Pass(Mapping[str, Any]):
 
     def _check_frames(self, frames):
         film = tuple(self["camera"].film.shape)
-        axes = ("...", "T", "windows", "H", "W") if len(film) == 3 else ("...", "T", "H", "W")
+        windows = film[0] if len(film) == 3 else 1
+        axes = "... T windows H W" if len(film) == 3 else "... T H W"
         by = self._by("frames", "render")
-        check_layout(
-            by, frames, Tensor, axes, T=self["t_s"].numel(), **dict(zip(axes[2:], film, strict=True))
-        )
-        self._check_count(
-            "frames", frames.shape[: -1 - len(film)].numel() * (film[0] if len(film) == 3 else 1)
-        )
+        sizes = {"T": self["t_s"].numel(), "windows": windows, "H": film[-2], "W": film[-1]}
+        check_layout(by, frames, Tensor, axes, **sizes)
+        self._check_count("frames", frames.shape[: -1 - len(film)].numel() * windows)
         if self._looked_at("frames"):
             look_at(by, frames)
 
@@ -206,9 +202,7 @@ class Pass(Mapping[str, Any]):
         pairs = scenes_of(scene, poses)
         parts = [self._call("render", self.system.render, scene=one, T_world_cam=its) for one, its in pairs]
         for part in parts[1:]:
-            check_layout(
-                "stage 'render' returned frames", part, Tensor, tuple(getattr(parts[0], "shape", ()))
-            )
+            check_layout("stage 'render' returned", part, Tensor, tuple(getattr(parts[0], "shape", ())))
         return torch.stack(parts) if isinstance(scene, (tuple, list)) else parts[0]
 
     def _volume(self) -> EventVolume:
@@ -234,9 +228,7 @@ class Pass(Mapping[str, Any]):
             return found
         count = self["t_s"].numel() - 1
         height, width = self["camera"].film.shape[-2:]
-        check_layout(
-            "stage 'events' returned counts", found, Tensor, ("N", count, 2, "H", "W"), H=height, W=width
-        )
+        check_layout("stage 'events' returned", found, Tensor, f"N {count} 2 H W", H=height, W=width)
         return event_stage.from_counts(found.permute(1, 2, 0, 3, 4), self["t_s"], self.system.bins)
 
     def _check_count(self, what: str, given: int) -> None:
@@ -282,7 +274,7 @@ class Pass(Mapping[str, Any]):
         recorded = getattr(self["batch"], "truth", None)
         if recorded is not None:
             height, width = self["camera"].film.shape[-2:]
-            check_layout("the batch's truth has", recorded, FlowField, H=height, W=width)
+            check_layout("the batch has as truth", recorded, FlowField, H=height, W=width)
             self._check_count("truth", recorded.flow_px.shape[0])
             return recorded
         last = self["t_s"].numel() - 1

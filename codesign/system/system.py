@@ -7,6 +7,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from codesign import render as render_stage
+from codesign.checks import check_choice, check_whole
 from codesign.errors import DomainError
 from codesign.system.batch import Batch
 from codesign.system.result import Result
@@ -95,10 +96,8 @@ class System(nn.Module):
             self.named_objectives = self._checked(value)
             held = [module for part in self.named_objectives.values() for module in modules_of(part)]
             value = nn.ModuleList(dict.fromkeys(held))  # their parameters are the system's too
-        elif name == "gradient" and value not in render_stage.sequence.WAYS:
-            raise DomainError(
-                f"gradient = {value!r} is not known; choose one of {', '.join(render_stage.sequence.WAYS)}."
-            )
+        elif name == "gradient":
+            check_choice(value, "gradient", render_stage.sequence.WAYS)
         elif name == "camera" and hasattr(value, "rays"):
             self.__dict__.pop("lens", None)
             super().__setattr__("lens", value.lens)
@@ -196,6 +195,4 @@ def _bins(flow: Any, bins: int | None) -> int:
             f"give bins={wanted} or leave bins out."
         )
     found = next((n for n in (bins, wanted) if n is not None), BINS)
-    if isinstance(found, bool) or not isinstance(found, int) or found < 1:
-        raise DomainError(f"bins is {found!r}; a whole number of at least 1 is needed.")
-    return found
+    return check_whole(found, "bins")

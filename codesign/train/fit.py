@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from codesign.checks import check_number, check_positive, check_whole
 from codesign.errors import DomainError
 from codesign.interrupt import Interruption
 from codesign.train import checkpoint, loop
@@ -82,13 +83,16 @@ def fit(
     >>> [round(float(weight.detach()), 2) for weight in network.parameters()], made.step
     ([2.0, 1.0], 300)
     """
-    _check(steps=steps, batch=batch, validate_every=validate_every, save_every=save_every)
+    numbers = {"steps": steps, "batch": batch, "validate_every": validate_every, "save_every": save_every}
+    for name, value in numbers.items():
+        check_whole(value, name)
     if batch % ranks.count:
         raise DomainError(
             f"batch {batch} cannot be shared evenly by {ranks.count} processes; give a multiple."
         )
-    if not clip > 0 or not 0 <= average < 1:
-        raise DomainError(f"clip {clip}, average {average}: more than 0, and from 0 to below 1, are needed.")
+    if clip != math.inf:
+        check_positive(clip, "clip")
+    check_number(average, "average", 0.0, below=1.0)
     loss = loss or Supervised()
     schedule = schedule or Cosine()
     learner = Learner(
@@ -136,12 +140,6 @@ def fit(
         network.train(training)
     learner.settle()
     return made
-
-
-def _check(**numbers):
-    for name, value in numbers.items():
-        if value < 1:
-            raise DomainError(f"{name} is {value}; at least 1 is needed.")
 
 
 def _batches(windows: Any, batch, loss, ranks) -> Callable[[int], Any]:

@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import TypeAlias, get_args, get_origin, get_type_hints
 
 from codesign import plain_yaml
-from codesign.errors import CodesignError, DomainError, as_number, shown
+from codesign.checks import check_number
+from codesign.errors import CodesignError, DomainError, shown
 from codesign.reading import read_text, reading
 from scenes.robots import pair as robot_pair
 from scenes.robots.pairs import PAIRS
@@ -268,9 +269,7 @@ def _value(kind, given, entry):
             raise DomainError(f"{entry} is {shown(given)}; give text.")
         return given
     if kind is float:
-        if isinstance(given, bool) or not math.isfinite(as_number(given, entry)):
-            raise DomainError(f"{entry} is {shown(given)}; give a finite number.")
-        return float(given)
+        return check_number(given, entry)
     if not isinstance(given, list) or (parts[-1] is not ... and len(given) != len(parts)):
         raise DomainError(
             f"{entry} is {shown(given)}; give a list of {'texts' if ... in parts else len(parts)}, in [ ]."

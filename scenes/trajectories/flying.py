@@ -15,7 +15,8 @@ import torch
 from scipy.interpolate import make_interp_spline
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.checks import check_finite
+from codesign.errors import DomainError, ShapeError
 from scenes.trajectories.trajectory import Trajectory, rigid
 
 TERMS = 8

@@ -11,7 +11,8 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.checks import check_finite
+from codesign.errors import DomainError, ShapeError
 from codesign.mount.pose import AXES_BODY_CAM
 from codesign.pose import check_pose, look_at, se3_exp
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from codesign.errors import check_finite
+from codesign.checks import check_finite
 from codesign.lens import GeoLens, Glass, Phase, Surface
 
 KINDS = (

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate, pad, silu, unfold
 
+from codesign.checks import check_whole
 from codesign.flow import checkpoint
 from codesign.flow.baselines.parts import Baseline, channels, rescale_flow, start
-from codesign.flow.checks import check_count
 from codesign.flow.entry import GROUPS, Layer
 from codesign.flow.warp import pixel_grid, read_at
 from codesign.types import EventVolume
@@ -117,7 +117,7 @@ class IDNet(Baseline):
         iterations: int = 4,
         seed: int = 0,
     ) -> None:
-        check_count(iterations, "iterations", 1)
+        check_whole(iterations, "iterations")
         super().__init__(bins, width, hidden, iterations=iterations, seed=seed)
         c, state = channels(width), channels(width, STATE)
         self.encoder = nn.Sequential(

@@ -109,12 +109,12 @@ def test_configuration_and_file_make_the_same_network(network, tmp_path):
 @pytest.mark.parametrize(
     ("build", "sentence"),
     [
-        (lambda: FlowNetEvents(bins=1), "whole number >= 2"),
-        (lambda: SpikeFlowNet(bins=5), "an even whole number"),
-        (lambda: SpikeFlowNet(threshold=0.0), "threshold is 0.0"),
+        (lambda: FlowNetEvents(bins=1), "whole number from 2"),
+        (lambda: SpikeFlowNet(bins=5), "an even number"),
+        (lambda: SpikeFlowNet(threshold=0.0), "threshold must be .* got 0"),
         (lambda: FlowNetEvents.with_weights(100), "budget of 100 weights is too small"),
         (lambda: ECN(hidden=6), "hidden is 6"),
-        (lambda: IDNet(width=0.0), "width is 0.0"),
+        (lambda: IDNet(width=0.0), "width must be .* got 0"),
         (lambda: IDNet(iterations=0), "iterations"),
     ],
 )

@@ -119,7 +119,7 @@ def rewritten(path, weights=None, **changes):
     [
         ({"version": 2}, "format version 2, this codesign reads version 1"),
         ({"kind": "training"}, "holds no network"),
-        ({"network": "gone"}, "network 'gone' is unknown"),
+        ({"network": "gone"}, "network must be one of .* got 'gone'"),
         ({"config": {"width": 4, "depth": 2}}, "another version of the network"),
         ({"config": {"width": 40}}, "width is at most 9"),
         ({"config": {"width": 5}}, r"'layer.bias' is \[4\], the network's is \[5\]"),

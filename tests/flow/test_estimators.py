@@ -165,19 +165,22 @@ def counted(counts):
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        (COUNTS, "Tensor; an EventVolume"),
-        (counted([1.0]), "is a list"),
+        (COUNTS, "must be an EventVolume, got a Tensor"),
+        (counted([1.0]), r"must be a torch tensor, got \[1\.0\]"),
         (counted(COUNTS.long()), "int64"),
         (counted(COUNTS.to_sparse()), "sparse"),
         (counted(COUNTS.to("meta")), "without values"),
-        (counted(COUNTS[0]), r"\[B, 2, .*, H, W\], got \(2, 4, 20, 24\)"),
+        (counted(COUNTS[0]), r"\[B, 2, .*, H, W\].*, got \[2, 4, 20, 24\]"),
         (counted(COUNTS[:, :1]), "got"),
         (counted(COUNTS[..., :0]), "empty"),
         (counted(COUNTS[:, :, :1]), "bins|B, 2, 4, H, W"),
         (counted(COUNTS - 0.5), "reach down to -0.5"),
         (counted(COUNTS.index_fill(4, torch.tensor(3), math.nan)), "NaN"),
-        (replace(VOLUME, centroid_s=None), "centroid_s .* is a NoneType"),
-        (replace(VOLUME, centroid_s=torch.ones(3)), r"centroid_s .* is \[3\]"),
+        (replace(VOLUME, centroid_s=None), "centroid_s .* must be a torch tensor, got None"),
+        (
+            replace(VOLUME, centroid_s=torch.ones(3)),
+            r"centroid_s .* must be \[bins\] with bins = 4, got \[3\]",
+        ),
         (replace(VOLUME, collected_s=torch.zeros(BINS)), "collected_s"),
     ],
 )

@@ -165,7 +165,7 @@ FOUR = torch.zeros(2, 2, 2, dtype=D)
     [
         (lambda: metrics.aee(FOUND, TRUTH, NOTHING), "selects no pixel"),
         (lambda: metrics.aee(FOUND, TRUTH[:, :, :3]), r"\[\.\.\., 2, H, W\]"),
-        (lambda: metrics.aee(FOUND, TRUTH, torch.ones(4, 4) > 0), r"mask.*\(4, 4\)"),
+        (lambda: metrics.aee(FOUND, TRUTH, torch.ones(4, 4) > 0), r"mask must be .*, got \[4, 4\]"),
         (lambda: metrics.fwl(EVERYWHERE, FOUR, 5, 9), "no event lies between"),
         (lambda: metrics.fwl(EVERYWHERE, FOUR, 0, 3), "equally many events"),
         (lambda: metrics.rsat(AT_ONCE, FOUR, 0, 3), "at the start of the interval"),

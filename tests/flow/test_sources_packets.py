@@ -192,7 +192,7 @@ def test_without_a_truth_beside_there_is_none(tmp_path):
         ({"columns": "abcd"}, "four letters"),
         ({"time_unit": "h"}, "time unit 'h'"),
         ({"skip": ("all",)}, "windows_without_events"),
-        ({"truth_pixels": "ideal"}, "'raw' or 'undistorted'"),
+        ({"truth_pixels": "ideal"}, "'raw', 'undistorted'"),
     ],
 )
 def test_options_that_mean_nothing(options, reason, place):

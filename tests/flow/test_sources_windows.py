@@ -123,7 +123,7 @@ def test_pieces_depend_on_seed_and_number_alone(dataset):
         (lambda folder: DatasetWindows(folder).batch([-1]), "the source has 24"),
         (lambda folder: DatasetWindows(folder).batch([]), "no samples"),
         (lambda folder: DatasetWindows(folder, window_frames=13), "no sequence"),
-        (lambda folder: DatasetWindows(folder, window_frames=0), "a whole number >= 1"),
+        (lambda folder: DatasetWindows(folder, window_frames=0), "a whole number from 1"),
     ],
 )
 def test_numbers_that_mean_nothing(call, reason, dataset):

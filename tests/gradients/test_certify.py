@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from codesign.errors import DomainError, GradientError, NonFiniteError, ShapeError
-from codesign.grad import certify, plateau
+from codesign.grad import certify
 from codesign.grad.differences import Ladder, rounding_noise
 from codesign.grad.row import verdict
 from tests.gradients.wrong_case import certified, grad_of
@@ -41,16 +41,6 @@ def test_scales_set_the_unit_of_every_number():
     (row,) = certify(lambda p: (2 * p["x"]).sum(), {"x": torch.zeros(1, dtype=D)}, scales={"x": 0.25})
     assert row.autograd == pytest.approx((0.5,))
     assert row.difference == pytest.approx((0.5,))
-
-
-def test_plateau_of_a_cubic():
-    # d/dx x^3 at 1: difference is 3 + h^2, so neighbouring rungs agree best at the smallest steps and the
-    # floor is their half distance
-    found = plateau(
-        lambda x: x.pow(3).sum(), torch.ones(1, dtype=D), torch.ones(1, dtype=D), (1e-1, 1e-2, 1e-3)
-    )
-    assert found.value == pytest.approx(3 + (1e-4 + 1e-6) / 2, abs=1e-9)
-    assert found.noise == pytest.approx((1e-4 - 1e-6) / 2, rel=1e-6)
 
 
 def on_a_thousand(seed, longer):
@@ -148,14 +138,6 @@ def test_ladder_of_a_cubic_is_exact():
     assert found.value == pytest.approx(3, abs=1e-12)
     assert [d for _, d in found.ladder] == pytest.approx([3.01, 3.0001, 3.000001], abs=1e-12)
     assert abs(found.value - 3) <= 3 * found.noise
-
-
-def test_exact_zeros_are_no_plateau_unless_all_are():
-    # 1000 + x in single precision: steps below half a unit in the last place, 3e-5, do not move it
-    one = torch.ones(1)
-    found = plateau(lambda x: 1e3 + x.sum(), torch.zeros(1), one, (1e-1, 1e-2, 1e-5, 1e-6))
-    assert found.value == pytest.approx(1.0, abs=1e-2)
-    assert plateau(lambda x: 0 * x.sum(), torch.zeros(1), one, (1e-1, 1e-2)).value == 0
 
 
 def test_steps_out_of_the_domain_are_left_out_and_named():

@@ -24,16 +24,21 @@ def stream(count=120):
     return ordered(t_us, x, y, 2 * p - 1, *SIZE)
 
 
+def made(name: str, write: Callable[[Path], object]) -> Callable[[], bytes]:
+    """The file of a name that ``write`` leaves in a folder."""
+
+    def content():
+        with tempfile.TemporaryDirectory() as folder:
+            write(Path(folder))
+            return next(Path(folder).rglob(name)).read_bytes()
+
+    return content
+
+
 def written(suffix: str, **options) -> Callable[[], bytes]:
     """A file that ``events.write`` makes."""
-
-    def made():
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / f"events{suffix}"
-            events.write(path, stream(), **options)
-            return path.read_bytes()
-
-    return made
+    name = f"events{suffix}"
+    return made(name, lambda folder: events.write(folder / name, stream(), **options))
 
 
 def dsec(packing=None) -> Callable[[], bytes]:

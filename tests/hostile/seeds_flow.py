@@ -1,7 +1,6 @@
 """Small whole files of flow, recordings, networks and data sets, and who reads each."""
 
 import io
-import tempfile
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -14,8 +13,9 @@ from codesign.flow.sources import truth
 from codesign.flow.sources.camera import read_calibration, read_gyroscope, read_poses
 from codesign.flow.sources.packet import PacketOptions
 from codesign.flow.sources.packets import read_packets
-from tests.hostile.seeds_events import Seed, arrays
-from tests.recording_case import ETH_CALIBRATION, eth_text, made
+from tests.hostile.seeds_events import Seed, arrays, made
+from tests.recording_case import ETH_CALIBRATION, eth_text
+from tests.recording_case import made as recording
 
 SIZE = (9, 12)
 FLOW = np.random.default_rng(0).normal(size=(2, *SIZE)).astype(np.float32)
@@ -23,14 +23,9 @@ FLOW = np.random.default_rng(0).normal(size=(2, *SIZE)).astype(np.float32)
 
 def flow(suffix: str) -> Callable[[], bytes]:
     """What ``write_flow`` writes."""
-
-    def written():
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / f"flow{suffix}"
-            files.write_flow(path, torch.from_numpy(FLOW), torch.from_numpy(FLOW[0] > -1))
-            return path.read_bytes()
-
-    return written
+    name = f"flow{suffix}"
+    values = torch.from_numpy(FLOW)
+    return made(name, lambda folder: files.write_flow(folder / name, values, values[0] > -1))
 
 
 def matlab(packed: bool) -> Callable[[], bytes]:
@@ -93,7 +88,7 @@ def archive() -> bytes:
     """A recording in a zip archive."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as packed:
-        packed.writestr("shapes/events.txt", eth_text(made(60, start_s=1.0)))
+        packed.writestr("shapes/events.txt", eth_text(recording(60, start_s=1.0)))
         packed.writestr("shapes/calib.txt", ETH_CALIBRATION)
         packed.writestr(
             "shapes/imu.txt", "\n".join(f"{1 + k * 0.01:.3f} 0 0 9.8 0.1 0 0.2" for k in range(12))
@@ -106,15 +101,11 @@ def packets(path: Path):
     return read_packets(path, options=PacketOptions(size_px=(180, 240), count=1))
 
 
-def network() -> bytes:
+def network(folder: Path) -> None:
     """Tensors and content with their checksum."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "network.safetensors"
-        weights = {"a": torch.arange(6.0).reshape(2, 3), "b": torch.ones(2, dtype=torch.int64)}
-        checkpoint.write_tensors(
-            path, weights, {"kind": "network", "network": "refiner", "config": {"bins": 3}}
-        )
-        return path.read_bytes()
+    weights = {"a": torch.arange(6.0).reshape(2, 3), "b": torch.ones(2, dtype=torch.int64)}
+    content = {"kind": "network", "network": "refiner", "config": {"bins": 3}}
+    checkpoint.write_tensors(folder / "network.safetensors", weights, content)
 
 
 def read_network(path: Path):
@@ -137,5 +128,5 @@ SEEDS: dict[str, Seed] = {
     "groundtruth.txt": (motion(8), turned(read_poses)),
     "calib.txt": (ETH_CALIBRATION.encode, read_calibration),
     "recording.zip": (archive, packets),
-    "network.safetensors": (network, read_network),
+    "network.safetensors": (made("network.safetensors", network), read_network),
 }

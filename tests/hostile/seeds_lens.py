@@ -1,10 +1,7 @@
 """Lens files of every format that is read."""
 
-import tempfile
-from pathlib import Path
-
 from codesign import lens
-from tests.hostile.seeds_events import Seed
+from tests.hostile.seeds_events import Seed, made
 
 SEQ = """RDM\nTITLE 'x'\nEPD 10\nDIM M\nWL 587.6\nYAN 0 5\nSO 0 1e13\nS 50 4 NBK7_SCHOTT\nSTO\nCIR 8\nASP
 K -1\nA 1e-7\nS -100 60; CIR 7\nPIM\nSI 0 0\n"""
@@ -12,13 +9,8 @@ TXT = """x\ntype distance roc diameter material\nO 0 0 0 AIR\nS 0 50 12 N-BK7 0.
 
 
 def saved(ending):
-    def made():
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / f"lens{ending}"
-            lens.save(lens.load("la1509"), path)
-            return path.read_bytes()
-
-    return made
+    name = f"lens{ending}"
+    return made(name, lambda folder: lens.save(lens.load("la1509"), folder / name))
 
 
 def read(path):

@@ -1,8 +1,6 @@
-"""Small whole files of runs, trainings, generators, hand-overs and lenses, and who reads each."""
+"""Small whole files of runs, trainings, generators and hand-overs, and who reads each."""
 
 import json
-import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,28 +15,13 @@ from codesign.train import checkpoint
 from codesign.train.loop import Progress
 from studies.frame.config import StudyConfig
 from studies.frame.run import Run, open_run
-from tests.hostile.seeds_events import Seed
-
-SEQ = "RDM\nTITLE 'x'\nEPD 10\nDIM M\nWL 587.6\nYAN 0 5\nSO 0 1e13\nS 50 4 NBK7_SCHOTT\nSTO\nCIR 8\nASP\nK -1\nA 1e-7\n"
-SEQ += "S -100 60; CIR 7\nPIM\nSI 0 0\n"
-TABLE = "x\ntype distance roc diameter material\nO 0 0 0 AIR\nS 0 50 12 N-BK7 0.1 1e-7\nS 4 -100 12 AIR\nI 60 0 9 AIR\n"
+from tests.hostile.seeds_events import Seed, made
 
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
     limit: float = 1.0
     sizes: tuple[int, ...] = (1, 2)
-
-
-def made(name: str, write: Callable[[Path], object]) -> Callable[[], bytes]:
-    """The file of a name that ``write`` leaves in a folder."""
-
-    def content():
-        with tempfile.TemporaryDirectory() as folder:
-            write(Path(folder))
-            return next(Path(folder).rglob(name)).read_bytes()
-
-    return content
 
 
 def run(folder: Path) -> Run[Config]:
@@ -117,11 +100,4 @@ SEEDS: dict[str, Seed] = {
         lambda path: plain_yaml.load(read_text(path)),
     ),
     "page.json": (lambda: json.dumps({"a": [1, {"b": None}]}).encode(), read_json),
-    "lens.json": (
-        made("l.json", lambda folder: lens.save(lens.load("la1509"), folder / "l.json")),
-        lens.load,
-    ),
-    "lens.zmx": (made("l.zmx", lambda folder: lens.save(lens.load("la1509"), folder / "l.zmx")), lens.load),
-    "lens.seq": (SEQ.encode, lens.load),
-    "lens.txt": (TABLE.encode, lens.load),
 }

@@ -195,7 +195,10 @@ FIGURES = [
     ),
     (lambda geo: analysis.psf_on_pixels(paraboloid(), 0.0, 0.01, 512, grid=64), "wider than the"),
     *(
-        (lambda geo, make=make, bad=bad, name=name: make(geo, 0.0, **(PIXELS | {name: bad})), f"^{name} = ")
+        (
+            lambda geo, make=make, bad=bad, name=name: make(geo, 0.0, **(PIXELS | {name: bad})),
+            f"^{name} must be ",
+        )
         for make in (analysis.psf_on_pixels, analysis.geometric_psf)
         for name in ("pixel_mm", "pixels")
         for bad in (-1, 0, NAN, INF, None, "fine")
@@ -231,7 +234,7 @@ DESIGN = [
     (lambda geo: moved_element(geo, (2, 6)), "surfaces 2 to 6 are no element"),
     (lambda geo: moved_element(geo, (2, 3), tilt_rad=torch.zeros(3)), r"tilt_rad is \[2\]"),
     (lambda geo: moved_element(geo, (2, 3), 0.1), r"decentre_mm is \[2\]"),
-    (lambda geo: moved_element(geo, (2, 3), tilt_rad=[INF, 0.0]), "1 of 2 values are NaN or infinite"),
+    (lambda geo: moved_element(geo, (2, 3), tilt_rad=[INF, 0.0]), "NaN or infinity in 1 of 2 values"),
     *(
         (lambda geo, f=f: moved_element(geo, f), "must be two whole numbers")
         for f in ((0,), (0, 1.5), (0, 1, 2))
@@ -307,7 +310,10 @@ TOLERANCES = [
     (lambda geo: cheapest(TWO, curvatures(2), True), "budget True"),
     (lambda geo: cheapest(linear(), [], 0.3), "no errors were given"),
     (lambda geo: cheapest(linear(0.0, 0.0), curvatures(2), 0.3), "the figure has no slope in any error"),
-    (lambda geo: cheapest(linear(1.0, NAN), curvatures(2), 0.3), "forecast: 1 of 2 values"),
+    (
+        lambda geo: cheapest(linear(1.0, NAN), curvatures(2), 0.3),
+        "forecast must be finite, got NaN or infinity in 1 of 2 values",
+    ),
     (
         lambda geo: cheapest(linear(1.0, 0.0), curvatures(2), 0.2),
         "not grow with curvature of surface 2, so give",
@@ -336,7 +342,7 @@ LIGHT = [
     (lambda geo: ZernikePlate({}, 4.0), "at least one Zernike term"),
     (
         lambda geo: ZernikePlate({4: 1.0, 5: INF}, 4.0),
-        "plate coefficients: 1 of 2 values .* give finite radians",
+        "plate coefficients must be finite, got .* in 1 of 2 values .* give finite radians",
     ),
     (lambda geo: ZernikePlate({4: 1.0}, 4.0, wavelength_um=0), "wavelength 0"),
     (lambda geo: GridPlate(torch.zeros(3, 4), 1.0), r"\[N, N\] with N of at least 4, got \(3, 4\)"),

@@ -7,7 +7,8 @@ import torch
 from torch import nn
 
 from codesign.errors import CodesignError, DomainError, GradientError, NonFiniteError, ShapeError
-from codesign.optimise import Descent, Loop, SampleGradients, clipped_mean, sample_gradients
+from codesign.optimise import Descent, Loop
+from codesign.optimise.gradients import clipped_mean, sample_gradients
 
 GOAL = torch.tensor([2.0, -1.0], dtype=torch.float64)
 
@@ -70,11 +71,11 @@ def test_normalised_descent_steps_as_far_as_told_over_all_parameters_and_stays_o
 def test_sample_gradients_are_clipped_one_by_one():
     x = parameter(0.0, 0.0)
     slopes = torch.tensor([[3.0, 4.0], [0.3, 0.4], [0.0, -1.0]], dtype=torch.float64)
-    found = sample_gradients(((x * s).sum() + 1 for s in slopes), [x])
-    assert found.values.tolist() == [1.0, 1.0, 1.0]
-    torch.testing.assert_close(found.gradients, slopes)
+    values, gradients = sample_gradients(((x * s).sum() + 1 for s in slopes), [x])
+    assert values.tolist() == [1.0, 1.0, 1.0]
+    torch.testing.assert_close(gradients, slopes)
     for limit in (1.0, None):  # the median length is 1
-        mean = clipped_mean(found.gradients, limit)
+        mean = clipped_mean(gradients, limit)
         torch.testing.assert_close(mean, torch.tensor([0.9 / 3, 0.2 / 3], dtype=torch.float64))
 
 
@@ -87,11 +88,9 @@ def test_groups_are_clipped_by_themselves():
 
 def test_a_worse_score_goes_back_to_the_best_with_smaller_steps():
     scores = iter([5.0, 3.0, 4.0, 6.0, 1.0])
-    x, loop = sgd_loop(
-        lambda x, step: [x.sum()], judge=lambda: next(scores), judge_every=1, patience=1, shrink=0.25
-    )
+    x, loop = sgd_loop(lambda x, step: [x.sum()], judge=lambda: next(scores), judge_every=1)
     best = loop.run(4)
-    # judged at 0 (5), -1 (3), -2 (4: borne), -3 (6: back to -1, step 1/4), -1.25 (1)
+    # judged at 0 (5), -1 (3), -2 (4: back to -1, step 1/2), -1.5 (6: back, step 1/4), -1.25 (1)
     assert x.item() == best[0].item() == -1.25
     assert loop.record.kept == [True, True, False, False, True]
     assert loop.best_score == 1.0
@@ -127,11 +126,8 @@ def test_resumed_equals_uninterrupted(optimiser):
     assert torch.equal(second.best[0], whole.best[0])
 
 
-def test_without_a_judge_the_last_point_is_the_best_and_a_schedule_scales_the_first_step_sizes():
+def test_without_a_judge_the_last_point_is_the_best():
     assert sgd_loop(lambda x, step: [x.sum()])[1].run(7)[0].item() == -7.0
-    x, loop = sgd_loop(lambda x, step: [x.sum()], schedule=lambda step: 1 / (step + 1))
-    loop.run(3)
-    assert x.item() == pytest.approx(-(1 + 1 / 2 + 1 / 3))
 
 
 def test_a_bad_gradient_stops_the_loop_at_the_best_point():
@@ -159,9 +155,9 @@ def loop_of(*samples, optimiser=None, **options):
         ),
         (lambda: loop_of(parameter(1.0).sum()).run(1), GradientError, "depend on any parameter"),
         (lambda: loop_of(x.detach().sum()).run(1), GradientError, "the graph is cut"),
-        (lambda: loop_of(clip=0), DomainError, "clip 0 must be above 0"),
+        (lambda: loop_of(clip=0), DomainError, "clip must be .* got 0"),
         (lambda: loop_of(optimiser=torch.optim.LBFGS([x])), DomainError, "LBFGS asks for the loss several"),
-        (lambda: Descent([x], lr=0.1, momentum=1.0), DomainError, r"momentum 1\.0 in"),
+        (lambda: Descent([x], lr=0.1, momentum=1.0), DomainError, r"momentum must be .* got 1\.0"),
         (
             lambda: loop_of(optimiser=torch.optim.SGD([parameter(0.0)])).resume(*noisy_loop().state()),
             ShapeError,
@@ -177,13 +173,6 @@ def loop_of(*samples, optimiser=None, **options):
         (lambda: Loop(torch.optim.SGD([x]), lambda step: x.sum()).run(1), CodesignError, "are one Tensor"),
         (lambda: loop_of(2 * x).run(1), ShapeError, r"a sample's loss is \(2,\)"),
         (lambda: (lambda y: loop_of(y.sum(), y.sum()).run(1))(x.exp()), GradientError, "share a graph"),
-        (
-            lambda: Loop(
-                torch.optim.SGD([x]), lambda step: SampleGradients(torch.zeros(3), torch.zeros(3, 5))
-            ).run(1),
-            ShapeError,
-            r"shape \(3, 5\); \[S, 2\]",
-        ),
     ],
 )
 def test_what_cannot_be_optimised_is_refused_with_a_sentence(call, error, said):

@@ -139,7 +139,9 @@ def test_a_rolling_shutter_shifts_a_moving_grating_row_by_row(exposure, samples)
 
 
 def test_a_line_time_without_end_is_refused():
-    with pytest.raises(DomainError, match="line_s = inf must be finite: the seconds from one row"):
+    with pytest.raises(
+        DomainError, match="line_s must be a finite number, got inf; the seconds from one row"
+    ):
         render.exposed_frames(camera(), grating(9.0), still, [0.0], 0.0, line_s=math.inf)
 
 

@@ -49,13 +49,13 @@ def test_a_damaged_hdr_ends_in_a_sentence(tmp_path, damage):
         (lambda: textures.picture(np.array([["a"]])), "holds no numbers"),
         (lambda: textures.picture(np.empty((0, 0))), r"shape \(0, 0\)"),
         (lambda: textures.picture(1e39 * EVEN), "NaN or infinite"),
-        (lambda: worlds.wall(EVEN, texel_m=float("nan")), "texel_m = nan"),
-        (lambda: worlds.wall(EVEN, texel_m=0), "texel_m = 0"),
+        (lambda: worlds.wall(EVEN, texel_m=float("nan")), "texel_m must be .* got nan"),
+        (lambda: worlds.wall(EVEN, texel_m=0), "texel_m must be .* got 0"),
         (lambda: worlds.wall(EVEN, texel_m=1e-9), "no longer tells texels apart"),
-        (lambda: worlds.wall(EVEN, half_width_m=-1), "half_width_m = -1"),
+        (lambda: worlds.wall(EVEN, half_width_m=-1), "half_width_m must be .* got -1"),
         (lambda: worlds.room(size_m=(4, -4, 2.6)), "width_m|height_m"),
-        (lambda: build.ball(backend.mitsuba(), 0, 0, 0, -0.1), "radius_m = -0.1"),
-        (lambda: worlds.from_mitsuba({"a": {"type": "sphere"}}, samples=0), "samples = 0"),
+        (lambda: build.ball(backend.mitsuba(), 0, 0, 0, -0.1), "radius_m must be .* got -0.1"),
+        (lambda: worlds.from_mitsuba({"a": {"type": "sphere"}}, samples=0), "samples must be .* got 0"),
     ],
 )
 def test_what_has_no_meaning_ends_in_a_sentence(call, says):

@@ -83,7 +83,7 @@ BAD = {
     "a class": ("is the class", of(flow=s.Convolution)),
     "a string": ("is a str", of(flow="refiner")),
     "no objective": ("at least one objective", of(objectives={})),
-    "a gradient of no kind": ("gradient = 'exact'", of(gradient="exact")),
+    "a gradient of no kind": ("gradient must be .* got 'exact'", of(gradient="exact")),
     "said to cut, of no stage": ("may_cut is", of(may_cut=("event",))),
     "one variable of 0": (
         "'estimate.gain' is exactly 0",

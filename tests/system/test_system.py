@@ -208,9 +208,13 @@ def test_estimator_and_bins_must_fit():
         (
             Batch(torch.eye(4).expand(3, 4, 4), T_S, "wall"),
             ShapeError,
-            "poses at 3 times .* give one time per pose",
+            r"poses must be \[\.\.\., T, 4, 4\] with T = .*, got \[3, 4, 4\]",
         ),
-        (Batch(torch.eye(3), T_S, "wall"), ShapeError, r"must be \[..., T, 4, 4\], got \(3, 3\)"),
+        (
+            Batch(torch.eye(3), T_S, "wall"),
+            ShapeError,
+            r"must be \[\.\.\., T, 4, 4\] with T = .*, got \[3, 3\]",
+        ),
         (Batch(None, T_S, "wall"), DomainError, "no poses and the system no trajectory"),
         (Batch(BATCH.T_world_body, T_S), DomainError, "no scene; give Batch"),
         (Batch(BATCH.T_world_body, T_S, ("a", "b")), ShapeError, "2 scenes and poses of shape"),

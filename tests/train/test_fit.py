@@ -154,9 +154,9 @@ def test_another_training_is_not_resumed(tmp_path, options, sentence):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"steps": 0}, "steps is 0; at least 1"),
-        ({"clip": 0.0}, "clip 0.0"),
-        ({"average": 1.0}, "average 1.0"),
+        ({"steps": 0}, "steps must be .* got 0"),
+        ({"clip": 0.0}, "clip must be .* got 0.0"),
+        ({"average": 1.0}, "average must be .* got 1.0"),
         (
             {"batch": 3, "ranks": train.Ranks(0, 2, torch.device("cpu"))},
             "batch 3 cannot be shared evenly by 2",

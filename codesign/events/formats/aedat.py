@@ -25,8 +25,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from codesign.checks import check_path
 from codesign.errors import FileFormatError
-from codesign.events.entry import check_path
 from codesign.events.formats.arrival import arranged, columns
 from codesign.optional import optional
 from codesign.reading import check_regular, open_regular, reading

@@ -18,8 +18,9 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
+from codesign.checks import check_choice, check_whole
 from codesign.errors import DomainError
-from codesign.events.entry import check_chunk, check_later, check_state, check_times, check_whole
+from codesign.events.entry import check_chunk, check_later, check_state, check_times
 from codesign.events.intensity import log_levels
 from codesign.events.layers.layer import EventLayer
 from codesign.events.layers.memory import memory, soft_counts
@@ -154,11 +155,7 @@ class Spikes:
     whole = True
 
     def __post_init__(self):
-        if self.gradient not in ("surrogate", "play"):
-            raise DomainError(
-                f"gradient is {self.gradient!r}; choose one of 'surrogate', 'play': the layer memorises a "
-                "level."
-            )
+        check_choice(self.gradient, "gradient", ("surrogate", "play"))
         self.steps = check_whole(self.steps, "steps", 1, MOST_STEPS)
 
     def __call__(self, frames, theta_on, theta_off, state, log_input):

@@ -9,8 +9,9 @@ from typing import Any
 import torch
 from torch import Generator, Tensor, nn
 
-from codesign.errors import DomainError, ShapeError, as_number, shown
-from codesign.events.entry import check_layout, check_positive, check_times
+from codesign.checks import FLOATS, check, check_kind, check_number, check_positive
+from codesign.errors import DomainError, ShapeError, shown
+from codesign.events.entry import check_times
 from codesign.events.intensity import FrontEnd
 from codesign.events.level_path import finer, parts
 from codesign.events.sensor.model import (
@@ -142,7 +143,7 @@ class EventLayer(nn.Module):
                 "leave the generator out."
             )
         frames = frames.movedim(-3, 0)
-        check_layout(frames, 2 if state is None else 1)
+        check(frames, "T>=2 ..." if state is None else "T ...", "frames", FLOATS)
         counts, state = self._count(frames, t_s, state, _generators(generator, frames.shape[1:-2]))
         return counts.movedim((0, 1), (-4, -3)), state
 
@@ -285,8 +286,7 @@ class Settled(nn.Module):
 
     def __init__(self, layer: EventLayer, lead_s: float) -> None:
         super().__init__()
-        if not isinstance(layer, EventLayer):
-            raise DomainError(f"the layer is a {type(layer).__name__}; one of events.layer is needed.")
+        check_kind(layer, EventLayer, "the layer", "events.layer makes one")
         self.layer = layer
         self.lead_s = check_lead(lead_s)
 
@@ -301,11 +301,7 @@ class Settled(nn.Module):
 
 def check_lead(lead_s: float) -> float:
     """Seconds. Raises: DomainError for others than finite ones of at least 0."""
-    if not 0 <= as_number(lead_s, "lead_s") < MOST_LEAD_S:
-        raise DomainError(
-            f"lead_s is {lead_s}; seconds of at least 0 and less than {MOST_LEAD_S:g} are needed."
-        )
-    return float(lead_s)
+    return check_number(lead_s, "lead_s", 0.0, below=MOST_LEAD_S)
 
 
 class HardSensor(nn.Module):
@@ -329,9 +325,7 @@ class HardSensor(nn.Module):
         generator: one for all samples, which stand above one another as one tall sensor; None: seed 0.
         Raises: ShapeError for other shapes; DomainError as ``simulate``.
         """
-        check_layout(frames, 1)
-        if frames.ndim != 4:
-            raise ShapeError(f"the hard sensor takes frames [N, T, H, W], got {tuple(frames.shape)}.")
+        check(frames, "N T H W", "frames", FLOATS)
         count, times, height, width = frames.shape
         tall = frames.movedim(1, 0).reshape(times, count * height, width)
         stream = simulate(tall, t_s, self.sensor, generator)

@@ -7,8 +7,8 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from codesign.errors import DomainError
-from codesign.events.entry import check_frames, check_layout, check_level, check_per_pixel
+from codesign.checks import FLOATS, check, check_choice, check_kind
+from codesign.events.entry import check_frames, check_level, check_per_pixel
 from codesign.events.intensity import FrontEnd, kernel_levels, log_levels
 from codesign.events.layers import memory_kernel as kernel
 
@@ -77,11 +77,11 @@ def memory(
     [[3.0, 0.0], [0.0, 2.0]]
     """
     front_end = FrontEnd(log_input)
-    check_layout(frames, minimum=2 if state is None else 1)
+    check(frames, "T>=2 ..." if state is None else "T ...", "frames", FLOATS)
     theta_on = check_per_pixel(theta_on, "theta_on", frames)
     theta_off = check_per_pixel(theta_off, "theta_off", frames)
-    if state is not None and not isinstance(state, Tensor):
-        raise DomainError(f"state is {type(state).__name__}; pass the tensor that an earlier call returned.")
+    if state is not None:
+        check_kind(state, Tensor, "the state", "pass what the call before returned")
     if state is not None and state.shape == frames.shape[1:]:
         state = torch.stack((state, state))
     if state is not None:
@@ -123,8 +123,8 @@ def soft_counts(
 def _gradient(name, theta_on, theta_off, steers):
     """The gradient that the thresholds [...] ask for where the caller leaves it open. steers: whether one may
     be asked for at all."""
-    if name not in (None, *GRADIENTS):
-        raise DomainError(f"gradient is {name!r}; allowed: {', '.join(map(repr, GRADIENTS))}, or None.")
+    if name is not None:
+        check_choice(name, "gradient", GRADIENTS)
     if name is not None:
         return name
     if theta_on.numel() > 1 or theta_off.numel() > 1:

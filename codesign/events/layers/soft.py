@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 
-from codesign.errors import DomainError, as_number
-from codesign.events.entry import check_level, check_per_pixel, check_positive
+from codesign.checks import check_number, check_positive
+from codesign.events.entry import check_level, check_per_pixel
 from codesign.events.intensity import log_levels
 
 GHOST_LOGIT = -5.0  # a pixel without change fires sigmoid(-5) = 0.67 % of an event per polarity and frame
@@ -136,12 +136,7 @@ def expected(
     Gradient: frames, thetas, spread, state: exact, smooth for D other than 0, where all derivatives vanish.
     Raises: ShapeError, DomainError as ``memory``, and for a spread outside its range.
     """
-    number = spread.detach() if isinstance(spread, Tensor) else spread
-    if not LEAST_SPREAD <= as_number(number, "spread") <= MOST_SPREAD:
-        raise DomainError(
-            f"spread is {float(number)!r}; one relative standard deviation from {LEAST_SPREAD:g} to "
-            f"{MOST_SPREAD:g} is needed (0.15 is typical)."
-        )
+    check_number(spread, "spread", LEAST_SPREAD, MOST_SPREAD, remedy="0.15 is typical")
 
     def step(difference, theta_on, theta_off):
         scatter = torch.as_tensor(spread, dtype=difference.dtype, device=difference.device)

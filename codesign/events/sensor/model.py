@@ -10,8 +10,9 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from codesign.errors import DomainError, ShapeError, as_number, shown
-from codesign.events.entry import MOST_VALUES, as_seconds, check_choice, check_dtype, check_flag
+from codesign.checks import check_choice, check_flag, check_kind, check_number
+from codesign.errors import DomainError, ShapeError, shown
+from codesign.events.entry import MOST_VALUES, as_seconds, check_dtype
 
 THETA_MINIMUM = 0.01  # no drawn threshold falls below, as in v2e
 MOST_NUMBER = 1e30
@@ -87,11 +88,7 @@ class SensorModel:
                     f"SensorModel.{name} is {shown(value)} ({type(value).__name__}); a finite Python "
                     f"number {'> 0' if positive else '>= 0'} is needed{hint}."
                 )
-        if self.hot_pixel_share > 1:
-            raise DomainError(
-                f"SensorModel.hot_pixel_share is {self.hot_pixel_share!r}; a share of pixels, 0 to 1, is "
-                "needed."
-            )
+        check_number(self.hot_pixel_share, "SensorModel.hot_pixel_share", 0.0, 1.0)
         if self.photoreceptor_noise and not (self.cutoff_hz > 0 and self.shot_rate_hz > 0):
             raise DomainError(
                 "photoreceptor_noise needs cutoff_hz and shot_rate_hz above 0 (its strength follows from "
@@ -170,11 +167,10 @@ PRESETS = {
 
 def check_sensor(sensor: object) -> SensorModel:
     """Return ``sensor`` when it is a SensorModel; DomainError otherwise."""
-    if not isinstance(sensor, SensorModel):
-        raise DomainError(
-            f"the sensor is {sensor!r}; an events.SensorModel is needed, or one of events.PRESETS "
-            f"({', '.join(map(repr, PRESETS))})."
-        )
+    names = ", ".join(map(repr, PRESETS))
+    check_kind(
+        sensor, SensorModel, "the sensor", f"give an events.SensorModel, or one of events.PRESETS ({names})"
+    )
     return sensor
 
 
@@ -196,7 +192,7 @@ def with_design(sensor: SensorModel, design: Mapping[str, Tensor | float]) -> Se
             raise DomainError(
                 f"{name} is {value.dtype} {list(value.shape)}; one real number, a 0-dim tensor, is needed."
             )
-        values[name] = as_number(value.detach() if isinstance(value, Tensor) else value, name)
+        values[name] = check_number(value, name)
         if isinstance(value, Tensor) and value.requires_grad and values[name] == 0:
             raise DomainError(
                 f"{name} is 0, which switches it off, and requires a gradient, which is then none; start "
@@ -207,10 +203,7 @@ def with_design(sensor: SensorModel, design: Mapping[str, Tensor | float]) -> Se
 
 def check_generator(generator: object) -> None:
     """Raise DomainError unless ``generator`` is a torch.Generator."""
-    if not isinstance(generator, Generator):
-        raise DomainError(
-            f"the generator is {generator!r}; a torch.Generator is needed: torch.Generator().manual_seed(0)."
-        )
+    check_kind(generator, Generator, "the generator", "give torch.Generator().manual_seed(0)")
 
 
 def draw_thresholds(

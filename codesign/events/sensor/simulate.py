@@ -7,16 +7,9 @@ import torch
 from torch import Generator, Tensor
 
 from codesign import backend
-from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import (
-    Times,
-    check_chunk,
-    check_frames,
-    check_later,
-    check_layout,
-    check_per_pixel,
-    check_times,
-)
+from codesign.checks import FLOATS, check
+from codesign.errors import DomainError
+from codesign.events.entry import Times, check_chunk, check_frames, check_later, check_per_pixel, check_times
 from codesign.events.intensity import FrontEnd, kernel_levels, log_levels
 from codesign.events.kernels import Lanes
 from codesign.events.sensor import crossing, v2e
@@ -81,9 +74,7 @@ def simulate(
     ([2885, 5771, 8656], [1, 1, 1])
     """
     check_sensor(sensor)
-    check_layout(frames, minimum=1)
-    if frames.ndim != 3:
-        raise ShapeError(f"frames have shape {list(frames.shape)}; [T, H, W] is needed.")
+    check(frames, "T H W", "frames", FLOATS)
     front_end = FrontEnd(log_input)
     state = SensorState() if state is None else state
     moved, frames, times_s, generator, at_once = _open(frames, t_s, sensor, generator, state, front_end)
@@ -152,7 +143,7 @@ def _open(frames, t_s, sensor, generator, state, front_end):
     check_state(state, sensor)
     state = replace(state)
     fresh = state.level is None
-    check_layout(frames, minimum=2 if fresh else 1)
+    check(frames, "T>=2 ..." if fresh else "T ...", "frames", FLOATS)
     times_s = check_times(t_s, len(frames))
     if state.generator is None:
         state.generator = torch.Generator().manual_seed(0)
@@ -266,8 +257,7 @@ def naive(frames: Tensor, t_s: Times, theta: Tensor | float, *, log_input: bool 
       input or times that do not increase.
     """
     level = log_levels(frames, log_input, minimum=2)
-    if level.ndim != 3:
-        raise ShapeError(f"frames have shape {list(frames.shape)}; [T, H, W] is needed.")
+    check(level, "T H W", "frames")
     theta = check_per_pixel(theta, "theta", level)
     times_us = (check_times(t_s, len(level)) * 1e6).round().long().to(level.device)
     step = level.diff(dim=0)

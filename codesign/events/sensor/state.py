@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from codesign.checks import check_kind
 from codesign.errors import DomainError
 from codesign.events.sensor.model import draw_deviates, draw_keys, draw_leaks, leak_rates, thresholds
 
@@ -57,8 +58,7 @@ class SensorState:
 
 def check_state(state, sensor):
     """Raise DomainError unless ``state`` is empty, or holds what the sensor carries on."""
-    if not isinstance(state, SensorState):
-        raise DomainError(f"the state is a {type(state).__name__}; an events.SensorState is needed.")
+    check_kind(state, SensorState, "the state", "pass an events.SensorState")
     if state.level is None:
         return
     needs = {

@@ -3,8 +3,8 @@ alike."""
 
 from pathlib import Path
 
+from codesign.checks import check_path
 from codesign.errors import FileFormatError
-from codesign.events.entry import check_path
 from codesign.events.sources.frames import PICTURES, FrameSource
 
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".gif")

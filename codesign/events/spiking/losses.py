@@ -4,8 +4,8 @@ counts."""
 import torch.nn.functional as F
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, check_finite
-from codesign.events.entry import check_layout, check_whole
+from codesign.checks import FLOATS, check, check_whole
+from codesign.errors import DomainError, ShapeError
 from codesign.events.spiking.srm import alpha_response
 
 
@@ -39,7 +39,7 @@ def count_loss(found: Tensor, target: Tensor, *, side_px: int = 8, steps: int = 
     """
     _difference(found, target)
     side_px, steps = check_whole(side_px, "side_px"), check_whole(steps, "steps")
-    if min(side_px, steps) < 1 or len(found) < steps or min(found.shape[-2:]) < side_px:
+    if len(found) < steps or min(found.shape[-2:]) < side_px:
         raise ShapeError(
             f"blocks of {steps} steps and {side_px} x {side_px} px do not fit into counts of shape "
             f"{list(found.shape)}; choose smaller ones."
@@ -55,8 +55,7 @@ def _pooled(counts, side_px, steps):
 
 def _difference(found, target):
     for counts in (found, target):
-        check_layout(counts, 1, name="counts")
-        check_finite(counts, "counts")
+        check(counts, "T ...", "counts", FLOATS, finite=True)
     if found.shape != target.shape:
         raise ShapeError(
             f"counts of shape {list(found.shape)} and {list(target.shape)} have no distance; give the same "

@@ -14,18 +14,15 @@ from torch import Generator, Tensor, nn
 
 from codesign.arrays import read_npz
 from codesign.atomic import write_atomic
-from codesign.errors import CodesignError, DomainError, FileFormatError, ShapeError, check_seed
+from codesign.checks import check_choice, check_path, check_positive, check_seed, check_whole
+from codesign.errors import CodesignError, DomainError, FileFormatError, ShapeError
 from codesign.events.entry import (
     Times,
-    check_choice,
     check_chunk,
     check_frames,
     check_later,
-    check_path,
-    check_positive,
     check_state,
     check_times,
-    check_whole,
     shown,
 )
 from codesign.events.intensity import lin_log

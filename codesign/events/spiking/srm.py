@@ -8,14 +8,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, as_number, check_finite
-from codesign.events.entry import (
+from codesign.checks import (
+    FLOATS,
+    MOST,
+    check,
     check_choice,
+    check_finite,
     check_flag,
-    check_layout,
-    check_per_pixel,
+    check_number,
     check_positive,
 )
+from codesign.errors import DomainError, ShapeError
+from codesign.events.entry import check_per_pixel
 from codesign.events.spiking.srm_loops import RESETS, RESPONSES, STATES, Setup, Srm
 from codesign.events.spiking.srm_means import (
     PlayState,
@@ -130,7 +134,8 @@ def srm(
     >>> spikes.flatten().tolist()  # it rests until the reset has faded to less than 0.2: e^-2
     [1.0, 0.0, 0.0, 1.0, 0.0, 0.0]
     """
-    check_layout(drive, 1, name="drive")  # the loop over time looks at every value anyway
+    # the loop over time looks at every value anyway
+    check(drive, "T ...", "drive", FLOATS)
     pixels = drive.shape[1:]
     check_flag(coupled, "coupled")
     check_flag(smooth, "smooth")
@@ -147,8 +152,7 @@ def srm(
     ):
         check_choice(value, name, choices)
     dt = check_positive(dt, "dt")
-    if reset_scale := as_number(reset_scale, "reset_scale"):
-        reset_scale = check_positive(reset_scale, "reset_scale")
+    reset_scale = check_number(reset_scale, "reset_scale", 0.0, MOST)
     theta = check_per_pixel(theta, "theta", drive, torch.float64)
     tau_s = _time_constant(tau_s, "tau_s", drive, dt) if response == "alpha" else None
     tau_r = _time_constant(tau_r, "tau_r", drive, dt) if kernel != "step" else torch.ones_like(theta)
@@ -271,8 +275,7 @@ def drive_scale(
     Raises: DomainError when less than that share of the potentials is above 0 (a silent input: no factor
       helps), or share is out of range.
     """
-    if isinstance(share, bool) or not isinstance(share, (int, float)) or not 0 < share < 1:
-        raise DomainError(f"share is {share!r}; give a number between 0 and 1 (0.05 is typical).")
+    check_number(share, "share", above=0.0, below=1.0, remedy="0.05 is typical")
     with torch.no_grad():
         potential, _ = _response(drive, tau_s=tau_s, dt=dt, response=response)
         relative = (potential / check_per_pixel(theta, "theta", drive, torch.float64)).flatten()

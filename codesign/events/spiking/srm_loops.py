@@ -22,7 +22,8 @@ from torch import Tensor
 from torch.autograd import Function
 
 from codesign.backend import arrays, first_only, load
-from codesign.errors import NonFiniteError, check_finite
+from codesign.checks import check_finite
+from codesign.errors import NonFiniteError
 from codesign.events.kernels import Lanes
 from codesign.events.spiking.surrogate import Operations, Surrogate
 from codesign.exclusive import exclusive

@@ -13,8 +13,8 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
+from codesign.checks import check_positive
 from codesign.errors import DomainError, shown
-from codesign.events.entry import check_positive
 
 LOG2_E = math.log2(math.e)
 

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from codesign.errors import ShapeError, check_seed
-from codesign.events.entry import check_chunk, check_frames, check_positive, check_state, check_whole
+from codesign.checks import check_positive, check_seed, check_whole
+from codesign.errors import ShapeError
+from codesign.events.entry import check_chunk, check_frames, check_state
 from codesign.events.spiking.spike_esim_parts import stepwise
 from codesign.events.spiking.srm import SrmState, drive_scale, srm
 from codesign.events.spiking.surrogate import Surrogate

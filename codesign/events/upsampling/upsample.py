@@ -11,15 +11,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from codesign.errors import DomainError, ShapeError, as_number
-from codesign.events.entry import (
-    Times,
-    check_frames,
-    check_layout,
-    check_positive,
-    check_times,
-    check_whole,
-)
+from codesign.checks import FLOATS, check, check_number, check_positive, check_whole
+from codesign.errors import DomainError, ShapeError
+from codesign.events.entry import Times, check_times
 from codesign.events.intensity import lin_log
 from codesign.events.upsampling.flow import blurred, flow_both_ways, flow_levels, inside, sampled, splatted
 
@@ -196,9 +190,7 @@ def upsample(
     Source: Gehrig et al., Video to Events, CVPR 2020 (upsampling before event generation); Rebecq et al.,
       ESIM, CoRL 2018 (both bounds).
     """
-    check_frames(frames)
-    if frames.ndim != 3:
-        raise ShapeError(f"frames have shape {list(frames.shape)}; [T, H, W] is needed.")
+    check(frames, "T>=2 H W", "frames", FLOATS)
     pieces = list(
         upsample_stream(
             frames,
@@ -230,31 +222,21 @@ def upsample_stream(
     max_displacement_px = check_positive(max_displacement_px, "max_displacement_px")
     if max_log_change is not None:
         max_log_change = check_positive(max_log_change, "max_log_change")
-    max_steps = check_whole(max_steps, "max_steps", 1)
+    max_steps = check_whole(max_steps, "max_steps")
     return _pieces(frames, t_s, max_displacement_px, max_log_change, max_steps)
 
 
 def _pieces(frames, t_s, max_displacement_px, max_log_change, max_steps):
     before = None
     before_s = -math.inf
+    sizes = {}
+    sizes = {}
     for index, (frame, time_s) in enumerate(zip_longest(frames, t_s)):
         if frame is None or time_s is None:
             raise ShapeError(f"there is no {'frame' if frame is None else 'time'} {index}; give one of each.")
-        check_layout(frame, 0, name=f"frame {index}")
-        check_frames(frame[None], 1, name=f"frame {index}")
-        time_s = as_number(time_s, f"the time of frame {index}")
-        if frame.ndim != 2 or (
-            before is not None and (frame.shape != before.shape or frame.dtype != before.dtype)
-        ):
-            raise ShapeError(
-                f"frame {index} is {frame.dtype} {list(frame.shape)}; all frames are [H, W] of one size and "
-                "type."
-            )
-        if not before_s < time_s < math.inf:
-            raise DomainError(
-                f"frame {index} is at {time_s!r} s, the one before at {before_s!r} s; times must be finite "
-                "and increase strictly."
-            )
+        dtypes = FLOATS if before is None else (before.dtype,)
+        check(frame, "H W", f"frame {index}", dtypes, sizes=sizes, least=0.0, finite=True)
+        time_s = check_number(time_s, f"the time of frame {index}", above=before_s)
         if before is None:
             yield frame[None], torch.tensor([time_s], dtype=torch.float64)
         else:

@@ -10,8 +10,8 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from codesign.checks import check_whole
 from codesign.errors import ShapeError
-from codesign.events.entry import check_whole
 
 ON_COLOUR, OFF_COLOUR = (
     "#d55e00",

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from codesign.atomic import replacing
-from codesign.errors import DomainError, FileFormatError, ShapeError, as_number
-from codesign.events.entry import Times, check_counts, check_layout, check_positive, check_times
+from codesign.checks import FLOATS, check, check_number, check_positive
+from codesign.errors import FileFormatError, ShapeError
+from codesign.events.entry import Times, check_counts, check_times
 from codesign.events.stream import to_counts
 from codesign.events.volumes.surface import decay
 from codesign.optional import optional
@@ -64,9 +65,7 @@ def rates(counts: Tensor, t_s: Times) -> tuple[Tensor, Tensor]:
 
 
 def _scaled(counts, full_scale):
-    check_layout(counts, 0, name="counts")
-    if counts.ndim < 3 or counts.shape[-3] != 2:
-        raise ShapeError(f"counts are {list(counts.shape)}; a tensor [..., 2, H, W] is needed (ON first).")
+    check(counts, "... 2 H W", "counts (ON first)", FLOATS)
     counts = counts.detach()
     if full_scale is None:
         full_scale = max(1.0, float(counts.max()))
@@ -88,8 +87,7 @@ def write_video(path: str | Path, pictures: Iterable[Any], fps: float) -> None:
       for anything but such pictures.
     """
     path = Path(path)
-    if not 0 < as_number(fps, "fps") <= 1000:
-        raise DomainError(f"fps is {fps!r}; pictures per second, above 0 and up to 1000, are needed.")
+    check_number(fps, "fps", above=0.0, most=1000.0)
     if path.suffix.lower() not in (".mp4", ".gif"):
         raise FileFormatError(f"{path} ends in {path.suffix or 'nothing'!r}; videos end in .mp4 or .gif.")
     ready = _prepared(pictures)

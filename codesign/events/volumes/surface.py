@@ -17,17 +17,9 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from codesign.errors import DomainError, ShapeError, check_finite
-from codesign.events.entry import (
-    Times,
-    check_counts,
-    check_dtype,
-    check_layout,
-    check_positive,
-    check_times,
-    check_whole,
-    shown,
-)
+from codesign.checks import FLOATS, check, check_positive, check_whole
+from codesign.errors import DomainError
+from codesign.events.entry import Times, check_counts, check_dtype, check_times, shown
 from codesign.events.stream import check_stream
 from codesign.types import EventStream
 
@@ -197,8 +189,7 @@ def decay(counts: Tensor, t_s: Times, tau_s: float) -> Tensor:
     Gradient: counts (the sum is linear in them).
     """
     tau_s = check_tau(tau_s)
-    check_layout(counts, 1, name="counts")
-    check_finite(counts, "counts")
+    check(counts, "T-1 ...", "counts", FLOATS, finite=True)
     fade = torch.exp(check_times(t_s, len(counts) + 1).diff() / -tau_s).tolist()
     trace = torch.zeros_like(counts[0])
     traces = []
@@ -241,13 +232,8 @@ def decay_from_stream(
     if start is not None:
         if not isinstance(start, tuple) or len(start) != 2 or not isinstance(start[0], Tensor):
             raise DomainError(f"start is {shown(start)}; a trace and its time in microseconds are needed.")
-        earlier, before_us = start[0], check_whole(start[1], "the time of the trace")
-        check_layout(earlier, name="the trace to go on with")
-        if earlier.shape != (2, height, width):
-            raise ShapeError(
-                f"the trace to go on with has shape {list(earlier.shape)}; the sensor's is "
-                f"{[2, height, width]}."
-            )
+        earlier, before_us = start[0], check_whole(start[1], "the time of the trace", None)
+        check(earlier, (2, height, width), "the trace to go on with", FLOATS)
         trace += earlier.to(trace).flatten()
     traces = []
     for time_us, (cell, t_us) in segments(stream, at_us):
@@ -272,7 +258,7 @@ def segments(stream, at_us):
     """
     try:
         times_us = torch.as_tensor(at_us)
-        check_whole(int(times_us.abs().max()) if len(times_us) else 0, "at_us")
+        check_whole(int(times_us.abs().max()) if len(times_us) else 0, "at_us", 0)
     except (TypeError, ValueError, RuntimeError, OverflowError):
         times_us = torch.empty(0)
     if (
@@ -294,4 +280,4 @@ def segments(stream, at_us):
 def check_tau(tau_s):
     """A fading time as a float; DomainError unless it is a finite number of seconds of at least a
     nanosecond."""
-    return check_positive(tau_s, "tau_s", " s", NANOSECOND)
+    return check_positive(tau_s, "tau_s", NANOSECOND)

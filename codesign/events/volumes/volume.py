@@ -11,16 +11,9 @@ networks take them.
 import torch
 from torch import Tensor
 
+from codesign.checks import check_kind, check_whole
 from codesign.errors import DomainError
-from codesign.events.entry import (
-    Times,
-    check_counts,
-    check_dtype,
-    check_room,
-    check_times,
-    check_whole,
-    shown,
-)
+from codesign.events.entry import Times, check_counts, check_dtype, check_room, check_times
 from codesign.events.stream import check_stream
 from codesign.types import EventStream, EventVolume
 
@@ -29,9 +22,7 @@ MOST_BINS = 2**20
 
 def check_bins(bins: object) -> None:
     """Raise DomainError unless ``bins`` is a whole number >= 1."""
-    if not isinstance(bins, int):
-        raise DomainError(f"bins is {shown(bins)}; a whole number >= 1 is needed.")
-    check_whole(bins, "bins", 1, MOST_BINS)
+    check_whole(check_kind(bins, int, "bins"), "bins", 1, MOST_BINS)
 
 
 def from_counts(counts: Tensor, t_s: Times, bins: int) -> EventVolume:
@@ -103,10 +94,8 @@ def from_stream(
     tensor([1.2688, 1.7312])
     """
     check_stream(stream, slice(0))
-    if check_whole(t1_us, "end of the interval t1_us") <= check_whole(t0_us, "start of the interval t0_us"):
-        raise DomainError(
-            f"the interval is {t0_us!r} to {t1_us!r} us; whole microseconds with t1 > t0 are needed."
-        )
+    check_whole(t0_us, "start of the interval t0_us", None)
+    check_whole(t1_us, "end of the interval t1_us", int(t0_us) + 1)
     check_bins(bins)
     check_dtype(dtype)
     check_room(2 * bins * stream.height_px * stream.width_px, "the volume")
@@ -159,9 +148,9 @@ def spikes_from_stream(
     Source: layout of Gehrig et al., Event-Based Angular Velocity Regression with Spiking Networks, ICRA 2020,
       and of SLAYER (Shrestha, Orchard 2018).
     """
-    t0_us = check_whole(t0_us, "t0_us")
-    step_us = check_whole(step_us, "step_us", 1)
-    steps = check_whole(steps, "steps", 1)
+    t0_us = check_whole(t0_us, "t0_us", None)
+    step_us = check_whole(step_us, "step_us")
+    steps = check_whole(steps, "steps")
     check_stream(stream)
     check_dtype(dtype)
     check_room(2 * stream.width_px * stream.height_px * steps, "the spikes")

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from codesign.errors import DomainError, check_seed, check_whole
+from codesign.checks import check_seed, check_whole
+from codesign.errors import DomainError
 from codesign.flow.entry import check_bins, check_sizes, normalise, pad_to, takes_volume, to_field
 from codesign.types import EventVolume, FlowField
 
@@ -133,8 +134,7 @@ def fill_budget(build: Callable[..., nn.Module], weights: int, inside: float = 8
         with torch.device("meta"):
             return count_weights(build(width=width, hidden=hidden))
 
-    if check_whole(weights, "weights") > MOST_WEIGHTS:
-        raise DomainError(f"a budget of {weights} weights is too large; at most {MOST_WEIGHTS} are possible.")
+    check_whole(weights, "weights", 1, MOST_WEIGHTS)
     if counted(1.0) > weights:
         raise DomainError(
             f"a budget of {weights} weights is too small; the narrowest network has {counted(1.0)}."

@@ -5,9 +5,9 @@ from torch import Tensor, nn
 from torch.nn.functional import conv_transpose2d, leaky_relu
 
 from codesign.backend import NoSecondDerivative
+from codesign.checks import check_positive
 from codesign.events.spiking.surrogate import FastSigmoid, Surrogate
 from codesign.flow.baselines.parts import Baseline, channels, rescale_flow, start
-from codesign.flow.checks import check_number
 from codesign.types import EventVolume
 
 _FIRST_ONLY = (
@@ -46,8 +46,8 @@ class SpikeFlowNet(Baseline):
         surrogate_width: float = 0.75,
         seed: int = 0,
     ) -> None:
-        threshold = check_number(threshold, "threshold", above=0.0)
-        surrogate_width = check_number(surrogate_width, "surrogate_width", above=0.0)
+        threshold = check_positive(threshold, "threshold")
+        surrogate_width = check_positive(surrogate_width, "surrogate_width")
         own = {"threshold": threshold, "surrogate_width": surrogate_width, "seed": seed}
         super().__init__(bins, width, hidden, even=True, **own)
         self.surrogate = FastSigmoid.unit(surrogate_width)

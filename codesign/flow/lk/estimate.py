@@ -14,8 +14,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, check_finite, shown
-from codesign.flow.checks import check_count, check_flow, check_number, check_real, check_volume
+from codesign.checks import check, check_choice, check_finite, check_number, check_whole
+from codesign.errors import DomainError, ShapeError, shown
+from codesign.flow.checks import MOST_STEPS, check_flow, check_volume
 from codesign.flow.lk.cells import Cells
 from codesign.flow.lk.level import Level, along_path
 from codesign.flow.lk.path import Path
@@ -81,23 +82,17 @@ def estimate_lk(
     [2.0, 1.0]
     """
     check_slopes(volume)
-    if not isinstance(model, str) or model not in MODELS:
-        raise DomainError(f"flow model '{model}' is unknown; choose one of {', '.join(MODELS)}.")
-    if not isinstance(clock, str) or clock not in CLOCKS:
-        raise DomainError(f"clock '{clock}' is unknown; choose one of {', '.join(CLOCKS)}.")
-    if check_number(prior_px, "prior_px", above=0.0) > LONGEST_PX:
-        raise DomainError(f"prior_px is {prior_px:g}; at most {LONGEST_PX:g} px are possible.")
+    check_choice(model, "model", MODELS)
+    check_choice(clock, "clock", CLOCKS)
+    check_number(prior_px, "prior_px", above=0.0, most=LONGEST_PX)
     check_number(noise_floor, "noise_floor", 0.0)
-    steps = check_count(steps, "steps", 1)
+    steps = check_whole(steps, "steps", 1, MOST_STEPS)
     if not isinstance(levels_px, Sequence) or not levels_px or isinstance(levels_px, str):
         raise DomainError(
             f"levels_px is {shown(levels_px)}; a list of blurs in pixels, coarse to fine, is needed."
         )
     for blur_px in levels_px:
-        if not LEAST_BLUR_PX <= check_number(blur_px, "a blur of levels_px", above=0.0) <= MOST_BLUR_PX:
-            raise DomainError(
-                f"a blur of levels_px is {blur_px:g} px; {LEAST_BLUR_PX} to {MOST_BLUR_PX} are possible."
-            )
+        check_number(blur_px, "a blur of levels_px", LEAST_BLUR_PX, MOST_BLUR_PX)
     found = along_path(volume, clock)
     return field(
         volume, found[0], *descended(volume, found, model, prior_px, levels_px, steps, noise_floor, start_px)
@@ -178,7 +173,7 @@ def check_slopes(volume: EventVolume) -> Tensor:
 def check_start(start_px: Tensor, counts: Tensor) -> Tensor:
     """``start_px`` of ``estimate_lk`` as [B, 2, H, W], of the type of ``counts``."""
     batch, _, _, height, width = counts.shape
-    if check_real(start_px, "start_px").ndim != 2:
+    if check(start_px, "...>=0", "start_px").ndim != 2:
         start_px = check_flow(start_px, (batch, 2, height, width), "start_px")
     elif tuple(start_px.shape) != (batch, 2):
         raise ShapeError(

@@ -12,8 +12,8 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation, Slerp
 
+from codesign.checks import check_kind, check_path
 from codesign.errors import DomainError, FileFormatError
-from codesign.flow.checks import check_kind, check_path
 from codesign.reading import open_regular, read_text, reading
 
 # of a calibration, and of a table of motion

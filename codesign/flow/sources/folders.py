@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from codesign.checks import check_path
 from codesign.errors import FileFormatError
 from codesign.events.files import READERS
-from codesign.flow.checks import check_path
 from codesign.reading import open_regular, reading
 
 # of several event files of one name the first of these kinds is read: text as the Event-Camera Dataset

@@ -7,11 +7,11 @@ from typing import TypeVar
 
 import numpy as np
 
+from codesign.checks import check_choice, check_kind, check_number, check_path, check_whole
 from codesign.errors import DomainError, shown
 from codesign.events.columns import EventColumns
-from codesign.events.entry import check_whole
 from codesign.events.formats.arrival import BACKWARDS, OFF_SENSOR
-from codesign.flow.checks import check_kind, check_number, check_path, check_size
+from codesign.flow.checks import check_size
 from codesign.types import EventStream, FlowField
 
 EMPTY = "windows_without_events"
@@ -109,9 +109,10 @@ def check_options(options: PacketOptions, truth_path: object) -> None:
     given = {
         n: v for n, v in vars(check_kind(options, PacketOptions, "the options")).items() if v is not None
     }
-    for name, above in (("window_s", 0.0), ("truth_interval_s", 0.0), ("start_s", None)):
-        if name in given and check_number(given[name], name, 0.0, above) > MOST_S:
-            raise DomainError(f"{name} is {shown(given[name])}; at most {MOST_S:g} s are possible.")
+    for name in {"window_s", "truth_interval_s"} & given.keys():
+        check_number(given[name], name, above=0.0, most=MOST_S)
+    if "start_s" in given:
+        check_number(given["start_s"], "start_s", 0.0, MOST_S)
     for name in {"count", "events"} & given.keys():
         check_whole(given[name], name, 1)
     if "size_px" in given:
@@ -121,11 +122,8 @@ def check_options(options: PacketOptions, truth_path: object) -> None:
     for path in (options.calibration, truth_path):
         if path is not None:
             check_path(path)
-    for name, possible in (("truth_unit", ("px", "px/s")), ("truth_pixels", ("raw", "undistorted"))):
-        if getattr(options, name) not in possible:
-            raise DomainError(
-                f"{name} is {shown(getattr(options, name))}; {' or '.join(map(repr, possible))} is possible."
-            )
+    check_choice(options.truth_unit, "truth_unit", ("px", "px/s"))
+    check_choice(options.truth_pixels, "truth_pixels", ("raw", "undistorted"))
     if not isinstance(options.skip, tuple) or not set(options.skip) <= set(SKIPPABLE):
         raise DomainError(f"skip is {shown(options.skip)}; a tuple of {', '.join(SKIPPABLE)} is possible.")
     if options.window_s is not None and options.events is not None:

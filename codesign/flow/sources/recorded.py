@@ -6,8 +6,8 @@ from pathlib import Path
 
 import torch
 
+from codesign.checks import check_path
 from codesign.events.volumes.volume import from_stream
-from codesign.flow.checks import check_path
 from codesign.flow.sources.dsec import DsecWindows
 from codesign.flow.sources.mvsec import DATA, MvsecWindows
 from codesign.flow.sources.packet import PacketOptions

@@ -10,10 +10,11 @@ import torch
 from numpy.polynomial import chebyshev
 from torch import Tensor
 
+from codesign.checks import check_whole
 from codesign.errors import DomainError, FileFormatError
 from codesign.events.formats.hdf5 import Hdf5Events
 from codesign.events.formats.hdf5_rows import Rows
-from codesign.flow.checks import check_count
+from codesign.flow.checks import MOST_STEPS
 from codesign.flow.sources.windows import Recording, Windows
 from codesign.flow.warp import chained
 from codesign.reading import read_json, reading
@@ -52,7 +53,7 @@ class DatasetWindows(Windows):
         crop_px: tuple[int, int] | None = None,
         seed: int = 0,
     ) -> None:
-        check_count(window_frames, "window_frames", 1)
+        check_whole(window_frames, "window_frames", 1, MOST_STEPS)
         sequences = [Sequence(place, sizes) for place, sizes in _places(Path(folder))]
         windows = [
             (k, tuple(sequence.times_us[[first, last]].tolist()), first, last)

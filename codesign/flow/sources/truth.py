@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from codesign.arrays import read_npy, read_npz
+from codesign.checks import check_path
 from codesign.errors import FileFormatError
-from codesign.flow.checks import check_path, check_size
+from codesign.flow.checks import check_size
 from codesign.flow.files import read_flow
 from codesign.flow.sources import folders
 from codesign.flow.sources.matlab import read_mat

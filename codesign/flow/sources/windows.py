@@ -8,9 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from codesign.checks import check_positive, check_whole
 from codesign.errors import DomainError, ShapeError
 from codesign.events.volumes.volume import from_stream
-from codesign.flow.checks import check_count, check_number
+from codesign.flow.checks import MOST_STEPS
 from codesign.types import EventVolume, FlowField, FlowWindows
 
 ALIKE = 0.05  # windows of one source may differ in length by this share
@@ -78,7 +79,7 @@ class Windows:
     ) -> None:
         self.recordings = recordings
         self.windows = windows
-        self.bins = check_count(bins, "bins", 1)
+        self.bins = check_whole(bins, "bins", 1, MOST_STEPS)
         self.crop_px = crop_px
         self.seed = seed
         for height, width in (recording.size_px for recording in recordings):
@@ -150,8 +151,8 @@ def collate(samples: Sequence[Sample]) -> FlowWindows:
 
 def bin_times(bins: int, seconds: float) -> tuple[Tensor, Tensor]:
     """(centroid_s, collected_s) [bins] of an even event rate, as events.from_stream has them."""
-    bins = check_count(bins, "bins", 1)
-    seconds = check_number(seconds, "the length of the interval", above=0.0)
+    bins = check_whole(bins, "bins", 1, MOST_STEPS)
+    seconds = check_positive(seconds, "the length of the interval")
     if bins == 1:
         return torch.tensor([seconds / 2], dtype=torch.float64), torch.tensor([seconds], dtype=torch.float64)
     node = torch.arange(bins, dtype=torch.float64) / (bins - 1)

@@ -1,13 +1,13 @@
 """Point spread functions: by diffraction from the pupil's wavefront, and geometric by counting rays on
 pixels."""
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, as_number, check_whole
+from codesign.checks import check_positive, check_whole
+from codesign.errors import DomainError
 from codesign.lens.analysis.rays import Light, chief_ray, spectral_lines
 from codesign.lens.analysis.spots import lit_points
 from codesign.lens.diffraction.pupil import pupil_function, pupil_functions
@@ -144,7 +144,4 @@ def geometric_psf(
 
 def _pixels(pixel_mm, pixels):
     """Size and number of the pixels of a grid. Raises: DomainError for what is none."""
-    size = as_number(pixel_mm, "pixel_mm")
-    if not 0 < size < math.inf:
-        raise DomainError(f"pixel_mm = {size} must be positive and finite.")
-    return size, check_whole(pixels, "pixels")
+    return check_positive(pixel_mm, "pixel_mm"), check_whole(pixels, "pixels")

@@ -16,7 +16,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.checks import check_finite
+from codesign.errors import DomainError, ShapeError
 from codesign.lens.distance import real_numbers
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import Glass

@@ -21,7 +21,8 @@ from statistics import NormalDist
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.checks import check_finite
+from codesign.errors import DomainError, ShapeError
 from codesign.lens.design.tolerance import Error, Forecast
 
 NODES = 2048  # of the sum over the characteristic function

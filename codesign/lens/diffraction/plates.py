@@ -11,7 +11,8 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
-from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.checks import check_finite
+from codesign.errors import DomainError, ShapeError
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.replaceable import Replaceable
 
