@@ -8,6 +8,7 @@ image. flow_px: (least, most), px per window.
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch.nn.functional import interpolate
 
 from codesign.errors import DomainError
@@ -187,13 +188,11 @@ def _sized(focal, twists, size_px, wanted, size, most, t):
     probe = np.stack([*corners, np.ones(5)])
 
     def motion(times):
-        steps = times[:, None, None]
-        return np.stack(
-            [
-                k @ (_rotations(size * w, times) + size * steps * np.outer(v, n)) @ k_inverse
-                for w, v, n in twists
-            ]
-        )
+        found = []
+        for w, v, n in twists:
+            turn = Rotation.from_rotvec(np.outer(times, size * w)).as_matrix()
+            found.append(k @ (turn + size * times[:, None, None] * np.outer(v, n)) @ k_inverse)
+        return np.stack(found)
 
     # flow is nearly proportional to the twist: three corrections find its size
     for _ in range(3):
@@ -209,17 +208,6 @@ def _twist(draw, focal, width_px):
     turn, move = draw.normal(0, 1, (2, 3)) * np.array([1, 1, 2 * focal / width_px])
     kind = draw.random()
     return turn * draw.uniform(0.1, 1) * (kind > 0.3), move * draw.uniform(0.1, 1) * (kind < 0.8)
-
-
-def _rotations(w, times):
-    """Rotations exp(t w) [T, 3, 3] (Rodrigues)."""
-    angle = np.linalg.norm(w)
-    cross = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]]) / max(angle, 1e-12)
-    return (
-        np.eye(3)
-        + np.sin(times * angle)[:, None, None] * cross
-        + (1 - np.cos(times * angle))[:, None, None] * cross @ cross
-    )
 
 
 def _field(draw, extent, heading, near):

@@ -96,18 +96,8 @@ class Polynomials:
     @cached_property
     def second_moments(self) -> Tensor:
         """[2K, 2K] of the basis over the square [-1, 1]^2, for both components."""
-        one = torch.tensor(
-            [
-                [1, 0, 0, 1 / 3, 0, 1 / 3],
-                [0, 1 / 3, 0, 0, 0, 0],
-                [0, 0, 1 / 3, 0, 0, 0],
-                [1 / 3, 0, 0, 1 / 5, 0, 1 / 9],
-                [0, 0, 0, 0, 1 / 9, 0],
-                [1 / 3, 0, 0, 1 / 9, 0, 1 / 5],
-            ],
-            dtype=torch.float64,
-            device=self.unit.device,
-        )[: self.terms, : self.terms]
+        sums = self.powers[:, None] + self.powers
+        one = (sums % 2 == 0).all(2) / (sums + 1).prod(2).double()
         return torch.block_diag(one, one)
 
     def mean_square(self, parameters: Tensor) -> Tensor:
