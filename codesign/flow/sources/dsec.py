@@ -73,7 +73,7 @@ class Sequence(Recording):
         )
         self.events = Hdf5Events(self.path)
         self.files, self.spans_us = _flows(flow)
-        first_us, last_us = (int(self.events.packet(k, k + 1)[0][0]) for k in (0, len(self.events) - 1))
+        first_us, last_us = self.ends_us()
         outside = [
             span
             for span in self.spans_us
@@ -82,7 +82,7 @@ class Sequence(Recording):
         if outside:
             raise FileFormatError(
                 f"{flow} has a flow from {outside[0][0]} to {outside[0][1]} us; the events of {self.path} "
-                f"run from {first_us} to {last_us} us."
+                f"run from {first_us:.0f} to {last_us:.0f} us."
             )
 
     def flow(self, file: Path) -> tuple[Tensor, Tensor]:

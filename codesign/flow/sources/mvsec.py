@@ -26,6 +26,7 @@ from codesign.flow.warp import chained
 DATA = "_data.hdf5"
 FLOW = "_gt_flow_dist.npz"
 COMPONENTS = ("x_flow_dist", "y_flow_dist")
+LEAST_S = 1e-9  # of an interval that counts
 MOST_BYTES = 2**35  # of one of them: outdoors the file has 9.5 GB
 
 
@@ -113,8 +114,8 @@ class Sequence(Recording):
             raise FileFormatError(
                 f"{data} has {len(self.events)} events, or frame times that do not rise; it is damaged."
             )
-        ends_us = [float(self.events.packet(k, k + 1)[0][0]) for k in (0, len(self.events) - 1)]
-        self.ends_s = ends_us[0] * 1e-6, ends_us[1] * 1e-6
+        first_us, last_us = self.ends_us()
+        self.ends_s = first_us * 1e-6, last_us * 1e-6
         if not all(map(math.isfinite, self.ends_s)):
             raise FileFormatError(f"{data}: its events run from {self.ends_s[0]} to {self.ends_s[1]} s.")
 
@@ -137,18 +138,14 @@ class Sequence(Recording):
         if self.fields is None:
             with open_npz(self.truth) as file:
                 self.fields = [file.mapped(name, MOST_BYTES) for name in COMPONENTS]
-        first = int(np.searchsorted(self.flow_s, t0_s, "right")) - 1
-        parts = []
-        masks = []
-        while first < len(self.flow_s) - 1 and self.flow_s[first] < t1_s - 1e-9:
-            length = self.flow_s[first + 1] - self.flow_s[first]
-            share = (min(t1_s, self.flow_s[first + 1]) - max(t0_s, self.flow_s[first])) / length
-            field = torch.from_numpy(np.stack([component[first] for component in self.fields])).double()
-            seen = torch.isfinite(field).all(0) & (field != 0).any(0)
-            parts.append(torch.where(seen, field, 0.0) * share)
-            masks.append(seen)
-            first += 1
-        return chained(torch.stack(parts), torch.stack(masks))
+        starts, ends = self.flow_s[:-1], self.flow_s[1:]
+        common_s = np.minimum(t1_s, ends) - np.maximum(t0_s, starts)
+        touched = np.flatnonzero(common_s > LEAST_S)
+        shares = torch.from_numpy(common_s[touched] / (ends - starts)[touched])
+        fields = np.stack([[component[k] for component in self.fields] for k in touched])
+        fields = torch.from_numpy(fields).double()
+        seen = fields.isfinite().all(1) & (fields != 0).any(1)
+        return chained(torch.where(seen[:, None], fields, 0.0) * shares[:, None, None, None], seen)
 
 
 def _rise(times):

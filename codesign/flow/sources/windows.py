@@ -52,6 +52,11 @@ class Recording:
         """[2, H, W] at both ends, or None."""
         return None
 
+    def ends_us(self) -> tuple[float, float]:
+        """Times of the first and of the last event of a file."""
+        first, last = (float(self.events.packet(k, k + 1)[0][0]) for k in (0, len(self.events) - 1))
+        return first, last
+
     def counts(self, bins: int, t0_us: int, t1_us: int) -> Tensor:
         """[2, bins, H, W]."""
         stream = self.events.window(t0_us, t1_us, self.size_px)
