@@ -24,6 +24,7 @@ from studies.flow_quality.estimators import estimators
 from studies.flow_quality.measures import figures, join, mean_of_known, measure
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.show import pictures
+from studies.train_flow import peers  # noqa: F401  which network files know
 
 SEED = 77  # of what is judged here: windows that guided no choice
 SHOWN = 3  # windows of a set in its picture

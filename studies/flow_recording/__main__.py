@@ -22,6 +22,7 @@ from codesign.flow.checkpoint import load as load_network
 from codesign.flow.sources import PacketOptions, read_packets, read_recording
 from studies.flow_recording import made, page, video
 from studies.frame.run import Run, StudyConfig, main
+from studies.train_flow import peers  # noqa: F401  which network files know
 
 SHOWN = 4  # packets with pictures
 MADE_PX = (180, 240)  # of the synthetic recording
