@@ -45,16 +45,11 @@ class EventTracks:
         """Raises: DomainError, ShapeError unless the parts fit each other."""
         for name in ("height_px", "width_px"):
             check_whole(check_kind(getattr(self, name), int, name), name, 1, MOST_SIDE_PX)
-        for name in ("x_px", "y_px", "time", "count", "flow_px"):
-            check(getattr(self, name), "...>=0", f"{name} of the tracks")
-        flow = self.flow_px
-        lone = [self.x_px.shape, self.y_px.shape, self.time.shape]
-        fits = flow.ndim == 3 and flow.shape[1] == 2 and self.count.shape == flow.shape
-        if not fits or any(shape != flow.shape[2:] for shape in lone):
-            raise ShapeError(
-                f"the tracks have flow {list(flow.shape)}, count {list(self.count.shape)}, x, y and time "
-                f"{list(map(list, lone))}; [B, 2, N] twice and [N] are needed."
-            )
+        sizes: dict[str, int] = {}
+        for name in ("flow_px", "count"):
+            check(getattr(self, name), "B 2 N", f"{name} of the tracks", sizes=sizes)
+        for name in ("x_px", "y_px", "time"):
+            check(getattr(self, name), "N", f"{name} of the tracks", sizes=sizes)
 
     def positions(self, at: float | Tensor) -> tuple[Tensor, Tensor]:
         """Places (x, y), [B, N] each, at the time ``at``."""

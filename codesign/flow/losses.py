@@ -257,18 +257,16 @@ def _covariance(field):
             "supervised_loss, or an estimator that gives one."
         )
     batch, _, height, width = field.flow_px.shape
-    name, wanted = ("covariance_px2", (batch, 3, height, width))
     if field.covariance_px2 is None:
-        name, wanted = ("confidence", (batch, height, width))
-    check(getattr(field, name), wanted, f"{name} of a prediction")
-    if field.covariance_px2 is None:
-        if not bool(((field.confidence >= 0) & (field.confidence <= 1)).all()):
+        confidence = check(field.confidence, (batch, height, width), "confidence of a prediction")
+        if not bool(((confidence >= 0) & (confidence <= 1)).all()):
             raise DomainError(
                 "a confidence lies outside 0 to 1; 0 means nothing was seen, 1 a flow known exactly."
             )
-        variance = PRIOR_PX**2 * (1 - field.confidence.to(full))
+        variance = PRIOR_PX**2 * (1 - confidence.to(full))
         return variance, torch.zeros_like(variance), variance
-    xx, xy, yy = field.covariance_px2.to(full).unbind(1)
+    claim = check(field.covariance_px2, (batch, 3, height, width), "covariance_px2 of a prediction")
+    xx, xy, yy = claim.to(full).unbind(1)
     slack = 1e-4 * xx * yy if xx.dtype == torch.float32 else 1e-9 * xx * yy  # rounding of the products
     if bool((xx < 0).any() | (yy < 0).any() | (xy.square() > xx * yy + slack).any()):
         raise DomainError(
