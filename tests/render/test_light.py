@@ -176,6 +176,12 @@ def test_baked_light_is_path_traced_light_on_every_kind_of_shape(still_life, bak
         assert abs(float((ours - theirs).mean())) < share * max(float(theirs.mean()), least)
 
 
+def test_faces_of_two_triangles_stay_whole_where_they_are_baked():
+    """A cube has twelve edges: no diagonal of a face parts two pieces of its texture."""
+    (edges,) = light.bake({"cube": {"type": "cube", **grey(0.5, 1.0)}}, samples=1).outline()
+    assert len(edges.start) == 12
+
+
 def test_the_sky_is_the_same_at_every_level():
     scene = {"sky": sky(backend.mitsuba(), textures.sky(3, 64))}
     camera = Camera(lens.Pinhole(3.0), 24, 18, 0.2, 4)
