@@ -241,7 +241,8 @@ class Camera:
 def _columns(of, *rays):
     """Rays of which every column is ``of`` those of the given ones; None where one of them does not say."""
     columns = zip(*((r.origin_m, r.direction, r.weight, r.irradiance) for r in rays), strict=True)
-    return Rays(*(None if any(v is None for v in column) else of(*column) for column in columns))
+    found: list[Any] = [None if any(v is None for v in column) else of(*column) for column in columns]
+    return Rays(*found)
 
 
 def lines(rays: Rays) -> tuple[Tensor, Tensor]:
