@@ -190,3 +190,14 @@ def test_a_pole_and_its_lid_have_one_rim():
     assert (
         len(rims_once(turned, u, v, 0 * u, np.zeros(3), 1e-4)[0]) == 2
     )  # the same circle turned and mirrored, and a smaller one
+
+
+def test_the_far_end_of_a_tube_is_hidden_by_its_near_wall():
+    """Seen from above and aside: all of the upper rim, and of the lower one what faces the eye."""
+    tube_of = {"type": "cylinder", "p0": [0, 0, 0], "p1": [0, 0, 1], "radius": 0.1, "emitter": LIGHT}
+    curves = MitsubaScene({"tube": tube_of}).outline()
+    (rims,) = [curve for curve in curves if isinstance(curve, Circles)]
+    index = torch.arange(2).repeat_interleave(50)
+    eye = torch.tensor([[0.0, -3.0, 3.0]], dtype=F64)
+    y = rims.points(index, torch.arange(100, dtype=F64) / 50, eye)
+    assert torch.equal(rims.counts(index, y, eye), (y[:, 2] > 0.5) | (y[:, 1] < -0.1 * 0.1 / 3))
