@@ -235,47 +235,16 @@ def _crossings(camera, scene, cameras, most):
 def _listed(camera, scene, curves, cameras, found):
     """Of the steps that can be judged their frames [n] and changes of light [n]; the changes [n] along their
     lines that the listed curves have there, as the boundary term reads them; and their places [n, 3] in
-    camera axes. A line
-    along a curve tells little of it: there is one across."""
+    camera axes. A line along a curve tells little of it: there is one across."""
     seen = camera.rays_through(found.film_px, found.pupil)
     place_cam_m = seen.origin_m + seen.direction * found.distance.clamp_max(1e6)[:, None]
-    angle = piece_rad(camera.slope_per_px())
-    near_rad = NEAR_PX * abs(camera.slope_per_px())
-    rays = []
-    points = []
-    for part, of_part in enumerate(curves):
-        pose = cameras[part][found.frame]
-        o = apply(pose, seen.origin_m[:, None])[:, 0]
-        d = (pose[:, :3, :3] @ seen.direction[..., None])[..., 0]
-        for frame in torch.unique(found.frame).tolist():
-            rows = torch.nonzero((found.frame == frame) & found.distance.isfinite())[:, 0]
-            eye = cameras[part, frame, :3, 3]
-            for curve in of_part:
-                index, bounds = curve.pieces(eye, angle, camera.aperture_m)
-                ray, piece = _near(
-                    curve, index, bounds, eye, o[rows], d[rows], found.distance[rows], near_rad
-                )
-                if not ray.numel():
-                    continue
-                ray = rows[ray]
-                index, bounds = index[piece], bounds[piece]
-                within, y, ahead = _place(curve, index, bounds, o[ray], d[ray])
-                count = curve.counts(index, y, o[ray]) & within
-                ray, index, y, ahead = (v[count] for v in (ray, index, y, ahead))
-                beside = known_beside(curve, index, y, o[ray])
-                of_ray = found.pupil[ray], torch.zeros_like(ray), found.window[ray], found.frame[ray]
-                each = torch.ones_like(y[:, 0])
-                points.append(CurvePoints(y, ahead, each, *beside, *of_ray, torch.full_like(ray, part)))
-                rays.append(ray)
     total = torch.zeros_like(found.change)
-    read = None
-    if rays:
-        ray, points = torch.cat(rays), CurvePoints.joined(points)
-        read = jumps(camera, scene, cameras, points)
+    near = _near_curves(camera, curves, cameras, found, seen)
+    read = jumps(camera, scene, cameras, CurvePoints.joined([points for _, points in near])) if near else None
     if read is None:
         return found.frame, found.change, total, place_cam_m
     read = read[torch.nonzero(read.seen)[:, 0]]
-    ray = ray[read.row]
+    ray = torch.cat([ray for ray, _ in near])[read.row]
     turned = (read.normal * found.along[ray]).sum(1)
     away = ((read.film_px - found.film_px[ray]) * read.normal).sum(1)
     met = torch.nonzero((away.abs() < SAFETY * read.aside_px + FOUND_PX) & (turned.abs() > 0))[:, 0]
@@ -290,15 +259,47 @@ def _listed(camera, scene, curves, cameras, found):
         for v in (away / turned, read.aside_px / turned.abs(), turned.abs())
     )
     within = (away / turned - place[ray]).abs() < half[ray]
-    change = (read.behind - read.before) * turned.sign() * within
-    total = total.index_add(0, ray, change)
+    total = total.index_add(0, ray, (read.behind - read.before) * turned.sign() * within)
     rows = torch.nonzero((nearest >= 0) & (slant > GRAZING))[:, 0]
-    beside = found[rows]
-    before, behind = (beside.film_px + (place + sign * half)[rows, None] * beside.along for sign in (-1, 1))
-    light = [_look(camera, scene, cameras, beside.frame, at, beside.pupil)[:, 2] for at in (before, behind)]
-    change = found.change.index_put((rows,), light[1] - light[0])
+    steps = found[rows]
+    before, behind = (
+        _look(camera, scene, cameras, steps.frame, steps.film_px + far[rows, None] * steps.along, steps.pupil)
+        for far in (place - half, place + half)
+    )
+    change = found.change.index_put((rows,), behind[:, 2] - before[:, 2])
     kept = torch.nonzero((nearest < 0) | (slant > GRAZING))[:, 0]
     return found.frame[kept], change[kept], total[kept], place_cam_m[kept]
+
+
+def _near_curves(camera, curves, cameras, found, seen):
+    """Pairs of the numbers of steps [n] and of CurvePoints [n] on the curves that their rays ``seen`` pass
+    by."""
+    slope_per_px = camera.slope_per_px()
+    near = []
+    for part, of_part in enumerate(curves):
+        pose = cameras[part][found.frame]
+        o = apply(pose, seen.origin_m[:, None])[:, 0]
+        d = (pose[:, :3, :3] @ seen.direction[..., None])[..., 0]
+        for frame in torch.unique(found.frame).tolist():
+            rows = torch.nonzero((found.frame == frame) & found.distance.isfinite())[:, 0]
+            eye = cameras[part, frame, :3, 3]
+            for curve in of_part:
+                index, bounds = curve.pieces(eye, piece_rad(slope_per_px), camera.aperture_m)
+                rays = o[rows], d[rows], found.distance[rows]
+                ray, piece = _near(curve, index, bounds, eye, *rays, NEAR_PX * abs(slope_per_px))
+                if not ray.numel():
+                    continue
+                ray = rows[ray]
+                index = index[piece]
+                within, y, ahead = _place(curve, index, bounds[piece], o[ray], d[ray])
+                count = curve.counts(index, y, o[ray]) & within
+                ray, index, y, ahead = (v[count] for v in (ray, index, y, ahead))
+                beside = known_beside(curve, index, y, o[ray])
+                of_ray = found.pupil[ray], torch.zeros_like(ray), found.window[ray], found.frame[ray]
+                each = torch.ones_like(y[:, 0])
+                points = CurvePoints(y, ahead, each, *beside, *of_ray, torch.full_like(ray, part))
+                near.append((ray, points))
+    return near
 
 
 def _look(camera, scene, cameras, frame, at, pupil):
