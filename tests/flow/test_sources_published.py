@@ -149,6 +149,15 @@ def test_mvsec_windows(frames, chunks, length_s, grid, tmp_path):
     assert batch.truth.interval_s == pytest.approx(length_s)
 
 
+def test_windows_end_with_the_events(tmp_path):
+    make_mvsec(tmp_path / "m")
+    columns = (MVSEC.x, MVSEC.y, MVSEC.t_us.double() / 1e6, MVSEC.p)
+    early = torch.stack([column.double() for column in columns], 1)[MVSEC.t_us < 10_300_000]
+    stores(tmp_path / "m" / GREY, "davis/left/events", early.numpy())
+    # flows begin at 10.02 s, 50 ms apart
+    assert len(MvsecWindows(tmp_path / "m", frames=0)) == 5
+
+
 # damage
 
 
