@@ -1,6 +1,7 @@
 """A small network that corrects the closed form: the volume is warped along the flow so far, and what still
 moves says what to add."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -166,15 +167,20 @@ def _on_cells(image):
     return avg_pool2d(pad(image, extra, mode="replicate") if any(extra) else image, CELL)
 
 
-def _on_pixels(image, edges):
-    """Pixels [B, C, CELL h, CELL w] of an image [B, C, h, w] on cells: each a mean of the nine cells
-    around, with weights that begin as those of linear interpolation (edges [B, 9 CELL^2, h, w] are 0),
-    as in RAFT (Teed and Deng, ECCV 2020, sec. 3.3)."""
-    batch, channels, rows, columns = image.shape
-    logits = edges.unflatten(1, (9, CELL, CELL)) + _linear().to(edges).log()[:, :, :, None, None]
+def mixed(image: Tensor, logits: Tensor) -> Tensor:
+    """Pixels [B, C, side h, side w] of an image [B, C, h, w] on cells: each a mean of the nine cells
+    around, by weights of these logits [B, 9 side^2, h, w]. Source: Teed and Deng, RAFT, ECCV 2020, sec. 3.3."""
+    channels, rows, columns = image.shape[1:]
+    side = math.isqrt(logits.shape[1] // 9)
+    weights = logits.unflatten(1, (9, side, side)).softmax(1).flatten(4)
     around = unfold(pad(image, (1, 1, 1, 1), mode="replicate"), 3).unflatten(1, (channels, 9))
-    found = torch.einsum("bnijp,bcnp->bcijp", logits.softmax(1).flatten(4), around)
-    return pixel_shuffle(found.flatten(1, 3).unflatten(2, (rows, columns)), CELL)
+    found = torch.einsum("bnijp,bcnp->bcijp", weights, around)
+    return pixel_shuffle(found.flatten(1, 3).unflatten(2, (rows, columns)), side)
+
+
+def _on_pixels(image, edges):
+    """``mixed`` by weights that begin as those of linear interpolation (edges [B, 9 CELL^2, h, w] are 0)."""
+    return mixed(image, edges + _linear().to(edges).log().flatten()[:, None, None])
 
 
 def _linear():

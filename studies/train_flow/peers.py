@@ -1,17 +1,17 @@
 """Two published networks that the refiner is raced with: ECN, small and evenly cascaded, and IDNet,
 recurrent, which deblurs. ``--network`` and files know them as "ecn" and "idnet" where this is imported."""
 
-import math
 from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import avg_pool2d, interpolate, pad, silu, unfold
+from torch.nn.functional import avg_pool2d, interpolate, pad, silu
 
 from codesign.checks import check_whole
 from codesign.flow import checkpoint
 from codesign.flow.baselines.parts import Baseline, channels, rescale_flow, start
 from codesign.flow.entry import GROUPS, Layer
+from codesign.flow.refiner import mixed
 from codesign.flow.warp import pixel_grid, read_at
 from codesign.types import EventVolume
 
@@ -154,7 +154,7 @@ class IDNet(Baseline):
             read = self.encoder(each).unflatten(0, (batch, bins))
             state = self._read(read)
             flow = flow + self.STRIDE * self.head(state)
-            full = _blended(flow, self.blend(state))
+            full = mixed(flow, self.blend(state))
             found.append(full)
         return found
 
@@ -167,17 +167,6 @@ class IDNet(Baseline):
             new = self.candidate(torch.cat([reset * state, seen], 1)).tanh()
             state = state + update * (new - state)
         return state
-
-
-def _blended(flow, weights):
-    """Every pixel as a learnt mean of the nine cells around its own (Teed and Deng, RAFT, ECCV 2020, section
-    3.3)."""
-    batch, _, height, width = flow.shape
-    side = math.isqrt(weights.shape[1] // 9)
-    mix = weights.reshape(batch, 1, 9, side, side, height, width).softmax(2)
-    near = unfold(pad(flow, (1, 1, 1, 1), mode="replicate"), 3).reshape(batch, 2, 9, 1, 1, height, width)
-    fine = (mix * near).sum(2).permute(0, 1, 4, 2, 5, 3)
-    return fine.reshape(batch, 2, side * height, side * width)
 
 
 checkpoint.NETWORKS |= {"ecn": f"{__name__}:ECN", "idnet": f"{__name__}:IDNet"}

@@ -12,7 +12,7 @@ from codesign.flow.baselines import FlowNetEvents, SpikeFlowNet
 from codesign.flow.baselines.parts import count_weights
 from codesign.flow.entry import normalise, presence
 from codesign.types import EventVolume
-from studies.train_flow.peers import ECN, IDNet, _blended
+from studies.train_flow.peers import ECN, IDNet
 
 D = torch.float64
 BINS = 4
@@ -162,14 +162,3 @@ def test_the_second_iteration_reads_what_the_first_one_deblurred():
     for k in range(1, BINS):
         torch.testing.assert_close(second[:, k], second[:, 0])
     assert bool((second[0, 0, 0, 4:20, 8] > 0).all())
-
-
-def test_a_blend_of_an_even_flow_is_even_and_of_centres_is_nearest():
-    flow = torch.randn(1, 2, 3, 4, dtype=D)
-    anything = torch.randn(1, 576, 3, 4, dtype=D)
-    even = _blended(torch.full((1, 2, 3, 4), 1.5, dtype=D), anything)
-    torch.testing.assert_close(even, torch.full((1, 2, 24, 32), 1.5, dtype=D))
-    centre = torch.zeros(1, 9, 64, 3, 4, dtype=D)
-    centre[:, 4] = 1e3
-    nearest = _blended(flow, centre.flatten(1, 2))
-    torch.testing.assert_close(nearest, flow.repeat_interleave(8, 2).repeat_interleave(8, 3))
