@@ -248,10 +248,10 @@ def sky(mi, picture):
     return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90)}
 
 
-def sun(irradiance, elevation_deg=40.0, azimuth_deg=200.0):
-    """Parallel light from a height over the horizon and a direction on the compass (0 is +y, 90 is +x)."""
-    elevation = math.radians(elevation_deg)
-    azimuth = math.radians(azimuth_deg)
+def sun(irradiance):
+    """Parallel light from where the procedural sky has its sun."""
+    elevation = math.radians(textures.SUN_ELEVATION_DEG)
+    azimuth = math.radians(textures.SUN_AZIMUTH_DEG)
     towards = [
         -math.cos(elevation) * math.sin(azimuth),
         -math.cos(elevation) * math.cos(azimuth),

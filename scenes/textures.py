@@ -28,6 +28,8 @@ PHOTOS = (
 LIFT = 2.0  # the darkest radiance of a photograph: no real wall is perfectly black
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear red, green and blue: ITU-R BT.709
 MOST_PIXELS = 32_000_000
+SUN_ELEVATION_DEG = 40.0  # over the horizon
+SUN_AZIMUTH_DEG = 200.0  # on the compass: 0 is +y, 90 is +x
 ZENITH, HORIZON, BELOW = 90.0, 190.0, 40.0  # radiance of the procedural sky
 HDR = (".hdr", ".exr")
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "GIF", "PPM", "TGA", "WEBP")
@@ -253,8 +255,7 @@ def picture(source, blur_texels=2.0, encoding=None):
 def sky(
     seed=0,
     height_px=256,
-    sun_elevation_deg=40.0,
-    sun_azimuth_deg=200.0,
+    sun_azimuth_deg=SUN_AZIMUTH_DEG,
 ):
     """A procedural sky as an equirectangular picture [height, 2 height], first row at the zenith: a gradient,
     soft clouds, a broad soft sun; 255 at most."""
@@ -269,7 +270,7 @@ def sky(
     clouds = 25 * np.tanh(1.5 * noise / noise.std()) * np.clip(2 * elevation, 0, 1)
     up = np.clip(elevation / (np.pi / 2), 0, 1)
     clear = HORIZON + (ZENITH - HORIZON) * up**0.6 + clouds
-    e = np.radians(sun_elevation_deg)
+    e = np.radians(SUN_ELEVATION_DEG)
     a = np.radians(sun_azimuth_deg)
     cosine = np.sin(elevation) * np.sin(e) + np.cos(elevation) * np.cos(e) * np.cos(azimuth - a)
     bright = clear + (250 - clear) * np.exp(20 * (cosine - 1))

@@ -40,8 +40,6 @@ CORRIDOR_M = (14.0, 2.2, 2.6)  # length, width, height
 GROUND_M = 14.0  # half width of the outdoor world
 SPOTS = 10  # of light in the dark room
 DARK, BRIGHT = 1.5, 255.0  # radiance there
-SUN_ELEVATION_DEG = 40.0
-SUN_AZIMUTH_DEG = 200.0
 
 __all__ = [
     "VIEWS",
@@ -219,12 +217,8 @@ def outdoor(
                 (tube, Paint(pictures[k % 4], (1, 4))),
                 (cap, Paint(np.full((4, 4), 90.0))),
             )
-    above = (
-        textures.sky(seed, sun_elevation_deg=SUN_ELEVATION_DEG, sun_azimuth_deg=SUN_AZIMUTH_DEG)
-        if environment is None
-        else textures.environment(environment)
-    )
-    lamps = {"sun": sun(800.0, SUN_ELEVATION_DEG, SUN_AZIMUTH_DEG)} if environment is None else {}
+    above = textures.sky(seed) if environment is None else textures.environment(environment)
+    lamps = {"sun": sun(800.0)} if environment is None else {}
     return light(World(shapes, {"sky": sky(mi, above)}, lamps, texel_m=0.08), device)
 
 
