@@ -198,7 +198,6 @@ class VelocityHead(nn.Module):
       plain: axes, prior, depth and how flow is read.
       width: of the layers.
       rounds: of weighing and solving.
-      design: False hides lens and mount from the network.
 
     >>> from codesign.mount import FREE, EgoVelocity, VelocityHead
     >>> plain = EgoVelocity(FREE, prior=(2.0, 2.0, 1.0, 1.0, 1.0, 1.0), depth="scene")
@@ -206,7 +205,7 @@ class VelocityHead(nn.Module):
     True
     """
 
-    def __init__(self, plain: EgoVelocity, width: int = 32, rounds: int = 2, design: bool = True) -> None:
+    def __init__(self, plain: EgoVelocity, width: int = 32, rounds: int = 2) -> None:
         super().__init__()
         self.plain = check_kind(plain, EgoVelocity, "plain")
         if isinstance(plain.depth, UnknownDepth):
@@ -215,7 +214,6 @@ class VelocityHead(nn.Module):
         self.config: dict[str, Any] = {
             "width": width,
             "rounds": check_whole(rounds, "rounds"),
-            "design": bool(design),
         }
         window = (*TOLD, *LENS, *SOLVED)
         around = (*MOUNT, *VELOCITY, *(1,) * SIX)
@@ -302,11 +300,10 @@ class VelocityHead(nn.Module):
             torch.log(expected.clamp_min(0) + 1e-4) / 2,
             torch.log(share.clamp_min(0) + 1e-3),
         ]
-        shown = float(self.config["design"])
-        windows = torch.cat([seen.told, shown * seen.lens, torch.stack(solved, -1)], -1)
+        windows = torch.cat([seen.told, seen.lens, torch.stack(solved, -1)], -1)
         deviation = (_deviation(covariance) / seen.prior).log()
         body = torch.cat(
-            [shown * seen.mount, self._six(torch.asinh(velocity / seen.prior)), self._six(deviation)], -1
+            [seen.mount, self._six(torch.asinh(velocity / seen.prior)), self._six(deviation)], -1
         )
         dtype = self.say[0].weight.dtype
         windows = (windows * self.of_window[:, None, None]).to(dtype)  # [2, N, W, ...], as is and in a mirror
@@ -342,7 +339,11 @@ class VelocityHead(nn.Module):
             raise FileFormatError(
                 f"'{path}' holds no velocity head; give a file that VelocityHead.save wrote."
             )
-        head = cls(plain, **content["config"])
+        config = dict(content["config"])
+        # of earlier versions: whether it hears lens and mount
+        if not config.pop("design", True):
+            raise FileFormatError(f"'{path}' holds a head that hears no design; train it anew.")
+        head = cls(plain, **config)
         checkpoint.fill(head, weights, path)
         return head.eval()
 

@@ -189,7 +189,7 @@ def test_gradient_is_that_of_differences(designs, what):
 
 
 def test_weights_are_kept_and_read_again(tmp_path, mount):
-    head = stirred(VelocityHead(plain_of(), width=16, rounds=1, design=False)).float()
+    head = stirred(VelocityHead(plain_of(), width=16, rounds=1)).float()
     head.save(tmp_path / "head.safetensors", {"note": "a"})
     again = VelocityHead.load(plain_of(), tmp_path / "head.safetensors")
     assert again.config == head.config
@@ -213,18 +213,6 @@ def test_every_body_may_have_a_mount_of_its_own(mount):
     torch.testing.assert_close(found, head(field, camera_of(), None, each, poses.flatten(0, 1)).velocity)
     alone = of_windows(field, lambda part: part[6:])
     torch.testing.assert_close(found[2:], head(alone, camera_of(), None, other, poses[1]).velocity)
-
-
-def test_hidden_design_is_not_heard(mount):
-    """With the same evidence, other lenses and mounts change nothing."""
-    plain = plain_of()
-    head = stirred(VelocityHead(plain, design=False))
-    read = plain.read(noisy(2), camera_of(), None, mount, moved(2, mount))
-    seen = evidence(read, plain.solve(read), camera_of(), mount, plain.prior)
-    other = replace(seen, lens=seen.lens + 1, mount=seen.mount - 1)
-    assert torch.equal(head.judged(seen)[0], head.judged(other)[0])
-    shown = stirred(VelocityHead(plain))
-    assert not torch.equal(shown.judged(seen)[0], shown.judged(other)[0])
 
 
 def test_the_delivered_head_is_ahead_of_least_squares_in_an_unseen_world():
