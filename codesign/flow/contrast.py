@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import conv2d
 
 from codesign.checks import check, check_kind, check_number, check_whole
 from codesign.errors import DomainError, ShapeError
@@ -188,13 +189,9 @@ def smooth_image(tracks: EventTracks, at: float | Tensor, weight: Tensor | None 
 def still_image(counts: Tensor) -> Tensor:
     """What smooth_image gives at zero flow, for counts [B, 2, bins, H, W], much faster."""
     image = counts.sum(2)
-    for axis in (2, 3):
-        nothing = torch.zeros_like(image.narrow(axis, 0, 1))
-        length = image.shape[axis] - 1
-        before = torch.cat([nothing, image.narrow(axis, 0, length)], axis)
-        after = torch.cat([image.narrow(axis, 1, length), nothing], axis)
-        image = 0.75 * image + 0.125 * (before + after)  # the B-spline at offset 0
-    return image
+    shares = counts.new_tensor([0.125, 0.75, 0.125])  # of the B-spline at offset 0
+    kernel = torch.outer(shares, shares)[None, None]
+    return conv2d(image.flatten(0, 1)[:, None], kernel, padding=1).reshape(image.shape)
 
 
 def warp_jacobian(

@@ -1,6 +1,7 @@
 """What the networks that event flow is compared with share: from volume to fields of flow, layers, how
 many weights they have, where these start, and the widths that fill a budget."""
 
+from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar, Self
 
@@ -10,7 +11,7 @@ from torch.nn.functional import interpolate
 
 from codesign.checks import check_seed, check_whole
 from codesign.errors import DomainError
-from codesign.flow.entry import check_bins, check_sizes, normalise, pad_to, takes_volume, to_field
+from codesign.flow.entry import WIDEST, check_bins, check_sizes, normalise, pad_to, takes_volume, to_field
 from codesign.types import EventVolume, FlowField
 
 MOST_WEIGHTS = 10**9
@@ -135,21 +136,14 @@ def fill_budget(build: Callable[..., nn.Module], weights: int, inside: float = 8
             return count_weights(build(width=width, hidden=hidden))
 
     check_whole(weights, "weights", 1, MOST_WEIGHTS)
-    if counted(1.0) > weights:
+    # widths in quarters
+    quarters = bisect_right(range(4 * WIDEST), weights, 4, key=lambda width: counted(width / 4)) - 1
+    if quarters < 4:
         raise DomainError(
             f"a budget of {weights} weights is too small; the narrowest network has {counted(1.0)}."
         )
-    # widths in quarters
-    low = 4
-    high = 8
-    while counted(high / 4) <= weights:
-        low = high
-        high = 2 * high
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if counted(middle / 4) <= weights else (low, middle)
-    width = low / 4
-    hidden = channels(low / 4, inside)
+    width = quarters / 4
+    hidden = channels(width, inside)
     while counted(width, hidden) < weights:
         hidden += 4
     return width, hidden

@@ -5,6 +5,8 @@ cx cy k1 k2 p1 p2 k3), and how it turned: from its gyroscope (imu.txt) or from r
 import math
 import warnings
 from dataclasses import dataclass
+from itertools import accumulate
+from operator import mul
 from pathlib import Path
 from typing import Any
 
@@ -211,10 +213,8 @@ def read_gyroscope(path: str | Path, axes: str = "xyz") -> Attitude:
     t_s = table[:, 0]
     rate = table[:, 4:] @ turned.T
     steps = Rotation.from_rotvec((rate[1:] + rate[:-1]) / 2 * np.diff(t_s)[:, None])
-    turns = [Rotation.identity()]
-    for step in steps:
-        turns.append(turns[-1] * step)
-    return Attitude(t_s, Rotation.concatenate(turns), None, str(path))
+    turns = accumulate(steps, mul, initial=Rotation.identity())
+    return Attitude(t_s, Rotation.concatenate(list(turns)), None, str(path))
 
 
 def read_poses(path: str | Path) -> Attitude:

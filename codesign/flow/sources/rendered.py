@@ -243,12 +243,12 @@ class CameraFit:
 def _fitted(unit, values, degree):
     """Coefficients [n, n, K] of Chebyshev products of total degree up to n - 1, for values [N, K] at places
     [N, 2] in [-1, 1]."""
-    one, two = (chebyshev.chebvander(unit[:, k], degree) for k in (0, 1))
-    kept = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
-    found = np.linalg.lstsq(np.stack([one[:, i] * two[:, j] for i, j in kept], -1), values, rcond=None)[0]
-    coefficients = np.zeros((degree + 1, degree + 1, values.shape[1]))
-    coefficients[tuple(np.array(kept).T)] = found
-    return coefficients
+    numbers = np.arange(degree + 1)
+    kept = np.add.outer(numbers, numbers).ravel() <= degree
+    design = chebyshev.chebvander2d(*unit.T, [degree, degree])[:, kept]
+    coefficients = np.zeros((len(kept), values.shape[1]))
+    coefficients[kept] = np.linalg.lstsq(design, values, rcond=None)[0]
+    return coefficients.reshape(degree + 1, degree + 1, -1)
 
 
 def _value(unit, coefficients):
