@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from scipy.stats import rankdata
+from scipy.stats import spearmanr
 
 from codesign.flow.contrast import nearest_images, volume_tracks
 from codesign.flow.metrics import endpoint_error
@@ -126,7 +126,7 @@ def spearman(doubt, error) -> float:
     """Rank correlation (ties take their mean rank) of two lists; NaN where one is constant."""
     if len(error) < 2 or np.ptp(doubt) == 0 or np.ptp(error) == 0:
         return float("nan")
-    return float(np.corrcoef(rankdata(doubt), rankdata(error))[0, 1])
+    return float(spearmanr(doubt, error).statistic)
 
 
 def sparsified(error, doubt) -> np.ndarray:
