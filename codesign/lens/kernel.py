@@ -82,7 +82,8 @@ class Kernel:
         o = arr.Array3(o.x + d.x * start, o.y + d.y * start, dr.select(travels_forward, 0, o.z))
         path = path + n[0] * start
         for i, work in enumerate(self.works):
-            frame = _Frame(decentre, cosines, sines, i) if work.moved else None
+            pair = slice(2 * i, 2 * i + 2)
+            frame = _Frame(*decentre[pair], *cosines[pair], *sines[pair]) if work.moved else None
             if frame:
                 o, d = frame.enter(o, d)
             conic = k[i] if work.conic else None
@@ -91,10 +92,9 @@ class Kernel:
             o = o + d * step
             path = path + n[i] * step
             r2 = dr.square(o.x) + dr.square(o.y)
-            edges = [
-                reach[i] - per_mm2[i] * r2,
-                *([inner_reach[i] + inner_per_mm2[i] * r2] if work.obstructed else []),
-            ]
+            edges = [reach[i] - per_mm2[i] * r2]
+            if work.obstructed:
+                edges.append(inner_reach[i] + inner_per_mm2[i] * r2)
             for edge in edges:  # 1/2 at the edge itself
                 weight *= _soft_edge(edge)
                 inside &= (edge >= 0.5) | ~now
@@ -106,9 +106,8 @@ class Kernel:
                     d = dr.select(now, d - 2 * dr.dot(d, normal) * normal, d)
                 else:
                     if work.path:
-                        added, gradient = _diffraction(
-                            arr, o, r2, path_terms[i * self.path_width :][: work.path]
-                        )
+                        phase = path_terms[i * self.path_width :][: work.path]
+                        added, gradient = _diffraction(arr, o, r2, phase)
                         path = path + dr.select(now, added, 0)
                         d, kept, lost = _diffract(d, normal, gradient, n[i], n[i + 1], now)
                     else:
@@ -149,37 +148,31 @@ class Kernel:
 
 @dataclass(frozen=True)
 class _Frame:
-    """Axes of a decentred and tilted surface: shifted by (x, y), turned about x, then about its own y."""
+    """Axes of a decentred and tilted surface: shifted by (x, y), turned about x (a), then about its own y (b)."""
 
-    decentre: list[Any]
-    cosines: list[Any]
-    sines: list[Any]
-    row: int
+    x: Any
+    y: Any
+    cos_a: Any
+    cos_b: Any
+    sin_a: Any
+    sin_b: Any
 
     def enter(self, o, d):
-        x, y = self.decentre[2 * self.row : 2 * self.row + 2]
-        return self._turn_in(type(o)(o.x - x, o.y - y, o.z)), self._turn_in(d)
+        return self._turn_in(type(o)(o.x - self.x, o.y - self.y, o.z)), self._turn_in(d)
 
     def leave(self, o, d):
-        x, y = self.decentre[2 * self.row : 2 * self.row + 2]
         o = self._turn_out(o)
-        return type(o)(o.x + x, o.y + y, o.z), self._turn_out(d)
+        return type(o)(o.x + self.x, o.y + self.y, o.z), self._turn_out(d)
 
     def _turn_in(self, v):
-        (ca, cb), (sa, sb) = (
-            values[2 * self.row : 2 * self.row + 2] for values in (self.cosines, self.sines)
-        )
-        y = v.y * ca + v.z * sa
-        z = v.z * ca - v.y * sa
-        return type(v)(v.x * cb - z * sb, y, v.x * sb + z * cb)
+        y = v.y * self.cos_a + v.z * self.sin_a
+        z = v.z * self.cos_a - v.y * self.sin_a
+        return type(v)(v.x * self.cos_b - z * self.sin_b, y, v.x * self.sin_b + z * self.cos_b)
 
     def _turn_out(self, v):
-        (ca, cb), (sa, sb) = (
-            values[2 * self.row : 2 * self.row + 2] for values in (self.cosines, self.sines)
-        )
-        x = v.x * cb + v.z * sb
-        z = v.z * cb - v.x * sb
-        return type(v)(x, v.y * ca - z * sa, v.y * sa + z * ca)
+        x = v.x * self.cos_b + v.z * self.sin_b
+        z = v.z * self.cos_b - v.x * self.sin_b
+        return type(v)(x, v.y * self.cos_a - z * self.sin_a, v.y * self.sin_a + z * self.cos_a)
 
 
 def _intersect(arr, o, d, c, conic, asphere, alive):
@@ -217,9 +210,9 @@ def _intersect(arr, o, d, c, conic, asphere, alive):
         od = dr.detach(o)
         dd = dr.detach(d)
         for _ in range(NEWTON_STEPS):
-            value, slope, _ = _implicit(arr, od + dd * t, dd, c, conic, asphere)
+            value, slope, _ = _implicit(od + dd * t, dd, c, conic, asphere)
             t -= value / dr.select(dr.abs(slope) > GRAZING, slope, 1)
-        value, slope, inside = _implicit(arr, od + dd * t, dd, c, conic, asphere)
+        value, slope, inside = _implicit(od + dd * t, dd, c, conic, asphere)
         hit = (
             alive
             & inside
@@ -230,28 +223,35 @@ def _intersect(arr, o, d, c, conic, asphere, alive):
         slope = dr.select(hit, slope, 1)
     # 1 where the conic is met but no point of the asphere was found
     shortfall = dr.select(shortfall > 0, shortfall, 1)
-    value, _, _ = _implicit(arr, dr.select(hit, o + d * t, 0), d, c, conic, asphere)
+    value, _, _ = _implicit(dr.select(hit, o + d * t, 0), d, c, conic, asphere)
     return dr.select(hit, t - value / slope, 0), hit, shortfall
 
 
-def _implicit(arr, p, d, c, conic, asphere):
+def _implicit(p, d, c, conic, asphere):
     """z - sag(r^2) at a point, its derivative along the ray, and whether the conic part exists there."""
+    r2, slope, root, inside = _slope(p, c, conic, asphere)
+    sag = c * r2 / (1 + root)
+    power = r2
+    for a in asphere:
+        sag = sag + a * power
+        power = power * r2
+    return p.z - sag, d.z - 2 * slope * (p.x * d.x + p.y * d.y), inside
+
+
+def _slope(p, c, conic, asphere):
+    """r^2, the derivative of the sag to it, the root of the conic part, and whether that exists."""
     import drjit as dr
 
     r2 = dr.square(p.x) + dr.square(p.y)
     q = 1 - (c * c * r2 if conic is None else (1 + conic) * c * c * r2)
     inside = q > GRAZING
     root = dr.sqrt(dr.select(inside, q, 1))
-    sag = c * r2 / (1 + root)
     slope = c / (2 * root)
-    power = r2
-    factor = arr.Float(1)
+    factor = type(r2)(1)
     for i, a in enumerate(asphere):
-        sag = sag + a * power
         slope = slope + (i + 1) * a * factor
-        power = power * r2
         factor = factor * r2
-    return p.z - sag, d.z - 2 * slope * (p.x * d.x + p.y * d.y), inside
+    return r2, slope, root, inside
 
 
 def _normal(o, c, conic, asphere):
@@ -264,13 +264,7 @@ def _normal(o, c, conic, asphere):
     if not asphere:
         normal = kind(-c * o.x, -c * o.y, 1 - c * (1 + conic) * o.z)
     else:
-        r2 = dr.square(o.x) + dr.square(o.y)
-        q = 1 - (c * c * r2 if conic is None else (1 + conic) * c * c * r2)
-        slope = c / (2 * dr.sqrt(dr.select(q > GRAZING, q, 1)))
-        factor = type(r2)(1)
-        for i, a in enumerate(asphere):
-            slope = slope + (i + 1) * a * factor
-            factor = factor * r2
+        _, slope, _, _ = _slope(o, c, conic, asphere)
         normal = kind(-2 * slope * o.x, -2 * slope * o.y, 1)
     return normal / dr.sqrt(dr.maximum(dr.squared_norm(normal), 1e-12))
 
