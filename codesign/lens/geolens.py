@@ -106,20 +106,11 @@ class GeoLens(Replaceable):
         self.plate: Any = None
         self.plate_at: tuple[int, float] = (0, 0.0)
 
-        def column(values):
-            return torch.tensor(values, dtype=dtype)
-
-        self.curvature_per_mm = nn.Parameter(column([s.curvature_per_mm for s in surfaces]))
-        self.thickness_mm = nn.Parameter(column([s.thickness_mm for s in surfaces]))
-        self.conic = nn.Parameter(column([s.conic for s in surfaces]))
-        self.asphere = nn.Parameter(_table([s.asphere for s in surfaces], dtype))
-        self.index_offset = nn.Parameter(torch.zeros(len(surfaces), dtype=dtype))
-        self.phase = nn.Parameter(_table([s.phase.coefficients if s.phase else () for s in surfaces], dtype))
-        self.register_buffer("decentre_mm", column([s.decentre_mm for s in surfaces]))
-        self.register_buffer("tilt_rad", column([[math.radians(a) for a in s.tilt_deg] for s in surfaces]))
-        self.register_buffer(
-            "semi_aperture_mm", torch.tensor([s.semi_aperture_mm for s in surfaces], dtype=dtype)
-        )
+        for name, value in _tensors(surfaces, dtype).items():
+            if name in self.parameter_names:
+                self.register_parameter(name, nn.Parameter(value))
+            else:
+                self.register_buffer(name, value)
         glass = [s.medium not in (None, AIR) and not s.mirror for s in surfaces]
         self.register_buffer("glass", torch.tensor(glass), persistent=False)
 
@@ -303,20 +294,19 @@ class GeoLens(Replaceable):
                 "cannot hold "
                 "it; take it out with diffraction.with_plate(lens, None)."
             )
-        found = []
-        at_first = torch.tensor([s.curvature_per_mm for s in self.surfaces], dtype=self.dtype).tolist()
-        tilts = torch.tensor(
-            [[math.radians(a) for a in s.tilt_deg] for s in self.surfaces], dtype=self.dtype
-        ).tolist()
+        first = _tensors(self.surfaces, self.dtype)
+        same_curvature = (self.curvature_per_mm.cpu() == first["curvature_per_mm"]).tolist()
+        same_tilt = (self.tilt_rad.cpu() == first["tilt_rad"]).all(1).tolist()
         now = self._now() | {"index_offset": torch.where(self.glass, self.index_offset, 0)}
         columns = (now[name].tolist() for name in self.tensor_names)
-        for old, first, tilted, c, t, k, a, shift, phase, decentre, tilt, semi_aperture in zip(
-            self.surfaces, at_first, tilts, *columns, strict=True
+        found = []
+        for old, bent_alike, tilted_alike, c, t, k, a, shift, phase, decentre, tilt, semi_aperture in zip(
+            self.surfaces, same_curvature, same_tilt, *columns, strict=True
         ):
             found.append(
                 dataclasses.replace(
                     old,
-                    radius_mm=old.radius_mm if c == first else 1 / c if c else math.inf,
+                    radius_mm=old.radius_mm if bent_alike else 1 / c if c else math.inf,
                     thickness_mm=t,
                     semi_aperture_mm=semi_aperture,
                     conic=k,
@@ -324,7 +314,7 @@ class GeoLens(Replaceable):
                     medium=(old.medium or AIR).shifted(shift) if shift else old.medium,
                     phase=old.phase and dataclasses.replace(old.phase, coefficients=tuple(phase)),
                     decentre_mm=tuple(decentre),
-                    tilt_deg=old.tilt_deg if tilt == tilted else tuple(map(math.degrees, tilt)),
+                    tilt_deg=old.tilt_deg if tilted_alike else tuple(map(math.degrees, tilt)),
                 )
             )
         return tuple(found)
@@ -476,9 +466,22 @@ class GeoLens(Replaceable):
         return f"{self.name}, {len(self.surfaces)} surfaces, entrance pupil {self.entrance_pupil_diameter_mm:g} mm"
 
 
-def _table(rows, dtype):
-    """Rows of different length as one tensor, filled up with zeros."""
-    width = max(map(len, rows))
-    return torch.tensor([[*row, *[0.0] * (width - len(row))] for row in rows], dtype=dtype).reshape(
-        len(rows), width
-    )
+def _tensors(surfaces, dtype):
+    """The tensors of a lens of these surfaces, by name; rows of different length are filled up with zeros."""
+
+    def filled(rows):
+        width = max(map(len, rows))
+        return [[*row, *[0.0] * (width - len(row))] for row in rows]
+
+    rows = {
+        "curvature_per_mm": [s.curvature_per_mm for s in surfaces],
+        "thickness_mm": [s.thickness_mm for s in surfaces],
+        "conic": [s.conic for s in surfaces],
+        "asphere": filled([s.asphere for s in surfaces]),
+        "index_offset": [0.0 for _ in surfaces],
+        "phase": filled([s.phase.coefficients if s.phase else () for s in surfaces]),
+        "decentre_mm": [s.decentre_mm for s in surfaces],
+        "tilt_rad": [[math.radians(a) for a in s.tilt_deg] for s in surfaces],
+        "semi_aperture_mm": [s.semi_aperture_mm for s in surfaces],
+    }
+    return {name: torch.tensor(values, dtype=dtype) for name, values in rows.items()}

@@ -16,6 +16,8 @@ BOUND_BEND = 5.0  # a bound on one side bends the map within about this part of 
 TRIAL = 1e-4  # of a reach: the step of the differences that measure how rays move
 DEAD = 1e-6  # of the natural step: a number whose whole reach moves the rays by less is no variable
 
+LABELS = ("low", "high", "width", "places", "start", "unit")  # buffers of each kind of variables
+
 Bound = float | Sequence[float] | Tensor | None
 
 
@@ -33,9 +35,16 @@ class Kind:
     reach: Tensor
     low: float = -math.inf
 
-    def part(self, keep: Tensor) -> "Kind":
-        """The numbers where ``keep`` [K] is true."""
-        return Kind(self.tensor, self.places[keep], self.reach[keep], self.low)
+
+@dataclass(frozen=True)
+class Chosen:
+    """Numbers of a tensor that become variables: [K] places, units, and lower and upper bounds."""
+
+    tensor: str
+    places: Tensor
+    unit: Tensor
+    low: Tensor
+    high: Tensor
 
 
 class Variables(nn.Module):
@@ -48,27 +57,20 @@ class Variables(nn.Module):
     """
 
     def __init__(
-        self,
-        tensors: Mapping[str, Tensor],
-        kinds: Mapping[str, Kind],
-        units: Mapping[str, Tensor],
-        bounds: Mapping[str, tuple[Tensor, Tensor]],
-        held: Mapping[str, Tensor],
+        self, tensors: Mapping[str, Tensor], chosen: Mapping[str, Chosen], held: Mapping[str, Tensor]
     ) -> None:
         super().__init__()
-        self.tensor_of = {name: kind.tensor for name, kind in kinds.items()}
-        for name, value in tensors.items():
-            self.register_buffer(f"start_{name}", value.detach().clone())
-        for name, value in held.items():
-            self.register_buffer(f"held_{name}", value.detach().clone())
-        for name, kind in kinds.items():
+        self.tensor_of = {name: kind.tensor for name, kind in chosen.items()}
+        for prefix, entries in (("start", tensors), ("held", held)):
+            for name, value in entries.items():
+                self.register_buffer(f"{prefix}_{name}", value.detach().clone())
+        for name, kind in chosen.items():
             value = tensors[kind.tensor].detach().reshape(-1)[kind.places]
-            low, high = bounds[name]
-            width = _width(value, low, high)
-            table = {"low": low, "high": high, "width": width, "places": kind.places}
-            start = _unbounded(value, low, high, width)
-            table |= {"start": start, "unit": units[name] / _slope(start, low, high, width)}
-            for label, entry in table.items():
+            width = _width(value, kind.low, kind.high)
+            start = _unbounded(value, kind.low, kind.high, width)
+            unit = kind.unit / _slope(start, kind.low, kind.high, width)
+            entries = kind.low, kind.high, width, kind.places, start, unit
+            for label, entry in zip(LABELS, entries, strict=True):
                 self.register_buffer(f"{name}_{label}", entry.detach().clone())
             self.register_parameter(name, nn.Parameter(torch.zeros_like(value)))
 
@@ -85,10 +87,7 @@ class Variables(nn.Module):
         """The tensors at the variables as they are, by name. Gradient: exact, to the variables."""
         made = self._labelled("start_")
         for name, tensor in self.tensor_of.items():
-            low, high, width, places, start, unit = (
-                getattr(self, f"{name}_{label}")
-                for label in ("low", "high", "width", "places", "start", "unit")
-            )
+            low, high, width, places, start, unit = (getattr(self, f"{name}_{label}") for label in LABELS)
             values = _bounded(start + unit * getattr(self, name), low, high, width)
             flat = made[tensor].reshape(-1).index_put((places,), values)
             made[tensor] = flat.reshape(made[tensor].shape)
@@ -120,15 +119,14 @@ def natural_units(
 
     Args: land: numbers [K] -> (positions [fields, M, 2] mm, weights [fields, M]).
     """
-    moves = []
+    moves = torch.zeros_like(values)
     for i in range(values.numel()):
         trial = torch.zeros_like(values)
         trial[i] = TRIAL * reach[i]
         with torch.no_grad():
             moved, weight = ray_motion(land(values + trial), land(values - trial))
         rms = torch.linalg.vector_norm(moved) / weight.sum().clamp_min(1).sqrt()
-        moves.append(rms / (2 * TRIAL))  # over the whole reach
-    moves = torch.stack(moves) if moves else values
+        moves[i] = rms / (2 * TRIAL)  # over the whole reach
     return reach / (moves / step_mm).clamp_min(1), moves > DEAD * step_mm
 
 
@@ -160,15 +158,13 @@ def checked_bounds(
             raise ShapeError(f"a bound of {name} is a number or {value.numel()} of them, got {side.numel()}.")
         sides.append(side.reshape(-1).expand_as(value)[rows])
     low, high = sides
-    for i, at, least, most in zip(
-        rows.tolist(), value[rows].tolist(), low.tolist(), high.tolist(), strict=True
-    ):
-        if not least < at < most:
-            raise DomainError(
-                f"{name} {i + 1} is {at:.6g}, not strictly inside its bounds {least:.6g} to {most:.6g}; "
-                "widen "
-                "them, start elsewhere, or mask it."
-            )
+    wrong = torch.nonzero(~((low < value[rows]) & (value[rows] < high)))[:, 0].tolist()
+    if wrong:
+        at = wrong[0]
+        raise DomainError(
+            f"{name} {int(rows[at]) + 1} is {float(value[rows][at]):.6g}, not strictly inside its bounds "
+            f"{float(low[at]):.6g} to {float(high[at]):.6g}; widen them, start elsewhere, or mask it."
+        )
     return low, high
 
 
@@ -233,49 +229,44 @@ def make_variables(
     """
     exact = lens._fixed().double()
     kinds = exact._kinds()
-    for label, found in (("variables", names), ("bounds of", bounds), ("mask of", mask)):
-        unknown = [name for name in found if name not in (kinds if label == "variables" else names)]
+    for label, found, known in (
+        ("variables", names, kinds),
+        ("bounds of", bounds, names),
+        ("mask of", mask, names),
+    ):
+        unknown = [name for name in found if name not in known]
         if unknown or len(set(found)) < len(found):
             raise DomainError(
                 f"{lens}: {label} {', '.join(map(repr, unknown or found))}: name each once, of "
-                f"{', '.join(kinds if label == 'variables' else names)}."
+                f"{', '.join(known)}."
             )
     if not names:
         raise DomainError(f"{lens}: name the numbers that become variables, of {', '.join(kinds)}.")
     tensors = {t: v.detach() for t, v in exact._now().items()}
-    values = {name: tensors[kinds[name].tensor].reshape(-1)[kinds[name].places] for name in names}
-    keep = {name: _kept(name, kinds[name], values[name], bounds, mask) for name in names}
-    places = [(kinds[name].tensor, kinds[name].places[keep[name]]) for name in names]
-    counts = [at.numel() for _, at in places]
-
-    def land(numbers):
-        moved = {kind.tensor: tensors[kind.tensor] for kind in map(kinds.get, names)} | {
-            solved: tensors[solved] for solved in map(exact.solved_tensors.get, held)
-        }
-        for (tensor, at), part in zip(places, numbers.split(counts), strict=True):
-            moved[tensor] = moved[tensor].reshape(-1).index_put((at,), part).reshape(moved[tensor].shape)
-        return exact._with(exact._solved(moved, held))._landing(fields_rad, wavelength_um)
-
-    start = torch.cat([values[name][keep[name]] for name in names])
-    reach = torch.cat([kinds[name].reach[keep[name]] for name in names])
-    units, alive = natural_units(land, start, reach, step_mm)
+    solved = [exact.solved_tensors[name] for name in held]
     chosen = {}
-    chosen_units = {}
-    chosen_bounds = {}
-    for name, unit, live in zip(names, units.split(counts), alive.split(counts), strict=True):
-        if not bool(live.any()):
+    for name in names:
+        kind = kinds[name]
+        value = tensors[kind.tensor].reshape(-1)[kind.places]
+        rows = torch.nonzero(_kept(name, kind, value, bounds, mask))[:, 0]
+
+        def land(numbers, tensor=kind.tensor, at=kind.places[rows]):
+            moved = tensors[tensor].reshape(-1).index_put((at,), numbers).reshape(tensors[tensor].shape)
+            given = {name: tensors[name] for name in solved} | {tensor: moved}
+            return exact._with(exact._solved(given, held))._landing(fields_rad, wavelength_um)
+
+        unit, alive = natural_units(land, value[rows], kind.reach[rows], step_mm)
+        if not bool(alive.any()):
             raise DomainError(
                 f"{lens}: no {name} moves a ray (none is there, or all are masked), so it cannot be a "
                 "variable; "
                 "leave it out."
             )
-        rows = keep[name].nonzero()[:, 0][live]
-        chosen[name] = kinds[name].part(rows)
-        chosen_units[name] = unit[live]
-        chosen_bounds[name] = checked_bounds(name, kinds[name], values[name], bounds.get(name), rows)
-    made = {kind.tensor for kind in chosen.values()} | {exact.solved_tensors[name] for name in held}
-    start_tensors = {name: tensors[name] for name in sorted(made)}
-    return Variables(start_tensors, chosen, chosen_units, chosen_bounds, held).to(lens.dtype)
+        rows = rows[alive]
+        limits = checked_bounds(name, kind, value, bounds.get(name), rows)
+        chosen[name] = Chosen(kind.tensor, kind.places[rows], unit[alive], *limits)
+    made = {kind.tensor for kind in chosen.values()} | set(solved)
+    return Variables({name: tensors[name] for name in sorted(made)}, chosen, held).to(lens.dtype)
 
 
 def _kept(name, kind, value, bounds, mask):

@@ -23,10 +23,10 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from codesign.errors import DomainError
 from codesign.grad.jacobian import by_differences
 from codesign.lens import GeoLens
-from codesign.lens.design.glass_map import neighbour_glasses
 from codesign.lens.design.moves import (
     elements,
     flattened,
+    neighbour_glasses,
     with_glass,
     without_element,
 )

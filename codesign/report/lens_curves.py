@@ -17,8 +17,8 @@ from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.seidel import SeidelSums
-from codesign.report.lens_figures import COLOURS, VISIBLE_UM
-from codesign.report.lens_layout import degrees
+from codesign.report.lens_figures import SIDES, VISIBLE_UM, draw_sides, finish
+from codesign.report.lens_layout import COLOURS, coloured, degrees
 
 SEIDEL_NAMES = ("spherical $S_I$", "coma $S_{II}$", "astigmatism $S_{III}$", "Petzval $S_{IV}$")
 SEIDEL_NAMES += ("distortion $S_V$",)
@@ -38,26 +38,23 @@ def field_errors(
     fields = [half_field_rad * i / (count - 1) for i in range(count)]
     angles = np.degrees(fields)
     figure, axes = plt.subplots(1, 3, figsize=(10, 3.8), sharey=True, layout="constrained")
-    shifts = analysis.focus_shift_mm(lens, fields, reference, at_m=at_m).numpy()
-    axes[0].plot(shifts[:, 0], angles, color=COLOURS[0], label="tangential")
-    axes[0].plot(shifts[:, 1], angles, color=COLOURS[0], ls="--", label="sagittal")
+    shifts = analysis.focus_shift_mm(lens, fields, reference, at_m=at_m)
+    for column, style, side in zip(shifts.T, ("-", "--"), SIDES, strict=True):
+        axes[0].plot(column.numpy(), angles, style, color=COLOURS[0], label=side)
     axes[0].set(xlabel="focus shift (mm)", ylabel="field (degrees)", title="Field curvature")
     # on the axis it is 0 by definition
     distortion = analysis.distortion_percent(lens, fields[1:], wavelength_um=reference, at_m=at_m)
     axes[1].plot(distortion.numpy(), angles[1:], color=COLOURS[2])
     axes[1].set(xlabel="distortion (%), f-tan", title="Distortion")
-    colour = analysis.lateral_colour_mm(lens, fields, others, reference, at_m) if others else ()
-    for k, wavelength in enumerate(others):
+    colours = analysis.lateral_colour_mm(lens, fields, others, reference, at_m).T if others else ()
+    for k, (wavelength, shift) in enumerate(zip(others, colours, strict=True)):
         label = f"{wavelength * 1e3:.0f} nm"
-        axes[2].plot(1e3 * colour[:, k].numpy(), angles, color=COLOURS[1:][k % 3], label=label)
+        axes[2].plot(1e3 * shift.numpy(), angles, color=COLOURS[1:][k % 3], label=label)
     axes[2].set(xlabel=f"height − that at {reference * 1e3:.0f} nm (µm)", title="Lateral colour")
     for axis in axes:
-        if axis.get_legend_handles_labels()[0]:
-            axis.legend(frameon=False, fontsize=8)
         axis.axvline(0, color="0.5", lw=0.6)
-        axis.grid(alpha=0.3)
         widest = np.abs(axis.get_xlim()).max()
-        axis.set(xlim=(-widest, widest), ylim=(0, angles[-1]))
+        finish(axis, xlim=(-widest, widest), ylim=(0, angles[-1]))
     return figure
 
 
@@ -71,24 +68,21 @@ def through_focus(
     vignetting: bool = False,
     at_m: float = PARALLEL,
 ) -> Figure:
-    """Figure over the position of the image plane: RMS spot, and MTF at one frequency."""
+    """Figure over the position of the image plane: RMS spot, and MTF of the rays at one frequency."""
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
     z = np.asarray(defocus_mm, dtype=float)
     sizes = analysis.through_focus_spot_mm(lens, fields_rad, z, light, 24, vignetting, at_m) * 1e3
-    for field, row, colour in zip(fields_rad, sizes, COLOURS * len(fields_rad), strict=False):
+    for (field, colour), row in zip(coloured(fields_rad), sizes, strict=True):
         axes[0].plot(z, row.numpy(), color=colour, label=degrees(field))
         curves = analysis.through_focus_mtf(
-            lens, field, frequency_per_mm, z, light, "geometric", vignetting, at_m=at_m
+            lens, field, frequency_per_mm, z, light, "geometric", vignetting, at_m
         )
-        for side, curve, style in zip(("tangential", "sagittal"), curves.numpy(), ("-", "--"), strict=True):
-            axes[1].plot(z, curve, style, color=colour, label=f"{degrees(field)}, {side}")
-    axes[0].set(ylabel="RMS spot (µm)", ylim=(0, None))
-    axes[1].set(ylabel=f"geometric MTF at {frequency_per_mm:g} / mm", ylim=(0, 1.02))
+        draw_sides(axes[1], z, curves, colour, degrees(field))
     for axis in axes:
         axis.axvline(0, color="0.5", lw=0.6)
-        axis.set_xlabel("defocus (mm)")
-        axis.grid(alpha=0.3)
-        axis.legend(frameon=False, fontsize=8)
+    finish(axes[0], xlabel="defocus (mm)", ylabel="RMS spot (µm)", ylim=(0, None))
+    label = f"geometric MTF at {frequency_per_mm:g} / mm"
+    finish(axes[1], xlabel="defocus (mm)", ylabel=label, ylim=(0, 1.02))
     return figure
 
 
@@ -121,15 +115,13 @@ def encircled_curves(
 ) -> Figure:
     """Figure of encircled energy (rays, about their mean) over the radius, a curve per field."""
     figure, axis = plt.subplots(figsize=(7, 3.4), layout="constrained")
-    options = (light, 48, vignetting)
-    largest = [analysis.encircled_radius_mm(lens, field, 1.0, *options, at_m=at_m) for field in fields_rad]
-    radii = torch.linspace(0, 1.02 * float(max(largest)), 200, dtype=lens.dtype)
-    for field, colour in zip(fields_rad, COLOURS * len(fields_rad), strict=False):
-        energy = analysis.encircled_energy(lens, field, radii, *options, at_m=at_m)
+    options = {"light": light, "grid": 48, "vignetting": vignetting, "at_m": at_m}
+    largest = max(float(analysis.encircled_radius_mm(lens, field, 1.0, **options)) for field in fields_rad)
+    radii = torch.linspace(0, 1.02 * largest, 200, dtype=lens.dtype)
+    for field, colour in coloured(fields_rad):
+        energy = analysis.encircled_energy(lens, field, radii, **options)
         axis.plot(radii.numpy() * 1e3, energy.numpy(), color=colour, label=degrees(field))
-    axis.set(xlabel="radius (µm)", ylabel="share of rays inside", ylim=(0, 1.02), xlim=(0, None))
-    axis.grid(alpha=0.3)
-    axis.legend(frameon=False, fontsize=8)
+    finish(axis, xlabel="radius (µm)", ylabel="share of rays inside", ylim=(0, 1.02), xlim=(0, None))
     return figure
 
 
@@ -147,11 +139,10 @@ def depth_curves(
     vergence = torch.linspace(1 / far_m, 1 / near_m, 129, dtype=lens.dtype)
     sizes = analysis.rms_spot_mm(lens, fields_rad, wavelength_um, 16, 1 / vergence) * 1e3
     figure, axis = plt.subplots(figsize=(7, 3.4), layout="constrained")
-    for field, column, colour in zip(fields_rad, sizes.T, COLOURS * len(fields_rad), strict=False):
+    for (field, colour), column in zip(coloured(fields_rad), sizes.T, strict=True):
         axis.plot(vergence.numpy(), column.numpy(), color=colour, label=degrees(field))
     axis.axhline(1e3 * blur_mm / math.sqrt(8), color="0.4", ls="--", lw=1)
     ticks = np.linspace(1 / far_m, 1 / near_m, 7)
     axis.set_xticks(ticks, [f"{1 / t:.3g}" if t > 0 else "∞" for t in ticks])
-    axis.set(xlabel="distance of the object (m)", ylabel="RMS spot (µm)", ylim=(0, None))
-    axis.legend(frameon=False, fontsize=8)
+    finish(axis, xlabel="distance of the object (m)", ylabel="RMS spot (µm)", ylim=(0, None))
     return figure

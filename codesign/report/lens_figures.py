@@ -20,23 +20,13 @@ from codesign.lens.analysis.psf import Psf
 from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
-from codesign.report.lens_layout import COLOURS, degrees, draw_layout, layouts, lens_layout
-
-__all__ = [
-    "COLOURS",
-    "VISIBLE_UM",
-    "draw_layout",
-    "layouts",
-    "lens_layout",
-    "mtf_curves",
-    "opd_maps",
-    "psf_pictures",
-    "ray_fans",
-    "spot_diagrams",
-    "spots_by_wavelength",
-]
+from codesign.report.lens_layout import COLOURS, degrees
+from codesign.report.lens_layout import draw_layout as draw_layout
+from codesign.report.lens_layout import layouts as layouts
+from codesign.report.lens_layout import lens_layout as lens_layout
 
 VISIBLE_UM = tuple(WAVELENGTH_UM[line] for line in "dFC")
+SIDES = ("tangential", "sagittal")
 FLOOR = 1e-4  # of the peak of a point spread
 LINE_COLOURS = ("#2e8b57", "#1b6ca8", "#c0392b", "#8e44ad", "#d68910")
 
@@ -110,7 +100,7 @@ def ray_fans(
         reference = analysis.chief_ray(lens, field, lines[0][0], at_m=at_m).position_mm[0]
         for wavelength, colour, label in lines:
             fan = analysis.ray_fan(lens, field, wavelength, 65, vignetting, reference, at_m=at_m)
-            for column, side in enumerate(("tangential", "sagittal"), 2 * k):
+            for column, side in enumerate(SIDES, 2 * k):
                 weight = getattr(fan, f"{side}_weight")
                 values = getattr(fan, f"{side}_mm") * 1e3, getattr(fan, f"{side}_waves")
                 for axis, value in zip(axes[:, column], values, strict=True):
@@ -186,14 +176,24 @@ def mtf_curves(frequency_per_mm: Tensor, curves: Mapping[str, Tensor], ideal: Te
     if ideal is not None:
         axis.plot(frequency, ideal.detach().numpy(), color="k", lw=1, ls=":", label="perfect lens")
     for (label, values), colour in zip(curves.items(), COLOURS * len(curves), strict=False):
-        for style, row, name in zip(["-", "--"], values.detach(), ("tangential", "sagittal"), strict=True):
-            axis.plot(frequency, row.numpy(), style, color=colour, lw=1.4, label=f"{label}, {name}")
-    axis.set(
-        xlabel="line pairs per mm", ylabel="modulation", ylim=(0, 1.02), xlim=(0, float(frequency.max()))
-    )
-    axis.grid(alpha=0.3)
-    axis.legend(fontsize=8, frameon=False)
+        draw_sides(axis, frequency, values.detach(), colour, label)
+    limits = {"ylim": (0, 1.02), "xlim": (0, float(frequency.max()))}
+    finish(axis, xlabel="line pairs per mm", ylabel="modulation", **limits)
     return figure
+
+
+def draw_sides(axis: Any, x: Any, curves: Tensor, colour: str, label: str) -> None:
+    """Draw curves [2, K], tangential (full line) and sagittal (dashed), into an axis."""
+    for curve, style, side in zip(curves, ("-", "--"), SIDES, strict=True):
+        axis.plot(x, curve.numpy(), style, color=colour, lw=1.4, label=f"{label}, {side}")
+
+
+def finish(axis: Any, **options: Any) -> None:
+    """Labels and limits of an axis, a grid, and a legend where anything has a label."""
+    axis.set(**options)
+    axis.grid(alpha=0.3)
+    if axis.get_legend_handles_labels()[0]:
+        axis.legend(fontsize=8, frameon=False)
 
 
 def _grid(rows: int, columns: int, width: float, height: float, **shared: Any) -> tuple[Figure, Any]:

@@ -1,7 +1,8 @@
 """Cross-section of a lens: surfaces, glass, stop, and the rays of a few fields, in millimetres."""
 
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -29,6 +30,11 @@ ENDINGS = (".svg", ".png", ".pdf")
 def degrees(angle_rad: float) -> str:
     """An angle as it stands in a title."""
     return f"{math.degrees(angle_rad):.3g}°"
+
+
+def coloured(fields_rad: Sequence[float]) -> Iterator[tuple[float, str]]:
+    """Each field with its colour."""
+    return zip(fields_rad, itertools.cycle(COLOURS))
 
 
 def lens_layout(
@@ -100,7 +106,7 @@ def draw_layout(
     line = torch.linspace(-1, 1, rays, dtype=lens.dtype)
     pupil = torch.stack([torch.zeros_like(line), line], 1)
     highest = 0.0
-    for field, colour in zip(fields_rad, COLOURS * len(fields_rad), strict=False):
+    for field, colour in coloured(fields_rad):
         for k, path in enumerate(ray_paths(lens, field, pupil, start, at_m)):
             axis.plot(*path.T, color=colour, lw=0.6, label=None if k else degrees(field))
             highest = max(highest, abs(path[-1, 1]))

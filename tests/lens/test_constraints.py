@@ -10,7 +10,6 @@ import torch
 from codesign import lens
 from codesign.lens import GeoLens, Glass, Surface
 from codesign.lens.analysis import field_rays
-from codesign.lens.design import glass_map
 from codesign.lens.design.constraints import (
     Constraint,
     Limits,
@@ -277,37 +276,3 @@ def test_rays_that_fail_push_back_until_they_pass():
     assert not final.trace(*rim_rays(final, (0.0, 0.2))).status.any()
     # no failed ray is the best there is: it holds, it does not bind
     assert evaluate(final, limits)[0].state() == "free"
-
-
-def test_glasses_against_their_definitions():
-    named = [Glass.named("N-BK7"), Glass.named("F2")]
-    geo = lens_of(
-        [(50.0, 5.0, named[0], 10.0), (-50.0, 5.0, named[1], 10.0), (PLANE, 90.0, None, 10.0)], 10.0
-    )
-    offset = geo.index_offset.clone().requires_grad_()
-    geo = geo.replace(index_offset=offset)
-    (nd, vd), (flint_nd, _) = found = [
-        tuple(v.item() for v in pair) for pair in glass_map.places(geo).values()
-    ]
-    for place, glass_ in zip(found, named, strict=True):
-        assert place == pytest.approx((glass_.index_d, glass_.abbe_number), rel=1e-11)
-    shifted = glass_map.places(geo.replace(index_offset=torch.tensor([0.02, 0.0, 0.0], dtype=D)))[0]
-    assert float(shifted[1]) == pytest.approx(vd * (nd + 0.02 - 1) / (nd - 1), rel=1e-11)
-    square = ((1.5, 30.0), (1.5, 70.0), (1.6, 70.0), (1.6, 30.0))
-    limits = found_in(geo, Limits(glass_polygon=square, index_range=(1.4, 1.61)))
-    inside = limits["glass behind surface 1 in the glass map"].value.item()
-    assert inside == pytest.approx(min(nd - 1.5, 0.0583), abs=1e-3)
-    outside = limits["glass behind surface 2 in the glass map"]
-    assert outside.value.item() == pytest.approx(1.6 - flint_nd, rel=1e-12)
-    assert outside.state() == "violated"
-    (slope,) = torch.autograd.grad(outside.penalty, offset)
-    assert slope.tolist() == pytest.approx([0.0, 2 * (flint_nd - 1.6) / 0.01**2, 0.0], rel=1e-9)
-    assert limits["index of glass behind surface 2"].slack.item() == pytest.approx(1.61 - flint_nd, rel=1e-12)
-
-
-def test_distance_inside_a_triangle_by_hand():
-    triangle = ((1.5, 40.0), (1.7, 40.0), (1.5, 60.0))
-    at = torch.tensor(1.55, dtype=D), torch.tensor(50.0, dtype=D)
-    # the slanted side is nd + Vd / 100 = 2.1
-    for corners in (triangle, triangle[::-1]):
-        assert float(glass_map.inside(*at, corners)) == pytest.approx(0.05 / math.sqrt(2), rel=1e-12)

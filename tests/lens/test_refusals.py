@@ -19,7 +19,7 @@ from codesign.lens import (
     design,
     diffraction,
 )
-from codesign.lens.design import Limits, Tolerances, glass_map, moved_element
+from codesign.lens.design import Limits, Tolerances, moved_element
 from codesign.lens.design.constraints import rows
 from codesign.lens.design.hits import traced_semi_aperture_mm
 from codesign.lens.design.precision import cheapest
@@ -219,14 +219,6 @@ DESIGN = [
     *(
         (lambda geo, bad=bad: design.fit_apertures(geo, (0.1,), margin=bad), "finite number of at least 0")
         for bad in (-2.0, NAN, INF)
-    ),
-    *(
-        (lambda geo, c=corners: glass_map.inside(torch.tensor(1.5), torch.tensor(50.0), c), "convex")
-        for corners in (
-            ((1.5, 50.0), (1.6, 60.0)),
-            ((1.5, 30.0), (1.6, 70.0), (1.5, 70.0), (1.6, 30.0)),
-            ((1.5, 50.0), (1.55, 50.0), (1.6, 50.0)),
-        )
     ),
     (lambda geo: Limits(incidence_deg=50.0), "fields_rad"),
     (lambda geo: Limits(rays=True), "fields_rad"),

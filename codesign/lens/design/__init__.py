@@ -3,7 +3,6 @@ motion."""
 
 from codesign.doors import explain
 from codesign.lens.design.constraints import Limits
-from codesign.lens.design.glass_map import neighbour_glasses
 from codesign.lens.design.hits import fit_apertures
 from codesign.lens.design.modes import LensDesign, detune, edge_thickness_mm, make_design
 from codesign.lens.design.moves import (
@@ -11,6 +10,7 @@ from codesign.lens.design.moves import (
     flattened,
     groups,
     moved_element,
+    neighbour_glasses,
     with_glass,
     without_element,
 )

@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.lens.design import glass_map
 from codesign.lens.design.hits import rim_rays, surface_hits
 from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
@@ -81,8 +80,6 @@ class Limits:
     incidence_deg: most angle of incidence of any rim or chief ray of ``fields_rad``. steepness: most
       semi-aperture over radius (1 is a hemisphere).
     rays: whether every rim and chief ray of ``fields_rad`` must arrive.
-    glass_polygon: corners (nd, Vd) of a convex region of the glass map, see glass_map. index_range: least and
-      most nd of any glass.
     at_m: distance of the object whose rays count, metres from the entrance pupil, or several; inf is
       parallel light.
     scale_mm, scale_deg: violations that cost 1.
@@ -98,8 +95,6 @@ class Limits:
     steepness: float | None = None
     rays: bool = False
     fields_rad: tuple[float, ...] = ()
-    glass_polygon: tuple[tuple[float, float], ...] | None = None
-    index_range: tuple[float, float] | None = None
     scale_mm: float = 0.5
     scale_deg: float = 5.0
     at_m: float | tuple[float, ...] = PARALLEL
@@ -141,7 +136,7 @@ def evaluate(lens: GeoLens, limits: Limits, semi_aperture_mm: Tensor | None = No
     Gradient: to every lens tensor the figure depends on. A least gap has that of its narrowest place.
     """
     apertures = lens.semi_aperture_mm if semi_aperture_mm is None else semi_aperture_mm
-    parts = _lengths(lens, limits, apertures), _rays(lens, limits), _glasses(lens, limits)
+    parts = _lengths(lens, limits, apertures), _rays(lens, limits)
     return [
         Constraint(name, value, bound, at_least, *scale)
         for part in parts
@@ -228,16 +223,3 @@ def _rays(lens, limits):
         # a radicand lacks the deficit: exactly 0 for a ray that passes
         deficit = lens.trace(origin, direction).deficit.sum()
         yield "deficit of rays that fail", deficit, 0.0, MOST, 0.1, "", False
-
-
-def _glasses(lens, limits):
-    low, high = limits.index_range or (None, None)
-    if limits.glass_polygon is None and low is None:
-        return
-    for i, (nd, vd) in glass_map.places(lens).items():
-        name = f"glass behind surface {i + 1}"
-        yield f"index of {name}", nd, low, LEAST, 0.01, ""
-        yield f"index of {name}", nd, high, MOST, 0.01, ""
-        if limits.glass_polygon is not None:
-            inside = glass_map.inside(nd, vd, limits.glass_polygon)
-            yield f"{name} in the glass map", inside, 0.0, LEAST, 0.01, "nd"

@@ -20,9 +20,11 @@ from codesign.checks import check_finite
 from codesign.errors import DomainError, ShapeError
 from codesign.lens.distance import real_numbers
 from codesign.lens.geolens import GeoLens
-from codesign.lens.glass import Glass
+from codesign.lens.glass import WAVELENGTH_UM, Glass, names
 from codesign.lens.solves import focus_paraxial, hold_efl
 from codesign.lens.surface import Surface, passes_of
+
+VD_PER_ND = 100.0  # an Abbe number of 1 counts like an index of 0.01
 
 
 def elements(lens: GeoLens) -> tuple[tuple[int, int], ...]:
@@ -123,6 +125,38 @@ def with_glass(lens: GeoLens, surface: int, medium: Glass | str) -> GeoLens:
         )
     name = other.surfaces[surface].medium.name
     return _held(lens, _surfaces(other), f"with {name} behind surface {surface + 1}")
+
+
+def neighbour_glasses(
+    medium: Glass | str, count: int = 4, apart: float = 2e-3, among: Sequence[str] | None = None
+) -> list[Glass]:
+    """The catalogue's glasses nearest to one on the (nd, Vd) map, the nearest first.
+
+    The distance is hypot(nd difference, Vd difference / 100), see VD_PER_ND.
+    Args: medium: a Glass, or a name of the catalogue. apart: least distance; other makers' versions of the
+      same glass lie closer and are left out. among: names of the catalogue to choose from, None for all.
+    Returns: at most ``count`` glasses. Raises: DomainError for a name the catalogue does not know, or a
+      medium without dispersion.
+
+    >>> from codesign import lens
+    >>> [glass.name for glass in lens.design.neighbour_glasses("F2", 3)]
+    ['F4', 'F1', 'S-TIM1']
+    """
+    given = Glass.named(medium) if isinstance(medium, str) else medium
+    if count < 1:
+        raise DomainError(f"{count} neighbours of {given.name} were asked for; give at least 1.")
+    if math.isinf(given.abbe_number):
+        raise DomainError(
+            f"medium {given.name} has no dispersion, so it has no place on the glass map and no neighbours."
+        )
+    chosen = map(Glass.named, names() if among is None else among)
+    found = [
+        (math.hypot(g.index_d - given.index_d, (g.abbe_number - given.abbe_number) / VD_PER_ND), g)
+        for g in chosen
+        if g.range_um[0] <= WAVELENGTH_UM["F"] and g.range_um[1] >= WAVELENGTH_UM["C"]
+    ]
+    found = [entry for entry in found if entry[0] >= apart and not math.isinf(entry[0])]
+    return [g for _, g in sorted(found, key=lambda entry: entry[0])[:count]]
 
 
 def _element_faces(lens, pairs, element):
