@@ -58,34 +58,25 @@ def hold_efl(lens: L, efl_mm: float | Tensor, surface: int | None = None) -> L:
     Gradient: the solved curvature carries that of all others, of thicknesses and of indices; efl_mm too when
       it is a tensor.
     Raises: DomainError when that curvature cannot do it.
-    Source: the y-u trace solved for one refraction, n'u' = n u - y phi, with the surfaces behind it as a
-      linear map of (y, n'u') (Smith, Modern Optical Engineering, ch. 2).
+    Source: the y-u trace, whose last angle is linear in the power of each surface (Smith, Modern Optical
+      Engineering, ch. 2).
     """
-    c = lens.curvature_per_mm
-    t = lens.thickness_mm
-    n = lens.index()
-    power = lens.surface_power()
+    c, t, n, power = lens.curvature_per_mm, lens.thickness_mm, lens.index(), lens.surface_power()
     at = holding_surface(lens) if surface is None else range(c.numel())[surface]
-    count = c.numel()
     one = torch.ones_like(c[0])
-    zero = torch.zeros_like(c[0])
-    heights, angles = yu_trace(power, t, n, one, zero, last=at)
-    y, nu = (heights[-1] + t[at - 1] * angles[-1] / n[at], angles[-1]) if heights else (one, zero)
-    # the last angle = by_height * y + by_angle * nu'
-    by_height = zero
-    by_angle = one
-    if at < count - 1:
-        by_height = yu_trace(power, t, n, one, zero, first=at + 1)[1][-1]
-        by_angle = yu_trace(power, t, n, t[at] / n[at + 1], one, first=at + 1)[1][-1]
+    heights, angles = yu_trace(power, t, n, one, 0 * one)
+    # of the last angle over that behind the surface
+    lever = yu_trace(power, t, n, t[at] / n[at + 1], one, first=at + 1)[1]
+    by_angle = lever[-1] if lever else one
     step = bending(n, lens.mirrors)[at]
-    weak = [float(v.detach()) for v in (step, y, by_angle)]
+    weak = [float(v.detach()) for v in (step, heights[at], by_angle)]
     if min(map(abs, weak)) < NO_POWER:
         raise DomainError(
             f"{lens.name}: surface {at + 1} cannot hold the focal length (index step {weak[0]:.3g}, ray "
             f"height {weak[1]:.3g}, lever {weak[2]:.3g}); name a refracting one away from an image."
         )
-    wanted = (-n[-1] / efl_mm - by_height * y) / by_angle
-    solved = c[at] + ((nu - wanted) / y - power[at]) / step
+    # the last angle falls in proportion to the surface's power
+    solved = c[at] + (angles[-1] + n[-1] / efl_mm) / (heights[at] * by_angle * step)
     return lens.replace(curvature_per_mm=torch.cat([c[:at], solved.reshape(1), c[at + 1 :]]))
 
 

@@ -1,6 +1,7 @@
 """Point spread functions: by diffraction from the pupil's wavefront, and geometric by counting rays on
 pixels."""
 
+import itertools
 from dataclasses import dataclass
 
 import torch
@@ -128,17 +129,12 @@ def geometric_psf(
     share = place - low
     low = low.long()
     energy = torch.zeros(pixels * pixels, dtype=lens.dtype, device=reference.device)
-    for step_x in (0, 1):
-        for step_y in (0, 1):
-            x = low[:, 0] + step_x
-            y = low[:, 1] + step_y
-            part = (
-                weight
-                * (share[:, 0] if step_x else 1 - share[:, 0])
-                * (share[:, 1] if step_y else 1 - share[:, 1])
-            )
-            on = (x >= 0) & (x < pixels) & (y >= 0) & (y < pixels)
-            energy = energy.index_add(0, (y * pixels + x)[on], part[on])
+    for corner in itertools.product((0, 1), (0, 1)):
+        at = low + low.new_tensor(corner)
+        parts = [s if step else 1 - s for s, step in zip(share.unbind(1), corner, strict=True)]
+        on = ((at >= 0) & (at < pixels)).all(1)
+        pixel = at[:, 1] * pixels + at[:, 0]
+        energy = energy.index_add(0, pixel[on], (weight * parts[0] * parts[1])[on])
     return Psf(energy.reshape(pixels, pixels), torch.full((2,), pixel_mm, dtype=lens.dtype), reference)
 
 

@@ -141,11 +141,10 @@ def encircled_energy(
     Args: radii_mm: [K] increasing or not; the others as for ``polychromatic_spot``. Returns: [K] in [0, 1],
       geometric, without diffraction. Gradient: none (a count).
     """
-    distance, weight = _distances(lens, field_rad, light, grid, vignetting, about_chief, at_m)
+    distance, reached = _distances(lens, field_rad, light, grid, vignetting, about_chief, at_m)
     radii = torch.as_tensor(radii_mm, dtype=distance.dtype, device=distance.device).reshape(-1)
-    order = distance.detach().argsort()
-    energy = torch.cat([torch.zeros_like(weight[:1]), weight.detach()[order].cumsum(0)])
-    return energy[torch.searchsorted(distance.detach()[order], radii, right=True)].clamp_max(1.0)
+    energy = torch.cat([torch.zeros_like(reached[:1]), reached])
+    return energy[torch.searchsorted(distance.detach(), radii, right=True)].clamp_max(1.0)
 
 
 def encircled_radius_mm(
@@ -162,21 +161,17 @@ def encircled_radius_mm(
     DomainError for a share outside (0, 1]."""
     if not 0 < share <= 1:
         raise DomainError(f"share {share} of encircled energy must lie in (0, 1].")
-    distance, weight = _distances(lens, field_rad, light, grid, vignetting, about_chief, at_m)
-    order = distance.detach().argsort()
-    reached = weight.detach()[order].cumsum(0)
-    at = int(
-        torch.searchsorted(reached, torch.tensor(share - 1e-12, dtype=reached.dtype)).clamp_max(
-            reached.numel() - 1
-        )
-    )
-    return distance[order[at]]
+    distance, reached = _distances(lens, field_rad, light, grid, vignetting, about_chief, at_m)
+    at = int(torch.searchsorted(reached, reached.new_tensor(share - 1e-12)))
+    return distance[min(at, len(distance) - 1)]
 
 
 def _distances(lens, field_rad, light, grid, vignetting, about_chief, at_m):
+    """Distances of the rays from the centre, in order, and the share of light up to each."""
     points, weight = lit_points(lens, field_rad, light, grid, vignetting, at_m)
     if about_chief:
         centre = chief_ray(lens, field_rad, spectral_lines(light)[0][0], at_m).position_mm
     else:
         centre = (points * weight[:, None]).sum(0)
-    return torch.linalg.vector_norm(points - centre, dim=1), weight
+    distance, order = torch.linalg.vector_norm(points - centre, dim=1).sort()
+    return distance, weight.detach()[order].cumsum(0)

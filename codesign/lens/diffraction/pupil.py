@@ -99,22 +99,14 @@ def pupil_function(
         )
     like = lens.curvature_per_mm
     line = (torch.arange(grid, dtype=like.dtype, device=like.device) + 0.5) / grid * 2 - 1
-    y, x = torch.meshgrid(line, line, indexing="ij")
-    seen = x * x + y * y <= 1
-    points = torch.stack([x, y], -1)[seen]
-    bare = with_plate(lens, None)
-    front = wavefront(bare, field_rad, wavelength_um, 0, vignetting, reference_mm, points, at_m)
+    seen, front = _bare_front(lens, field_rad, wavelength_um, vignetting, reference_mm, at_m, line)
     scale = _cosine_radius(front)
     if lens.plate is not None:
-        waves, reaches = plate_waves(lens, field_rad, points, wavelength_um, at_m)
+        waves, reaches = plate_waves(lens, field_rad, front.pupil, wavelength_um, at_m)
         front = replace(
             front, opd_mm=front.opd_mm - waves * (wavelength_um * 1e-3), weight=front.weight * reaches
         )
-    phase = 2 * math.pi * front.waves
-    amplitude = torch.where(front.weight > 0, front.weight, 1).sqrt() * (front.weight > 0)
-    opd = torch.zeros_like(x).masked_scatter(seen, front.waves.detach())
-    lit = torch.zeros_like(seen).masked_scatter(seen, front.weight > 0)
-    worst = _largest_step(opd, lit)
+    worst = _largest_step(front, seen)
     if worst > LARGEST_STEP_WAVES:
         raise DomainError(
             f"{lens.name}: neighbouring pupil cells differ by {worst:.2g} waves at field "
@@ -122,13 +114,10 @@ def pupil_function(
             f"below {LARGEST_STEP_WAVES} is needed: give a finer grid, or use the geometric spread, which "
             "fits such large aberrations."
         )
-    field = torch.zeros(
-        grid,
-        grid,
-        dtype=torch.complex128 if like.dtype == torch.float64 else torch.complex64,
-        device=like.device,
-    )
-    field = field.masked_scatter(seen, torch.complex(amplitude * phase.cos(), -amplitude * phase.sin()))
+    phase = 2 * math.pi * front.waves
+    amplitude = torch.where(front.weight > 0, front.weight, 1).sqrt() * (front.weight > 0)
+    values = torch.complex(amplitude * phase.cos(), -amplitude * phase.sin())
+    field = torch.zeros(grid, grid, dtype=values.dtype, device=like.device).masked_scatter(seen, values)
     # light from above goes down
     mirrored = [axis for axis, value in ((1, scale[0]), (0, scale[1])) if float(value.detach()) < 0]
     return PupilFunction(field.flip(mirrored), scale.abs(), wavelength_um, front.reference_mm)
@@ -151,6 +140,15 @@ def pupil_functions(
     )
 
 
+def _bare_front(lens, field_rad, wavelength_um, vignetting, reference_mm, at_m, line):
+    """Which points of a square grid lie in the pupil, and the Wavefront there of the lens without its plate."""
+    y, x = torch.meshgrid(line, line, indexing="ij")
+    seen = x * x + y * y <= 1
+    points = torch.stack([x, y], -1)[seen]
+    bare = with_plate(lens, None)
+    return seen, wavefront(bare, field_rad, wavelength_um, 0, vignetting, reference_mm, points, at_m)
+
+
 def _cosine_radius(front):
     """Least-squares slope of direction cosines over pupil coordinates, [2]; negative where light from above
     goes down."""
@@ -160,14 +158,13 @@ def _cosine_radius(front):
     return (pupil * cosines * w).sum(0) / (pupil * pupil * w).sum(0)
 
 
-def _largest_step(opd, lit):
-    """Largest difference of neighbours where both are lit."""
+def _largest_step(front, seen):
+    """Largest difference in waves of neighbouring points of the grid where both are lit."""
+    opd = torch.zeros_like(seen, dtype=front.opd_mm.dtype).masked_scatter(seen, front.waves.detach())
+    lit = torch.zeros_like(seen).masked_scatter(seen, front.weight > 0)
     steps = [
-        ((a - b).abs() * (p & q)).max()
-        for a, b, p, q in (
-            (opd[1:], opd[:-1], lit[1:], lit[:-1]),
-            (opd[:, 1:], opd[:, :-1], lit[:, 1:], lit[:, :-1]),
-        )
+        (opd.diff(dim=d).abs() * (lit.narrow(d, 1, len(lit) - 1) & lit.narrow(d, 0, len(lit) - 1))).max()
+        for d in (0, 1)
     ]
     return float(torch.stack(steps).max())
 
@@ -176,20 +173,8 @@ def _enough_cells(lens, field_rad, wavelength_um, vignetting, reference_mm, at_m
     """Power of two for which neighbours differ by at most a third of a wave, from a coarse look at the
     wavefront."""
     line = torch.linspace(-1, 1, 65, dtype=lens.dtype, device=lens.curvature_per_mm.device)
-    y, x = torch.meshgrid(line, line, indexing="ij")
-    inside = x * x + y * y <= 1
     with torch.no_grad():
-        front = wavefront(
-            with_plate(lens, None),
-            field_rad,
-            wavelength_um,
-            0,
-            vignetting,
-            reference_mm,
-            torch.stack([x, y], -1)[inside],
-            at_m,
-        )
-    opd = torch.zeros_like(x).masked_scatter(inside, front.waves)
-    lit = torch.zeros_like(inside).masked_scatter(inside, front.weight > 0)
-    needed = 64 * _largest_step(opd, lit) / (LARGEST_STEP_WAVES / 1.5) + cells_for_plate(lens, wavelength_um)
+        seen, front = _bare_front(lens, field_rad, wavelength_um, vignetting, reference_mm, at_m, line)
+    step = _largest_step(front, seen)
+    needed = 64 * step / (LARGEST_STEP_WAVES / 1.5) + cells_for_plate(lens, wavelength_um)
     return min(max(2 ** math.ceil(math.log2(max(needed, 1.0))), COARSEST), FINEST)
