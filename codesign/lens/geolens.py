@@ -16,7 +16,7 @@ from codesign.lens.distance import real_numbers
 from codesign.lens.glass import AIR, WAVELENGTH_UM, Glass
 from codesign.lens.pinhole import ThinLens
 from codesign.lens.replaceable import Replaceable, settled
-from codesign.lens.solves import hold_efl, holding_surface, image_distance_mm
+from codesign.lens.solves import focus_at, hold_efl, holding_surface
 from codesign.lens.surface import Surface, checked, described, scaled, with_medium
 from codesign.lens.trace import PlateAt, Prescription, TraceResult, check_rays, trace
 from codesign.lens.variables import Bound, checked_step, kinds
@@ -240,8 +240,7 @@ class GeoLens(Replaceable):
         Raises: DomainError for a point that does not lie before the lens and beyond its front focal plane,
           and for a spot of a single ray.
         """
-        image_mm = image_distance_mm(self, distance_m, wavelength_um, spot_grid)
-        return self.replace(thickness_mm=torch.cat([self.thickness_mm[:-1], image_mm.reshape(1)]))
+        return focus_at(self, distance_m, wavelength_um, spot_grid)
 
     def replace_glass(self, surface: int, glass: Glass | str | None) -> "GeoLens":
         """The lens with another medium behind a surface; shapes, gaps and apertures stay, the focal length

@@ -80,14 +80,8 @@ def hold_efl(lens: L, efl_mm: float | Tensor, surface: int | None = None) -> L:
     return lens.replace(curvature_per_mm=torch.cat([c[:at], solved.reshape(1), c[at + 1 :]]))
 
 
-def image_distance_mm(
-    lens: TracedLens,
-    distance_m: float | Tensor,
-    wavelength_um: float = WAVELENGTH_UM["d"],
-    spot_grid: int | None = None,
-) -> Tensor:
-    """Distance from the last vertex of a GeoLens to the image of an axial point, scalar mm; see
-    ``GeoLens.focus_at``."""
+def focus_at(lens: L, distance_m: float | Tensor, wavelength_um: float, spot_grid: int | None) -> L:
+    """The lens with its film where an axial point is imaged; see ``GeoLens.focus_at``."""
     vergence = vergence_per_mm(lens, one_distance(distance_m))
     height, angle = paraxial.focused_image(lens, vergence, wavelength_um)
     if not float(angle.detach()) < -1e-12:
@@ -96,11 +90,10 @@ def image_distance_mm(
             "pupil "
             f"does not converge behind the lens; {_remedy(lens)}."
         )
-    image = -height * lens.index(wavelength_um)[-1] / angle
+    focused = _last_thickness(lens, -height * lens.index(wavelength_um)[-1] / angle)
     if spot_grid is None:
-        return image
-    at_focus = _last_thickness(lens, image)
-    return focus_rays(at_focus, [0.0], [wavelength_um], spot_grid, distance_m).thickness_mm[-1]
+        return focused
+    return focus_rays(focused, [0.0], [wavelength_um], spot_grid, distance_m)
 
 
 def least_spot_shift(position: Tensor, slope: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:

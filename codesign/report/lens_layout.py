@@ -18,7 +18,7 @@ from codesign.lens.analysis.rays import field_rays
 from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
 from codesign.lens.surface import sag_mm
-from codesign.lens.trace import trace
+from codesign.lens.trace import at_surfaces
 
 COLOURS = ("#1b6ca8", "#2e8b57", "#c0392b", "#8e44ad")
 OUTLINE = "#24425c"
@@ -128,13 +128,12 @@ def ray_paths(
     """Polylines [points, 2] (z, y) in mm of the rays of a field that arrive, found by tracing them up to each
     surface."""
     rays = field_rays(lens, field_rad, pupil, start_z_mm=start_z_mm, at_m=at_m)
-    whole = lens.prescription()
-    vertices = [0.0, *lens.thickness_mm.cumsum(0).tolist()]
-    count = len(lens.surfaces)
     end = lens.trace(*rays)
-    places = [trace(whole.until(i), *rays).position_mm for i in range(count)] + [end.position_mm]
-    depths = [rays[0][:, 2], *(p[:, 2] + z for p, z in zip(places, vertices, strict=True))]
-    points = torch.stack([torch.stack(depths), torch.stack([rays[0][:, 1], *(p[:, 1] for p in places)])], -1)
+    vertices = [0.0, *lens.thickness_mm.cumsum(0).tolist()]
+    places = [rays[0]]
+    for at, z in zip([*at_surfaces(lens.prescription(), *rays), end], vertices, strict=True):
+        places.append(at.position_mm + at.position_mm.new_tensor([0.0, 0.0, z]))
+    points = torch.stack(places)[..., [2, 1]]
     # rays that an aperture stops are not drawn
     passed = (end.status == 0) & (end.weight > 0)
     return list(points.transpose(0, 1)[passed].numpy())

@@ -29,6 +29,7 @@ DISTANCE_M = 2.0
 DURATION_S = 0.05
 BINS = 5
 DIRECTIONS = 10  # of detuning that are tried
+NO_FIELD_DEG = 20.0  # half field of a lens that names none: that of the Cooke triplet
 FLOOR_SHARE = 0.6  # of the thicknesses of the published lens, which no design may go below
 SENSOR = events.SensorModel(theta_on=0.2, theta_off=0.2, theta_sigma=0.03, shot_rate_hz=1.0)
 # daylight as a silicon sensor sees it, in four wavelengths of equal weight
@@ -147,10 +148,7 @@ def make_task(source, seed, detuned_px=1.5):
       (above one, so that the flow suffers).
     """
     published = lens.load(source)
-    if str(source) in lens.catalogue.LENSES:
-        half_field = math.radians(lens.half_field_deg(str(source)))
-    else:
-        half_field = math.radians(20.0)  # files do not say their field; that of the Cooke triplet
+    half_field = math.radians(published.half_field_deg or NO_FIELD_DEG)
     nominal = published.scaled(
         HALF_DIAGONAL_MM / (float(published.first_order().efl_mm.detach()) * math.tan(half_field))
     ).freeze()

@@ -14,7 +14,7 @@ from codesign.lens.distance import PARALLEL, Distances, one_distance, vergence_p
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.paraxial import paraxial_rays
-from codesign.lens.trace import onward, trace
+from codesign.lens.trace import at_surfaces, onward, trace
 
 DENSER = 1.5  # index behind a surface whose normal is looked for: no ray is totally reflected
 
@@ -48,9 +48,8 @@ def surface_hits(
             "incidence limit out."
         )
     whole = lens.prescription(wavelength_um)
-    count = whole.curvature_per_mm.numel()
     traced = [
-        *(trace(whole.until(i), origin_mm, direction) for i in range(count)),
+        *at_surfaces(whole, origin_mm, direction),
         lens.trace(origin_mm, direction, wavelength_um),
     ]
     heights = []
@@ -114,9 +113,8 @@ def traced_semi_aperture_mm(
             f"{lens.name}: {int(failed.sum())} of {failed.numel()} rim rays fail, so its "
             "apertures cannot be sized; use a smaller field or weaker curvatures."
         )
-    whole = lens.prescription()
-    reached = [trace(whole.until(i), *rays).position_mm for i in range(len(lens.surfaces))]
-    return torch.stack([torch.linalg.vector_norm(p[:, :2], dim=1).amax() for p in reached]) * (1 + margin)
+    reached = torch.stack([at.position_mm[:, :2] for at in at_surfaces(lens.prescription(), *rays)])
+    return torch.linalg.vector_norm(reached, dim=2).amax(1) * (1 + margin)
 
 
 def fit_apertures(
