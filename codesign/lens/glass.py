@@ -4,11 +4,12 @@ import difflib
 import functools
 import math
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from importlib.resources import files
 from typing import Any
 
 from codesign.errors import DomainError
-from codesign.lens import glass_catalogue
 
 WAVELENGTH_UM = {"F": 0.4861327, "d": 0.5875618, "C": 0.6562725}
 LONGEST_NAME = 80
@@ -32,6 +33,24 @@ _MAKERS = (
     "MISC",
     "PLASTIC",
 )
+# other spellings in use -> row; CODE V's manufacturer suffixes and all of "-", "_" and " " are dropped before
+# a name is looked up
+ALIASES = {
+    "SILICA": "F-SILICA",
+    "FUSED SILICA": "F-SILICA",
+    "SIO2": "F-SILICA",
+    "HPFS7980": "C79-80",
+    "7980": "C79-80",
+    "AL2O3": "SAPPHIRE",
+    "SSK4": "SSK4A",
+    "E48": "E48R",
+    "ZEONEX E48R": "E48R",
+    "ZEONEX 480R": "480R",
+    "PC": "POLYCARB",
+    "POLYCARBONATE": "POLYCARB",
+    "PS": "POLYSTYR",
+    "POLYSTYRENE": "POLYSTYR",
+}
 _CODE = re.compile(r"([0-9]{3})([0-9]{3})(?:\.[0-9]{3})?|([0-9]{3,9})\.([0-9]{3,9})")
 _PAIR = re.compile(r"([0-9]\.[0-9]{1,16}) ?[/:] ?([0-9]{1,3}(?:\.[0-9]{1,16})?)")
 
@@ -291,6 +310,23 @@ class Glass:
         return (self.index_d - 1) / spread if spread else math.inf
 
 
+def rows() -> Iterator[tuple[str, str, tuple[float, float], tuple[float, float], tuple[float, ...], str]]:
+    """Name, model, range in um, published (nd, Vd), coefficients and source of each entry of glasses.txt.
+
+    A row there holds them in this order; a line that starts with # names the source of the rows below it.
+    Indices are relative to air at 20 to 25 C, wavelengths in air, as the catalogues state. Coefficients are
+    facts of the makers' catalogues; read from the refractiveindex.info database (CC0) and public catalogue files.
+    """
+    source = ""
+    for line in files("codesign.lens").joinpath("glasses.txt").read_text(encoding="utf-8").splitlines():
+        if line.startswith("#"):
+            source = line[2:]
+            continue
+        name, model, *numbers = line.split()
+        first, last, nd, abbe, *coefficients = map(float, numbers)
+        yield name, model, (first, last), (nd, abbe), tuple(coefficients), source
+
+
 def names() -> tuple[str, ...]:
     """The names of the catalogue, in its order."""
     return tuple(dict.fromkeys(glass.name for glass in _by_key().values()))
@@ -300,9 +336,9 @@ def names() -> tuple[str, ...]:
 def _by_key():
     found = {
         _key(name): Glass(name, model, coefficients, span, source)
-        for name, model, span, _, coefficients, source in glass_catalogue.rows()
+        for name, model, span, _, coefficients, source in rows()
     }
-    found |= {_key(alias): found[_key(name)] for alias, name in glass_catalogue.ALIASES.items()}
+    found |= {_key(alias): found[_key(name)] for alias, name in ALIASES.items()}
     return found | {"AIR": AIR}
 
 

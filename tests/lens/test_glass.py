@@ -10,13 +10,13 @@ import pytest
 
 from codesign import lens
 from codesign.errors import DomainError
-from codesign.lens import WAVELENGTH_UM, Glass, glass_catalogue
+from codesign.lens import WAVELENGTH_UM, Glass
 from codesign.lens.catalogue import LENSES
-from codesign.lens.glass import AIR, names
+from codesign.lens.glass import AIR, names, rows
 from codesign.lens.spectrum import LINE_UM
 from tests.lens.systems import reference
 
-ROWS = {row[0]: row for row in glass_catalogue.rows()}
+ROWS = {row[0]: row for row in rows()}
 
 # indices as the makers' own tables print them beside the coefficients, to five decimals: Schott 2018, Ohara,
 # Hoya 2018, Hikari 2020, Sumita 2020

@@ -7,11 +7,21 @@ from collections.abc import Iterator
 from typing import Any
 
 from codesign.errors import FileFormatError
-from codesign.lens.files.keywords import Rule, all_numbers, one_whole, take, yes
-from codesign.lens.files.seq_glass import PrivateGlasses
-from codesign.lens.files.seq_surface import IDLE_TABLE, SURFACE, SeqSurface
+from codesign.lens.files.seq_surface import IDLE_TABLE, SURFACE, PrivateGlasses, SeqSurface
 from codesign.lens.files.system import FileLens
-from codesign.lens.files.text import MOST_SURFACES, at, lines, number, shown, title
+from codesign.lens.files.text import (
+    MOST_SURFACES,
+    Rule,
+    all_numbers,
+    at,
+    lines,
+    number,
+    one_whole,
+    shown,
+    take,
+    title,
+    yes,
+)
 
 UNITS_MM = {"M": 1.0, "MM": 1.0, "C": 10.0, "CM": 10.0, "I": 25.4, "IN": 25.4}
 PUPILS = {"EPD": "diameter", "FNO": "working f-number", "NA": "numerical aperture"}

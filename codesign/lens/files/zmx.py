@@ -8,9 +8,20 @@ import numpy as np
 
 from codesign.errors import FileFormatError
 from codesign.lens.files.breaks import along, place
-from codesign.lens.files.keywords import Rule, all_numbers, one_whole, take
 from codesign.lens.files.system import FileLens
-from codesign.lens.files.text import MOST_SURFACES, at, lines, number, shown, title, whole
+from codesign.lens.files.text import (
+    MOST_SURFACES,
+    Rule,
+    all_numbers,
+    at,
+    lines,
+    number,
+    one_whole,
+    shown,
+    take,
+    title,
+    whole,
+)
 from codesign.lens.files.zmx_surface import SURFACE, Entry
 
 UNITS_MM = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "INCH": 25.4, "M": 1000.0, "METER": 1000.0}

@@ -7,9 +7,20 @@ import numpy as np
 
 from codesign.errors import FileFormatError
 from codesign.lens.files.breaks import coordinate_break
-from codesign.lens.files.keywords import IDLE, Rule, all_numbers, all_words, one_number, take, yes
 from codesign.lens.files.system import FileSurface
-from codesign.lens.files.text import at, number, shown, whole
+from codesign.lens.files.text import (
+    IDLE,
+    Rule,
+    all_numbers,
+    all_words,
+    at,
+    number,
+    one_number,
+    shown,
+    take,
+    whole,
+    yes,
+)
 from codesign.lens.glass import Glass
 from codesign.lens.surface import Phase
 
