@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.glass import D_UM
 from codesign.lens.trace import Prescription, Status, trace
 from codesign.lens.traced import TracedLens, in_float64
 
@@ -114,7 +114,7 @@ def aimed_rays(
     lens: TracedLens,
     field_rad: float | Tensor,
     pupil: Tensor,
-    wavelength_um: float = WAVELENGTH_UM["d"],
+    wavelength_um: float = D_UM,
 ) -> tuple[Tensor, Tensor]:
     """Parallel rays of one field angle (in +y) that meet the real stop at points of its disc.
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.lens.aiming import aim_at_stop, area_at_stop
-from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.glass import D_UM
 from codesign.lens.trace import Status, trace
 from codesign.lens.traced import TracedLens, in_float64
 from codesign.types import Rays
@@ -73,8 +73,7 @@ def film_points(
 def _origin_z_mm(lens, f, wavelength_um):
     """Where the camera's origin lies: at the entrance pupil of the d line, one for all colours. f:
     first-order figures at the wavelength."""
-    d = WAVELENGTH_UM["d"]
-    return (f if wavelength_um == d else lens.first_order(d)).entrance_pupil_z_mm
+    return (f if wavelength_um == D_UM else lens.first_order()).entrance_pupil_z_mm
 
 
 def _where(lens, out):

@@ -13,7 +13,7 @@ from codesign.errors import DomainError
 from codesign.lens import camera, paraxial
 from codesign.lens.analysis.spots import spots
 from codesign.lens.distance import real_numbers
-from codesign.lens.glass import AIR, WAVELENGTH_UM, Glass
+from codesign.lens.glass import AIR, D_UM, Glass
 from codesign.lens.pinhole import ThinLens
 from codesign.lens.replaceable import Replaceable, settled
 from codesign.lens.solves import focus_at, hold_efl, holding_surface
@@ -127,7 +127,7 @@ class GeoLens(Replaceable):
         keep_efl: bool = False,
         focus_at_m: float | None = None,
         fields_rad: Sequence[float] | None = None,
-        wavelength_um: float = WAVELENGTH_UM["d"],
+        wavelength_um: float = D_UM,
     ) -> list[nn.Parameter]:
         """Make the named numbers variables for torch.optim; every other number of the lens is held.
 
@@ -219,7 +219,7 @@ class GeoLens(Replaceable):
     def focus_at(
         self,
         distance_m: float | torch.Tensor,
-        wavelength_um: float = WAVELENGTH_UM["d"],
+        wavelength_um: float = D_UM,
         spot_grid: int | None = None,
     ) -> "GeoLens":
         """The lens with its film where a point of the axis at ``distance_m`` is imaged: a solve of the last
@@ -318,7 +318,7 @@ class GeoLens(Replaceable):
             )
         return tuple(found)
 
-    def index(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> torch.Tensor:
+    def index(self, wavelength_um: float = D_UM) -> torch.Tensor:
         """Indices [S + 1] at a wavelength, the first before the lens (air). Behind a mirror it is the index
         before it."""
         values = [1.0, *[1.0 if s.medium is None else s.medium.index(wavelength_um) for s in self.surfaces]]
@@ -334,7 +334,7 @@ class GeoLens(Replaceable):
             gaps[i + 1] = gaps[i] if mirror else gaps[i + 1]
         return gaps
 
-    def path_mm(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> torch.Tensor:
+    def path_mm(self, wavelength_um: float = D_UM) -> torch.Tensor:
         """Optical path that the diffractive phases add, as coefficients [S, P] of r^2, r^4, ... in mm."""
         orders = torch.tensor(
             [s.phase.order if s.phase else 0 for s in self.surfaces],
@@ -344,7 +344,7 @@ class GeoLens(Replaceable):
         return self.phase * (orders * (wavelength_um * 1e-3 / (2 * math.pi)))[:, None]
 
     @settled
-    def surface_power(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> torch.Tensor:
+    def surface_power(self, wavelength_um: float = D_UM) -> torch.Tensor:
         """Paraxial power of each surface, [S] per mm: vertex curvature (with the r^2 asphere term) times
         bending, and diffraction."""
         vertex = (
@@ -354,7 +354,7 @@ class GeoLens(Replaceable):
         return power - 2 * self.path_mm(wavelength_um)[:, 0] if self.phase.shape[1] else power
 
     @settled
-    def first_order(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> paraxial.FirstOrder:
+    def first_order(self, wavelength_um: float = D_UM) -> paraxial.FirstOrder:
         """Paraxial figures (FirstOrder) at a wavelength, differentiable.
 
         Example:
@@ -372,7 +372,7 @@ class GeoLens(Replaceable):
         )
 
     @settled
-    def prescription(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> Prescription:
+    def prescription(self, wavelength_um: float = D_UM) -> Prescription:
         """The numbers the ray-trace kernel needs."""
         shape = (self.curvature_per_mm, self.thickness_mm, self.conic, self.asphere)
         efficiency = math.prod(s.phase.efficiency(wavelength_um) for s in self.surfaces if s.phase)
@@ -396,7 +396,7 @@ class GeoLens(Replaceable):
 
     @settled
     def trace(
-        self, origin_mm: torch.Tensor, direction: torch.Tensor, wavelength_um: float = WAVELENGTH_UM["d"]
+        self, origin_mm: torch.Tensor, direction: torch.Tensor, wavelength_um: float = D_UM
     ) -> TraceResult:
         """Trace rays to the image plane: origins [N, 3] relative to the first vertex, unit directions [N, 3]
         -> TraceResult.
@@ -428,7 +428,7 @@ class GeoLens(Replaceable):
         self,
         film_mm: torch.Tensor,
         pupil: torch.Tensor,
-        wavelength_um: float = WAVELENGTH_UM["d"],
+        wavelength_um: float = D_UM,
         aim: bool = False,
     ) -> Rays:
         """Rays from image points through the lens towards the scene.
@@ -448,7 +448,7 @@ class GeoLens(Replaceable):
 
     @settled
     def film_points(
-        self, points_mm: torch.Tensor, pupil: torch.Tensor, wavelength_um: float = WAVELENGTH_UM["d"]
+        self, points_mm: torch.Tensor, pupil: torch.Tensor, wavelength_um: float = D_UM
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Where light from points of space meets the film, through points of the paraxial entrance pupil; the
         other way of ``camera_rays``.

@@ -12,6 +12,7 @@ from typing import Any
 from codesign.errors import DomainError
 
 WAVELENGTH_UM = {"F": 0.4861327, "d": 0.5875618, "C": 0.6562725}
+D_UM = WAVELENGTH_UM["d"]  # whose figures are those of a lens, unless another wavelength is asked for
 LONGEST_NAME = 80
 LONGEST_SOURCE = 200
 LEAST_INDEX = 1.0
@@ -297,7 +298,7 @@ class Glass:
 
     @property
     def index_d(self) -> float:
-        return self.index(WAVELENGTH_UM["d"])
+        return self.index(D_UM)
 
     @property
     def index_C(self) -> float:

@@ -10,9 +10,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.lens.glass import WAVELENGTH_UM
-
-D_LINE = WAVELENGTH_UM["d"]
+from codesign.lens.glass import D_UM
 
 
 @dataclass(frozen=True)
@@ -40,11 +38,11 @@ class ParaxialLens(Protocol):
     name: str
     thickness_mm: Tensor
 
-    def index(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> Tensor: ...
+    def index(self, wavelength_um: float = D_UM) -> Tensor: ...
 
-    def surface_power(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> Tensor: ...
+    def surface_power(self, wavelength_um: float = D_UM) -> Tensor: ...
 
-    def first_order(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> FirstOrder: ...
+    def first_order(self, wavelength_um: float = D_UM) -> FirstOrder: ...
 
 
 def bending(index: Tensor, mirrors: Sequence[bool]) -> Tensor:
@@ -124,7 +122,7 @@ def first_order(
     return FirstOrder(efl, bfl, efl / diameter, entrance_z, diameter, exit_z, exit_diameter, semi_stop)
 
 
-def system_matrix(lens: ParaxialLens, wavelength_um: float = WAVELENGTH_UM["d"]) -> Tensor:
+def system_matrix(lens: ParaxialLens, wavelength_um: float = D_UM) -> Tensor:
     """Matrix [[A, B], [C, D]] from the plane of the first vertex to that of the last, for columns (y in mm, n
     u). Its determinant is 1.
 
@@ -160,7 +158,7 @@ class CardinalPoints:
     rear_focal_length_mm: Tensor
 
 
-def cardinal_points(lens: ParaxialLens, wavelength_um: float = WAVELENGTH_UM["d"]) -> CardinalPoints:
+def cardinal_points(lens: ParaxialLens, wavelength_um: float = D_UM) -> CardinalPoints:
     """CardinalPoints of a lens. Focal lengths are n / power and n' / power, both positive for a converging
     lens.
 
@@ -209,7 +207,7 @@ class ParaxialRays:
 def paraxial_rays(
     lens: ParaxialLens,
     field_rad: float | Tensor,
-    wavelength_um: float = WAVELENGTH_UM["d"],
+    wavelength_um: float = D_UM,
     vergence_per_mm: float | Tensor = 0.0,
 ) -> ParaxialRays:
     """ParaxialRays of an object plane.
@@ -239,7 +237,7 @@ def paraxial_rays(
     index = lens.index(wavelength_um)
     vergence = torch.as_tensor(vergence_per_mm, dtype=power.dtype, device=power.device)
     # colours have pupils of their own, and one object plane
-    shift = f.entrance_pupil_z_mm - (f if wavelength_um == D_LINE else lens.first_order()).entrance_pupil_z_mm
+    shift = f.entrance_pupil_z_mm - (f if wavelength_um == D_UM else lens.first_order()).entrance_pupil_z_mm
     slope = field.tan().to(power) / (1 + vergence * shift)
     spread = vergence / (1 + vergence * shift) * (f.entrance_pupil_diameter_mm / 2)
     starts = (
@@ -255,7 +253,7 @@ def paraxial_rays(
 
 
 def focused_image(
-    lens: ParaxialLens, vergence_per_mm: float | Tensor = 0.0, wavelength_um: float = WAVELENGTH_UM["d"]
+    lens: ParaxialLens, vergence_per_mm: float | Tensor = 0.0, wavelength_um: float = D_UM
 ) -> tuple[Tensor, Tensor]:
     """Height and reduced angle (n u) behind the last vertex of the ray of an axial point that crosses the
     first vertex plane at height 1, so that its image lies -height n / angle behind the last vertex.
@@ -276,7 +274,7 @@ def focused_image(
 
 
 def image_place_mm(
-    lens: ParaxialLens, vergence_per_mm: float | Tensor = 0.0, wavelength_um: float = D_LINE
+    lens: ParaxialLens, vergence_per_mm: float | Tensor = 0.0, wavelength_um: float = D_UM
 ) -> Tensor:
     """Distance from the last vertex to the paraxial image of an axial point, mm: the back focal length for
     parallel light. Negative where the image lies in the lens or is virtual, infinite where the light leaves
@@ -286,7 +284,7 @@ def image_place_mm(
 
 
 def image_scale_mm(
-    lens: ParaxialLens, vergence_per_mm: float | Tensor = 0.0, wavelength_um: float = D_LINE
+    lens: ParaxialLens, vergence_per_mm: float | Tensor = 0.0, wavelength_um: float = D_UM
 ) -> Tensor:
     """Height of the paraxial image per tangent of the field, mm: the focal length for parallel light, and
     magnification x distance otherwise. Shape of the vergence; gradient as for ``focused_image``."""

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from codesign.lens.distance import PARALLEL, one_distance, vergence_per_mm
 from codesign.lens.geolens import GeoLens
-from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.glass import D_UM, WAVELENGTH_UM
 from codesign.lens.paraxial import ParaxialRays, bending, paraxial_rays
 
 NAMES = ("spherical", "coma", "astigmatism", "petzval", "distortion")
@@ -52,7 +52,7 @@ class SeidelSums:
 def seidel_sums(
     lens: GeoLens,
     field_rad: float,
-    wavelength_um: float = WAVELENGTH_UM["d"],
+    wavelength_um: float = D_UM,
     at_m: float | Tensor = PARALLEL,
 ) -> SeidelSums:
     """SeidelSums of a lens for an object plane.

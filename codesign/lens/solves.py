@@ -11,7 +11,7 @@ from codesign.errors import DomainError
 from codesign.lens import paraxial
 from codesign.lens.analysis.rays import pupil_grid, source_rays, trace_source
 from codesign.lens.distance import PARALLEL, Distances, one_distance, vergence_per_mm
-from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.glass import D_UM
 from codesign.lens.paraxial import bending, focused_image, yu_trace
 from codesign.lens.traced import TracedLens
 
@@ -142,7 +142,7 @@ def focus_paraxial(lens: L, defocus_mm: float | Tensor = 0.0, at_m: float | Tens
 def focus_rays(
     lens: L,
     fields_rad: Sequence[float],
-    wavelengths_um: Sequence[float] = (WAVELENGTH_UM["d"],),
+    wavelengths_um: Sequence[float] = (D_UM,),
     grid: int = 16,
     at_m: Distances = PARALLEL,
 ) -> L:

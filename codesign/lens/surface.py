@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.lens.glass import AIR, WAVELENGTH_UM, Glass
+from codesign.lens.glass import AIR, D_UM, WAVELENGTH_UM, Glass
 
 
 @dataclass(frozen=True)
@@ -271,7 +271,7 @@ def with_medium(
             f"{label}: {type(glass).__name__} is no medium; give a Glass, the name of one, or None for air."
         )
     if glass is not None:
-        glass.index(WAVELENGTH_UM["d"])  # every figure of a lens starts from the d line
+        glass.index(D_UM)  # every figure of a lens starts from the d line
     medium = None if glass == AIR else glass
     return (*surfaces[:at], dataclasses.replace(surfaces[at], medium=medium), *surfaces[at + 1 :])
 

@@ -5,7 +5,7 @@ from typing import Protocol, Self, TypeVar
 import torch
 from torch import Tensor
 
-from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.glass import D_UM
 from codesign.lens.paraxial import ParaxialLens
 from codesign.lens.surface import Surface
 from codesign.lens.trace import Prescription, TraceResult
@@ -28,11 +28,9 @@ class TracedLens(ParaxialLens, Protocol):
     @property
     def dtype(self) -> torch.dtype: ...
 
-    def prescription(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> Prescription: ...
+    def prescription(self, wavelength_um: float = D_UM) -> Prescription: ...
 
-    def trace(
-        self, origin_mm: Tensor, direction: Tensor, wavelength_um: float = WAVELENGTH_UM["d"]
-    ) -> TraceResult: ...
+    def trace(self, origin_mm: Tensor, direction: Tensor, wavelength_um: float = D_UM) -> TraceResult: ...
 
     def replace(self, **tensors: Tensor) -> Self: ...
 

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from codesign.lens import analysis
 from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
-from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.glass import D_UM
 from codesign.lens.seidel import SeidelSums
 from codesign.report.lens_figures import SIDES, VISIBLE_UM, draw_sides, finish
 from codesign.report.lens_layout import COLOURS, coloured, degrees
@@ -64,7 +64,7 @@ def through_focus(
     fields_rad: Sequence[float],
     defocus_mm: Sequence[float] | np.ndarray,
     frequency_per_mm: float,
-    light: analysis.Light = WAVELENGTH_UM["d"],
+    light: analysis.Light = D_UM,
     vignetting: bool = False,
     at_m: float = PARALLEL,
 ) -> Figure:
@@ -86,7 +86,7 @@ def through_focus(
     return figure
 
 
-def seidel_bars(sums: SeidelSums, wavelength_um: float = WAVELENGTH_UM["d"]) -> Figure:
+def seidel_bars(sums: SeidelSums, wavelength_um: float = D_UM) -> Figure:
     """Figure of Seidel sums (``SeidelSums``) per surface and, on a scale of its own, in total; in waves."""
     values, total = (v.detach().numpy() / (wavelength_um * 1e-3) for v in (sums.per_surface, sums.total))
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), width_ratios=[4, 1.2], layout="constrained")
@@ -109,7 +109,7 @@ def seidel_bars(sums: SeidelSums, wavelength_um: float = WAVELENGTH_UM["d"]) -> 
 def encircled_curves(
     lens: GeoLens,
     fields_rad: Sequence[float],
-    light: analysis.Light = WAVELENGTH_UM["d"],
+    light: analysis.Light = D_UM,
     vignetting: bool = False,
     at_m: float = PARALLEL,
 ) -> Figure:
@@ -132,7 +132,7 @@ def depth_curves(
     near_m: float,
     far_m: float,
     blur_mm: float,
-    wavelength_um: float = WAVELENGTH_UM["d"],
+    wavelength_um: float = D_UM,
 ) -> Figure:
     """Figure over the distance of the object, even in 1 / distance: RMS spot of each field with the film where it is,
     and the RMS radius of a disc ``blur_mm`` across as a dashed line."""

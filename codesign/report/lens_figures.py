@@ -19,7 +19,7 @@ from codesign.lens import analysis
 from codesign.lens.analysis.psf import Psf
 from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
-from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.glass import D_UM, WAVELENGTH_UM
 from codesign.report.lens_layout import COLOURS, degrees
 from codesign.report.lens_layout import draw_layout as draw_layout
 from codesign.report.lens_layout import layouts as layouts
@@ -121,7 +121,7 @@ def ray_fans(
 def opd_maps(
     lens: GeoLens,
     fields_rad: Sequence[float],
-    wavelength_um: float = WAVELENGTH_UM["d"],
+    wavelength_um: float = D_UM,
     grid: int = 96,
     vignetting: bool = False,
     at_m: float = PARALLEL,

@@ -16,7 +16,7 @@ from codesign.errors import DomainError
 from codesign.lens.analysis.spots import rms_spot_mm
 from codesign.lens.distance import real_numbers
 from codesign.lens.geolens import GeoLens
-from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.glass import D_UM
 from codesign.lens.paraxial import yu_trace
 
 RMS_OF_DISC = 1 / (2 * math.sqrt(2))  # RMS radius of an evenly filled disc over its diameter
@@ -36,7 +36,7 @@ class DepthOfField:
 def depth_of_field(
     lens: GeoLens,
     blur_mm: float | Tensor,
-    wavelength_um: float = WAVELENGTH_UM["d"],
+    wavelength_um: float = D_UM,
 ) -> DepthOfField:
     """DepthOfField where the paraxial blur disc of an axial point is at most ``blur_mm`` across.
 
@@ -69,7 +69,7 @@ def depth_of_field(
     return DepthOfField(near, _metres(sharpest - reach), _metres(sharpest))
 
 
-def hyperfocal_m(lens: GeoLens, blur_mm: float | Tensor, wavelength_um: float = WAVELENGTH_UM["d"]) -> Tensor:
+def hyperfocal_m(lens: GeoLens, blur_mm: float | Tensor, wavelength_um: float = D_UM) -> Tensor:
     """The nearest distance to focus on (metres from the entrance pupil) for which parallel light is blurred
     to a disc of ``blur_mm`` and no more, scalar: f^2 / (N blur) + f for a thin lens.
 
@@ -91,7 +91,7 @@ def hyperfocal_m(lens: GeoLens, blur_mm: float | Tensor, wavelength_um: float = 
 def traced_depth_of_field(
     lens: GeoLens,
     blur_mm: float,
-    wavelength_um: float = WAVELENGTH_UM["d"],
+    wavelength_um: float = D_UM,
     grid: int = 16,
 ) -> DepthOfField:
     """DepthOfField where the RMS spot on the axis is at most that of an even disc ``blur_mm`` across.

@@ -24,7 +24,7 @@ from codesign.lens.analysis.spots import spot_radius_mm
 from codesign.lens.analysis.wavefront import path_difference_mm
 from codesign.lens.distance import PARALLEL, Distances, one_distance, vergence_per_mm
 from codesign.lens.geolens import GeoLens
-from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.glass import D_UM
 from codesign.lens.paraxial import image_place_mm, image_scale_mm
 from codesign.lens.traced import in_float64
 
@@ -33,7 +33,7 @@ def lateral_colour_mm(
     lens: GeoLens,
     fields_rad: Sequence[float],
     wavelengths_um: Sequence[float],
-    reference_um: float = WAVELENGTH_UM["d"],
+    reference_um: float = D_UM,
     at_m: Distances = PARALLEL,
 ) -> Tensor:
     """Chief ray heights minus that at the reference wavelength, [F, W] mm, [D, F, W] for D distances
@@ -46,7 +46,7 @@ def lateral_colour_mm(
 def chromatic_focus_shift_mm(
     lens: GeoLens,
     wavelengths_um: Sequence[float],
-    reference_um: float = WAVELENGTH_UM["d"],
+    reference_um: float = D_UM,
     at_m: Distances = PARALLEL,
 ) -> Tensor:
     """Place of the paraxial image of an axial point minus that at the reference wavelength, [W] mm, [D, W]
@@ -63,7 +63,7 @@ MAPPINGS = {"f-tan": math.tan, "f-theta": float}
 def chief_height_mm(
     lens: GeoLens,
     fields_rad: Sequence[float],
-    wavelength_um: float = WAVELENGTH_UM["d"],
+    wavelength_um: float = D_UM,
     at_m: Distances = PARALLEL,
 ) -> Tensor:
     """Height y of the real chief ray on the image plane, [F] mm; [D, F] for D distances ``at_m`` of the
@@ -76,7 +76,7 @@ def distortion_percent(
     lens: GeoLens,
     fields_rad: Sequence[float],
     mapping: str = "f-tan",
-    wavelength_um: float = WAVELENGTH_UM["d"],
+    wavelength_um: float = D_UM,
     at_m: Distances = PARALLEL,
 ) -> Tensor:
     """100 (y / (f m(field)) - 1) of the real chief ray, [F] percent, [D, F] for D distances; 0 on the axis.
@@ -104,7 +104,7 @@ def distortion_percent(
 def focus_shift_mm(
     lens: GeoLens,
     fields_rad: Sequence[float],
-    wavelength_um: float = WAVELENGTH_UM["d"],
+    wavelength_um: float = D_UM,
     at_m: Distances = PARALLEL,
 ) -> Tensor:
     """Tangential and sagittal focus of each field, along z from the image plane; the difference is the
@@ -161,7 +161,7 @@ class RayFan:
 def ray_fan(
     lens: GeoLens,
     field_rad: float,
-    wavelength_um: float = WAVELENGTH_UM["d"],
+    wavelength_um: float = D_UM,
     count: int = 33,
     vignetting: bool = False,
     reference_mm: Tensor | None = None,
@@ -202,7 +202,7 @@ def through_focus_spot_mm(
     lens: GeoLens,
     fields_rad: Sequence[float],
     defocus_mm: Values,
-    light: Light = WAVELENGTH_UM["d"],
+    light: Light = D_UM,
     grid: int = 32,
     vignetting: bool = False,
     at_m: float | Tensor = PARALLEL,
@@ -232,7 +232,7 @@ def through_focus_mtf(
     field_rad: float,
     frequency_per_mm: float,
     defocus_mm: Values,
-    light: Light = WAVELENGTH_UM["d"],
+    light: Light = D_UM,
     method: str = "diffraction",
     vignetting: bool = False,
     at_m: float | Tensor = PARALLEL,

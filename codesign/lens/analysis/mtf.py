@@ -15,7 +15,7 @@ from codesign.lens.analysis.spots import lit_points
 from codesign.lens.diffraction.pupil import pupil_functions
 from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
-from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.glass import D_UM
 
 PADDING = 2  # the line spread is then free of aliasing up to the cut-off
 
@@ -23,7 +23,7 @@ PADDING = 2  # the line spread is then free of aliasing up to the cut-off
 def ideal_mtf(
     frequency_per_mm: float | Values,
     fno: float | Tensor,
-    wavelength_um: float = WAVELENGTH_UM["d"],
+    wavelength_um: float = D_UM,
 ) -> Tensor:
     """MTF of a perfect lens with a round pupil, (2 / pi) (acos v - v sqrt(1 - v^2)), v = frequency x
     wavelength x f-number. Shape of the frequency; 0 beyond v = 1."""
@@ -35,7 +35,7 @@ def diffraction_mtf(
     lens: GeoLens,
     field_rad: float,
     frequency_per_mm: Values,
-    light: Light = WAVELENGTH_UM["d"],
+    light: Light = D_UM,
     grid: int | None = None,
     vignetting: bool = False,
     at_m: float | Tensor = PARALLEL,
@@ -62,7 +62,7 @@ def geometric_mtf(
     lens: GeoLens,
     field_rad: float,
     frequency_per_mm: Values,
-    light: Light = WAVELENGTH_UM["d"],
+    light: Light = D_UM,
     grid: int = 64,
     vignetting: bool = False,
     at_m: float | Tensor = PARALLEL,

@@ -14,7 +14,7 @@ from codesign.lens.analysis.spots import lit_points
 from codesign.lens.diffraction.pupil import pupil_function, pupil_functions
 from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
-from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.glass import D_UM
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Psf:
 def diffraction_psf(
     lens: GeoLens,
     field_rad: float,
-    wavelength_um: float = WAVELENGTH_UM["d"],
+    wavelength_um: float = D_UM,
     grid: int | None = None,
     padding: int = 4,
     vignetting: bool = False,
@@ -70,7 +70,7 @@ def psf_on_pixels(
     field_rad: float,
     pixel_mm: float,
     pixels: int = 64,
-    light: Light = WAVELENGTH_UM["d"],
+    light: Light = D_UM,
     grid: int | None = None,
     vignetting: bool = False,
     at_m: float | Tensor = PARALLEL,
@@ -109,7 +109,7 @@ def geometric_psf(
     field_rad: float,
     pixel_mm: float,
     pixels: int = 64,
-    light: Light = WAVELENGTH_UM["d"],
+    light: Light = D_UM,
     grid: int = 128,
     vignetting: bool = False,
     at_m: float | Tensor = PARALLEL,

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
 from codesign.lens.distance import PARALLEL, Distances, one_distance, vergence_per_mm
-from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.glass import D_UM
 from codesign.lens.traced import TracedLens
 
 
@@ -101,7 +101,7 @@ def field_rays(
     lens: TracedLens,
     field_rad: float,
     pupil: Tensor,
-    wavelength_um: float = WAVELENGTH_UM["d"],
+    wavelength_um: float = D_UM,
     start_z_mm: float = -5.0,
     at_m: float | Tensor = PARALLEL,
 ) -> tuple[Tensor, Tensor]:
@@ -152,7 +152,7 @@ def trace_field(
     lens: TracedLens,
     field_rad: float | Sequence[float] | Tensor,
     pupil: Tensor,
-    wavelength_um: float = WAVELENGTH_UM["d"],
+    wavelength_um: float = D_UM,
     vignetting: bool = False,
     at_m: Distances = PARALLEL,
 ) -> ImageRays:
@@ -220,7 +220,7 @@ def trace_with_chief(
 def chief_ray(
     lens: TracedLens,
     field_rad: float | Sequence[float] | Tensor,
-    wavelength_um: float = WAVELENGTH_UM["d"],
+    wavelength_um: float = D_UM,
     at_m: Distances = PARALLEL,
 ) -> ImageRays:
     """The ray through the centre of the pupil, as ImageRays with M = 1. Raises: DomainError when it does not

@@ -17,14 +17,14 @@ from codesign.lens.analysis.rays import (
     trace_source,
 )
 from codesign.lens.distance import PARALLEL, Distances, one_distance
-from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.glass import D_UM
 from codesign.lens.traced import TracedLens
 
 
 def spots(
     lens: TracedLens,
     fields_rad: Sequence[float],
-    wavelength_um: float = WAVELENGTH_UM["d"],
+    wavelength_um: float = D_UM,
     grid: int = 32,
     at_m: Distances = PARALLEL,
 ) -> tuple[Tensor, Tensor]:
@@ -44,7 +44,7 @@ def spots(
 def rms_spot_mm(
     lens: TracedLens,
     fields_rad: Sequence[float],
-    wavelength_um: float = WAVELENGTH_UM["d"],
+    wavelength_um: float = D_UM,
     grid: int = 32,
     at_m: Distances = PARALLEL,
 ) -> Tensor:
@@ -130,7 +130,7 @@ def encircled_energy(
     lens: TracedLens,
     field_rad: float,
     radii_mm: Values,
-    light: Light = WAVELENGTH_UM["d"],
+    light: Light = D_UM,
     grid: int = 64,
     vignetting: bool = False,
     about_chief: bool = False,
@@ -151,7 +151,7 @@ def encircled_radius_mm(
     lens: TracedLens,
     field_rad: float,
     share: float = 0.8,
-    light: Light = WAVELENGTH_UM["d"],
+    light: Light = D_UM,
     grid: int = 64,
     vignetting: bool = False,
     about_chief: bool = False,

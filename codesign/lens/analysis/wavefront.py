@@ -19,7 +19,7 @@ from codesign.errors import DomainError
 from codesign.lens.analysis.rays import ImageRays, pupil_grid, trace_with_chief
 from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
-from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.glass import D_UM
 from codesign.lens.traced import in_float64
 
 
@@ -64,7 +64,7 @@ def path_difference_mm(
 def wavefront(
     lens: GeoLens,
     field_rad: float,
-    wavelength_um: float = WAVELENGTH_UM["d"],
+    wavelength_um: float = D_UM,
     grid: int = 64,
     vignetting: bool = False,
     reference_mm: Tensor | None = None,

@@ -12,7 +12,7 @@ from codesign.errors import DomainError
 from codesign.lens.analysis.rays import source_rays
 from codesign.lens.distance import PARALLEL, Distances, one_distance, vergence_per_mm
 from codesign.lens.geolens import GeoLens
-from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.glass import D_UM
 from codesign.lens.paraxial import paraxial_rays
 from codesign.lens.trace import at_surfaces, onward, trace
 
@@ -30,9 +30,7 @@ class Hits:
     passed: Tensor
 
 
-def surface_hits(
-    lens: GeoLens, origin_mm: Tensor, direction: Tensor, wavelength_um: float = WAVELENGTH_UM["d"]
-) -> Hits:
+def surface_hits(lens: GeoLens, origin_mm: Tensor, direction: Tensor, wavelength_um: float = D_UM) -> Hits:
     """Trace rays once per surface, up to it, and once to the image. Args: origin_mm, direction [N, 3], see
     GeoLens.trace. Returns: Hits.
 

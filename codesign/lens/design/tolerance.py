@@ -32,7 +32,7 @@ from codesign.lens.design.constraints import is_glass
 from codesign.lens.design.moves import groups, moved_element
 from codesign.lens.distance import PARALLEL, Distances, one_distance, vergence_per_mm
 from codesign.lens.geolens import GeoLens
-from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.glass import D_UM
 from codesign.lens.paraxial import image_scale_mm
 from codesign.lens.surface import passes_of
 
@@ -373,7 +373,7 @@ class Forecast:
 
 def spot_errors(
     fields_rad: Sequence[float],
-    wavelengths_um: Sequence[float] = (WAVELENGTH_UM["d"],),
+    wavelengths_um: Sequence[float] = (D_UM,),
     grid: int = 12,
     at_m: Distances = PARALLEL,
 ) -> Callable[[GeoLens], Tensor]:

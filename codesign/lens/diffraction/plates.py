@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from codesign.checks import check_finite
 from codesign.errors import DomainError, ShapeError
-from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.glass import D_UM
 from codesign.lens.replaceable import Replaceable
 
 
@@ -135,7 +135,7 @@ class ZernikePlate(Plate):
         self,
         coefficients_rad: Mapping[int, float],
         radius_mm: float,
-        wavelength_um: float = WAVELENGTH_UM["d"],
+        wavelength_um: float = D_UM,
         diffractive: bool = False,
     ) -> None:
         super().__init__(wavelength_um, diffractive)
@@ -182,7 +182,7 @@ class GridPlate(Plate):
         self,
         phase_rad: Tensor | Sequence[Sequence[float]],
         pitch_mm: float,
-        wavelength_um: float = WAVELENGTH_UM["d"],
+        wavelength_um: float = D_UM,
         diffractive: bool = False,
     ) -> None:
         super().__init__(wavelength_um, diffractive)

@@ -13,7 +13,7 @@ from codesign.lens.analysis.wavefront import wavefront
 from codesign.lens.diffraction.place import cells_for_plate, plate_waves, with_plate
 from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
-from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.glass import D_UM
 
 # cells across the pupil when the number is found from the aberration
 COARSEST = 128
@@ -65,7 +65,7 @@ class PupilFunction:
 def pupil_function(
     lens: GeoLens,
     field_rad: float,
-    wavelength_um: float = WAVELENGTH_UM["d"],
+    wavelength_um: float = D_UM,
     grid: int | None = None,
     vignetting: bool = False,
     reference_mm: Tensor | None = None,
