@@ -105,12 +105,11 @@ class GeoLens(Replaceable):
         self.mirrors = tuple(s.mirror for s in surfaces)
         self.plate: Any = None
         self.plate_at: tuple[int, float] = (0, 0.0)
-
-        for name, value in _tensors(surfaces, dtype).items():
-            if name in self.parameter_names:
-                self.register_parameter(name, nn.Parameter(value))
+        for tensor, value in _tensors(surfaces, dtype).items():
+            if tensor in self.parameter_names:
+                self.register_parameter(tensor, nn.Parameter(value))
             else:
-                self.register_buffer(name, value)
+                self.register_buffer(tensor, value)
         glass = [s.medium not in (None, AIR) and not s.mirror for s in surfaces]
         self.register_buffer("glass", torch.tensor(glass), persistent=False)
 
@@ -293,19 +292,18 @@ class GeoLens(Replaceable):
                 "cannot hold "
                 "it; take it out with diffraction.with_plate(lens, None)."
             )
-        first = _tensors(self.surfaces, self.dtype)
-        same_curvature = (self.curvature_per_mm.cpu() == first["curvature_per_mm"]).tolist()
-        same_tilt = (self.tilt_rad.cpu() == first["tilt_rad"]).all(1).tolist()
+        bent = torch.tensor([s.curvature_per_mm for s in self.surfaces], dtype=self.dtype).tolist()
+        tilted = torch.tensor([_tilt_rad(s) for s in self.surfaces], dtype=self.dtype).tolist()
         now = self._now() | {"index_offset": torch.where(self.glass, self.index_offset, 0)}
         columns = (now[name].tolist() for name in self.tensor_names)
         found = []
-        for old, bent_alike, tilted_alike, c, t, k, a, shift, phase, decentre, tilt, semi_aperture in zip(
-            self.surfaces, same_curvature, same_tilt, *columns, strict=True
+        for old, first_c, first_tilt, c, t, k, a, shift, phase, decentre, tilt, semi_aperture in zip(
+            self.surfaces, bent, tilted, *columns, strict=True
         ):
             found.append(
                 dataclasses.replace(
                     old,
-                    radius_mm=old.radius_mm if bent_alike else 1 / c if c else math.inf,
+                    radius_mm=old.radius_mm if c == first_c else 1 / c if c else math.inf,
                     thickness_mm=t,
                     semi_aperture_mm=semi_aperture,
                     conic=k,
@@ -313,7 +311,7 @@ class GeoLens(Replaceable):
                     medium=(old.medium or AIR).shifted(shift) if shift else old.medium,
                     phase=old.phase and dataclasses.replace(old.phase, coefficients=tuple(phase)),
                     decentre_mm=tuple(decentre),
-                    tilt_deg=old.tilt_deg if tilted_alike else tuple(map(math.degrees, tilt)),
+                    tilt_deg=old.tilt_deg if tilt == first_tilt else tuple(map(math.degrees, tilt)),
                 )
             )
         return tuple(found)
@@ -465,6 +463,10 @@ class GeoLens(Replaceable):
         return f"{self.name}, {len(self.surfaces)} surfaces, entrance pupil {self.entrance_pupil_diameter_mm:g} mm"
 
 
+def _tilt_rad(surface):
+    return [math.radians(angle) for angle in surface.tilt_deg]
+
+
 def _tensors(surfaces, dtype):
     """The tensors of a lens of these surfaces, by name; rows of different length are filled up with zeros."""
 
@@ -480,7 +482,7 @@ def _tensors(surfaces, dtype):
         "index_offset": [0.0 for _ in surfaces],
         "phase": filled([s.phase.coefficients if s.phase else () for s in surfaces]),
         "decentre_mm": [s.decentre_mm for s in surfaces],
-        "tilt_rad": [[math.radians(a) for a in s.tilt_deg] for s in surfaces],
+        "tilt_rad": [_tilt_rad(s) for s in surfaces],
         "semi_aperture_mm": [s.semi_aperture_mm for s in surfaces],
     }
     return {name: torch.tensor(values, dtype=dtype) for name, values in rows.items()}

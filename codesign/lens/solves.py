@@ -64,10 +64,11 @@ def hold_efl(lens: L, efl_mm: float | Tensor, surface: int | None = None) -> L:
     c, t, n, power = lens.curvature_per_mm, lens.thickness_mm, lens.index(), lens.surface_power()
     at = holding_surface(lens) if surface is None else range(c.numel())[surface]
     one = torch.ones_like(c[0])
-    heights, angles = yu_trace(power, t, n, one, 0 * one)
-    # of the last angle over that behind the surface
-    lever = yu_trace(power, t, n, t[at] / n[at + 1], one, first=at + 1)[1]
-    by_angle = lever[-1] if lever else one
+    heights, angles = yu_trace(power, t, n, one, torch.zeros_like(one))
+    # change of the last angle by that behind the surface
+    by_angle = one
+    if at < c.numel() - 1:
+        by_angle = yu_trace(power, t, n, t[at] / n[at + 1], one, first=at + 1)[1][-1]
     step = bending(n, lens.mirrors)[at]
     weak = [float(v.detach()) for v in (step, heights[at], by_angle)]
     if min(map(abs, weak)) < NO_POWER:

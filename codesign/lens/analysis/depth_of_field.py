@@ -6,6 +6,7 @@ circle of confusion. Traced limits hold the RMS spot instead, diameter / (2 sqrt
 aberrations included.
 """
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -108,6 +109,7 @@ def traced_depth_of_field(
     centre = min(max(float(-at_parallel / per_vergence), 0.0), top)
     width = 3 * float(blur_mm) / float(lens.first_order().entrance_pupil_diameter_mm * per_vergence.abs())
 
+    @functools.cache
     def rms(vergence):
         at_m = 1e-3 / torch.tensor(vergence, dtype=lens.dtype)
         return float(rms_spot_mm(lens, [0.0], wavelength_um, grid, at_m))
@@ -133,7 +135,7 @@ def _least(function, low, high):
     from scipy.optimize import minimize_scalar
 
     found = minimize_scalar(
-        function, bounds=(low, high), method="bounded", options={"xatol": 1e-7 * (high - low)}
+        function, bounds=(low, high), method="bounded", options={"xatol": 1e-6 * (high - low)}
     )
     return float(found.x)
 
@@ -146,7 +148,7 @@ def _edge(function, start, end, step):
     while inside != end:
         ahead = min(inside + step, end) if end > start else max(inside - step, end)
         if function(ahead) > 0:
-            return brentq(function, inside, ahead, xtol=1e-9 * abs(ahead - inside))
+            return brentq(function, inside, ahead, xtol=1e-7 * abs(ahead - inside))
         inside, step = ahead, 2 * step
     return end
 
