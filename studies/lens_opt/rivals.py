@@ -14,7 +14,7 @@ from torch import Tensor
 from codesign import lens
 from codesign.errors import CodesignError, DomainError
 from codesign.grad.jacobian import by_differences
-from codesign.lens.design import edge_thickness_mm
+from codesign.lens.design.modes import sizes_of
 from codesign.optimise import DampedLeastSquares, StopRules
 from studies.lens_opt.spots import refocused, spot_rays
 from studies.lens_opt.task import DISTANCE_M, HALF_DIAGONAL_MM, LIGHT, PITCH_MM, LensTask, film
@@ -91,7 +91,7 @@ def shrink_spots(
     """
     generator = torch.Generator().manual_seed(seed)
     weights = field_weights(task)
-    size = relative_size(task)
+    size = sizes_of(task.design.reference)
     first = torch.zeros_like(size)
     others = [
         SPREAD * torch.randn(len(size), generator=generator, dtype=size.dtype) for _ in range(starts - 1)
@@ -121,13 +121,6 @@ def shrink_spots(
     return found
 
 
-def relative_size(task: LensTask) -> Tensor:
-    """Sizes of the free numbers of a design, [V]: the mean curvature per mm, each thickness in mm."""
-    reference = task.design.reference
-    curvature = reference.curvature_per_mm.abs().mean().expand(reference.curvature_per_mm.numel() - 1)
-    return torch.cat([curvature, reference.thickness_mm]).detach()
-
-
 def residuals(task: LensTask, size: Tensor, weights: tuple[float, ...]) -> Callable[[Tensor], Tensor]:
     """Function of relative changes [V] to ray errors in pixels, whose squares sum to the weighted mean square spot;
     and to failed rays and edges below their floors."""
@@ -142,9 +135,7 @@ def residuals(task: LensTask, size: Tensor, weights: tuple[float, ...]) -> Calla
         except DomainError:  # no focal length, or no light: a failed step
             return changes.new_full((1,), torch.nan)
         error = root * rays.share.sqrt()[..., None] * rays.spread()[0] / PITCH_MM
-        thin = (task.design.edge_floor_mm - edge_thickness_mm(optics)).clamp_min(0) / (
-            0.01 * task.design.efl_mm
-        )
+        thin = task.design.shortfall(optics)
         return torch.cat([error.reshape(-1), EDGE_WEIGHT * thin, MISS_WEIGHT * rays.missed.reshape(1)])
 
     return found

@@ -106,3 +106,12 @@ def test_gradients_of_point_spreads(make, grid, step, rel, generator):
         step=step,
         rel=rel,
     )
+
+
+@pytest.mark.parametrize("defocus_mm", [47.0, 94.0])
+def test_a_pupil_has_as_many_cells_as_the_aberration_asks_for(defocus_mm):
+    geo = paraboloid(defocus_mm=defocus_mm)
+    rim = wavefront(geo, 0.0, pupil=torch.tensor([[0.0, 1.0], [0.0, 31 / 32]], dtype=D)).waves
+    # a third of a wave from cell to cell, of which there are powers of two
+    needed = 3 * 64 * float((rim[0] - rim[1]).detach())
+    assert needed <= analysis.pupil_function(geo, 0.0).field.shape[0] < 2 * needed

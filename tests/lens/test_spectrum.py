@@ -124,6 +124,7 @@ def test_a_thin_layer_of_silicon_absorbs_by_its_coefficient(wavelength_um, absor
 def test_a_thick_layer_counts_every_visible_photon():
     w, value = silicon_response(1000)
     visible = (w > 0.37) & (w < 0.9)
+    assert value.max() == 1
     # 30 absorption lengths at 0.9 um: the response in A/W is proportional to w
     assert value[visible] / w[visible] == pytest.approx(
         np.full(visible.sum(), value[visible][0] / w[visible][0]), rel=1e-12

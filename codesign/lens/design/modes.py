@@ -60,11 +60,19 @@ class LensDesign:
             self.reference.replace(curvature_per_mm=curvature, thickness_mm=thickness), self.efl_mm, at
         )
 
+    def shortfall(self, lens: GeoLens) -> Tensor:
+        """How far edge thicknesses lie below their floors, [S - 1], in units of 1 % of the focal length."""
+        return (self.edge_floor_mm - edge_thickness_mm(lens)).clamp_min(0) / (0.01 * self.efl_mm)
+
     def penalty(self, lens: GeoLens) -> Tensor:
-        """Smooth hinge on edge thicknesses below their floors, in units of 1 % of the focal length squared; 0
-        when all hold."""
-        shortfall = (self.edge_floor_mm - edge_thickness_mm(lens)).clamp_min(0) / (0.01 * self.efl_mm)
-        return shortfall.square().sum()
+        """Smooth hinge, the sum of the squared shortfalls; 0 when all floors hold."""
+        return self.shortfall(lens).square().sum()
+
+
+def sizes_of(lens: GeoLens) -> Tensor:
+    """Sizes of the free numbers of a design, [V]: the mean curvature per mm for S - 1, each thickness in mm."""
+    curvature = lens.curvature_per_mm.detach().abs().mean()
+    return torch.cat([curvature.expand(len(lens.surfaces) - 1), lens.thickness_mm.detach()])
 
 
 def make_design(
@@ -86,10 +94,7 @@ def make_design(
     """
     # the caller's lens keeps its gradients
     lens = lens.replace(**{name: getattr(lens, name).detach().clone() for name in LEARNABLES})
-    count = lens.curvature_per_mm.numel()
-    size = torch.cat(
-        [lens.curvature_per_mm.detach().abs().mean().expand(count - 1), lens.thickness_mm.detach()]
-    )
+    size = sizes_of(lens)
     with torch.no_grad():
         edges = edge_thickness_mm(lens)
         least = (
