@@ -23,7 +23,7 @@ from codesign.lens.diffraction import ZernikePlate, with_plate
 from codesign.report import lens_figures
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.show import Panel, panels, table
-from studies.frame.sweep import plain
+from studies.frame.sweep import plain, sweep
 
 D = torch.float64
 PERIODS_PX = (8, 4)
@@ -123,37 +123,36 @@ def design(run, geo):
     """The best plate of all starts, and the losses of each."""
     config = run.config
     radius = 1.1 * float(geo.first_order().stop_semi_aperture_mm)
-    starts = list(STARTS.items())[: config.starts]
-    stored = run.load_state() if run.resumed else None
-    done = [] if stored is None else list(stored.tensors["coefficients"])
-    losses = {} if stored is None else stored.numbers["losses"]
-    with run.progress(len(starts) * config.steps, "steps of the plate", len(done) * config.steps) as progress:
-        for name, start in starts[len(done) :]:
-            terms = {term: start.get(term, 0.0) for term in TERMS}
-            plate = ZernikePlate(terms, radius, wavelength_um=LINES[0])
-            plated = with_plate(geo, plate, z_mm=config.plate_z_mm)
-            optimiser = torch.optim.Adam(plate.parameters(), lr=0.15, betas=(0.8, 0.99))
-            fade = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.steps, 0.01)
-            path = []
-            losses[name] = []
-            for _ in range(config.steps):
-                optimiser.zero_grad()
-                path.append(plate.coefficients_rad.detach().clone())
-                loss = shortfall(config, plated, config.per_m(config.depths))
-                losses[name].append(float(loss.detach()))
-                loss.backward()
-                optimiser.step()
-                fade.step()
-                progress.advance(loss=losses[name][-1])
-            done.append(path[losses[name].index(min(losses[name]))])
-            run.save_state({"coefficients": torch.stack(done)}, {"losses": losses})
-    name = min(losses, key=lambda n: min(losses[n]))
-    found = dict(zip(TERMS, done[list(losses).index(name)].tolist(), strict=True))
-    run.card("Plate", name, f"the better of {len(losses)} starts")
+    given = {"config": config, "geo": geo, "radius_mm": radius}
+    rows = sweep(run, descended, "starts", given=given, start=list(STARTS)[: config.starts])
+    best = min(rows, key=lambda row: min(row["losses"]))
+    found = dict(zip(TERMS, best["coefficients"], strict=True))
+    run.card("Plate", best["start"], f"the better of {len(rows)} starts")
     run.section("The plate", "Noll's terms, radians RMS over 1.1 times the stop's radius.")
     run.table("Coefficients", ("term", "rad"), [(str(t), f"{v:+.3f}") for t, v in found.items()])
-    run.record(plate_loss=min(losses[name]), **{f"plate_z{t}_rad": v for t, v in found.items()})
-    return ZernikePlate(found, radius, wavelength_um=LINES[0]).requires_grad_(False), losses
+    run.record(plate_loss=min(best["losses"]), **{f"plate_z{t}_rad": v for t, v in found.items()})
+    plate = ZernikePlate(found, radius, wavelength_um=LINES[0]).requires_grad_(False)
+    return plate, {row["start"]: row["losses"] for row in rows}
+
+
+def descended(start, config, geo, radius_mm):
+    """The way down from one plate: the loss before each step, and the coefficients of the least."""
+    terms = {term: STARTS[start].get(term, 0.0) for term in TERMS}
+    plate = ZernikePlate(terms, radius_mm, wavelength_um=LINES[0])
+    plated = with_plate(geo, plate, z_mm=config.plate_z_mm)
+    optimiser = torch.optim.Adam(plate.parameters(), lr=0.15, betas=(0.8, 0.99))
+    fade = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.steps, 0.01)
+    path = []
+    losses = []
+    for _ in range(config.steps):
+        optimiser.zero_grad()
+        path.append(plate.coefficients_rad.tolist())
+        loss = shortfall(config, plated, config.per_m(config.depths))
+        losses.append(float(loss.detach()))
+        loss.backward()
+        optimiser.step()
+        fade.step()
+    return {"coefficients": path[losses.index(min(losses))], "losses": losses}
 
 
 def refocused(config, geo):
