@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from codesign import lens
-from codesign.lens import analysis
+from codesign.lens import GeoLens, Surface, analysis
 from codesign.lens.analysis import (
     diffraction_mtf,
     geometric_mtf,
@@ -158,3 +158,13 @@ def test_gradients_of_the_mtf(make):
         step=1e-7,
         rel=1e-5,
     )
+
+
+def test_an_aperture_inside_the_pupil_makes_a_smaller_pupil():
+    # of half the diameter, so an f/40
+    mirror = Surface(-200.0, 100.0, None, 1.25, conic=-1.0, is_stop=True, mirror=True)
+    clipped = GeoLens([mirror], 5.0, soft_edge_mm=0.0)
+    frequency = torch.linspace(0, 40, 9, dtype=D)
+    found = diffraction_mtf(clipped, 0.0, frequency, grid=256, vignetting=True)[0].detach()
+    # the staircase rim of 128 cells across
+    torch.testing.assert_close(found, ideal_mtf(frequency, 40.0), rtol=0, atol=2e-3)
