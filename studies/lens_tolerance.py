@@ -304,7 +304,7 @@ def report_needed(run, geo, figure, refocus):
     errors = errors_of(geo, tolerances)
     slopes = sensitivities(geo, errors, figure, compensate=refocus)
     forecast = forecast_spot(compensated(figure, refocus)(geo), slopes, len(FIELDS)).averaged()
-    budget = ((1 + GROWTH) ** 2 - 1) * forecast.nominal
+    budget = ((1 + GROWTH) ** 2 - 1) * float(forecast.nominal)
     needed = precision.cheapest(forecast, errors, budget, SHARE, most=config.widest)
 
     def square(faulty):

@@ -30,7 +30,7 @@ PERIODS_PX = (8, 4)
 DIRECTIONS = 8  # of the half circle
 FINER = 2  # samples of the point spread per pixel
 SAMPLES = 64
-TERMS = (4, 7, 8, 9, 10, 11, 22)
+TERMS: tuple[int, ...] = (4, 7, 8, 9, 10, 11, 22)
 # radians RMS; the cubic is x^3 + y^3
 STARTS: dict[str, dict[int, float]] = {"cubic": {7: 0.7, 8: 0.7, 9: -0.7, 10: 0.7}, "round": {11: 0.8}}
 FOCI = 9  # distances tried for a lens without a plate

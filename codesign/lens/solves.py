@@ -193,5 +193,5 @@ def focus_rays(
     return _last_thickness(lens, lens.thickness_mm[-1] + shift)
 
 
-def _last_thickness(lens: L, value):
+def _last_thickness(lens: L, value: Tensor) -> L:
     return lens.replace(thickness_mm=torch.cat([lens.thickness_mm[:-1], value.reshape(1)]))

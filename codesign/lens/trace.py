@@ -286,18 +286,15 @@ def trace_surfaces(prescription: Prescription, origin_mm: Tensor, direction: Ten
 def _in_segments(p, origin_mm, direction):
     """Trace through SEGMENT surfaces at a time, from vertex plane to vertex plane."""
     count = len(p.mirrors)
-    found = None
-    for first in range(0, count, SEGMENT):
+
+    def segment(first):
         stop = min(first + SEGMENT, count)
-        segment = replace(
-            p.part(first, stop),
-            to_plane=p.to_plane or stop < count,
-            efficiency=1.0 if found else p.efficiency,
-        )
-        if found is None:
-            found = trace_surfaces(segment, origin_mm, direction)
-        else:
-            found = joined(found, trace_surfaces(segment, *onward(found)), first)
+        efficiency = 1.0 if first else p.efficiency
+        return replace(p.part(first, stop), to_plane=p.to_plane or stop < count, efficiency=efficiency)
+
+    found = trace_surfaces(segment(0), origin_mm, direction)
+    for first in range(SEGMENT, count, SEGMENT):
+        found = joined(found, trace_surfaces(segment(first), *onward(found)), first)
     return found
 
 

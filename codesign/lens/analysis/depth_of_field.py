@@ -9,6 +9,7 @@ aberrations included.
 import functools
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -134,7 +135,7 @@ def _least(function, low, high):
     """Where a function of one number is least between two ends."""
     from scipy.optimize import minimize_scalar
 
-    found = minimize_scalar(
+    found: Any = minimize_scalar(
         function, bounds=(low, high), method="bounded", options={"xatol": 1e-6 * (high - low)}
     )
     return float(found.x)

@@ -10,8 +10,9 @@ Every Constraint is a value, a bound and a side. Its penalty is (violation / sca
 where it holds, so values and slopes are continuous. Surfaces are counted from 1.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -186,7 +187,7 @@ def is_glass(lens: GeoLens) -> list[bool]:
 LEAST, MOST = True, False  # of a figure: name, value, bound or None, side, scale, unit, whether it can bind
 
 
-def _lengths(lens, limits, apertures):
+def _lengths(lens, limits, apertures) -> Iterator[tuple[Any, ...]]:
     """Thicknesses, gaps, lengths and steepness."""
     heights = torch.linspace(0, 1, 33, dtype=lens.dtype, device=apertures.device)
     gaps = gap_mm(lens, heights, apertures)
@@ -208,7 +209,7 @@ def _lengths(lens, limits, apertures):
         yield f"steepness of surface {i + 1}", value, limits.steepness, MOST, 0.1, ""
 
 
-def _rays(lens, limits):
+def _rays(lens, limits) -> Iterator[tuple[Any, ...]]:
     if limits.incidence_deg is None and not limits.rays:
         return
     origin, direction = rim_rays(lens, limits.fields_rad, at_m=limits.at_m)

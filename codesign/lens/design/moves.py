@@ -119,12 +119,12 @@ def with_glass(lens: GeoLens, surface: int, medium: Glass | str) -> GeoLens:
             f"{fronts or 'none'}."
         )
     other = lens.replace_glass(surface, medium)
-    if other.surfaces[surface].medium is None:
+    found = other.surfaces[surface].medium
+    if found is None:
         raise DomainError(
             f"{lens.name}: {medium} is no glass; give one, or take the element out with without_element."
         )
-    name = other.surfaces[surface].medium.name
-    return _held(lens, _surfaces(other), f"with {name} behind surface {surface + 1}")
+    return _held(lens, _surfaces(other), f"with {found.name} behind surface {surface + 1}")
 
 
 def neighbour_glasses(

@@ -368,7 +368,7 @@ class Forecast:
 
     def averaged(self) -> "Forecast":
         """The mean over the figures, as one."""
-        return Forecast(float(self.nominal.mean()), self.linear.mean(0), self.square.mean(0))
+        return Forecast(float(torch.as_tensor(self.nominal).mean()), self.linear.mean(0), self.square.mean(0))
 
 
 def spot_errors(

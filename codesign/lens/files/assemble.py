@@ -60,16 +60,16 @@ class Paraxial:
     """Paraxial rays through a lens at one wavelength, as plain numbers in mm."""
 
     def __init__(self, draft: GeoLens, wavelength_um: float) -> None:
-        columns = draft.surface_power(wavelength_um), draft.thickness_mm, draft.index(wavelength_um)
-        self.columns = [column.tolist() for column in columns]
-        self.index = self.columns[2][-1]
+        self.power = draft.surface_power(wavelength_um).tolist()
+        self.thickness = draft.thickness_mm.tolist()
+        self.index = draft.index(wavelength_um).tolist()
         self.stop = draft.stop_index
 
     def trace(self, y: float, u: float) -> tuple[list[float], float]:
         """Heights at the surfaces, and the angle behind the last, of a ray that meets the first at height y
         with slope u (in air)."""
-        heights, angles = yu_trace(*self.columns, y, u)
-        return heights, angles[-1] / self.index
+        heights, angles = yu_trace(self.power, self.thickness, self.index, y, u)
+        return heights, angles[-1] / self.index[-1]
 
     def focal_length(self) -> float:
         _, u = self.trace(1.0, 0.0)
@@ -145,7 +145,7 @@ def _pupil(lens, rows, optics):
         raise FileFormatError(f"its {kind} is {value:g}; it must be positive.")
     if kind == "diameter":
         return value * lens.unit_mm
-    if optics.index != 1:
+    if optics.index[-1] != 1:
         raise FileFormatError(
             f"its {kind} is counted in the image space, which is glass here; give the entrance pupil "
             "diameter."

@@ -207,7 +207,8 @@ class PrivateGlasses:
             )
         # linear in 1 / wavelength^2
         lines, knots = (-1 / np.square(list(w)) for w in (WAVELENGTH_UM.values(), waves_um))
-        return Glass.from_indices(*np.interp(lines, knots, indices).tolist(), name)
+        F, d, C = np.interp(lines, knots, indices).tolist()
+        return Glass.from_indices(F, d, C, name)
 
 
 def _plain(word):
