@@ -235,7 +235,7 @@ def test_a_checkpoint_that_does_not_fit_is_named(tmp_path, capsys, damage, sente
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ("--network refinr", "network 'refinr' is unknown; choose one of ecn, flownet-events"),
+        ("--network refinr", "the network must be one of 'ecn', 'flownet-events'"),
         ("--options depth=3", "has no option 'depth'; it has bins, gain"),
         ("--weights 500", "which 'linear' does not"),
         ("--mix fog", "--mix fog is unknown; choose from"),
