@@ -1,14 +1,13 @@
 """Event streams: put in order, joined, and counted per frame interval."""
 
 from collections.abc import Iterable
-from numbers import Integral
 
 import torch
 from torch import Tensor
 
 from codesign.checks import check_kind
 from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import Times, check_dtype, check_room, check_times
+from codesign.events.entry import Times, check_dtype, check_room, check_times, check_whole
 from codesign.types import EventStream
 
 
@@ -40,10 +39,7 @@ def check_stream(stream: EventStream, part: slice = slice(None)) -> EventStream:
     back, pixels of the sensor, polarities +1 and -1; DomainError, ShapeError otherwise."""
     check_kind(stream, EventStream, "the events", "events.read and events.simulate give an EventStream")
     for side, name in ((stream.height_px, "height_px"), (stream.width_px, "width_px")):
-        if isinstance(side, bool) or not isinstance(side, Integral) or not 0 <= side < 2**31:
-            raise DomainError(
-                f"{name} of the stream is {' '.join(repr(side).split())}; a whole number is needed."
-            )
+        check_whole(side, f"{name} of the stream", 0, 2**31 - 1)
     columns = (stream.t_us, stream.x, stream.y, stream.p)
     if not all(
         isinstance(values, Tensor)

@@ -143,23 +143,32 @@ class Arrival:
         Raises: FileFormatError naming the first that is no event, lies outside the sensor or more than
           DISORDER_US before an earlier one.
         """
-        height, width = (LIMIT_PX if side is None else side for side in self.size)
         latest_us = np.maximum(np.maximum.accumulate(t_us), self.latest_us) if len(t_us) else t_us
         if self.off is None:
             self.off = next(iter(p[(p == 0) | (p == -1)][:1].tolist()), None)
-        outside_x, outside_y = (
-            ~((values >= 0) & (values < limit)) | (values % 1 != 0)
-            for values, limit in ((x, width), (y, height))
-        )
-        faults = (
-            ("", ~((t_us > -LAST_US) & (t_us < LAST_US)), self._bad_time),
-            (BACKWARDS, latest_us - t_us > DISORDER_US, self._late),
-            (OFF_SENSOR, outside_x, self._outside),
-            (OFF_SENSOR, outside_y, self._outside),
-            ("", ~((p == 1) | (p == (0 if self.off is None else self.off))), self._bad_polarity),
-        )
+        unfit = ~((p == 1) | (p == (0 if self.off is None else self.off)))
+
+        def bad_time(at):
+            return f"its time is {t_us[at]} us; 61 bits of microseconds are read"
+
+        def late(at):
+            return (
+                f"it lies {int(latest_us[at]) - int(t_us[at])} us before an earlier one; at most {DISORDER_US} "
+                "us of disorder is put in order"
+            )
+
+        def bad_polarity(at):
+            off = "0 or -1" if self.off is None else f"{self.off:g}, as in the events before"
+            return f"its polarity is {p[at]:g}; 1 for ON, {off}, for OFF is allowed"
+
         kept = np.ones(len(t_us), bool)
-        for fault, bad, say in faults:
+        for fault, bad, say in (
+            ("", ~((t_us > -LAST_US) & (t_us < LAST_US)), bad_time),
+            (BACKWARDS, latest_us - t_us > DISORDER_US, late),
+            (OFF_SENSOR, *self._outside("x", x, self.size[1])),
+            (OFF_SENSOR, *self._outside("y", y, self.size[0])),
+            ("", unfit, bad_polarity),
+        ):
             bad &= kept
             if fault in self.left_out:
                 self.left_out[fault] += int(bad.sum())
@@ -167,13 +176,9 @@ class Arrival:
             elif bool(bad.any()):
                 at = int(np.argmax(bad))
                 number = self.count + at if places is None else places[at]
-                event = {"t": t_us[at], "x": x[at], "y": y[at], "p": p[at], "latest": latest_us[at]}
-                advice = (
-                    f", or leave such events out (skip: {fault})"
-                    if fault and self.asked.skip is not None
-                    else ""
-                )
-                raise FileFormatError(f"{self.path}, {self.place} {number}: {say(event)}{advice}.")
+                skips = fault and self.asked.skip is not None
+                advice = f", or leave such events out (skip: {fault})" if skips else ""
+                raise FileFormatError(f"{self.path}, {self.place} {number}: {say(at)}{advice}.")
         self.count += len(t_us)
         self.latest_us = latest_us[-1] if len(t_us) else self.latest_us
         if self.count > MOST_EVENTS:
@@ -206,29 +211,18 @@ class Arrival:
                 return sensor[1], sensor[0], f"{name}, the smallest known sensor that holds the events"
         return height or needed[1], width or needed[0], "the events themselves"
 
-    def _bad_time(self, event):
-        return f"its time is {event['t']} us; 61 bits of microseconds are read"
+    def _outside(self, name, values, limit):
+        """Which values lie outside a side of the sensor, and what to say of one."""
+        by = f" by {self.size_from}" if limit is not None else ", as far as sensors are known,"
+        most = LIMIT_PX if limit is None else limit
 
-    def _late(self, event):
-        lag_us = int(event["latest"]) - int(event["t"])
-        return (
-            f"it lies {lag_us} us before an earlier one; at most {DISORDER_US} us of disorder is put in order"
-        )
+        def said(at):
+            return (
+                f"it lies at {name} = {values[at]:.15g}; the sensor has {most} pixels there{by} (0 to "
+                f"{most - 1}, whole numbers); give its true size"
+            )
 
-    def _outside(self, event):
-        for name, limit in zip("yx", self.size, strict=True):
-            value, most = event[name], LIMIT_PX if limit is None else limit
-            if not (0 <= value < most and value % 1 == 0):
-                by = f" by {self.size_from}" if limit is not None else ", as far as sensors are known,"
-                said = (
-                    f"{name} = {value:.15g}; the sensor has {most} pixels there{by} (0 to {most - 1}, "
-                    "whole numbers)"
-                )
-        return f"it lies at {said}; give its true size"
-
-    def _bad_polarity(self, event):
-        off = "0 or -1" if self.off is None else f"{self.off:g}, as in the events before"
-        return f"its polarity is {event['p']:g}; 1 for ON, {off}, for OFF is allowed"
+        return ~((values >= 0) & (values < most)) | (values % 1 != 0), said
 
 
 def arranged(path, asked, t_us, x, y, p, size=None):
