@@ -238,12 +238,6 @@ def exact_sum(first, second):
     return total, (first - (total - part)) + (second - part)
 
 
-def reaches(dr, distance, theta, count):
-    """Whether ``count`` thresholds fit in a distance >= 0, exactly for the floats as they are: a rounded
-    quotient may be a whole number too early."""
-    return dr.fma(-count, theta, distance) >= 0
-
-
 class _Step:
     """One frame of one pixel, as drjit operations. Built once per chunk; every number that changes between
     chunks is opaque or in memory."""
@@ -344,8 +338,12 @@ class _Step:
         hazard = now.get("hazard", arr.Float(0))
         drawn = now.get("shots", arr.UInt32(0))
 
+        def due(nth, end, rising):
+            # exactly for the floats as they are: a rounded quotient may be a whole number too early
+            return dr.fma(-(nth + 1), dr.select(rising, theta_on, theta_off), dr.abs(end)) >= 0
+
         def going(nth, start, base, end, rising, last_s, tally, hazard, drawn):
-            more = reaches(dr, dr.abs(end), dr.select(rising, *self.thetas), nth + 1)
+            more = due(nth, end, rising)
             return more | (hazard < pace) if shots else more
 
         def event(nth, start, base, end, rising, last_s, tally, hazard, drawn):
@@ -355,8 +353,7 @@ class _Step:
             on = rising
             kept = arr.Bool(True)
             if shots:
-                more = reaches(dr, dr.abs(end), dr.select(rising, *self.thetas), nth + 1)
-                is_shot = (hazard < pace) & (~more | (hazard < when * pace))
+                is_shot = (hazard < pace) & (~due(nth, end, rising) | (hazard < when * pace))
                 when = dr.select(is_shot, hazard / pace, when)
                 bits = hashed(self.key + hashed(drawn + 1))
                 on = dr.select(is_shot, uniform(arr, bits) * pace < on_pace, rising)
