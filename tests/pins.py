@@ -51,7 +51,6 @@ RENAMED: dict[str, str] = {
     },
     "codesign.events.formats.aedat4": "codesign.events.formats.aedat",
     "codesign.events.spiking.srm_state.SrmState": "codesign.events.spiking.srm.SrmState",
-    "codesign.events.spiking.srm_state.PlayState": "codesign.events.spiking.srm_means.PlayState",
     "codesign.events.spiking.two_branches": "codesign.events.spiking.thesis_network",
     "codesign.events.layers.layer.ComparatorLayer": "codesign.events.layers.comparators.ComparatorLayer",
     "codesign.events.layers.layer.LayerState": "codesign.events.layers.comparators.LayerState",

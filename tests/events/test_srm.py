@@ -120,7 +120,6 @@ MODES = {
     **{name: FADING | {"kernel": name, "gradient": "mean"} for name in ("slayer", "thesis", "exp")},
     "no response": FADING | {"response": "none", "gradient": "mean"},
     "summed": FADING | {"response": "step", "gradient": "mean"},
-    "play": STEP | {"gradient": "play"},
 }
 
 
@@ -205,7 +204,6 @@ def test_drive_scale_brings_the_asked_share_to_threshold(response, tau_s):
 DRIVE = torch.zeros(3, 2, 1)
 PLAIN = {"theta": 1.0, "tau_r": 1.0}
 MEAN = FADING | {"gradient": "mean"}
-PLAY = STEP | {"gradient": "play"}
 
 
 @pytest.mark.parametrize(
@@ -236,9 +234,6 @@ PLAY = STEP | {"gradient": "play"}
         (MEAN, {"tau_r": 40.0}, "tau_r is up to 40 steps, and gradient 'mean' goes up to 30"),
         (MEAN, {"state": srm(DRIVE, **FADING)[2]}, "a layer without gradient='mean'"),
         (MEAN, {"state": srm(DRIVE.double(), **MEAN)[2]}, "state.mean is torch.float64"),
-        (PLAY, {"response": "none"}, "goes with response='step'"),
-        (PLAY, {"drive": DRIVE + 1}, "minus the ON drive"),
-        (PLAY, {"state": srm(DRIVE, **STEP)[2]}, "the state comes from a layer without"),
     ],
 )
 def test_bad_input_is_refused_with_a_sentence(layer, change, words):

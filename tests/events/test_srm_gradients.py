@@ -15,7 +15,7 @@ import torch
 from codesign import events
 from codesign.events.kernels import recursion
 from codesign.events.spiking import srm_means
-from codesign.events.spiking.srm import srm
+from codesign.events.spiking.srm import count_spikes, srm
 from codesign.events.spiking.srm_means import PACE, WIDTH, held_back, rested
 from tests.events.slopes import cosine_and_scale, seeded
 
@@ -23,7 +23,6 @@ D = torch.float64
 THETA = 0.2
 KINDS = {"pair": 2, "early": 1}
 FADING = {"theta": THETA, "kernel": "exp", "response": "alpha", "tau_s": 2.4, "tau_r": 1.2}
-STEP = {"theta": THETA, "kernel": "step", "response": "step", "reset_scale": 1.0, "coupled": True}
 
 
 def mean_spikes(kind, response, theta, a, m, pace, start):
@@ -249,8 +248,7 @@ def test_the_level_that_is_held_back_passes_gradcheck():
 def test_the_slope_to_the_threshold_is_that_of_the_mean():
     level = walk(5, size=0.1)
     theta = torch.tensor(THETA, dtype=D, requires_grad=True)
-    step = level.diff(dim=0)
-    spikes, _, _ = srm(torch.stack((step, -step), 1), **STEP | {"theta": theta}, gradient="play")
+    spikes, _ = count_spikes(level, torch.stack((theta, theta)), None)
     (slope,) = torch.autograd.grad(spikes[:, 0].sum(), theta)
     wide = 200_000
     # by scaling: counts of (level, C) are those of (level / C, 1)

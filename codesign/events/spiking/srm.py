@@ -21,18 +21,10 @@ from codesign.checks import (
 from codesign.errors import DomainError, ShapeError
 from codesign.events.entry import check_per_pixel
 from codesign.events.spiking.srm_loops import RESETS, RESPONSES, STATES, Setup, Srm
-from codesign.events.spiking.srm_means import (
-    PlayState,
-    check_mean,
-    check_play,
-    mean_spikes,
-    played,
-    straight_through,
-    with_play,
-)
+from codesign.events.spiking.srm_means import check_mean, mean_spikes, straight_through, with_play
 from codesign.events.spiking.surrogate import FastSigmoid, Laplace, Surrogate
 
-GRADIENTS = ("surrogate", "play", "mean")
+GRADIENTS = ("surrogate", "mean")
 THROUGH_RESET = ("off", "full", "bounded")
 MOST_STEPS = 1e9
 
@@ -44,21 +36,18 @@ class SrmState:
 
     response: [states, ...] of the response kernel, float64 whatever the drive (0 to 2 states).
     reset: [states, ...] of the reset kernel, likewise (1 or 2 states).
-    play: PlayState with ``gradient="play"``, else None.
     mean: [1 + states, ages, ...] with ``gradient="mean"``, in the type of the drive: shares of neurons by
       the age of their last spike, and the mean states of their resets; else None.
     """
 
     response: Tensor
     reset: Tensor
-    play: PlayState | None = None
     mean: Tensor | None = None
 
     def detach(self) -> "SrmState":
         """The same state without its graph."""
-        play = None if self.play is None else self.play.detach()
         mean = None if self.mean is None else self.mean.detach()
-        return SrmState(self.response.detach(), self.reset.detach(), play, mean)
+        return SrmState(self.response.detach(), self.reset.detach(), mean)
 
 
 def srm(
@@ -99,11 +88,9 @@ def srm(
         the other. With ``kernel="step"``,
         ``response="step"``, ``reset_scale=1`` and log-intensity steps as drive (ON +, OFF -) this is the
         memorised-reference event model.
-      gradient: "surrogate", or for that event model "play": the gradient of the mean count over where inside
-        its threshold a pixel may have begun, as ``events.memory``, with one event per step. For resets that
-        fade "mean": the exact gradient of a smooth mean response, of many neurons with noise at the
-        threshold that spiked last at a random time. It points better than a surrogate; docs/srm.md says how
-        well.
+      gradient: "surrogate"; for resets that fade "mean": the exact gradient of a smooth mean response, of many
+        neurons with noise at the threshold that spiked last at a random time. It points better than a surrogate;
+        docs/srm.md says how well. (That of the event model's mean count: ``events.layer("srm")``.)
       surrogate: Laplace, FastSigmoid or Triangular; None: Laplace of unit mass and width mean(theta), that is
         alpha = 2 theta, beta = 1 / theta.
       through_reset: gradient of a spike by way of the resets it causes: "off" (as SLAYER), "full", or
@@ -117,9 +104,8 @@ def srm(
         whole bit for bit.
     Gradient: drive, theta, tau_s, tau_r, state; spikes by the surrogate. theta and tau_r act through the
       reset amplitude with spikes held, also when
-      through_reset is "off". With ``gradient="play"`` spikes carry a gradient to drive, theta and
-      state.play, and the potential none. With ``gradient="mean"`` spikes carry one to drive, theta, tau_s,
-      tau_r, state.response and state.mean, and the potential none. Second derivatives raise.
+      through_reset is "off". With ``gradient="mean"`` spikes carry one to drive, theta, tau_s, tau_r,
+      state.response and state.mean, and the potential none. Second derivatives raise.
     Raises: ShapeError for T = 0, no pixel, shapes that do not fit; DomainError for thresholds, time constants
       or dt that are not positive, unknown
       names, NaN or infinite drive; NonFiniteError when a finite drive overflows. Warns (RuntimeWarning) when
@@ -156,13 +142,6 @@ def srm(
     theta = check_per_pixel(theta, "theta", drive, torch.float64)
     tau_s = _time_constant(tau_s, "tau_s", drive, dt) if response == "alpha" else None
     tau_r = _time_constant(tau_r, "tau_r", drive, dt) if kernel != "step" else torch.ones_like(theta)
-    if gradient == "play":
-        layer = {"kernel": kernel, "response": response, "reset_scale": reset_scale, "coupled": coupled}
-        check_play(drive, layer, state)
-        with torch.no_grad():
-            spikes, potential, after = srm(drive, theta=theta, state=state, **layer)
-        spikes, play = played(spikes, drive, theta, None if state is None else state.play)
-        return spikes, potential, replace(after, play=play)
     if gradient == "mean":
         others = {
             "surrogate": (surrogate, None),
@@ -217,7 +196,7 @@ def count_spikes(level: Tensor, theta: Tensor, state: Any, gradient: str = "play
       None.
     Returns: counts [T-1, 2, ...] ([T, 2, ...] with a state); state to carry on.
     Gradient: "play": of the mean count over places inside the threshold, with the cap of one event per step
-      (``srm``). "surrogate": by a fast sigmoid of width theta, through the reset where it cannot grow.
+      . "surrogate": by a fast sigmoid of width theta, through the reset where it cannot grow.
     """
     start, neurons, play = (level[:1], None, None) if state is None else (state[0][None], *state[1:])
     step = torch.cat((start, level if state is not None else level[1:])).diff(dim=0)

@@ -20,7 +20,6 @@ exact; otherwise E is the edge of a play of their mean width.
 """
 
 import math
-from dataclasses import dataclass
 from functools import partial
 
 import torch
@@ -49,7 +48,7 @@ def check_mean(kernel, coupled, others, state):
     if kernel == "step":
         raise DomainError(
             "gradient 'mean' goes with a reset that fades ('slayer', 'thesis' or 'exp'), got kernel 'step'; "
-            "use gradient='play' for a layer that memorises a level."
+            "use events.layer('srm') for a layer that memorises a level."
         )
     if coupled:
         raise DomainError(
@@ -62,7 +61,11 @@ def check_mean(kernel, coupled, others, state):
                 f"{name} is {value!r}, which gradient 'mean' has no use for; leave it out, or use "
                 "gradient='surrogate'."
             )
-    check_same_gradient("mean", state)
+    if state is not None and getattr(state, "mean", None) is None:
+        raise DomainError(
+            "the state comes from a layer without gradient='mean'; begin with that gradient, or go on with "
+            "gradient='surrogate'."
+        )
 
 
 def mean_spikes(
@@ -149,70 +152,18 @@ def _mixed(shares, carried):
     return [sum(column) / total for column in zip(*weighted, strict=True)]
 
 
-@dataclass(frozen=True)
-class PlayState:
-    """What ``gradient="play"`` carries on. memory: state of ``events.memory``. centre: [...] centre of the
-    play that holds the level back to a threshold per step. level: [...] sum of the drive so far."""
-
-    memory: Tensor
-    centre: Tensor
-    level: Tensor
-
-    def detach(self) -> "PlayState":
-        """The same state without its graph."""
-        return PlayState(self.memory.detach(), self.centre.detach(), self.level.detach())
-
-
-def check_play(drive, given, state):
-    """Raises: DomainError where a layer, given by its options, memorises no level, so that its mean count is
-    not that of a play, or a state comes from a layer with another gradient."""
-    for name, needed in {"kernel": "step", "response": "step", "reset_scale": 1.0, "coupled": True}.items():
-        if given[name] != needed:
-            raise DomainError(
-                f"gradient 'play' goes with {name}={needed!r}, got {given[name]!r}: only a layer that "
-                "memorises a level has it; use gradient='surrogate'."
-            )
-    if not torch.equal(drive[:, 0], -drive[:, 1]):
-        raise DomainError(
-            "gradient 'play' needs the OFF drive to be minus the ON drive, steps of one level; use "
-            "gradient='surrogate' for two drives of their own."
-        )
-    check_same_gradient("play", state)
-
-
-def check_same_gradient(name, state):
-    """Raises: DomainError for a state of a layer with another gradient."""
-    if state is not None and getattr(state, name, None) is None:
-        raise DomainError(
-            f"the state comes from a layer without gradient={name!r}; begin with that gradient, or go on "
-            "with gradient='surrogate'."
-        )
-
-
-def played(spikes, drive, theta, state):
-    """``with_play`` for a drive [T, 2, ...] of steps: the level is their sum. theta broadcasts over [2,
-    ...]. state: PlayState or None."""
-    one = theta.numel() == 1
-    thetas = (theta.reshape(()).to(drive),) * 2 if one else theta.expand(drive.shape[1:]).to(drive)
-    step = (drive[:, 0] - drive[:, 1]) / 2
-    before = torch.zeros_like(step[0]) if state is None else state.level
-    level = before + step.cumsum(0)
-    return with_play(spikes, torch.cat((before[None], level)) if state is None else level, *thetas, state)
-
-
-def with_play(
-    spikes: Tensor, level: Tensor, theta_on: Tensor, theta_off: Tensor, state: PlayState | None
-) -> tuple[Tensor, PlayState]:
+def with_play(spikes, level, theta_on, theta_off, state):
     """The spikes with the gradient of the mean count.
 
     Args: spikes: [T-1, 2, ...] of a level [T, ...], or [T, 2, ...] with a state of the chunk before.
-    Returns: the same spikes; state to carry on, with its graph. Gradient: level, thetas, state.
+    Returns: the same spikes; state to carry on, with its graph: that of ``events.memory``, and the centre [...]
+      of the play that holds the level back. Gradient: level, thetas, state.
     """
     now = level if state is not None else level[1:]
-    centre, before = (level[0], level[0]) if state is None else (state.centre, state.memory)
+    before, centre = (level[0], level[0]) if state is None else state
     slow, centre = held_back(now, centre, theta_on, theta_off)
-    counts, after = memory(slow, theta_on, theta_off, state=before, log_input=True)
-    return straight_through(spikes, counts), PlayState(after, centre, level[-1])
+    counts, before = memory(slow, theta_on, theta_off, state=before, log_input=True)
+    return straight_through(spikes, counts), (before, centre)
 
 
 def held_back(level: Tensor, centre: Tensor, theta_on: Tensor, theta_off: Tensor) -> tuple[Tensor, Tensor]:
