@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from codesign.checks import check_choice, check_whole
+from codesign.checks import check_whole
 from codesign.errors import DomainError
 from codesign.events.entry import check_chunk, check_later, check_state, check_times
 from codesign.events.intensity import log_levels
@@ -144,18 +144,16 @@ class Expected:
 @dataclass
 class Spikes:
     """``events.srm`` with step kernels and coupled polarities, fed with steps of the log level: at most one
-    event per frame and polarity, the rest of a step stays for the frames after it. gradient: "play" (of the
-    mean count, as ``events.memory``) or "surrogate" (of a fast sigmoid). steps: of the neurons per frame
-    interval, over which the level runs linearly: the most events that an interval can give."""
+    event per frame and polarity, the rest of a step stays for the frames after it; with the gradient of the
+    mean count, as ``events.memory``. steps: of the neurons per frame interval, over which the level runs
+    linearly: the most events that an interval can give."""
 
-    gradient: str = "play"
     steps: int = 1
     mismatched = True
     refines = True
     whole = True
 
     def __post_init__(self):
-        check_choice(self.gradient, "gradient", ("surrogate", "play"))
         self.steps = check_whole(self.steps, "steps", 1, MOST_STEPS)
 
     def __call__(self, frames, theta_on, theta_off, state, log_input):
@@ -164,7 +162,7 @@ class Spikes:
             level = _between(_with_last(level, None if state is None else state[0]), self.steps)
             level = level if state is None else level[1:]
         thetas = torch.stack((theta_on, theta_off))
-        spikes, state = count_spikes(level, thetas, state, self.gradient)
+        spikes, state = count_spikes(level, thetas, state)
         return spikes.unflatten(0, (-1, self.steps)).sum(1) if self.steps > 1 else spikes, state
 
 
@@ -343,8 +341,8 @@ def layer(name: str = "memory", sensor: SensorModel | None = None, **options: An
         straight-through counts: the default), "expected" (mean counts under threshold mismatch), "srm"
         (spike response model, at most one event per frame), "physical" (the full sensor).
       sensor: SensorModel to start from. options: learn, log_input (see ``EventLayer``), and spread of
-        "expected", sharpness of "sigmoid" and "dense", gradient ("play" or "surrogate") and steps (per frame
-        interval) of "srm".
+        "expected", sharpness of "sigmoid" and "dense", gradient of "memory" ("exact", "play" or None), steps
+        (per frame interval) of "srm".
     Raises: DomainError for an unknown name, with the nearest one, an unknown option, or a value that cannot
       be learnt. A warning names what the sensor has and the layer does not know (leak, dead time, ...).
 

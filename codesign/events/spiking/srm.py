@@ -22,11 +22,13 @@ from codesign.errors import DomainError, ShapeError
 from codesign.events.entry import check_per_pixel
 from codesign.events.spiking.srm_loops import RESETS, RESPONSES, STATES, Setup, Srm
 from codesign.events.spiking.srm_means import check_mean, mean_spikes, straight_through, with_play
-from codesign.events.spiking.surrogate import FastSigmoid, Laplace, Surrogate
+from codesign.events.spiking.surrogate import Laplace, Surrogate
 
 GRADIENTS = ("surrogate", "mean")
 THROUGH_RESET = ("off", "full", "bounded")
 MOST_STEPS = 1e9
+# the layer that memorises a level
+MEMORISING: dict[str, Any] = {"kernel": "step", "response": "step", "reset_scale": 1.0, "coupled": True}
 
 
 @dataclass(frozen=True)
@@ -188,32 +190,22 @@ def srm(
     return spikes.view(drive.shape), potential.view(drive.shape), after
 
 
-def count_spikes(level: Tensor, theta: Tensor, state: Any, gradient: str = "play") -> tuple[Tensor, Any]:
+def count_spikes(level: Tensor, theta: Tensor, state: Any) -> tuple[Tensor, Any]:
     """At most one event per step and polarity: a layer with step kernels and coupled polarities, which
     memorises a level.
 
     Args: level: [T, ...]. theta: [2], or [2, ...] of every pixel. state: what an earlier call returned, or
       None.
     Returns: counts [T-1, 2, ...] ([T, 2, ...] with a state); state to carry on.
-    Gradient: "play": of the mean count over places inside the threshold, with the cap of one event per step
-      . "surrogate": by a fast sigmoid of width theta, through the reset where it cannot grow.
+    Gradient: of the mean count over places inside the threshold, with the cap of one event per step.
     """
     start, neurons, play = (level[:1], None, None) if state is None else (state[0][None], *state[1:])
     step = torch.cat((start, level if state is not None else level[1:])).diff(dim=0)
     thetas = theta.to(level)[(..., *[None] * (level.ndim - theta.ndim))]
-    with torch.set_grad_enabled(torch.is_grad_enabled() and gradient == "surrogate"):
-        spikes, _, neurons = srm(
-            torch.stack((step, -step), 1),
-            theta=thetas,
-            kernel="step",
-            response="step",
-            reset_scale=1.0,
-            coupled=True,
-            state=neurons,
-            surrogate=FastSigmoid.unit(float(theta.detach().mean())),
-            through_reset="bounded",
-        )
-    if gradient == "play" and torch.is_grad_enabled():
+    with torch.no_grad():
+        drive = torch.stack((step, -step), 1)
+        spikes, _, neurons = srm(drive, theta=thetas, state=neurons, **MEMORISING)
+    if torch.is_grad_enabled():
         # a chunk that kept no gradient carries no play on: it begins again at the last level
         begun = level if play is not None or state is None else torch.cat((start, level))
         spikes, play = with_play(spikes, begun, thetas[0], thetas[1], play)
