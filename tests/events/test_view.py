@@ -81,6 +81,7 @@ def test_the_figure_in_space_and_time_shows_as_many_events_as_it_says(generator)
     index = np.rint(shown[0] * 10).astype(int)  # 0.1 ms apart
     assert len(index) == 1000
     np.testing.assert_array_equal(shown[1:], [stream.x[index], stream.y[index]])
+    assert figure.axes[0].get_xlim() == pytest.approx((0, 499.9))
     assert "all 5,000 events" in space_time_figure(stream).get_suptitle()
 
 
