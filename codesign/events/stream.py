@@ -5,9 +5,9 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from codesign.checks import check_kind
+from codesign.checks import check_kind, check_whole
 from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import Times, check_dtype, check_room, check_times, check_whole
+from codesign.events.entry import Times, check_dtype, check_room, check_times
 from codesign.types import EventStream
 
 
