@@ -134,17 +134,7 @@ def check_counts(counts: Tensor, *, non_negative: bool = False) -> None:
 def check_level(state: Tensor, level: Tensor) -> Tensor:
     """Return a level carried from an earlier chunk unchanged when it has the shape and type of one frame of
     ``level``, finite; ShapeError, DomainError otherwise."""
-    if not isinstance(state, Tensor) or (state.shape, state.dtype, state.device) != (
-        level.shape[1:],
-        level.dtype,
-        level.device,
-    ):
-        given = f"{state.dtype} {list(state.shape)}" if isinstance(state, Tensor) else type(state).__name__
-        raise ShapeError(
-            f"state is {given}, one frame is {level.dtype} {list(level.shape[1:])}; pass the state of the same "
-            "sensor."
-        )
-    return check_finite(state, "state")
+    return check(state, tuple(level.shape[1:]), "the state", (level.dtype,), finite=True)
 
 
 def check_state(state: object, kind: type) -> None:

@@ -184,10 +184,10 @@ WRONG = [
     ),
     # functions of frames
     (lambda: events.expected(FRAMES, 0.2, 0.2, 0.1, state=FRAMES[0] * NAN), "state"),
-    (lambda: events.memory(FRAMES, 0.2, 0.2, state=FRAMES[0].double()), "same sensor"),
+    (lambda: events.memory(FRAMES, 0.2, 0.2, state=FRAMES[0].double()), "must be float32"),
     (lambda: events.memory(FRAMES, 0.2, 0.2, gradient="mean"), "'exact', 'play'"),
     (lambda: events.one_pole(FRAMES, torch.ones(3, 1, 1)), "one per interval"),
-    (lambda: events.one_pole(FRAMES, torch.ones(4, 1, 1), torch.zeros(6)), r"\[6\], one frame is"),
+    (lambda: events.one_pole(FRAMES, torch.ones(4, 1, 1), torch.zeros(6)), r"must be \[4, 6\], got \[6\]"),
     (lambda: events.upsample(FRAMES.roll((3, 5), (1, 2)), T_S, max_steps=1), "max_steps = 1: record faster"),
     (lambda: streamed(FRAMES, [0.0]), "there is no time 1"),
     (lambda: streamed([FRAMES[0], FRAMES[1, 1:]], T_S[:2]), "frame 1"),
