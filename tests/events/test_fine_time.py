@@ -223,6 +223,7 @@ def test_the_gradient_of_a_surface_is_that_of_the_two_windows_behind_its_events(
 
 RATE = 25.0  # of the log level, per second
 WINDOW_S = 0.02
+START_S = 3.0  # of the window, on the clock of the frames
 IDEAL = events.SensorModel(theta_on=0.2, theta_off=0.2)
 STEADY = RATE * WINDOW_S / 0.2
 
@@ -230,9 +231,9 @@ STEADY = RATE * WINDOW_S / 0.2
 def ramps(lead_s, slope=1.0):
     """Frames [1, T, 1, 200] and times: log levels that rise by RATE, up to one event's time after the first
     frame, so that all phases of the threshold are alike often; without a lead all begin with the window."""
-    t_s = torch.linspace(-lead_s, WINDOW_S, 61, dtype=D)
+    t_s = START_S + torch.linspace(-lead_s, WINDOW_S, 61, dtype=D)
     delay_s = torch.linspace(0, 0.2 / RATE, 201, dtype=D)[:-1] * (lead_s > 0)
-    since_s = (t_s[:, None] + lead_s - delay_s).clamp(min=0)
+    since_s = (t_s[:, None] - START_S + lead_s - delay_s).clamp(min=0)
     return (4.0 + slope * RATE * since_s).exp()[None, :, None], t_s, 5
 
 
