@@ -177,7 +177,7 @@ def show(run, name, shown, dt_s):
     medians = {title: judge.filtered(counts, dt_s).sum((2, 3)).T for title, counts in shown.items()}
     charts = [
         chart({title: rate[polarity] for title, rate in rates.items()}, f"{label}{where}")
-        for rates, where in ((totals, ""), (medians, " behind the median,"))
+        for rates, where in ((totals, ""), (medians, ", median:"))
         for polarity, label in enumerate(("ON", "OFF"))
     ]
     caption = "Events of the whole picture, and what a median of 5 x 5 px leaves of every 10 ms."
