@@ -217,16 +217,11 @@ def _on_plane(corners, height):
     ``height``
     [n, 3]: one corner lies on one side, the two others on the other."""
     above = height >= 0
-    lone = np.where(above.sum(1) == 1, above.argmax(1), (~above).argmax(1))
-    rows = np.arange(len(corners))
-    found = []
-    for step in (1, 2):
-        other = (lone + step) % 3
-        a = height[rows, lone]
-        b = height[rows, other]
-        share = (a / (a - b))[:, None]
-        found.append(corners[rows, lone] + share * (corners[rows, other] - corners[rows, lone]))
-    return np.stack(found, 1)
+    lone = np.where(above.sum(1) == 1, above.argmax(1), (~above).argmax(1))[:, None]
+    rows = np.arange(len(corners))[:, None]
+    others = (lone + [1, 2]) % 3
+    share = height[rows, lone] / (height[rows, lone] - height[rows, others])
+    return corners[rows, lone] + share[..., None] * (corners[rows, others] - corners[rows, lone])
 
 
 def overlaps(
@@ -239,24 +234,16 @@ def overlaps(
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     axes = np.stack([u, np.cross(normal, u)], 2)
     p, q = ((corners - origin) @ axes for corners in (first, second))
-    depth = np.full(len(p), np.inf)
-    for corners in (p, q):
-        for k in range(3):
-            along = corners[:, (k + 1) % 3] - corners[:, k]
-            across = np.stack([-along[:, 1], along[:, 0]], 1) / np.linalg.norm(along, axis=1, keepdims=True)
-            a, b = ((v * across[:, None]).sum(2) for v in (p, q))
-            depth = np.minimum(depth, np.minimum(a.max(1), b.max(1)) - np.maximum(a.min(1), b.min(1)))
+    along = np.concatenate([np.roll(corners, -1, axis=1) - corners for corners in (p, q)], 1)
+    across = np.stack([-along[..., 1], along[..., 0]], 2) / np.linalg.norm(along, axis=2, keepdims=True)
+    a, b = ((corners[:, None] * across[:, :, None]).sum(3) for corners in (p, q))
+    depth = (np.minimum(a.max(2), b.max(2)) - np.maximum(a.min(2), b.min(2))).min(1)
     rows = np.nonzero(depth > apart_m)[0]
     p, q, axes, origin = p[rows], q[rows], axes[rows], origin[rows]
-    points = [p, q]
-    shared = [_within(p, q), _within(q, p)]
-    for i in range(3):
-        for j in range(3):
-            at, meet = _meeting(p[:, i], p[:, (i + 1) % 3], q[:, j], q[:, (j + 1) % 3])
-            points.append(at[:, None])
-            shared.append(meet[:, None])
-    points = np.concatenate(points, 1)
-    shared = np.concatenate(shared, 1)
+    one, other = ((corners, np.roll(corners, -1, axis=1)) for corners in (p, q))
+    at, meet = _meeting(*(v[:, :, None] for v in one), *(v[:, None] for v in other))
+    points = np.concatenate([p, q, at.reshape(-1, 9, 2)], 1)
+    shared = np.concatenate([_within(p, q), _within(q, p), meet.reshape(-1, 9)], 1)
     middle = (points * shared[..., None]).sum(1) / np.maximum(shared.sum(1), 1)[:, None]
     away = np.where(shared, np.linalg.norm(points - middle[:, None], axis=2), -1.0)
     end = points[np.arange(len(rows)), away.argmax(1)] if len(rows) else middle
@@ -269,19 +256,15 @@ def _turn(a, b):
 
 def _within(points, corners):
     """Whether points [n, 3, 2] lie in triangles [n, 3, 2]."""
-    sides = np.stack(
-        [
-            _turn((corners[:, (k + 1) % 3] - corners[:, k])[:, None], points - corners[:, k][:, None])
-            for k in range(3)
-        ]
-    )
-    return (sides >= 0).all(0) | (sides <= 0).all(0)
+    along = np.roll(corners, -1, axis=1) - corners
+    sides = _turn(along[:, None], points[:, :, None] - corners[:, None])
+    return (sides >= 0).all(2) | (sides <= 0).all(2)
 
 
 def _meeting(a, b, c, d):
-    """Where segments a to b and c to d [n, 2] meet, and whether they do."""
+    """Where segments a to b and c to d [..., 2] meet, and whether they do."""
     size = _turn(b - a, d - c)
     safe = np.where(np.abs(size) > 1e-300, size, 1.0)
     s = _turn(c - a, d - c) / safe
     t = _turn(c - a, b - a) / safe
-    return a + s[:, None] * (b - a), (size != 0) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
+    return a + s[..., None] * (b - a), (size != 0) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)

@@ -60,16 +60,20 @@ class Intersections(Curve, Rows):
         """Points x [n, 3] near pieces [n] carried onto both surfaces, and how far [n] they still are from
         these."""
         c, A, b, k = (v[piece] for v in (self.c, self.A, self.b, self.k))
-        for _ in range(TURNS):
+
+        def surfaces(x):
             away = x[:, None] - c
-            f = (away * ((A @ away[..., None])[..., 0] + b)).sum(2) + k
-            first, second = (2 * (A @ away[..., None])[..., 0] + b).unbind(1)
+            lean = (A @ away[..., None])[..., 0]
+            return (away * (lean + b)).sum(2) + k, 2 * lean + b
+
+        for _ in range(TURNS):
+            f, slopes = surfaces(x)
+            first, second = slopes.unbind(1)
             p, q, r = ((u * v).sum(1) for u, v in ((first, first), (first, second), (second, second)))
             p, r = p + 1e-12, r + 1e-12
             s, t = ((r * f[:, 0] - q * f[:, 1]), (p * f[:, 1] - q * f[:, 0]))
             x = x - (s[:, None] * first + t[:, None] * second) / (p * r - q * q)[:, None]
-        away = x[:, None] - c
-        return x, ((away * ((A @ away[..., None])[..., 0] + b)).sum(2) + k).abs().amax(1)
+        return x, surfaces(x)[0].abs().amax(1)
 
     def aside_rad(self, index, viewpoint):
         """As for Segments: as for the outline of the rounder of the two shapes."""

@@ -212,25 +212,21 @@ def sliver_radiance(
     normal = torch.linalg.cross(edge[:, None].expand_as(apex), apex - y[:, None])
     facing = (normal * ahead[:, None]).sum(2)
     nearer = -(normal * across[:, None]).sum(2) / torch.where(facing.abs() > 0, facing, THIN)  # per angle
-    none = torch.zeros(0, dtype=torch.long)
-    found = [(none, none, none.double())]
-    for side, sign in ((0, -1.0), (1, 1.0)):
-        there = width * sign > 0
-        seen = torch.where(there, nearer * sign, torch.inf).argmin(1)
-        rows = torch.nonzero(there.any(1))[:, 0]
-        face = seen[rows]
-        reach = (y - origin)[rows].norm(dim=1)
-        low = width[rows, face].abs() < NARROW * points.aside_rad[rows]
-        rows, face, reach = rows[low], face[low], reach[low]
-        if not rows.numel():
-            continue
-        way = apex[rows, face] - y[rows]
-        least = FLOAT32 * (points.world_m[rows].norm(dim=1) + reach)
-        up = normalize(normal[rows, face], dim=1) * -facing[rows, face].sign()[:, None]
-        share = (least / way.norm(dim=1).clamp_min(THIN)).clamp(WITHIN, 0.5)
-        height = torch.maximum(least, 1e-3 * way.norm(dim=1))
-        start = y[rows] + share[:, None] * way + height[:, None] * up
-        light, distance = look(scene, cameras, points.frame[rows], start, -up)
-        met = torch.nonzero((distance - height).abs() < least)[:, 0]
-        found.append((torch.full_like(met, side), known[rows[met]], light[met]))
-    return tuple(torch.cat(column) for column in zip(*found, strict=True))
+    sign = torch.tensor([-1.0, 1.0], dtype=y.dtype)[:, None, None]
+    there = width * sign > 0
+    face = torch.where(there, nearer * sign, torch.inf).argmin(2)
+    side, row = torch.nonzero(there.any(2)).unbind(1)
+    face = face[side, row]
+    low = width[row, face].abs() < NARROW * points.aside_rad[row]
+    side, row, face = (v[low] for v in (side, row, face))
+    if not row.numel():
+        return side, row, y.new_zeros(0)
+    way = apex[row, face] - y[row]
+    least = FLOAT32 * (points.world_m[row].norm(dim=1) + (y - origin)[row].norm(dim=1))
+    up = normalize(normal[row, face], dim=1) * -facing[row, face].sign()[:, None]
+    share = (least / way.norm(dim=1).clamp_min(THIN)).clamp(WITHIN, 0.5)
+    height = torch.maximum(least, 1e-3 * way.norm(dim=1))
+    start = y[row] + share[:, None] * way + height[:, None] * up
+    light, distance = look(scene, cameras, points.frame[row], start, -up)
+    met = torch.nonzero((distance - height).abs() < least)[:, 0]
+    return side[met], known[row[met]], light[met]

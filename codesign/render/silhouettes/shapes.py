@@ -262,12 +262,8 @@ def _distance(corners):
     normal = across(corners)
     size = np.linalg.norm(normal, axis=1)
     above = np.abs((corners[:, 0] * normal).sum(1)) / np.maximum(size, 1e-300)
-    within = size > 0
-    nearest = np.full(len(corners), np.inf)
-    for k in range(3):
-        a = corners[:, k]
-        along = corners[:, (k + 1) % 3] - a
-        within &= (np.cross(along, -a) * normal).sum(1) >= 0
-        share = -(a * along).sum(1) / np.maximum((along * along).sum(1), 1e-300)
-        nearest = np.minimum(nearest, np.linalg.norm(a + share.clip(0, 1)[:, None] * along, axis=1))
+    along = np.roll(corners, -1, axis=1) - corners
+    within = (size > 0) & ((np.cross(along, -corners) * normal[:, None]).sum(2) >= 0).all(1)
+    share = -(corners * along).sum(2) / np.maximum((along * along).sum(2), 1e-300)
+    nearest = np.linalg.norm(corners + share.clip(0, 1)[..., None] * along, axis=2).min(1)
     return np.where(within, above, nearest)
