@@ -102,19 +102,14 @@ def _edge(camera):
     turn = torch.arange(ANGLES, dtype=torch.float64) * (2 * math.pi / ANGLES)
     radius = torch.arange(RADII + 1, dtype=torch.float64) / RADII
     disc = (radius[:, None, None] * torch.stack([turn.cos(), turn.sin()], 1)).reshape(-1, 2)
-    least = most = torch.ones(0)
-    for line, _ in camera.colours:
-        rays = camera.rays_through(
-            fields.repeat_interleave(len(disc), 0), disc.repeat(len(fields), 1), **line
-        )
-        share = rays.weight.reshape(FIELDS + 1, FIELDS + 1, RADII + 1, ANGLES).double()
-        if bool((share.diff(dim=2) > 1e-9).any()) or bool((share[:, :, 0] < WHOLE).any()):
-            return None
-        least = torch.minimum(least, share) if least.numel() else share
-        most = torch.maximum(most, share) if most.numel() else share
-    whole = ((least >= WHOLE).sum(2) - 2).clamp(
-        0, RADII
-    )  # the last radius at which all passes, and one before
+    at = fields.repeat_interleave(len(disc), 0), disc.repeat(len(fields), 1)
+    shares = [camera.rays_through(*at, **line).weight for line, _ in camera.colours]
+    shares = torch.stack(shares).reshape(-1, FIELDS + 1, FIELDS + 1, RADII + 1, ANGLES).double()
+    if bool((shares.diff(dim=3) > 1e-9).any()) or bool((shares[:, :, :, 0] < WHOLE).any()):
+        return None
+    least, most = shares.amin(0), shares.amax(0)
+    # the last radius at which all passes, and one before
+    whole = ((least >= WHOLE).sum(2) - 2).clamp(0, RADII)
     some = ((most > 0).sum(2) + 1).clamp(0, RADII)
     whole = torch.where((least >= WHOLE).all(2), RADII, whole)
     low, high = (_over_cells(v, f) / RADII for v, f in ((whole, torch.minimum), (some, torch.maximum)))
