@@ -174,8 +174,11 @@ def views_of(scene: Any, T_world_cam: Poses, rays: Rays | None = None) -> Views:
     for part in parts(scene):
         check_kind(part)
     T_world_cam = as_poses(T_world_cam)
-    if rays is not None:
-        check_device(rays, T_world_cam)
+    if rays is not None and rays.weight.device != T_world_cam.device:
+        raise DomainError(
+            f"poses are on {T_world_cam.device}, the rays of the camera on {rays.weight.device}; move one to the "
+            "other with .to(device)."
+        )
     check_poses(T_world_cam)
     batch = tuple(T_world_cam.shape[:-2])
     cameras = T_world_cam.reshape(-1, 4, 4).double()
@@ -186,15 +189,6 @@ def views_of(scene: Any, T_world_cam: Poses, rays: Rays | None = None) -> Views:
     objects = [poses.double() for poses in scene.T_world_object]
     seen = [_product(inverse(poses.to(cameras.device)), cameras) for poses in objects]
     return Views(scene, torch.stack([still, *objects]), torch.stack([cameras, *seen]), batch)
-
-
-def check_device(rays: Rays, poses: Tensor) -> None:
-    """Raise DomainError unless the rays of a camera are on one device with its poses."""
-    if rays.weight.device != poses.device:
-        raise DomainError(
-            f"poses are on {poses.device}, the rays of the camera on {rays.weight.device}; move one to the "
-            "other with .to(device)."
-        )
 
 
 def _product(a, b):

@@ -10,7 +10,7 @@ from codesign.checks import check_whole
 from codesign.errors import DomainError, ShapeError
 from codesign.exclusive import exclusive
 from codesign.pose import Poses
-from codesign.render.moving import MovingScene, Scene, Views, check_device, parts, says_distance, views_of
+from codesign.render.moving import MovingScene, Scene, Views, parts, says_distance, views_of
 from codesign.render.pixel_means import Wavefront, lanes, nearest, pixel_means, placed
 from codesign.types import Rays
 
@@ -28,7 +28,6 @@ def shade(rays: Rays, scene: Scene | MovingScene, T_world_cam: Poses, samples_pe
 
 def shaded(rays: Rays, views: Views, samples_per_pixel: int) -> Tensor:
     """As ``shade``, of views that are known already."""
-    check_device(rays, views.cameras)
     scene = views.scene
     count = rays.weight.numel()
     poses = views.cameras.shape[1]

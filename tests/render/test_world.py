@@ -75,7 +75,6 @@ def test_texels_have_the_size_they_are_given():
 
 
 @pytest.mark.bits
-@pytest.mark.bits
 def test_a_static_camera_sees_equal_frames_and_the_seed_decides_the_samples():
     scene, geo = worlds.room(), lens.load("cooke-triplet").scaled(0.1)
     pose = look_at((0.5, -1.2, 1.4), (0, 1, 0.8))[None]
