@@ -207,8 +207,9 @@ class Camera:
             return trace(pixels, pupil)
         rows = [torch.nonzero(colour == number)[:, 0] for number in range(len(self.colours))]
         parts = [trace(pixels[k], pupil[k], **line) for k, (line, _) in zip(rows, self.colours, strict=True)]
-        back = torch.cat(rows).argsort()
-        return _columns(lambda *column: torch.cat(column)[back], *parts)
+        order = torch.cat(rows)
+        back = torch.empty_like(order).scatter_(0, order, torch.arange(len(order)))
+        return _columns(lambda *column: torch.cat(column).index_select(0, back), *parts)
 
     def coloured_rays(self, pixels: Tensor, pupil: Tensor, colour: Tensor) -> Rays:
         """As ``rays_through``, each in the colour of its number [N]."""
