@@ -40,13 +40,6 @@ class Difference:
     left_out: tuple[float, ...] = ()
 
 
-def central(fn: Scalar, point: torch.Tensor, direction: torch.Tensor, step: float) -> float:
-    """(f(x + h d) - f(x - h d)) / 2h for a function of one tensor. fn must use the same random numbers at
-    both ends."""
-    with torch.no_grad():
-        return (float(fn(point + step * direction)) - float(fn(point - step * direction))) / (2 * step)
-
-
 def rounding_noise(
     fn: Scalar, point: torch.Tensor, direction: torch.Tensor, step: float, spacings: int = 4
 ) -> float:

@@ -64,24 +64,16 @@ def random_lines(value: torch.Tensor, count: int, generator: torch.Generator) ->
         yield (drawn / drawn.norm()).to(value)
 
 
-def loss_at(fn: Loss, point: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """A function's scalar loss with its graph, and the leaves that it starts from.
+def gradients(fn: Loss, point: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Gradient to every group by one pass of autograd.
 
-    Raises: GradientError where the loss is no floating scalar.
+    Raises: GradientError where the loss is no floating scalar, or the graph is cut; NonFiniteError where a gradient is
+      not finite.
     """
     leaves = {name: value.clone().requires_grad_(True) for name, value in point.items()}
     with torch.enable_grad():
         loss = fn(dict(leaves))
     check_scalar(loss)
-    return loss, leaves
-
-
-def gradients(fn: Loss, point: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Gradient to every group by one pass of autograd.
-
-    Raises: GradientError where the graph is cut; NonFiniteError where a gradient is not finite.
-    """
-    loss, leaves = loss_at(fn, point)
     if not loss.requires_grad:
         raise GradientError(
             "the function returns a loss without a graph; do not detach it, convert it to a number, or "
