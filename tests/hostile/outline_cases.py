@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from codesign import backend, pose
 from codesign.render import MitsubaScene, MovingScene
 from codesign.render.charts import emissive_mesh
 from scenes import silhouettes
+from tests.hostile.random_worlds import convex
 
 RADIUS_M = 0.01  # of the cylinders that are seen from afar
 
@@ -52,7 +52,7 @@ def icosphere(level):
     corners = np.array([[0, s, t * g] for s in (-1, 1) for t in (-1, 1)])
     vertices = np.concatenate([np.roll(corners, k, 1) for k in range(3)])
     vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
-    faces = _outward(vertices)
+    _, faces = convex(vertices)
     for _ in range(level):
         edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
         ends, which = np.unique(edges, axis=0, return_inverse=True)
@@ -66,16 +66,14 @@ def icosphere(level):
     return vertices, faces
 
 
-def _outward(vertices):
-    """Faces [F, 3] of the convex hull of points [V, 3] that all lie on it."""
-    hull = ConvexHull(vertices)
-    a, b, c = (vertices[hull.simplices[:, k]] for k in range(3))
-    inward = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(1) < 0
-    return np.where(inward[:, None], hull.simplices[:, ::-1], hull.simplices)
+def _shape(kind, value, **entries):
+    """A shape of one radiance."""
+    light = {"type": "area", "radiance": {"type": "rgb", "value": float(value)}}
+    return {"type": kind, **entries, "emitter": light}
 
 
-def _light(value):
-    return {"type": "area", "radiance": {"type": "rgb", "value": float(value)}}
+def _placed(matrix):
+    return backend.mitsuba("cpu").ScalarTransform4f(matrix)
 
 
 def _ahead(roll=0.3):
@@ -84,44 +82,31 @@ def _ahead(roll=0.3):
     return pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)) @ pose.se3_exp(turn)
 
 
-def _wall(mi, distance_m, emitter):
-    placed = frame([0.15, -1.0, 0.1], (0, distance_m, 0), 0.4)
-    matrix = mi.ScalarTransform4f(placed @ np.diag([2 * distance_m, 2 * distance_m, 1, 1]))
-    return {"type": "rectangle", "to_world": matrix, "emitter": emitter}
+def _wall(distance_m, value):
+    leaning = frame([0.15, -1.0, 0.1], (0, distance_m, 0), 0.4)
+    matrix = _placed(leaning @ np.diag([2 * distance_m, 2 * distance_m, 1, 1]))
+    return _shape("rectangle", value, to_world=matrix)
 
 
 def poles() -> World:
     """Five poles 5 to 8 mm thick, 1 m away, with their ends in view."""
-    mi = backend.mitsuba("cpu")
-    shapes: dict[str, Any] = {"wall": _wall(mi, 2.5, _light(120))}
+    shapes: dict[str, Any] = {"wall": _wall(2.5, 120)}
     for k in range(5):
         x = -0.22 + 0.11 * k
-        shapes[f"pole{k}"] = {
-            "type": "cylinder",
-            "p0": [x - 0.03, 1.0 + 0.02 * k, -0.16 + 0.02 * k],
-            "p1": [x + 0.05, 1.05, 0.15 + 0.01 * k],
-            "radius": 0.0025 + 0.0004 * k,
-            "emitter": _light(20 + 45 * k),
-        }
+        low, high = [x - 0.03, 1.0 + 0.02 * k, -0.16 + 0.02 * k], [x + 0.05, 1.05, 0.15 + 0.01 * k]
+        radius = 0.0025 + 0.0004 * k
+        shapes[f"pole{k}"] = _shape("cylinder", 20 + 45 * k, p0=low, p1=high, radius=radius)
     return World(MitsubaScene(shapes), _ahead(), 1.0)
 
 
 def far_pole(ratio: float) -> World:
     """A cylinder seen from ``ratio`` times its radius, its ends out of view, through a film that is narrower where
     it is further."""
-    mi = backend.mitsuba("cpu")
     distance = ratio * RADIUS_M
     half = 0.5 * distance
-    shapes = {
-        "wall": _wall(mi, 1.5 * distance, _light(40)),
-        "pole": {
-            "type": "cylinder",
-            "p0": [-0.17 * half, distance, -half],
-            "p1": [0.17 * half, distance, half],
-            "radius": RADIUS_M,
-            "emitter": _light(200),
-        },
-    }
+    low, high = [-0.17 * half, distance, -half], [0.17 * half, distance, half]
+    pole = _shape("cylinder", 200, p0=low, p1=high, radius=RADIUS_M)
+    shapes = {"wall": _wall(1.5 * distance, 40), "pole": pole}
     narrow = min(1.0, 20.0 / ratio)
     return World(
         MitsubaScene(shapes), _ahead(), distance, focus_m=distance, narrow=narrow, kinds=("pinhole",)
@@ -130,86 +115,65 @@ def far_pole(ratio: float) -> World:
 
 def facets() -> World:
     """A ball of 5,120 faces with one radiance per face, as bodies and baked meshes have."""
-    mi = backend.mitsuba("cpu")
     vertices, faces = icosphere(4)
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     light = 30 + 180 * np.maximum(across @ np.array([0.5, -0.6, 0.6]), 0)
-    ball = emissive_mesh(mi, 0.3 * vertices + [0.05, 1.2, 0.02], faces, light)
-    return World(MitsubaScene({"wall": _wall(mi, 2.5, _light(120)), "ball": ball}), _ahead(), 0.9)
+    ball = emissive_mesh(backend.mitsuba("cpu"), 0.3 * vertices + [0.05, 1.2, 0.02], faces, light)
+    return World(MitsubaScene({"wall": _wall(2.5, 120), "ball": ball}), _ahead(), 0.9)
 
 
 def t_junction() -> World:
     """One edge of a floor against the lower edges of two walls."""
-    mi = backend.mitsuba("cpu")
-    T = mi.ScalarTransform4f
-    shapes = {
-        "floor": {
-            "type": "rectangle",
-            "to_world": T().translate([0, 1.0, -0.3]).scale([2, 1, 1]),
-            "emitter": _light(60),
-        }
-    }
+    T = backend.mitsuba("cpu").ScalarTransform4f
+    floor = T().translate([0, 1.0, -0.3]).scale([2, 1, 1])
+    shapes = {"floor": _shape("rectangle", 60, to_world=floor)}
     for name, left, right, value in (("left", -2.0, 0.15, 150), ("right", 0.15, 2.0, 220)):
         half = (right - left) / 2
         place = T().translate([left + half, 2.0, 0.7]).rotate([1, 0, 0], 90).scale([half, 1, 1])
-        shapes[name] = {"type": "rectangle", "to_world": place, "emitter": _light(value)}
+        shapes[name] = _shape("rectangle", value, to_world=place)
     return World(MitsubaScene(shapes), _ahead(), 0.6)
 
 
-def _floor(mi):
-    T = mi.ScalarTransform4f
-    place = T().translate([0, 1.5, -0.3]).scale([3, 3, 1])
-    return {"type": "rectangle", "to_world": place, "emitter": _light(60)}
+def _in_floor(thing):
+    T = backend.mitsuba("cpu").ScalarTransform4f
+    floor = _shape("rectangle", 60, to_world=T().translate([0, 1.5, -0.3]).scale([3, 3, 1]))
+    return World(MitsubaScene({"floor": floor, "thing": thing}), _ahead(), 0.8)
 
 
 def sphere_in_floor() -> World:
     """A ball that sticks in a floor by half its radius."""
-    mi = backend.mitsuba("cpu")
-    ball = {"type": "sphere", "center": [0.03, 1.2, -0.2], "radius": 0.2, "emitter": _light(200)}
-    return World(MitsubaScene({"floor": _floor(mi), "ball": ball}), _ahead(), 0.8)
+    return _in_floor(_shape("sphere", 200, center=[0.03, 1.2, -0.2], radius=0.2))
 
 
 def cylinder_in_floor() -> World:
     """A leaning cylinder that passes through a floor."""
-    mi = backend.mitsuba("cpu")
-    pole = {
-        "type": "cylinder",
-        "p0": [-0.05, 1.2, -0.5],
-        "p1": [0.15, 1.3, 0.15],
-        "radius": 0.08,
-        "emitter": _light(200),
-    }
-    return World(MitsubaScene({"floor": _floor(mi), "pole": pole}), _ahead(), 0.8)
+    return _in_floor(_shape("cylinder", 200, p0=[-0.05, 1.2, -0.5], p1=[0.15, 1.3, 0.15], radius=0.08))
 
 
 def crossing_mesh() -> World:
     """Two balls of one mesh that pass through each other, each of one radiance."""
-    mi = backend.mitsuba("cpu")
     vertices, faces = icosphere(3)
     both = np.concatenate([0.2 * vertices + [-0.1, 1.2, 0], 0.16 * vertices + [0.12, 1.15, 0.05]])
     joined = np.concatenate([faces, faces + len(vertices)])
     light = np.repeat([60.0, 210.0], len(faces))
-    mesh = emissive_mesh(mi, both, joined, light)
-    return World(MitsubaScene({"wall": _wall(mi, 2.5, _light(120)), "mesh": mesh}), _ahead(), 1.0)
+    mesh = emissive_mesh(backend.mitsuba("cpu"), both, joined, light)
+    return World(MitsubaScene({"wall": _wall(2.5, 120), "mesh": mesh}), _ahead(), 1.0)
 
 
 def defocus() -> World:
     """A card just beside the film's border, whose blur reaches far into it."""
-    mi = backend.mitsuba("cpu")
-    placed = frame([0.0, -1.0, 0.0], (0.155, 0.4, 0.02), 0.1) @ np.diag([0.1, 0.1, 1, 1])
-    card = {"type": "rectangle", "to_world": mi.ScalarTransform4f(placed), "emitter": _light(220)}
-    world = MitsubaScene({"wall": _wall(mi, 8.0, _light(60)), "card": card})
+    place = _placed(frame([0.0, -1.0, 0.0], (0.155, 0.4, 0.02), 0.1) @ np.diag([0.1, 0.1, 1, 1]))
+    world = MitsubaScene({"wall": _wall(8.0, 60), "card": _shape("rectangle", 220, to_world=place)})
     return World(world, _ahead(), 0.4, focus_m=8.0, lens_scale=15.0, narrow=0.3, kinds=("thin", "traced"))
 
 
 def ball_ahead() -> World:
     """A ball cut by the film's border, straight along a diagonal of the axes: where its outline begins must not depend on
     the point of the pupil it is seen from."""
-    mi = backend.mitsuba("cpu")
-    ball = {"type": "sphere", "center": [0.2, 1.5, 0.2], "radius": 0.3, "emitter": _light(200)}
-    world = MitsubaScene({"wall": _wall(mi, 3.0, _light(60)), "ball": ball})
+    ball = _shape("sphere", 200, center=[0.2, 1.5, 0.2], radius=0.3)
+    world = MitsubaScene({"wall": _wall(3.0, 60), "ball": ball})
     ahead = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
     return World(world, ahead, 1.2, kinds=("pinhole", "thin", "traced"))
 

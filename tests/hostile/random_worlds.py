@@ -248,7 +248,7 @@ class _World:
 def _hull(rng):
     corners = rng.standard_normal((int(rng.integers(6, 14)), 3))
     corners /= np.linalg.norm(corners, axis=1, keepdims=True)
-    return _convex(corners * rng.uniform(0.5, 1, 3))
+    return convex(corners * rng.uniform(0.5, 1, 3))
 
 
 def _fine(rng):
@@ -256,7 +256,7 @@ def _fine(rng):
     k = np.arange(int(rng.integers(40, 400))) + 0.5
     z = 1 - 2 * k / len(k)
     turn = np.pi * (1 + 5**0.5) * k
-    return _convex(np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], 1))
+    return convex(np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], 1))
 
 
 def _bowl(rng):
@@ -264,7 +264,8 @@ def _bowl(rng):
     return vertices, faces[vertices[faces].mean(1)[:, 2] > rng.uniform(-0.5, 0.3)]
 
 
-def _convex(corners):
+def convex(corners):
+    """Points [V, 3] that lie on their convex hull, and its faces [F, 3], wound outwards."""
     found = ConvexHull(corners)
     a, b, c = corners[found.simplices].transpose(1, 0, 2)
     inward = (np.cross(b - a, c - a) * found.equations[:, :3]).sum(1) < 0
