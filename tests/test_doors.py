@@ -29,7 +29,7 @@ from tests.hostile import calls
             lambda: pose.se3_exp(torch.ones(6, dtype=torch.complex64)),
             r"pose.se3_exp cannot work with twist = Tensor \[",
         ),
-        (lambda: lens.ThinLens(float("inf"), 5.0), "focal length inf mm"),
+        (lambda: lens.ThinLens(float("inf"), 5.0), "focal length, mm, must be .* got inf"),
         (
             lambda: lens.analysis.ideal_mtf((10.0,), float("nan")),
             r"analysis.ideal_mtf: an argument is NaN, which is no number; give one \(.*fno = nan",

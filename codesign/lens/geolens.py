@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import torch
 from torch import nn
 
+from codesign.checks import check_number, check_positive
 from codesign.errors import DomainError
 from codesign.lens import camera, paraxial
 from codesign.lens.analysis.spots import spots
@@ -84,18 +85,10 @@ class GeoLens(Replaceable):
     ) -> None:
         super().__init__()
         surfaces, stop = checked(name, surfaces)
-        if not 0 < entrance_pupil_diameter_mm < math.inf:
-            raise DomainError(
-                f"{name}: entrance pupil diameter {entrance_pupil_diameter_mm} mm must be positive and "
-                "finite."
-            )
-        if not 0 <= soft_edge_mm < math.inf:
-            raise DomainError(
-                f"{name}: soft edge {soft_edge_mm} mm must be a finite width of at least 0; about 0.1 mm "
-                "keeps gradients true."
-            )
-        if half_field_deg is not None and not 0 < half_field_deg < 90:
-            raise DomainError(f"{name}: half field {half_field_deg} degrees must lie between 0 and 90.")
+        check_positive(entrance_pupil_diameter_mm, f"{name}: entrance_pupil_diameter_mm")
+        check_number(soft_edge_mm, f"{name}: soft_edge_mm", 0.0, remedy="about 0.1 keeps gradients true")
+        if half_field_deg is not None:
+            check_number(half_field_deg, f"{name}: half_field_deg", above=0.0, below=90.0)
         self.name = name
         self.surfaces = surfaces
         self.stop_index = stop

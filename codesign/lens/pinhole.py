@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from codesign.checks import check_number, check_positive
 from codesign.errors import DomainError
 from codesign.lens.analysis.rays import pupil_grid
 from codesign.lens.replaceable import Replaceable, settled
@@ -49,16 +50,14 @@ class ThinLens(Replaceable):
         self._hold("image_distance_mm", image)
         self.entrance_pupil_diameter_mm = float(entrance_pupil_diameter_mm)
         focal_mm, image_mm = float(self.efl_mm.detach()), float(self.image_distance_mm.detach())
-        if not (0 < focal_mm < float("inf") and 0 < image_mm < float("inf")):
-            raise DomainError(
-                f"thin lens: focal length {focal_mm} mm and image distance {image_mm} mm must be positive "
-                "and finite."
-            )
-        if not 0 <= self.entrance_pupil_diameter_mm < float("inf"):
-            raise DomainError(
-                f"thin lens: entrance pupil diameter {self.entrance_pupil_diameter_mm} mm must be finite "
-                "and at least 0 (0 is a pinhole)."
-            )
+        check_positive(focal_mm, "thin lens: focal length, mm,")
+        check_positive(image_mm, "thin lens: image distance, mm,")
+        check_number(
+            self.entrance_pupil_diameter_mm,
+            "thin lens: entrance_pupil_diameter_mm",
+            0.0,
+            remedy="0 is a pinhole",
+        )
 
     def _hold(self, name, value):
         if value is None or isinstance(value, nn.Parameter):

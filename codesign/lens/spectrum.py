@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from codesign.checks import check_number, check_whole
 from codesign.errors import DomainError, ShapeError
 
 Curve = tuple[NDArray[np.float64], NDArray[np.float64]]  # wavelengths in um, values
@@ -76,11 +77,7 @@ class Spectrum:
                 f"{len(wavelengths)} wavelengths and {len(weights)} weights were given."
             )
         for wavelength_um in wavelengths:
-            if not 0.1 <= wavelength_um <= 100:
-                raise DomainError(
-                    f"wavelength {wavelength_um:g} um lies outside 0.1 to 100 um; give wavelengths in "
-                    "micrometres."
-                )
+            check_number(wavelength_um, "wavelength_um", 0.1, 100, remedy="give micrometres")
         if not (min(weights) >= 0 and abs(math.fsum(weights) - 1) <= 1e-9):
             raise DomainError(
                 "weights of a spectrum must be at least 0 and sum to 1; they sum to "
@@ -138,8 +135,7 @@ class Spectrum:
         from scipy.interpolate import PPoly
         from scipy.optimize import brentq
 
-        if isinstance(count, bool) or not isinstance(count, int) or not 0 < count <= MOST_WAVELENGTHS:
-            raise DomainError(f"count {str(count)[:20]} must be a whole number from 1 to {MOST_WAVELENGTHS}.")
+        count = check_whole(count, "count", 1, MOST_WAVELENGTHS)
         (w1, v1), (w2, v2) = _curve(response, "response"), _curve(illuminant, "illuminant")
         first = max(w1[0], w2[0])
         last = min(w1[-1], w2[-1])
@@ -213,11 +209,13 @@ def blackbody(temperature_k: float) -> Curve:
 
     Args: temperature_k from 500 to 100000. Raises: DomainError.
     """
-    if not 500 <= temperature_k <= 100_000:
-        raise DomainError(
-            f"temperature {temperature_k:g} K must lie in 500 to 100000 K; daylight has about 6500 K, a "
-            "tungsten lamp 2856 K."
-        )
+    check_number(
+        temperature_k,
+        "temperature_k",
+        500,
+        100_000,
+        remedy="daylight has about 6500 K, a tungsten lamp 2856 K",
+    )
     wavelength_um = np.linspace(0.30, 1.20, 181)
     value = wavelength_um**-5 / np.expm1(SECOND_RADIATION_UM_K / (wavelength_um * temperature_k))
     return wavelength_um, value / value.max()
@@ -240,10 +238,7 @@ def silicon_response(depth_um: float = 5.0) -> Curve:
     Args: depth_um from 0.01 to 1000. Raises: DomainError.
     Source: Beer and Lambert's law with the extinction coefficient of Green, 2008.
     """
-    if not 0.01 <= depth_um <= 1000:
-        raise DomainError(
-            f"depth {depth_um:g} um must lie in 0.01 to 1000 um; sensors have about 2 to 10 um."
-        )
+    check_number(depth_um, "depth_um", 0.01, 1000, remedy="sensors have about 2 to 10 um")
     extinction = np.array(_SILICON_K.split(), dtype=float)
     wavelength_um = np.linspace(0.36, 1.10, len(extinction))
     value = -wavelength_um * np.expm1(-4 * np.pi * extinction * depth_um / wavelength_um)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 from torch import Tensor
 
+from codesign.checks import check_positive
 from codesign.errors import DomainError
 from codesign.lens.glass import AIR, D_UM, WAVELENGTH_UM, Glass
 
@@ -39,8 +40,8 @@ class Phase:
                 f"{label}: a phase needs finite coefficients and a whole order, got {self.coefficients} and "
                 f"{self.order!r}."
             )
-        if self.blaze_um is not None and not 0 < self.blaze_um < math.inf:
-            raise DomainError(f"{label}: blaze wavelength {self.blaze_um} um must be positive.")
+        if self.blaze_um is not None:
+            check_positive(self.blaze_um, f"{label}: blaze_um")
 
     def efficiency(self, wavelength_um: float) -> float:
         """Scalar efficiency of the order at a wavelength: sinc^2(m (blaze / w) - m) for a surface blazed for

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from codesign.checks import check_positive
 from codesign.errors import DomainError, ShapeError
 from codesign.lens.traced import TracedLens
 
@@ -132,10 +133,7 @@ def natural_units(
 
 def checked_step(step_mm: float) -> float:
     """The natural step as a number. Raises: DomainError unless it is positive and finite."""
-    if not 0 < step_mm < math.inf:
-        raise DomainError(
-            f"natural step {step_mm} mm must be positive and finite; the pixel pitch is a good one."
-        )
+    check_positive(step_mm, "natural step, mm,", remedy="the pixel pitch is a good one")
     return float(step_mm)
 
 

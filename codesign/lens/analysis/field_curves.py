@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from codesign.checks import check_choice
 from codesign.errors import DomainError
 from codesign.lens.aiming import aimed_rays
 from codesign.lens.analysis.mtf import diffraction_mtf, geometric_mtf
@@ -88,8 +89,7 @@ def distortion_percent(
     Gradient: to every lens tensor and to at_m. Raises: DomainError for another mapping, or when a chief ray
       does not arrive.
     """
-    if mapping not in MAPPINGS:
-        raise DomainError(f"mapping '{mapping}' is not known; known mappings: {', '.join(MAPPINGS)}.")
+    check_choice(mapping, "mapping", MAPPINGS)
     scale = image_scale_mm(lens, vergence_per_mm(lens, at_m), wavelength_um)
     ideal = scale[..., None] * torch.tensor(
         [MAPPINGS[mapping](float(field)) for field in fields_rad],
@@ -239,8 +239,7 @@ def through_focus_mtf(
 ) -> Tensor:
     """MTF at one frequency on several planes, [2, Z] tangential, sagittal. Args: method: "diffraction" or
     "geometric"; at_m: metres to the object plane. Gradient: to every lens tensor."""
-    if method not in METHODS:
-        raise DomainError(f"method '{method}' is not known; known methods: {', '.join(METHODS)}.")
+    check_choice(method, "method", METHODS)
     behind = torch.zeros_like(lens.thickness_mm)
     behind[-1] = 1.0
     lenses = [lens.replace(thickness_mm=lens.thickness_mm + float(z) * behind) for z in defocus_mm]

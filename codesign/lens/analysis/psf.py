@@ -50,8 +50,7 @@ def diffraction_psf(
       energy is not aliased.
     Gradient: energy and pitch to every lens tensor. Raises: DomainError, see ``pupil_function``.
     """
-    if int(padding) != padding or padding < 2:
-        raise DomainError(f"padding {padding} must be a whole number of at least 2.")
+    padding = check_whole(padding, "padding", 2)
     pupil = pupil_function(lens, field_rad, wavelength_um, grid, vignetting, at_m=at_m)
     count = pupil.field.shape[0] * int(padding)
     # signs in a chequer put the reference point into the middle; columns of padding alone need no transform

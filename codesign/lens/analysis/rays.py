@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from codesign.checks import check_whole
 from codesign.errors import DomainError, ShapeError
 from codesign.lens.distance import PARALLEL, Distances, one_distance, vergence_per_mm
 from codesign.lens.glass import D_UM
@@ -31,10 +32,7 @@ Light = float | Values | SpectralLines  # wavelengths in um, of equal weight whe
 
 def pupil_grid(count: int, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
     """Cell centres of a count x count grid over [-1, 1]^2 that lie in the unit disc, [M, 2]."""
-    if not isinstance(count, int) or count < 1:
-        raise DomainError(
-            f"a pupil grid of {count} samples across cannot be; give a whole number of at least 1."
-        )
+    count = check_whole(count, "samples across a pupil grid")
     line = (torch.arange(count, dtype=dtype, device=device) + 0.5) / count * 2 - 1
     y, x = torch.meshgrid(line, line, indexing="ij")
     points = torch.stack([x.reshape(-1), y.reshape(-1)], 1)

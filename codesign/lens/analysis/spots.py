@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError
+from codesign.checks import check_number
+from codesign.errors import ShapeError
 from codesign.lens.analysis.rays import (
     Light,
     Values,
@@ -159,8 +160,7 @@ def encircled_radius_mm(
 ) -> Tensor:
     """Radius that holds a share of the rays, scalar mm. Gradient: that of the ray on the rim. Raises:
     DomainError for a share outside (0, 1]."""
-    if not 0 < share <= 1:
-        raise DomainError(f"share {share} of encircled energy must lie in (0, 1].")
+    check_number(share, "share of encircled energy", above=0.0, most=1.0)
     distance, reached = _distances(lens, field_rad, light, grid, vignetting, about_chief, at_m)
     at = int(torch.searchsorted(reached, reached.new_tensor(share - 1e-12)))
     return distance[min(at, len(distance) - 1)]

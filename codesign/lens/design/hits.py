@@ -1,6 +1,5 @@
 """Where rays meet each surface and how steeply: clear apertures and angles of incidence."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -8,6 +7,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from codesign.checks import check_number
 from codesign.errors import DomainError
 from codesign.lens.analysis.rays import source_rays
 from codesign.lens.distance import PARALLEL, Distances, one_distance, vergence_per_mm
@@ -99,11 +99,7 @@ def traced_semi_aperture_mm(
 
     Gradient: of the highest ray. Raises: DomainError when a rim ray fails, or for a margin below 0.
     """
-    if not 0 <= margin < math.inf:
-        raise DomainError(
-            f"{lens.name}: margin {margin} is added to semi-apertures as a share; give a finite number of "
-            "at least 0."
-        )
+    check_number(margin, f"{lens.name}: margin", 0.0, remedy="it is added to semi-apertures as a share")
     rays = rim_rays(lens, fields_rad, at_m=at_m)
     failed = lens.trace(*rays).status != 0
     if bool(failed.any()):

@@ -25,6 +25,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from codesign.checks import check_number, check_whole
 from codesign.errors import DomainError, ShapeError
 from codesign.grad.jacobian import Jacobian, by_differences, finite
 from codesign.lens.analysis import spots
@@ -66,10 +67,7 @@ class Tolerances:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not 0 <= value < math.inf:
-                raise DomainError(
-                    f"tolerance {name} is {value}; it is a standard deviation, a finite number of at least 0."
-                )
+            check_number(value, f"tolerance {name}", 0.0, remedy="it is a standard deviation")
         if not any(vars(self).values()):
             raise DomainError("all tolerances are 0, so nothing varies; give at least one.")
 
@@ -276,8 +274,7 @@ def monte_carlo(
     A lens that raises DomainError (no ray arrives, no focal length) is a failed trial: counted, never dropped
     in silence.
     """
-    if count < 1:
-        raise DomainError(f"{count} trials were asked for; give at least 1.")
+    count = check_whole(count, "number of trials")
     errors = errors_of(lens, tolerances)
     figures = compensated(figures, compensate)
     amounts = torch.randn(count, len(errors), generator=generator, dtype=lens.dtype)

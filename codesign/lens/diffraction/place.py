@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor
 
+from codesign.checks import check_number
 from codesign.errors import DomainError
 from codesign.lens import paraxial
 from codesign.lens.analysis.rays import source_rays
@@ -40,10 +41,7 @@ def with_plate(lens: GeoLens, plate: Plate | None, surface: int | None = None, z
     twin.borrows = False
     if plate is None:
         return twin
-    if not math.isfinite(z_mm):
-        raise DomainError(
-            f"{lens.name}: a plate {z_mm} mm from a surface cannot be; give a finite distance in mm."
-        )
+    check_number(z_mm, f"{lens.name}: distance of a plate, mm,")
     last = len(lens.surfaces) - 1
     at = lens.stop_index if surface is None else surface % (last + 1) if -1 <= surface <= last else surface
     if at not in (lens.stop_index, last) or (z_mm < 0 and at != lens.stop_index):

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
-from codesign.checks import check_finite
+from codesign.checks import check_finite, check_positive, check_whole
 from codesign.errors import DomainError, ShapeError
 from codesign.lens.glass import D_UM
 from codesign.lens.replaceable import Replaceable
@@ -24,8 +24,7 @@ def noll(term: int) -> tuple[int, int]:
     >>> [noll(j) for j in (1, 4, 7, 8, 11)]
     [(0, 0), (2, 0), (3, -1), (3, 1), (4, 0)]
     """
-    if int(term) != term or term < 1:
-        raise DomainError(f"Noll's terms are whole numbers from 1 (piston), got {term}.")
+    check_whole(term, "Noll's term", remedy="1 is piston")
     n = math.isqrt(8 * int(term) - 7) // 2 + (math.isqrt(8 * int(term) - 7) % 2) - 1
     place = int(term) - n * (n + 1) // 2  # 1 to n + 1 within the radial order
     m = place // 2 * 2 if n % 2 == 0 else (place - 1) // 2 * 2 + 1
@@ -95,8 +94,7 @@ class Plate(Replaceable):
 
     def __init__(self, wavelength_um: float, diffractive: bool) -> None:
         super().__init__()
-        if not 0 < wavelength_um < math.inf:
-            raise DomainError(f"plate: wavelength {wavelength_um} um must be positive.")
+        check_positive(wavelength_um, "plate: wavelength_um")
         self.wavelength_um = float(wavelength_um)
         self.diffractive = bool(diffractive)
 
