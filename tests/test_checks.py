@@ -193,6 +193,7 @@ REFUSED = [
     ),
     (lambda: check_number(-1, "x", 0.0), "x must be a finite number >= 0, got -1."),
     (lambda: check_number(2, "x", most=1.0), "x must be a finite number <= 1, got 2."),
+    (lambda: check_number(3.5, "x", below=3.5), "x must be a finite number < 3.5, got 3.5."),
     (lambda: check_number(2, "x", 0.0, 1.0), "x must be a finite number from 0 to 1, got 2."),
     (
         lambda: check_number(0, "x", above=0.0, below=3.5),
