@@ -137,27 +137,10 @@ def test_look_at_along_down_and_at_itself_are_refused():
     )
 
 
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        (lambda p: p[:, :3], "poses must be"),
-        (lambda p: p[:0], "poses must be"),
-        (lambda p: p * torch.diag(torch.tensor([1.01, 1, 1, 1], dtype=D)), "not rigid: R R"),
-        (lambda p: p @ torch.diag(torch.tensor([-1.0, 1, 1, 1], dtype=D)), "mirrors"),
-        (lambda p: torch.cat([p[:, :3], p[:, 3:] + 0.1], 1), "last row"),
-        (
-            lambda p: torch.where(torch.eye(4, dtype=torch.bool).roll(1, 1), torch.nan, p),
-            "poses must be finite, got NaN",
-        ),
-        (
-            lambda p: torch.where(torch.arange(16).reshape(4, 4) == 3, torch.inf, p),
-            "poses must be finite, got NaN or infinity",
-        ),
-    ],
-)
-def test_poses_that_are_not_rigid_are_refused(change, sentence):
-    with pytest.raises((DomainError, ShapeError), match=sentence):
-        check_poses(change(torch.eye(4, dtype=D).repeat(2, 1, 1)))
+@pytest.mark.parametrize("part", [(slice(None), slice(3)), slice(0)])
+def test_poses_of_another_shape_are_refused(part):
+    with pytest.raises(ShapeError, match="poses must be"):
+        check_poses(torch.eye(4, dtype=D).repeat(2, 1, 1)[part])
 
 
 @pytest.mark.parametrize(
@@ -166,7 +149,14 @@ def test_poses_that_are_not_rigid_are_refused(change, sentence):
         (lambda p: p @ torch.diag(torch.tensor([1.0, -1, 1, 1], dtype=D)), "mirrors"),
         (lambda p: p @ torch.diag(torch.tensor([1.0, 1.01, 1, 1], dtype=D)), "not rigid: R R"),
         (lambda p: torch.cat([p[:3], p[3:] + 0.1]), "last row"),
-        (lambda p: p * torch.nan, "poses must be finite, got NaN"),
+        (
+            lambda p: torch.where(torch.eye(4, dtype=torch.bool).roll(1, 1), torch.nan, p),
+            "poses must be finite, got NaN",
+        ),
+        (
+            lambda p: torch.where(torch.arange(16).reshape(4, 4) == 3, torch.inf, p),
+            "must be finite, got NaN or infinity",
+        ),
     ],
 )
 @pytest.mark.parametrize("place", [(0, 0), (1, 2)])
