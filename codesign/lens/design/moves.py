@@ -16,7 +16,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from codesign.checks import check_finite
+from codesign.checks import check_finite, check_whole
 from codesign.errors import DomainError, ShapeError
 from codesign.lens.distance import real_numbers
 from codesign.lens.geolens import GeoLens
@@ -143,8 +143,7 @@ def neighbour_glasses(
     ['F4', 'F1', 'S-TIM1']
     """
     given = Glass.named(medium) if isinstance(medium, str) else medium
-    if count < 1:
-        raise DomainError(f"{count} neighbours of {given.name} were asked for; give at least 1.")
+    count = check_whole(count, "number of neighbours")
     if math.isinf(given.abbe_number):
         raise DomainError(
             f"medium {given.name} has no dispersion, so it has no place on the glass map and no neighbours."
