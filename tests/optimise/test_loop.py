@@ -121,6 +121,7 @@ def test_resumed_equals_uninterrupted(optimiser):
     with pytest.raises(KeyboardInterrupt):
         first.run(23, advance=stop)
     second = noisy_loop(optimiser=optimiser).resume(*kept)
+    assert second.best_score == first.best_score < math.inf
     second.run(23)
     assert second.record == whole.record
     assert torch.equal(second.best[0], whole.best[0])
