@@ -82,7 +82,7 @@ def read_mutants(module: str, name: str, seed: int, count: int, seconds: float =
             )
             first = current + 1
         else:
-            first = last if "done" in told else current
+            first = last if "done" in told else current or first
     return first - 1, findings
 
 
