@@ -10,7 +10,7 @@ from torch.nn.functional import avg_pool2d
 from codesign import lens, pose, render
 from codesign.events import SensorModel, lin_log, simulate, to_counts, upsample, upsample_stream
 from codesign.events.upsampling.flow import flow_both_ways, with_matches
-from codesign.events.upsampling.upsample import between, visibility
+from codesign.events.upsampling.upsample import between, repaired, visibility
 from scenes import trajectories, worlds
 
 D = torch.float64
@@ -182,6 +182,18 @@ def test_matches_find_a_small_thing_that_jumps_far():
     # elsewhere, but for what one frame hides, nothing moves
     flow[:, 18:28, 18:37] = 0
     assert not flow.any()
+
+
+def test_a_doubted_flow_is_taken_from_what_looks_alike_not_from_what_is_nearest():
+    levels = torch.zeros(2, 24, 24)
+    levels[:, :, 12:] = 1  # log units: the thing on the right is e times as bright
+    flows = torch.zeros(2, 2, 24, 24)
+    flows[:, 0, :, 12:] = 3  # and moves by 3 px, before a ground at rest
+    seen = torch.ones(2, 24, 24)
+    seen[:, :, 9:12] = 0  # the ground beside it is hidden in the other frame
+    truth = flows.clone()
+    flows[:, 0, :, 9:12] = 3  # so its flow was guessed: that of the thing
+    assert torch.equal(repaired(levels, flows, seen), truth)
 
 
 def test_what_leaves_the_picture_is_blended_where_it_stands_and_holes_are_filled():
