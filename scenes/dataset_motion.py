@@ -113,16 +113,7 @@ def make_world(name: str, light: str = "emissive") -> tuple[MitsubaScene, Stage]
     if light != "emissive" and "light" not in inspect.signature(build).parameters:
         raise DomainError(f"the world '{name}' has no lamps; only the light 'emissive' suits it.")
     options = {} if light == "emissive" else {"light": LEVELS[light]}
-    if name in STAGES:
-        return build(**options), STAGES[name]
-    origin, target = worlds.VIEWS[name]
-    distance = math.dist(origin, target)
-    x, y, z = origin
-    yaw = math.atan2(target[1] - y, target[0] - x)
-    low, high = ((x + side, y + side, z + side) for side in (-0.2, 0.2))
-    return build(**options), Stage(
-        target, low, high, (0.7 * distance, 0.3 * distance), 0.5, (x, y), yaw, 0.0, height_m=z
-    )
+    return build(**options), STAGES[name]
 
 
 def motion(family, stage, scene, camera, duration_s, generator):

@@ -93,6 +93,16 @@ def test_slope_and_curvature_are_those_of_differences():
         )
 
 
+def test_a_curvature_that_is_not_positive_counts_by_its_size():
+    """Away from the maximum, where an ellipsoid has no axis along which the density grows."""
+    seen, _ = points(3)
+    velocity = 5 * torch.randn(4, 6, generator=torch.Generator().manual_seed(4), dtype=D)
+    values, vectors = torch.linalg.eigh(unknown_depth.look(seen, velocity).curvature)
+    assert bool((values < 0).any())
+    expected = vectors @ (vectors.mT / values.abs()[..., None])
+    torch.testing.assert_close(unknown_depth.covariance(seen, velocity), expected, rtol=1e-6, atol=1e-9)
+
+
 @pytest.fixture(scope="module")
 def camera():
     film = render.Film(346, 260, 32, 32, 0.0185, WINDOWS)
