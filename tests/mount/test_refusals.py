@@ -132,7 +132,7 @@ WRONG = [
     ),
     (lambda: check_mount(rover_mount(), [NEAR], SMALL), "image circle"),
     (
-        lambda: starts(ranges(4, 0.9, 1.5), 3, [NEAR, LookAhead(3.0, share=0.9)], CAMERA),
+        lambda: starts(ranges(4, 0.9, 1.5), 3, [LookAhead(3.0, share=0.9), NEAR], CAMERA),
         r"most, \d+%, fail first at 'look-ahead'",
     ),
     # flow and what it tells
