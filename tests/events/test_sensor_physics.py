@@ -118,7 +118,7 @@ def test_any_chunking_gives_the_events_of_the_whole_and_dense_counts_are_theirs(
         (lambda frames, t_s: (frames, t_s - 1), "go on increasing"),
         (lambda frames, t_s: (frames, t_s[-1].expand(30)), "increase"),
         (lambda frames, t_s: (frames.index_fill(0, torch.tensor([20]), math.nan), t_s), "NaN"),
-        (lambda frames, t_s: (frames - 300, t_s), "negative"),
+        (lambda frames, t_s: (frames - 300, t_s), "frames must be >= 0"),
         (lambda frames, t_s: (frames[:, :2], t_s), "keep their size"),
         (lambda frames, t_s: (frames, t_s * 1e15), "exceed 64-bit"),
     ],
