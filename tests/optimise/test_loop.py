@@ -109,6 +109,7 @@ def test_resumed_equals_uninterrupted(optimiser):
     # element-wise operations on two numbers, so the same bits by construction
     whole = noisy_loop(optimiser=optimiser)
     whole.run(23)
+    assert whole.record.judged_step == [0, 5, 10, 15, 20, 23]
     first = noisy_loop(optimiser=optimiser)
     kept = []
 
