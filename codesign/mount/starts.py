@@ -11,12 +11,13 @@ from torch.quasirandom import SobolEngine
 from codesign.checks import check_seed, check_whole
 from codesign.errors import DomainError
 from codesign.mount.pose import Mount, MountRanges
-from codesign.mount.requirements import Clearance, Requirement, first_missed, judge
+from codesign.mount.requirements import Clearance, Requirement, judge
 from codesign.mount.triangles import closest_points
 from codesign.types import ChiefRayCamera
 
 EDGE = 0.05  # of the bounds at either end, in which no search begins
 TRIES = 2048
+DRAWS = 16  # looked at together
 PLACES = 256  # of a box, in which room is looked for
 NEAREST = 8  # places of the box from which the way to the body is followed
 WAYS = 50  # steps of it, to and fro between box and body
@@ -49,18 +50,21 @@ def starts(
     random = torch.Generator().manual_seed(check_seed(seed, "starts: seed"))
     found: list[Tensor] = []
     failed: Counter[str] = Counter()
-    for _ in range(TRIES):
-        share = EDGE + (1 - 2 * EDGE) * torch.rand(6, generator=random, dtype=torch.float64)
-        missed = first_missed(requirements, ranges.pose(share), camera)
-        if missed is None:
-            found.append(share)
-        else:
-            failed[missed.name] += 1
-        if len(found) == count:
-            return torch.stack(found)
+    for _ in range(TRIES // DRAWS):
+        draw = torch.rand(DRAWS, 6, generator=random, dtype=torch.float64)
+        share = EDGE + (1 - 2 * EDGE) * draw
+        for each in requirements:
+            kept = (each.exact(ranges.pose(share), camera) >= 0).all(-1)
+            failed[each.name] += int((~kept).sum())
+            share = share[kept]
+            if not len(share):
+                break
+        found.append(share)
+        if sum(map(len, found)) >= count:
+            return torch.cat(found)[:count]
     [(worst, often)] = failed.most_common(1) or [("none", 0)]
     raise DomainError(
-        f"starts: of {TRIES} mounts within the bounds {len(found)} keep what is required, {count} are needed; most, "
+        f"starts: of {TRIES} mounts within the bounds {sum(map(len, found))} keep what is required, {count} are needed; most, "
         f"{often / TRIES:.0%}, fail first at '{worst}': widen the bounds, or ask for less."
     )
 
