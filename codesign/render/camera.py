@@ -34,8 +34,7 @@ class Camera:
     """A lens (GeoLens, ThinLens or Pinhole: anything with ``camera_rays``) before a film.
 
     >>> from codesign import lens, render
-    >>> camera = render.Camera(lens.load("cooke-triplet").scaled(0.2), 8, 8, pixel_pitch_mm=0.5,
-    samples_per_pixel=4)
+    >>> camera = render.Camera(lens.load("cooke-triplet").scaled(0.2), 8, 8, 0.5, samples_per_pixel=4)
     >>> camera.check().rays().weight.shape  # 8 x 8 pixels x 4 samples
     torch.Size([256])
 
@@ -265,8 +264,7 @@ def project(camera: Camera, points_cam_m: Tensor, pupil: Tensor | None = None) -
 
     >>> from codesign import lens, render
     >>> camera = render.Camera(lens.Pinhole(8.0), 8, 8, pixel_pitch_mm=0.5)
-    >>> points = torch.tensor([[0.0, 0.0, 2.0], [0.125, 0.0, 2.0]])  # metres; 8 / 2000 / 0.5 px per
-    millimetre
+    >>> points = torch.tensor([[0.0, 0.0, 2.0], [0.125, 0.0, 2.0]])  # metres; 8 / 2000 / 0.5 px per mm
     >>> render.project(camera, points).tolist()
     [[3.5, 3.5], [4.5, 3.5]]
 
