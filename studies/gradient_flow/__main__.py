@@ -34,7 +34,7 @@ CASES: dict[str, Topic] = {
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
-    QUICK: ClassVar = {"hard_cases": 6, "scenes": 1, "samples": 512, "seeds": 2}
+    QUICK: ClassVar = {"hard_cases": 2, "scenes": 1, "samples": 512, "seeds": 2}
     cases: tuple[str, ...] = ("chain", "joint")
     """What to measure: chain, joint, layers, sensors, timing, silhouettes, silhouettes_chain."""
     hard_cases: int = 32
