@@ -53,7 +53,7 @@ BAD = {
     "truth [1, 2, H, W]": ("'truth' holds 1", truth(PX[:1])),
     "truth valid of floats": ("truth", truth(PX, valid=False)),
     "frames of one drive": ("'frames' holds 1", of(render=s.picture(after=lambda f: f[:1]))),
-    "frames on 0 to 1": ("scale is 0 to 255", of(render=s.picture(after=lambda f: f / 255))),
+    "frames on 0 to 1": ("scale is 0 to 255", of(render=s.picture(after=lambda f: (f - f.min()) / 255))),
     "counts below 0": ("0 or more", of(events=lambda f: counted(f) - 1)),
     "rays as a tensor": ("camera", of(camera=s.Camera(glass(), lambda r: r.direction))),
     "mounts of three drives": ("mount", of(mount=held(lambda T: T.expand(3, 4, 4)))),
