@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from codesign.errors import DomainError, GradientError, NonFiniteError, ShapeError
 from codesign.grad import certify
 from codesign.grad.differences import Ladder, rounding_noise
 from codesign.grad.row import verdict
@@ -144,8 +143,6 @@ def test_steps_out_of_the_domain_are_left_out_and_named():
     (row,) = certify(lambda p: p["x"].sqrt().sum(), {"x": torch.full((2,), 5e-3, dtype=D)})
     assert row.left_out == (0.01,)
     assert row.verdict == "pass"
-    with pytest.raises(NonFiniteError, match="at any step"):
-        certify(lambda p: p["x"].sqrt().sum(), {"x": torch.full((2,), 5e-3, dtype=D)}, ladder=(0.1, 0.05))
 
 
 def test_directions_are_the_same_at_every_call():
@@ -153,53 +150,6 @@ def test_directions_are_the_same_at_every_call():
     first, again = (certify(lambda p: p["x"].exp().sum(), x, directions=3)[0] for _ in range(2))
     assert first == again
     assert len(first.difference) == 3
-
-
-def test_random_numbers_that_differ_between_calls_are_refused():
-    generator = torch.Generator().manual_seed(0)
-
-    def loss(p):
-        return (p["x"] * torch.rand(3, generator=generator, dtype=D)).sum()
-
-    with pytest.raises(GradientError, match="seed your generator inside the function"):
-        certify(loss, {"x": torch.ones(3, dtype=D)})
-
-
-X = {"x": torch.ones(2, dtype=D)}
-
-
-@pytest.mark.parametrize(
-    ("fn", "params", "options", "error", "words"),
-    [
-        (lambda p: p["x"], X, {}, GradientError, r"got shape \(2,\)"),
-        (lambda p: p["x"].detach().sum(), X, {}, GradientError, "without a graph"),
-        (lambda p: 1.0, X, {}, GradientError, "returned a float"),
-        (lambda p: p["x"].sum(), X | {"y": torch.ones(1)}, {}, GradientError, "does not depend on 'y'"),
-        (lambda p: p["x"].log().sum(), {"x": -torch.ones(2)}, {}, NonFiniteError, "gradient|loss"),
-        (
-            lambda p: p["x"].sqrt().sum(),
-            {"x": torch.zeros(2)},
-            {},
-            NonFiniteError,
-            "gradient with respect to 'x'",
-        ),
-        (lambda p: p["x"].sum(), {"x": torch.ones(2, dtype=torch.int64)}, {}, DomainError, "torch.int64"),
-        (lambda p: p["x"].sum(), {"x": torch.ones(0)}, {}, DomainError, "non-empty"),
-        (lambda p: p["x"].sum(), {"x": 1.0}, {}, DomainError, "a float"),
-        (lambda p: p["x"].sum(), {}, {}, DomainError, "no parameters"),
-        (lambda p: p["x"].sum(), X, {"scales": {"y": 1.0}}, DomainError, "no parameter"),
-        (lambda p: p["x"].sum(), X, {"scales": {"x": 0.0}}, DomainError, "positive"),
-        (lambda p: p["x"].sum(), X, {"scales": {"x": torch.ones(3)}}, ShapeError, r"shape \(3,\)"),
-        (lambda p: p["x"].sum(), X, {"ladder": ()}, DomainError, "ladder"),
-        (lambda p: p["x"].sum(), X, {"ladder": (0.1, 0.1)}, DomainError, "ladder"),
-        (lambda p: p["x"].sum(), X, {"tolerance": 0.0}, DomainError, "tolerance"),
-        (lambda p: p["x"].sum(), X, {"directions": 0}, DomainError, "directions"),
-        (lambda p: p["x"].sum(), X, {"difference_fn": lambda p: p["x"]}, GradientError, "got shape"),
-    ],
-)
-def test_bad_input_is_refused_in_one_sentence(fn, params, options, error, words):
-    with pytest.raises(error, match=words):
-        certify(fn, params, **options)
 
 
 def test_the_stages_of_the_page_are_certified():

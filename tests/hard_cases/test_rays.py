@@ -6,18 +6,14 @@ import math
 import pytest
 import torch
 
-from codesign import lens, render
-from codesign.errors import DomainError, ShapeError
+from codesign import lens
 from codesign.lens import GeoLens, Glass, Status, Surface
 from codesign.lens.surface import Phase
 from codesign.lens.trace import trace
+from tests.lens.systems import close, f64
 
 INF = float("inf")
 GLASS = Glass.from_indices(1.5, 1.5, 1.5)
-
-
-def f64(rows):
-    return torch.tensor(rows, dtype=torch.float64)
 
 
 def unit(rows):
@@ -190,81 +186,8 @@ def test_bad_rays_leave_the_gradients_of_good_ones_alone(kind, generator):
     # weight 0 times anything finite adds exactly 0; sums over lanes may run in another order
     a = gradients(geo, alone)
     b = gradients(geo, crowd)
-    torch.testing.assert_close(b, a, rtol=1e-13, atol=1e-14 * float(a.abs().max()))
-    assert alone.item() == pytest.approx(crowd.item(), rel=1e-14)
-
-
-def test_a_camera_whose_rays_all_fail_says_where():
-    # the ball lens reflects everything that comes from 8 mm off the axis behind it
-    ball = GeoLens(
-        [Surface(5.0, 10.0, GLASS, 4.99, is_stop=True), Surface(-5.0, 8.0, None, 4.99)], 8.0, name="ball"
-    )
-    film = f64([[8.0, 0.0]])
-    pupil = f64([[-1.0, 0.0]])
-    with pytest.raises(
-        DomainError,
-        match=r"ball: every ray fails \(most at surface \d of 2, counted from the object\); weaken",
-    ):
-        ball.camera_rays(film, pupil)
-    with pytest.raises(DomainError, match="ball: every ray fails"):
-        render.Camera(ball, 4, 4, 0.1, 1, film=render.Film(400, 400, 2, 2, 0.1, ((0, 0),))).rays()
-
-
-def test_a_camera_that_is_all_vignetted_says_so():
-    narrow = GeoLens([Surface(50.0, 3.0, GLASS, 5.0, is_stop=True), Surface(-50.0, 40.0, None, 0.01)], 4.0)
-    with pytest.raises(DomainError, match="edges of the apertures"):
-        narrow.camera_rays(f64([[0.0, 0.0]]), f64([[0.9, 0.0]]))
-
-
-def test_a_telecentric_stop_is_named():
-    # stop in the front focal plane of a thin plano-convex lens: f = R / (n - 1) = 100, its exit pupil at
-    # infinity
-    telecentric = GeoLens(
-        [
-            Surface(INF, 100.0, None, 5.0, is_stop=True),
-            Surface(50.0, 1.0, GLASS, 9.0),
-            Surface(INF, 100.0, None, 9.0),
-        ],
-        3.0,
-    )
-    with pytest.raises(DomainError, match="telecentric"):
-        telecentric.camera_rays(f64([[0.0, 0.0]]), f64([[0.0, 0.0]]))
-
-
-def test_no_rays_wrong_shapes_and_non_finite_rays_are_refused():
-    geo = lens.load("la1509")
-    with pytest.raises(ShapeError, match=r"\[N >= 1, 3\]"):
-        geo.trace(torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64))
-    with pytest.raises(ShapeError, match=r"direction must be \[N >= 1, 3\]"):
-        geo.trace(f64([[0.0, 0, -5]]), f64([0.0, 0, 1]))
-    with pytest.raises(ShapeError, match="2 origins but 1 directions"):
-        geo.trace(f64([[0.0, 0, -5], [1.0, 0, -5]]), f64([[0.0, 0, 1]]))
-    with pytest.raises(DomainError, match="origin_mm"):
-        geo.trace(f64([[math.nan, 0, -5]]), f64([[0.0, 0, 1]]))
-    with pytest.raises(DomainError, match="unit"):
-        geo.trace(f64([[0.0, 0, -5]]), f64([[0.0, 0, 2]]))
-    with pytest.raises(DomainError, match="unit"):
-        geo.trace(f64([[0.0, 0, -5]]), f64([[0.0, math.nan, 1]]))
-
-
-def test_concentric_spheres_leave_rays_through_their_centre_straight():
-    # both radii end in one centre: a ray towards it meets every surface along the normal
-    geo = GeoLens(
-        [
-            Surface(10.0, 4.0, GLASS, 9.9),
-            Surface(6.0, 12.0, Glass.named("F2"), 5.9),
-            Surface(-6.0, 20.0, None, 5.9),
-        ],
-        4.0,
-    )
-    towards = unit([(x, y, 1.0) for x, y in ((0.0, 0.0), (0.3, 0.1), (-0.6, 0.2), (0.0, 0.9))])
-    out = geo.trace(f64([0.0, 0.0, 10.0]) - 30 * towards, towards)
-    assert not out.status.any()
-    torch.testing.assert_close(out.direction, towards, rtol=0, atol=1e-13)
-    # centre at z = 10, image plane at 4 + 12 + 20 = 36
-    torch.testing.assert_close(
-        out.position_mm[:, :2], towards[:, :2] / towards[:, 2:] * 26, rtol=0, atol=1e-12
-    )
+    close(b, a, 1e-13, atol=1e-14 * float(a.abs().max()))
+    close(alone, crowd, 1e-14)
 
 
 @pytest.mark.parametrize("name", ["double-gauss", "cooke-triplet"])
@@ -301,18 +224,7 @@ def test_a_ball_lens_has_its_textbook_focal_length():
     assert abs(out.position_mm[1, 0].item() - math.tan(turn) * (crossing - n * R / (2 * (n - 1)))) <= 1e-12
 
 
-def test_the_far_half_of_a_sphere_is_not_a_surface():
-    # a ray that dives past the rim behind the centre would meet the sphere only on the half that the lens
-    # does not have
-    geo = GeoLens([Surface(10.0, 5.0, GLASS, 9.0), Surface(INF, 10.0, None, 9.0)], 4.0)
-    towards = unit([(-1.0, 0.0, 0.05)])
-    start = f64([[30.0, 0.0, 13.0 - 0.05 * 30]])  # passes the axis at z = 13, beyond the centre at 10
-    out = geo.trace(start, towards)
-    assert (out.status.item(), out.failed_surface.item()) == (Status.MISS, 0)
-    assert out.deficit.item() > 0.1
-
-
-@pytest.mark.parametrize("conic", [3.0, 0.5, -0.5])
+@pytest.mark.parametrize("conic", [3.0, 0.5, 0.0, -0.5])
 def test_the_far_half_of_an_ellipsoid_is_not_a_surface(conic):
     """Half axes: R / (1 + k) along the axis, where its middle lies too, and R / sqrt(1 + k) across. A ray that
     crosses the axis 1.3 half axes behind the vertex, nearly at right angles, meets the far half only."""
@@ -323,6 +235,7 @@ def test_the_far_half_of_an_ellipsoid_is_not_a_surface(conic):
     start = f64([[3 * wide, 0.0, 1.3 * deep - 0.02 * 3 * wide]])
     out = geo.trace(start, unit([(-1.0, 0.0, 0.02)]))
     assert (out.status.item(), out.failed_surface.item()) == (Status.MISS, 0)
+    assert out.deficit.item() > 0.1
 
 
 @pytest.mark.parametrize("conic", [3.0, 0.5, -0.5, -1.0, -2.0])
@@ -336,27 +249,8 @@ def test_deep_conics_are_met_at_their_sag(conic):
     out = trace(surface, f64([(0.0, r, -5.0) for r in heights]), f64([(0, 0, 1.0)] * len(heights)))
     assert out.status.tolist() == [Status.OK] * len(heights)
     for r, z in zip(heights, out.position_mm[:, 2].tolist(), strict=True):
-        assert 2 * radius * z - (1 + conic) * z * z == pytest.approx(r * r, rel=1e-12)
+        close(2 * radius * z - (1 + conic) * z * z, r * r, 1e-12)
         assert z < (radius / (1 + conic) if conic > -1 else math.inf)  # the half that holds the vertex
-
-
-def test_flat_surfaces_have_the_derivatives_of_slightly_bent_ones():
-    """At zero curvature the sphere has no centre, but the ray and its derivative do: central differences over
-    1e-6 per mm err by their square."""
-    flat = GeoLens([Surface(INF, 4.0, GLASS, 9.0), Surface(INF, 30.0, None, 9.0)], 4.0)
-    origin = f64([(1.0, 2.0, -5.0), (-3.0, 0.5, -5.0)])
-    direction = unit([(0.1, 0.05, 1.0)] * 2)
-
-    def merit(c):
-        return (
-            flat.replace(curvature_per_mm=c).trace(origin, direction).position_mm[:, :2]
-            * f64([[1.0, 0.3], [-0.7, 0.2]])
-        ).sum()
-
-    start = torch.zeros(2, dtype=torch.float64, requires_grad=True)
-    (slope,) = torch.autograd.grad(merit(start), start)
-    for i, shift in enumerate(1e-6 * torch.eye(2, dtype=torch.float64)):
-        assert slope[i].item() == pytest.approx((merit(shift) - merit(-shift)).item() / 2e-6, rel=1e-8)
 
 
 @pytest.mark.parametrize("distance", [1e-3, 1e-5, 1e-7])
@@ -369,12 +263,14 @@ def test_grazing_rays_have_the_steep_but_true_derivatives_of_the_closed_form(dis
     origin = f64([(0.0, height, -5.0)]).requires_grad_()
     out = trace(ball, origin, f64([(0, 0, 1.0)]))
     depth = radius - math.sqrt((radius - height) * (radius + height))
-    assert out.position_mm[0, 2].item() == pytest.approx(depth, abs=1e-11)
+    close(out.position_mm[0, 2], depth, atol=1e-11)
     (slope,) = torch.autograd.grad(out.position_mm[0, 2], origin)
     # R^2 - h^2 is a difference of nearly equal numbers: rounding 1e-16 relative to 2 e / R, and half of that
     # in the root
-    assert slope[0, 1].item() == pytest.approx(
-        height / math.sqrt((radius - height) * (radius + height)), rel=1e-15 * radius / distance + 1e-12
+    close(
+        slope[0, 1],
+        height / math.sqrt((radius - height) * (radius + height)),
+        1e-15 * radius / distance + 1e-12,
     )
 
 
@@ -388,10 +284,10 @@ def test_the_soft_edge_is_a_cubic_step_in_the_square_of_the_radius():
     radius = (semi**2 - (2 * share - 1) * edge * semi).sqrt().requires_grad_()
     origin = torch.stack([0 * radius, radius, 0 * radius], 1)
     weight = geo.trace(origin, f64([(0, 0, 1.0)] * len(share))).weight
-    torch.testing.assert_close(weight.detach(), 3 * share**2 - 2 * share**3, rtol=0, atol=1e-12)
+    close(weight, 3 * share**2 - 2 * share**3, atol=1e-12)
     (slope,) = torch.autograd.grad(weight.sum(), radius)
     truth = -6 * share * (1 - share) * radius.detach() / (edge * semi)
-    torch.testing.assert_close(slope, truth, rtol=1e-11, atol=1e-11)
+    close(slope, truth, 1e-11, atol=1e-11)
 
 
 def test_a_ray_that_meets_the_vertex_plane_but_not_the_asphere_has_deficit_one():
@@ -421,7 +317,7 @@ def test_steep_aspheres_are_met_far_from_their_vertex_plane(fourth):
         low, high = (middle, high) if above(middle) < 0 else (low, middle)
     out = trace(surface, f64([origin]), direction)
     assert out.status.item() == Status.OK
-    assert out.optical_path_mm.item() == pytest.approx(low, abs=1e-12)
+    close(out.optical_path_mm, low, atol=1e-12)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -448,7 +344,7 @@ def test_the_hard_mask_is_half_the_soft_edge():
         f64([(0, 0, 1.0)] * 4),
     )
     assert out.inside.tolist() == [True, False, False, True]
-    assert out.weight[1].item() == pytest.approx(0.5, abs=1e-8)
+    close(out.weight[1], 0.5, atol=1e-8)
     assert 0.5 < out.weight[0].item() < 1
     assert 0 < out.weight[2].item() < 0.5
     assert out.weight[3].item() == 1.0

@@ -2,10 +2,11 @@
 
 It shares nothing with codesign.lens: surfaces are met by Newton steps on z - sag, pupils come from two
 forward paraxial rays, wavefronts from whole path lengths (where ours subtracts first). With 64 bits of
-mantissa its rounding is some two thousand times finer than float64's.
+mantissa its rounding is some two thousand times finer than float64's. Beside it a tracer of spheres from one local
+frame to the next, for what is tilted and shifted.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -40,12 +41,14 @@ class System:
 @dataclass(frozen=True)
 class Rays:
     """On the film: position [N, 2], direction [N, 3], path [N] from the object point; heights [S, N] on the
-    surfaces; worst [N], the least cosine of incidence or refraction (NaN where a ray fails)."""
+    surfaces, cosines [S, N] of incidence; worst [N], the least cosine of incidence or refraction (NaN where a ray
+    fails)."""
 
     position: np.ndarray
     direction: np.ndarray
     path: np.ndarray
     heights: np.ndarray
+    cosines: np.ndarray
     worst: np.ndarray
 
     @property
@@ -64,7 +67,7 @@ def field_rays(system, line, field, pupil, at):
     n = system.index[line]
     path = np.zeros(len(o), dtype=L)
     worst = np.ones(len(o), dtype=L)
-    heights = []
+    heights, cosines = [], []
     for i, thickness in enumerate(system.thickness):
         shape = system.curvature[i], system.conic[i], system.asphere[i]
         t = -o[:, 2] / d[:, 2]
@@ -78,15 +81,16 @@ def field_rays(system, line, field, pupil, at):
         normal = np.concatenate([-_sag(p, *shape)[1] * p[:, :2], np.ones((len(p), 1))], 1)
         normal = normal / np.sqrt((normal**2).sum(1))[:, None]
         cosine = (d * normal).sum(1)
+        cosines.append(cosine)
         ratio = n[i] / n[i + 1]
         refracted = np.sqrt(1 - ratio**2 * (1 - cosine**2))
         d = ratio * d + (refracted - ratio * cosine)[:, None] * normal
         worst = np.minimum(worst, np.minimum(cosine, refracted))
         o = p - np.array([0, 0, 1], dtype=L) * thickness
     t = -o[:, 2] / d[:, 2]
-    return Rays(
-        (o + d * t[:, None])[:, :2], d, path + n[-1] * t, np.stack(heights), np.minimum(worst, d[:, 2])
-    )
+    film = (o + d * t[:, None])[:, :2]
+    worst = np.minimum(worst, d[:, 2])
+    return Rays(film, d, path + n[-1] * t, np.stack(heights), np.stack(cosines), worst)
 
 
 def _sag(p, c, k, asphere):
@@ -250,6 +254,35 @@ def _indices(rng, media):
     return found
 
 
-def stopped_down(system, share):
-    """The same lens with a smaller pupil."""
-    return replace(system, diameter=float(system.diameter * share))
+INDICES = {"glass": 1.6, "air": 1.0}
+
+
+def by_frames(rows, p, d, bends=True):
+    """A ray through rows of (medium or "mirror", thickness, curvature) and of coordinate breaks ("break", thickness, and
+    PARM 1 to 6 of a .zmx file: shifts, angles in degrees, order), each in the frame of its own, to a plane; only led
+    through the frames where it does not bend. Media are names or indices; point and direction [3] -> the same."""
+    n = L(1)
+    p, d = (np.array(v, dtype=L) for v in (p, d))
+    for kind, thickness, *what in [*rows, ("air", 0.0, 0.0)]:
+        what = np.array(what, dtype=L)
+        if kind == "break":
+            (sx, sy, sz), (cx, cy, cz) = np.sin(np.radians(what[2:5])), np.cos(np.radians(what[2:5]))
+            # components along axes that were turned right-handed
+            about_x = np.array([[1, 0, 0], [0, cx, sx], [0, -sx, cx]])
+            about_y = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
+            about_z = np.array([[cz, sz, 0], [-sz, cz, 0], [0, 0, 1]])
+            turn = about_x @ about_y @ about_z if what[5] else about_z @ about_y @ about_x
+            shift = np.array([*what[:2], 0])
+            p, d = turn @ p - shift if what[5] else turn @ (p - shift), turn @ d
+        elif bends:
+            c = what[0]
+            f, g = c * (p @ p) - 2 * p[2], d[2] - c * (p @ d)
+            p = p + d * f / (g + np.copysign(np.sqrt(g * g - c * f), d[2]))
+            normal = np.array([0, 0, 1]) - c * p
+            cosine = d @ normal
+            behind = n if kind == "mirror" else L(INDICES.get(kind, kind))
+            root = np.copysign(np.sqrt(1 - (n / behind) ** 2 * (1 - cosine**2)), cosine)
+            d = n / behind * d + ((-root if kind == "mirror" else root) - n / behind * cosine) * normal
+            n = behind
+        p = p - np.array([0, 0, thickness])
+    return p, d

@@ -13,7 +13,7 @@ from codesign.errors import CodesignError, DomainError, FileFormatError
 from codesign.lens import GeoLens, Glass, Surface
 from codesign.lens.files.text import LARGEST_BYTES, read_text
 from codesign.lens.surface import Phase
-from tests.lens.file_case import FAULTS, load
+from tests.lens.systems import FAULTS, close, f64, load_file
 
 PLANE = float("inf")
 SPECIAL = [
@@ -57,22 +57,22 @@ def test_a_round_trip_is_exact(name, tmp_path):
 
 def test_changed_values_are_what_is_saved(tmp_path):
     geo = LENSES["special"]
-    offset = torch.tensor([0.01, 0, -0.02, 0], dtype=torch.float64)
+    offset = f64([0.01, 0, -0.02, 0])
     changed = geo.replace(
         curvature_per_mm=geo.curvature_per_mm * 1.1, thickness_mm=geo.thickness_mm + 0.01, index_offset=offset
     )
     lens.save(changed, tmp_path / "a.json")
-    points = torch.tensor([[1.0, 2.0, -5.0], [-3.0, 0.5, -5.0]], dtype=torch.float64)
-    rays = points, torch.tensor([[0.0, 0.0, 1.0]] * 2, dtype=torch.float64)
+    points = f64([[1.0, 2.0, -5.0], [-3.0, 0.5, -5.0]])
+    rays = points, f64([[0.0, 0.0, 1.0]] * 2)
     found = lens.load(tmp_path / "a.json").trace(*rays).position_mm
     # 1 / (1 / c) may differ from c in the last bit
-    torch.testing.assert_close(found, changed.trace(*rays).position_mm, rtol=0, atol=1e-13)
+    close(found, changed.trace(*rays).position_mm, atol=1e-13)
 
 
 @pytest.mark.parametrize(("kind", "exchanges", "pattern"), FAULTS)
 def test_a_fault_gives_one_sentence_naming_file_place_and_value(kind, exchanges, pattern, tmp_path):
     with pytest.raises(CodesignError, match=pattern) as caught:
-        load(tmp_path, kind, exchanges)
+        load_file(tmp_path, kind, exchanges)
     message = str(caught.value)
     assert re.match(rf"lens file {tmp_path}/lens\.\w+: ", message)
     assert "\n" not in message
@@ -111,7 +111,7 @@ HOSTILE = {
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_every_hostile_file_ends_in_one_short_sentence(kind, ending, tmp_path):
     with pytest.raises(CodesignError) as caught:
-        load(tmp_path, ending, content=HOSTILE[kind])
+        load_file(tmp_path, ending, content=HOSTILE[kind])
     message = str(caught.value)
     assert message.startswith(f"lens file {tmp_path / 'lens'}.{ending}: ")
     assert message.isprintable()
@@ -186,15 +186,13 @@ def test_a_zmx_file_reads_back_to_the_last_digit_or_two(name, tmp_path):
         same_in_zmx(old, new)
         assert (new.medium and new.medium.name) == (old.medium and old.medium.name)
     for wavelength_um in lens.WAVELENGTH_UM.values():
-        assert after.index(wavelength_um).tolist() == pytest.approx(
-            before.index(wavelength_um).tolist(), abs=1e-8
-        )
+        close(after.index(wavelength_um), before.index(wavelength_um), atol=1e-8)
     assert [getattr(after, fact) for fact in FACTS] == [getattr(before, fact) for fact in FACTS]
 
 
 def same_in_zmx(old, new):
     # the radius passes through its reciprocal
-    assert new.radius_mm == pytest.approx(old.radius_mm, rel=3e-16)
+    close(new.radius_mm, old.radius_mm, 3e-16)
     assert new.asphere[: len(old.asphere)] == old.asphere
     assert not any(new.asphere[len(old.asphere) :])
     for name in ("thickness_mm", "semi_aperture_mm", "conic", "mirror", "inner_semi_aperture_mm"):
@@ -226,7 +224,7 @@ def test_all_a_zmx_file_can_hold_is_written(tmp_path):
         same_in_zmx(old, new)
     assert (after.stop_index, after.to_surfaces()[2].medium) == (0, flint)
     # of the model glass, nd and Vd are kept
-    assert after.index(0.65).tolist() == pytest.approx(before.index(0.65).tolist(), abs=2e-5)
+    close(after.index(0.65), before.index(0.65), atol=2e-5)
 
 
 def written(folder, *media):

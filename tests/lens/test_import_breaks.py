@@ -8,6 +8,8 @@ import pytest
 import torch
 
 from codesign import lens
+from tests.lens.long_double_lens import by_frames
+from tests.lens.systems import close, f64
 
 HEAD = "MODE SEQ\nUNIT MM\nENPD 4\nFTYP 0 0 2 1 0 0 0\nYFLN 0 8\nWAVM 1 0.5875618 1\nSURF 0\n  DISZ INFINITY"
 MEDIA = {"air": ["GLAS AIR"], "glass": ["GLAS ___BLANK 1 0 1.6 50"], "mirror": ["GLAS MIRROR 0 0 1.5 40"]}
@@ -60,52 +62,24 @@ def load(folder, rows):
     return lens.load(folder / "a.zmx")
 
 
-def by_hand(rows, p, d, bends=True):
-    """A ray through the rows, each in the frame of its own; only led through the frames where it does not
-    bend."""
-    n = 1.0
-    for kind, thickness, *what in [*rows, ("air", 0.0, 0.0)]:
-        if kind == "break":
-            x, y, *angles, order = what
-            (sx, sy, sz), (cx, cy, cz) = np.sin(np.radians(angles)), np.cos(np.radians(angles))
-            # components along axes that were turned right-handed
-            about_x = np.array([[1, 0, 0], [0, cx, sx], [0, -sx, cx]])
-            about_y = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
-            about_z = np.array([[cz, sz, 0], [-sz, cz, 0], [0, 0, 1]])
-            turn = about_x @ about_y @ about_z if order else about_z @ about_y @ about_x
-            shift = np.array([x, y, 0.0])
-            p, d = turn @ p - shift if order else turn @ (p - shift), turn @ d
-        elif bends:
-            f, g = what[0] * (p @ p) - 2 * p[2], d[2] - what[0] * (p @ d)
-            p = p + d * f / (g + math.copysign(math.sqrt(g * g - what[0] * f), d[2]))
-            normal = np.array([0.0, 0.0, 1.0]) - what[0] * p
-            cosine = d @ normal
-            behind = {"glass": 1.6, "air": 1.0, "mirror": n}[kind]
-            root = math.copysign(math.sqrt(1 - (n / behind) ** 2 * (1 - cosine**2)), cosine)
-            d = n / behind * d + ((-root if kind == "mirror" else root) - n / behind * cosine) * normal
-            n = behind
-        p = p - np.array([0.0, 0.0, thickness])
-    return p, d
-
-
 @pytest.mark.filterwarnings("ignore:.* the centre of the stop")
 @pytest.mark.parametrize("case", [*CASES, *range(20)])
 def test_rays_go_where_a_trace_by_hand_leads_them(case, tmp_path):
     rows = typed(CASES[case]) if case in CASES else drawn(case)
     geo = load(tmp_path, rows)
     first = next(i for i, row in enumerate(rows) if row[0] != "break")
-    vertex, _ = by_hand(rows[first:], np.zeros(3), np.zeros(3), bends=False)
+    vertex, _ = by_frames(rows[first:], np.zeros(3), np.zeros(3), bends=False)
     draw = np.random.default_rng(7).uniform
     starts = [np.array([*draw(-1.5, 1.5, 2), -10.0]) for _ in range(6)]
     aims = [np.array([*draw(-0.06, 0.06, 2), 1.0]) for _ in range(6)]
     towards = [aim / np.linalg.norm(aim) for aim in aims]
-    led = np.array([by_hand(rows, *ray, bends=False) for ray in zip(starts, towards, strict=True)])
-    rays = geo.trace(torch.tensor(led[:, 0] - [0.0, 0.0, vertex[2]]), torch.tensor(led[:, 1]))
-    true = np.array([by_hand(rows, *ray) for ray in zip(starts, towards, strict=True)])
+    led = np.array([by_frames(rows, *ray, bends=False) for ray in zip(starts, towards, strict=True)], float)
+    rays = geo.trace(torch.tensor(led[:, 0] - [0.0, 0.0, float(vertex[2])]), torch.tensor(led[:, 1]))
+    true = np.array([by_frames(rows, *ray) for ray in zip(starts, towards, strict=True)], float)
     true[:, 1, 2] = abs(true[:, 1, 2])  # light travels along +z behind a mirror too
     assert not rays.status.any()
-    np.testing.assert_allclose(rays.position_mm.detach().numpy()[:, :2], true[:, 0, :2], rtol=0, atol=1e-10)
-    np.testing.assert_allclose(rays.direction.detach().numpy(), true[:, 1], rtol=0, atol=1e-12)
+    close(rays.position_mm[:, :2], true[:, 0, :2], atol=1e-10)
+    close(rays.direction, true[:, 1], atol=1e-12)
 
 
 def test_what_returns_leaves_the_rest_on_the_axis_and_a_tilted_image_narrows_the_field(tmp_path):
@@ -116,7 +90,7 @@ def test_what_returns_leaves_the_rest_on_the_axis_and_a_tilted_image_narrows_the
     with pytest.warns(UserWarning, match="centre of the stop lies 3.931 mm beside the axis"):
         tilted = load(tmp_path, typed(CASES["a tilted image plane"]))
     angle = math.degrees(math.acos(math.cos(math.radians(3)) * math.cos(math.radians(2))))
-    assert tilted.half_field_deg == pytest.approx(8 - angle, rel=1e-12)
+    close(tilted.half_field_deg, 8 - angle, 1e-12)
 
 
 @pytest.mark.filterwarnings("ignore:.* the centre of the stop")
@@ -126,9 +100,9 @@ def test_four_tilted_mirrors_bring_the_beam_to_the_stated_spot(shared):
     angle = -2 * math.radians(16.44 - 12 + 15.939999999989485 - 5.9999999994997468)
     around = torch.linspace(0, 2 * math.pi, 7201, dtype=torch.float64)[:, None]
     tilt = [[1, 0, 0], [0, math.cos(angle), -math.sin(angle)], [0, math.sin(angle), math.cos(angle)]]
-    across, up, along = torch.tensor(tilt, dtype=torch.float64).T
-    vertex = torch.tensor([*geo.to_surfaces()[0].decentre_mm, 0.0], dtype=torch.float64)
+    across, up, along = f64(tilt).T
+    vertex = f64([*geo.to_surfaces()[0].decentre_mm, 0.0])
     origins = vertex + 10 * (around.sin() * up + around.cos() * across)
     rays = geo.trace(origins, along.expand(7201, 3).contiguous())
     # the semi-diameter of its image, of a beam 20 mm wide
-    assert rays.position_mm.norm(dim=1).max().item() == pytest.approx(0.0026768395313191379, rel=1e-3)
+    close(rays.position_mm.norm(dim=1).max(), 0.0026768395313191379, 1e-3)

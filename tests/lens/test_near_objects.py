@@ -4,13 +4,12 @@ import dataclasses
 import math
 
 import numpy as np
-import pytest
 import torch
 
 from codesign import lens
 from codesign.lens import analysis
 from codesign.lens.design import focus_rays
-from codesign.lens.design.hits import traced_semi_aperture_mm
+from codesign.lens.design.hits import surface_hits, traced_semi_aperture_mm
 from codesign.lens.seidel import seidel_sums
 from tests.lens import long_double_lens as ld
 from tests.lens.long_double_lens import FIELDS, L
@@ -30,6 +29,7 @@ ALLOWED = {
     "fans": 1e-12,
     "fan paths": 1e-9,
     "apertures": 1e-14,
+    "incidence": 1e-13,
     "Seidel sums": 1e-14,
     "distortion": 2e-11,
     "field curvature": 1e-9,
@@ -98,6 +98,9 @@ def rays(system, at_m):
     turn = np.arange(16) * (2 * np.pi / 16) + np.pi / 2
     rim = np.concatenate([CENTRE, np.stack([np.cos(turn), np.sin(turn)], 1)])
     heights = np.max([ld.field_rays(system, "d", f, rim, at).heights.max(1) for f in FIELDS], 0)
+    bends = np.diff(system.index["d"])[:, None] != 0
+    incidence = np.where(bends, ld.field_rays(system, "d", FIELD, pupil, at).cosines, 1)
+    hits = surface_hits(geo, *analysis.field_rays(geo, FIELD, analysis.pupil_grid(GRID), at_m=at_m))
     return {
         "spot positions": error(lens.spots(geo, FIELDS, grid=GRID, at_m=at_m)[0], spots),
         "spots": error(
@@ -112,6 +115,7 @@ def rays(system, at_m):
             error(fan.sagittal_mm, (sagittal.position - chief.position)[:, 0]),
         ),
         "fan paths": max(error(fan.tangential_waves, paths[0]), error(fan.sagittal_waves, paths[1])),
+        "incidence": error(hits.cosine, incidence),
         "apertures": error(traced_semi_aperture_mm(geo, FIELDS, 0.0, at_m=at_m), heights),
     }
 
@@ -153,7 +157,7 @@ def waves(system, at_m):
     points = np.stack([x[seen], y[seen]], 1)
     steepest = math.inf
     while steepest > 0.2:  # waves between cells
-        system = ld.stopped_down(system, 0.7)
+        system = dataclasses.replace(system, diameter=float(system.diameter * 0.7))
         light, chief = (ld.field_rays(system, "d", FIELD, p, at) for p in (points, CENTRE))
         paths, slope = ld.path_differences(system, "d", light, chief)
         waves = np.where(seen, L(0), np.nan)
@@ -221,18 +225,3 @@ def focus(system, at_m):
         "ray focus": error(shared, system.thickness[-1] - product / square),
         "depth of field": max(float(abs(blur(d) / 0.02 - 1)) for d in limits),
     }
-
-
-@pytest.mark.parametrize("seed", [0, 1, 3, 5])
-def test_the_judge_agrees_with_the_third_order(seed):
-    """Axial path differences of the long-double lens tend to S_I / 8 rho^4 with a paraxially focused film."""
-    system, at_m = ld.draw(seed)
-    at = 1e3 * L(at_m)
-    system.thickness[-1] = ld.crossing(system, "d", at)
-    found = []
-    for share in (0.1, 0.05):
-        small = dataclasses.replace(system, diameter=system.diameter * share)
-        rim, chief = (ld.field_rays(small, "d", 0.0, np.array([[0.0, h]]), at) for h in (1.0, 0.0))
-        found.append(ld.path_differences(small, "d", rim, chief)[0][0] / L(share) ** 4)
-    limit = (4 * found[1] - found[0]) / 3  # the next order goes as the square
-    assert float(limit) == pytest.approx(float(ld.seidel(system, 0.1, at)[0].sum() / 8), rel=2e-5)

@@ -2,6 +2,7 @@
 
 import math
 from functools import partial
+from statistics import NormalDist
 
 import pytest
 import torch
@@ -11,9 +12,11 @@ from codesign.errors import DomainError
 from codesign.grad.jacobian import by_autograd
 from codesign.lens import GeoLens, Glass, Surface
 from codesign.lens.design import groups, moved_element
+from codesign.lens.design.precision import cheapest, share_within
 from codesign.lens.design.tolerance import (
     LINEAR_FIGURES,
     Error,
+    Forecast,
     Tolerances,
     compare,
     compensated,
@@ -28,7 +31,7 @@ from codesign.lens.design.tolerance import (
     worst_offenders,
 )
 from codesign.lens.solves import focus_paraxial, focus_rays
-from tests.lens.systems import PLANE, glass
+from tests.lens.systems import PLANE, close, f64, glass
 
 D = torch.float64
 FIELD = math.radians(20)
@@ -60,7 +63,7 @@ def test_the_errors_of_a_lens_by_name_and_size():
     found = {e.name: e for e in errors}
     c = 1 / 60
     curvature = math.hypot(c * 1e-3, c * c * 0.1, 2 * 546.074e-6 / 64)
-    assert found["curvature of surface 1"].deviation == pytest.approx(curvature, rel=1e-12)
+    close(found["curvature of surface 1"].deviation, curvature, 1e-12)
     thickness = "thickness behind surface 1"
     assert found[thickness] == Error(thickness, "thickness_mm", (0,), 0.02)
     tilt = found["tilt of surface 2 about y"]
@@ -68,12 +71,12 @@ def test_the_errors_of_a_lens_by_name_and_size():
     bent = c + errors_of(singlet(), Tolerances(fringes=3.0))[0].deviation
     sag = [(1 - math.sqrt(1 - (k * 8) ** 2)) / k for k in (c, bent)]
     # a^2 / 2 is the first term of the sag: a^2 / R^2 = 2 % off in slope
-    assert sag[1] - sag[0] == pytest.approx(3 * 546.074e-6 / 2, rel=0.03)
+    close(sag[1] - sag[0], 3 * 546.074e-6 / 2, 0.03)
 
 
 def test_the_perturbed_lens_has_the_errors_and_nothing_else(triplet):
     errors = errors_of(triplet, ALL)
-    amounts = torch.tensor([2.0 * (e.name == "decentre of surface 3 in y") for e in errors], dtype=D)
+    amounts = f64([2.0 * (e.name == "decentre of surface 3 in y") for e in errors])
     faulty = perturbed(triplet, errors, amounts)
     assert faulty.decentre_mm[2].tolist() == [0.0, pytest.approx(0.02, rel=1e-14)]
     assert int((faulty.decentre_mm != 0).sum()) == 1
@@ -105,7 +108,7 @@ def test_analytic_sensitivities_agree_with_differences(triplet):
     exact = sensitivities(triplet, ALL, figures, by_autograd)
     close = sensitivities(triplet, ALL, figures)
     # central differences of a tenth of a deviation: changes bend by 1e-4 of themselves per deviation, squared
-    assert bool(((exact - close).abs().amax(1) <= 1e-6 * exact.abs().amax(1)).all())
+    assert ((exact - close).abs().amax(1) <= 1e-6 * exact.abs().amax(1)).all()
     assert len(LINEAR_FIGURES) == exact.shape[0]
 
 
@@ -117,7 +120,7 @@ def test_a_decentred_thin_element_shifts_the_image_by_the_prism_it_makes():
     shifts = sensitivities(geo, t, linear_figures(0.05))[3:]
     pair = [e.name.endswith("in x") for e in errors_of(geo, t)]
     # aberration of an f/50 lens: (y / R)^2 = 1e-4 and its kin
-    assert float(shifts[0, pair].sum()) == pytest.approx(0.01, rel=2e-3)
+    close(shifts[0, pair].sum(), 0.01, 2e-3)
     assert float(shifts[1, pair].abs().max()) <= 1e-12
 
 
@@ -128,12 +131,12 @@ def test_linear_forecast_and_trials_agree(triplet):
     found = compare(slopes, trials)
     assert trials.failed == 0
     # 400 trials know a standard deviation to 1 / sqrt(800) = 3.5 %: four such errors
-    torch.testing.assert_close(found.forecast / found.simulated, torch.ones(5, dtype=D), rtol=0, atol=0.14)
+    close(found.forecast / found.simulated, torch.ones(5, dtype=D), atol=0.14)
     # errors of a thousandth bend their effect by about as much
     assert float(found.correlation.min()) >= 0.9999
     assert float(found.bias.abs().max()) <= 4 / 400**0.5
     median = trials.figures.quantile(0.5, dim=0)
-    torch.testing.assert_close(trials.quantiles((0.5,))[0], median, rtol=1e-12, atol=0)
+    close(trials.quantiles((0.5,))[0], median, 1e-12)
 
 
 def test_a_refocus_takes_the_shift_of_the_image_plane_out(triplet):
@@ -145,7 +148,7 @@ def test_a_refocus_takes_the_shift_of_the_image_plane_out(triplet):
         figures = sensitivities(triplet, t, linear_figures(FIELD), compensate=compensate)[:2]
         errors = sensitivities(triplet, t, spot_errors((0.0,)), compensate=compensate)
         size[compensate] = figures, errors.square().sum().item()
-    torch.testing.assert_close(size[None][0], size[focus_paraxial][0], rtol=1e-9, atol=1e-12)
+    close(size[None][0], size[focus_paraxial][0], 1e-9, atol=1e-12)
     # defocus is most of what radii do to an axial spot
     assert size[focus_paraxial][1] < 0.05 * size[None][1]
 
@@ -164,7 +167,7 @@ def test_the_quadratic_forecast_of_the_spot_agrees_with_trials(triplet, refocus)
     trials = monte_carlo(triplet, ALL, spots, 200, generator, compensate=compensate)
     predicted = forecast.at(trials.amounts)
     # lens by lens: what is left out is the bend of the rays, some 1 % of the spot here
-    torch.testing.assert_close(predicted.mean(0), trials.figures.mean(0), rtol=0.02, atol=0)
+    close(predicted.mean(0), trials.figures.mean(0), 0.02)
     for pair in zip(predicted.T, trials.figures.T, strict=True):
         assert float(torch.corrcoef(torch.stack(pair))[0, 1]) >= 0.999
     # the slope alone forecasts much less than what happens to the axial spot, and says nothing of the mean
@@ -182,22 +185,16 @@ def test_mean_and_deviation_of_the_quadratic_form_against_draws(triplet):
     )
     # 1e5 draws know the mean to 0.3 % of a deviation, and the deviation of a heavy-tailed square to about 1 %
     added, deviation = forecast.moments()
-    torch.testing.assert_close(drawn.mean(0), forecast.nominal + added, rtol=0.015, atol=0)
-    torch.testing.assert_close(drawn.std(0), deviation, rtol=0.04, atol=0)
-    torch.testing.assert_close((drawn - forecast.nominal).mean(0), forecast.added.sum(1), rtol=0.03, atol=0)
-
-
-def test_the_nominal_spot_is_the_traced_one(triplet):
-    figure = spot_errors(FIELDS, grid=32)
-    truth = lens.rms_spot_mm(triplet, FIELDS, grid=32).square()
-    torch.testing.assert_close(squared_spots(figure(triplet), 3), truth, rtol=1e-12, atol=0)
+    close(drawn.mean(0), forecast.nominal + added, 0.015)
+    close(drawn.std(0), deviation, 0.04)
+    close((drawn - forecast.nominal).mean(0), forecast.added.sum(1), 0.03)
 
 
 def test_worst_offenders_share_the_whole_variance(triplet):
     slopes = sensitivities(triplet, ALL, linear_figures(FIELD))
     every = worst_offenders(triplet, ALL, slopes, 0, most=100)
     sizes = [abs(change) for _, change, _ in every]
-    assert sum(share for *_, share in every) == pytest.approx(1.0, rel=1e-12)
+    close(sum(share for *_, share in every), 1.0, 1e-12)
     assert sizes == sorted(sizes, reverse=True)
     # a lens of strong surfaces: the steepest radii lead, and decentres do not change the focal length at
     # first order
@@ -223,7 +220,7 @@ def test_trials_repeat_and_failures_are_counted(triplet):
     trials = monte_carlo(triplet, ALL, sometimes, 5, torch.Generator().manual_seed(0))
     assert trials.failed == 1
     assert trials.figures.isnan().any(1).tolist() == [False, True, False, False, False]
-    assert bool(trials.quantiles().isfinite().all())
+    assert trials.quantiles().isfinite().all()
 
 
 def test_tolerances_of_elements_move_them_as_bodies():
@@ -238,11 +235,11 @@ def test_tolerances_of_elements_move_them_as_bodies():
         "wedge of element 7-9 about x": 3.0,
     }
     assert drawn.keys() < {e.name for e in errors}
-    found = perturbed(geo, errors, torch.tensor([drawn.get(e.name, 0.0) for e in errors], dtype=D))
+    found = perturbed(geo, errors, f64([drawn.get(e.name, 0.0) for e in errors]))
     wanted = moved_element(geo, (2, 4), [0.02, 0.0], [0.0, -math.radians(0.02)])
     wanted = moved_element(wanted, (6, 8), wedge_rad=[3 * math.radians(0.03), 0.0])
     for tensor in ("decentre_mm", "tilt_rad", "thickness_mm"):
-        torch.testing.assert_close(getattr(found, tensor), getattr(wanted, tensor), rtol=1e-12, atol=1e-16)
+        close(getattr(found, tensor), getattr(wanted, tensor), 1e-12, atol=1e-16)
 
 
 @pytest.mark.parametrize(
@@ -264,3 +261,127 @@ def test_stops_and_planes_have_less_to_get_wrong(t, first, bent):
     found = errors_of(geo, t)
     assert {e.name.split()[0] for e in found} == {first}
     assert {e.at[0] for e in found} == set(bent)
+
+
+TWO_FIELDS = (0.0, 0.3)
+SHARE = 0.9
+Z = NormalDist().inv_cdf(SHARE)
+MOUNTED = Tolerances(radius_relative=1e-3, thickness_mm=0.02, element_decentre_mm=0.01, element_tilt_deg=0.02)
+
+
+def named(count):
+    return [Error(f"curvature of surface {i + 1}", "curvature_per_mm", (i,), 0.5) for i in range(count)]
+
+
+def plain(slopes):
+    return Forecast(3.0, slopes, torch.zeros(len(slopes), len(slopes), dtype=D))
+
+
+@pytest.fixture
+def slopes(generator):
+    return torch.rand(6, dtype=D, generator=generator) + 0.1
+
+
+def test_cheapest_tolerances_of_a_linear_figure(slopes):
+    """Lagrange: s^(-2/3), scaled so that the root sum of squares is budget / z."""
+    found = cheapest(plain(slopes), named(6), 0.2, SHARE)
+    shape = slopes ** (-2 / 3)
+    wanted = shape * (0.2 / Z) / torch.linalg.vector_norm(shape * slopes)
+    close(found.factors, wanted, 1e-6)
+    close(found.cost, (1 / wanted).sum(), 1e-6)
+    # the same budget in equal parts, budget / z / sqrt(P) of a standard deviation each, costs more
+    assert found.cost < float((slopes * Z * math.sqrt(6) / 0.2).sum())
+    close(found.shares.sum(), 1.0, 1e-12)
+    close([e.deviation for e in found.errors], 0.5 * found.factors, 1e-12)
+
+
+def test_the_share_of_one_square_is_that_of_chi_squared():
+    """F = x^2: P(x^2 <= y) = erf(sqrt(y / 2)); a single square has the slowest characteristic function of
+    all."""
+    forecast = Forecast(0.0, torch.zeros(1, dtype=D), torch.ones(1, 1, dtype=D))
+    for y in (0.5, 1.0, 2.7, 6.0):
+        truth = math.erf(math.sqrt(y / 2))
+        # the sum leaves off after 2048 terms that fall as k^-1.5: some 1e-4
+        close(share_within(forecast, y, torch.ones(1, dtype=D)), truth, atol=3e-4)
+
+
+def test_the_share_of_several_squares_and_of_a_slope():
+    """Ten squares: chi squared of ten degrees, 1 - exp(-y/2) sum (y/2)^k / k! over k < 5; a slope: the
+    normal."""
+    ten = Forecast(0.0, torch.zeros(10, dtype=D), torch.eye(10, dtype=D))
+    for y in (5.0, 12.0, 25.0):
+        truth = 1 - math.exp(-y / 2) * sum((y / 2) ** k / math.factorial(k) for k in range(5))
+        close(share_within(ten, y, torch.ones(10, dtype=D)), truth, atol=1e-9)
+    one = plain(f64([2.0]))
+    close(share_within(one, 3.0, f64([0.5])), NormalDist().cdf(3.0), atol=1e-9)
+    assert share_within(one, 1e9, torch.ones(1, dtype=D)) == 1.0
+
+
+@pytest.fixture(scope="module")
+def spot():
+    """Forecast of the refocused triplet's squared spot under mounted elements, with its errors and figure."""
+    geo = lens.load("cooke-triplet").freeze()
+    compensate = partial(focus_rays, fields_rad=TWO_FIELDS, grid=6)
+    figure = spot_errors(TWO_FIELDS, grid=6)
+    slopes = sensitivities(geo, MOUNTED, figure, compensate=compensate)
+    forecast = forecast_spot(compensated(figure, compensate)(geo), slopes, len(TWO_FIELDS)).averaged()
+    return geo, errors_of(geo, MOUNTED), forecast, figure, compensate
+
+
+def test_ninety_percent_of_drawn_errors_keep_the_budget(spot, generator):
+    _, errors, forecast, _, _ = spot
+    budget = 0.21 * forecast.nominal
+    found = cheapest(forecast, errors, budget, SHARE)
+    draws = torch.randn(200_000, len(errors), generator=generator, dtype=D) * found.factors
+    inside = (forecast.at(draws) - forecast.nominal <= budget).double().mean()
+    # 2e5 draws know the share to 0.0007, four of which; x and y of a tolerance have one factor
+    close(inside, SHARE, atol=0.003)
+    ties = {e.drawn: f for e, f in zip(errors, found.factors.tolist(), strict=True)}
+    assert [ties[e.drawn] for e in errors] == found.factors.tolist()
+
+
+def test_the_cheapest_is_a_minimum(spot, generator):
+    """Any other factors that keep the budget cost more."""
+    _, errors, forecast, _, _ = spot
+    budget = 0.21 * forecast.nominal
+    names = list(dict.fromkeys(e.drawn for e in errors))
+    member = torch.tensor([names.index(e.drawn) for e in errors])
+    found = cheapest(forecast, errors, budget, SHARE)
+    best = torch.zeros(len(names), dtype=D).index_copy(0, member, found.factors)
+    for _ in range(5):
+        other = best * (0.2 * torch.randn(len(names), generator=generator, dtype=D)).exp()
+        low, high = 0.1, 10.0
+        for _ in range(30):
+            middle = math.sqrt(low * high)
+            inside = share_within(forecast, budget, (other * middle)[member]) >= SHARE
+            low, high = (middle, high) if inside else (low, middle)
+        # at the minimum a change of 20 % costs its square; the normal approximation of the shape costs far
+        # less
+        assert float((1 / (other * low)).sum()) > found.cost * (1 + 1e-3)
+
+
+def test_ninety_percent_of_lenses_keep_the_budget(spot):
+    geo, errors, forecast, figure, compensate = spot
+    found = cheapest(forecast, errors, 0.21 * forecast.nominal, SHARE)
+    trials = monte_carlo(
+        geo,
+        found.errors,
+        lambda faulty: squared_spots(figure(faulty), len(TWO_FIELDS)).mean().reshape(1),
+        200,
+        torch.Generator().manual_seed(0),
+        compensate=compensate,
+    )
+    inside = (trials.figures[:, 0] <= 1.21 * trials.nominal[0]).double().mean()
+    close(inside, SHARE, atol=4 * math.sqrt(0.09 / 200))
+
+
+def test_a_tolerance_that_does_not_matter_stays_at_the_largest_factor(slopes):
+    slopes[2] = 0.0
+    found = cheapest(plain(slopes), named(6), 0.2, most=4.0)
+    assert float(found.factors[2]) == float(found.factors.max()) == 4.0
+
+
+def test_a_forecast_in_float32_is_that_in_float64(slopes):
+    forecast = Forecast(3.0, slopes.float(), torch.zeros(6, 6))
+    wanted = cheapest(plain(slopes.float().double()), named(6), 0.2)
+    close(cheapest(forecast, named(6), 0.2).factors, wanted.factors, 1e-12)

@@ -7,12 +7,11 @@ import math
 import pytest
 import torch
 
-from codesign import lens, pose, render
+from codesign import lens, render
 from codesign.lens import GeoLens, Glass, Pinhole, Surface, ThinLens
 from codesign.lens.analysis import field_rays, pupil_grid
 from codesign.lens.variables import ray_motion
-from scenes import worlds
-from tests.lens.systems import PLANE, Asked, check_gradient, figure_of
+from tests.lens.systems import PLANE, check_gradient, close, f64, figure_of
 
 D = torch.float64
 GLASS = Glass.from_indices(1.51, 1.5, 1.49, "g")
@@ -49,7 +48,7 @@ def test_a_unit_of_every_variable_moves_the_rays_by_the_natural_step(
                 variable[i] = sign
                 moved = geo.trace(*rays, wavelength_um).position_mm - base
                 variable[i] = 0.0
-                assert float(moved.square().sum(1).mean().sqrt()) == pytest.approx(step_mm, rel=0.1)
+                close(moved.square().sum(1).mean().sqrt(), step_mm, 0.1)
 
 
 def test_weak_numbers_are_held_to_their_reach_and_dead_ones_left_out():
@@ -71,7 +70,7 @@ def test_a_unit_never_goes_beyond_the_reach():
     (conic,) = geo.variables("conic")
     conic.fill_(1.0)
     # the second surface, radius 435.76 mm, hardly notices: (c a)^2 changes by 0.1 and no more
-    assert float(geo.conic[1]) == pytest.approx(0.1 * (435.76044 / 9.5) ** 2, rel=1e-12)
+    close(geo.conic[1], 0.1 * (435.76044 / 9.5) ** 2, 1e-12)
     assert float(geo.conic[2].abs()) < 0.09 * (22.21328 / 5.0) ** 2
 
 
@@ -98,45 +97,18 @@ def test_gradients_of_rays_against_differences(generator):
     check_gradient(figure_of(geo, loss, variables), *drawn, step=1e-3)
 
 
-def test_gradients_of_frames_reach_the_variables():
-    geo = lens.load("cooke-triplet").scaled(0.22)
-    wall = worlds.smooth_plane(0, pose.look_at((0, 0, 0), (0, -1, 0)))
-    camera = render.Camera(geo, 12, 8, 0.2, 4)
-    view = pose.look_at((0.1, -2, 0.05), (0, 0, 0))[None]
-    variables = geo.variables("curvature", "focus", step_mm=0.02)
-    weight = torch.linspace(-1, 1, 96, dtype=D).reshape(1, 8, 12)
-    loss = figure_of(geo, lambda _: (weight * render.frames(camera, wall, view)).sum(), variables)
-    check_gradient(loss, *variables, step=1e-3, rel=1e-5)
-
-
-def test_a_step_takes_effect_and_lowers_the_spot():
-    geo = lens.load("cooke-triplet")
-    with torch.no_grad():
-        geo.thickness_mm[-1] += 1.0
-    fields = (0.0, 0.245, 0.349)
-    optimiser = torch.optim.Adam(geo.variables("curvature", "focus", step_mm=0.02, keep_efl=True), lr=0.5)
-    first = lens.rms_spot_mm(geo, fields).mean().item()
-    for _ in range(60):
-        optimiser.zero_grad()
-        lens.rms_spot_mm(geo, fields).mean().backward()
-        optimiser.step()
-    published = lens.rms_spot_mm(lens.load("cooke-triplet"), fields).mean().item()
-    assert first > 5 * published
-    assert lens.rms_spot_mm(geo, fields).mean().item() < 1.2 * published
-
-
 def test_values_never_leave_their_bounds():
     geo = lens.load("cooke-triplet")
     start = geo.thickness_mm.detach().clone()
-    low = torch.tensor([1.0, 0.5, 0.9, 0.5, 1.0], dtype=D)
+    low = f64([1.0, 0.5, 0.9, 0.5, 1.0])
     variables = geo.variables("thickness", "focus", bounds={"thickness": (low, 9.0), "focus": (40.0, None)})
-    torch.testing.assert_close(geo.thickness_mm.detach(), start, rtol=1e-14, atol=0)
+    close(geo.thickness_mm, start, 1e-14)
     for value in (-1e4, -30.0, 30.0, 1e4):
         fill(variables, value)
         now = geo.thickness_mm.detach()
-        assert bool(((now[:-1] >= low) & (now[:-1] <= 9.0)).all())
+        assert ((now[:-1] >= low) & (now[:-1] <= 9.0)).all()
         assert float(now[-1]) >= 40.0
-    torch.testing.assert_close(now[:-1], torch.full_like(low, 9.0), rtol=1e-12, atol=0)
+    close(now[:-1], torch.full_like(low, 9.0), 1e-12)
     free = lens.load("cooke-triplet")
     fill(free.variables("thickness"), -1e4)
     # light never travels backwards
@@ -145,18 +117,18 @@ def test_values_never_leave_their_bounds():
 
 def test_solves_hold_while_variables_move(generator):
     geo = lens.load("double-gauss")
-    efl = geo.first_order().efl_mm.item()
+    efl = geo.first_order().efl_mm
     variables = geo.variables("curvature", "thickness", keep_efl=True, focus_at_m=3.0)
     # all but the solved and the stop; all gaps
     assert [v.numel() for v in variables] == [9, 10]
     for v in variables:
         fill([v], 3 * torch.randn(v.shape, generator=generator, dtype=D))
-    assert geo.first_order().efl_mm.item() == pytest.approx(efl, rel=1e-12)
+    close(geo.first_order().efl_mm, efl, 1e-12)
     moved = geo.thickness_mm.detach()
-    assert bool((moved != lens.load("double-gauss").thickness_mm.detach()).all())
+    assert (moved != lens.load("double-gauss").thickness_mm.detach()).all()
     elsewhere = torch.cat([moved[:-1], moved[-1:] + 1])
     again = geo.replace(thickness_mm=elsewhere).focus_at(3.0).thickness_mm.detach()
-    torch.testing.assert_close(moved[-1], again[-1], rtol=1e-13, atol=0)
+    close(moved[-1], again[-1], 1e-13)
 
 
 def test_masks_choose_entries():
@@ -189,13 +161,13 @@ def test_variables_are_saved_and_restored(tmp_path):
     lens.save(geo, tmp_path / "lens.json")
     for found in (other, twin, lens.load(tmp_path / "lens.json")):
         for name in ("curvature_per_mm", "thickness_mm"):
-            torch.testing.assert_close(getattr(found, name), getattr(geo, name), rtol=1e-15, atol=0)
+            close(getattr(found, name), getattr(geo, name), 1e-15)
     with torch.no_grad():
         variables[2].zero_()
     assert float(twin.thickness_mm[-1].detach()) != float(geo.thickness_mm[-1].detach())
     again = geo.variables("focus")[0]
     assert again.tolist() == [0.0]
-    torch.testing.assert_close(geo.curvature_per_mm, twin.curvature_per_mm.detach(), rtol=1e-12, atol=0)
+    close(geo.curvature_per_mm, twin.curvature_per_mm, 1e-12)
 
 
 def test_a_twin_keeps_the_values_it_was_made_with():
@@ -206,7 +178,7 @@ def test_a_twin_keeps_the_values_it_was_made_with():
     with torch.no_grad():
         focus += 1.0
     moved = geo.thickness_mm[-1] - twin.thickness_mm[-1]
-    assert float(moved.detach()) == pytest.approx(float(slope), rel=1e-2)  # bent by its bound at 0
+    close(moved, float(slope), 1e-2)  # bent by its bound at 0
 
 
 @pytest.mark.parametrize("bounds", [None, (45.0, 60.0), (45.0, None), (None, 60.0)])
@@ -215,9 +187,9 @@ def test_thin_lenses_have_natural_steps_too(bounds):
     given = {} if bounds is None else {"efl": bounds, "focus": bounds}
     variables = thin.variables("efl", "focus", step_mm=0.02, bounds=given)
     lengths = (thin.efl_mm, thin.image_distance_mm)
-    assert lengths[0].item() == pytest.approx(50.0, rel=1e-14)
+    close(lengths[0], 50.0, 1e-14)
     q = 5 * pupil_grid(12)
-    slope = torch.tensor([[0.0, math.tan(f)] for f in (0.0, 0.25, 0.35)], dtype=D)[:, None]
+    slope = f64([[0.0, math.tan(f)] for f in (0.0, 0.25, 0.35)])[:, None]
 
     def landing():
         return ((slope + q / thin.efl_mm) * thin.image_distance_mm - q).detach()
@@ -227,15 +199,10 @@ def test_thin_lenses_have_natural_steps_too(bounds):
         fill([v], 1.0)
         moved = float((landing() - base).square().sum(-1).mean().sqrt())
         fill([v], 0.0)
-        assert moved == pytest.approx(0.02, rel=0.1)
-    rays = torch.tensor([[0.3, -0.2]], dtype=D), torch.tensor([[0.5, 0.1]], dtype=D)
-    leaves = [t.detach().requires_grad_() for t in lengths]
-    made = ThinLens(leaves[0], 10.0, leaves[1])
-    outer = torch.autograd.grad(made.camera_rays(*rays).direction[0, 0], leaves)
-    inner = [torch.autograd.grad(t, v)[0] for t, v in zip(lengths, variables, strict=True)]
-    found = torch.autograd.grad(thin.camera_rays(*rays).direction[0, 0], variables)
-    chain = [float(a * b) for a, b in zip(outer, inner, strict=True)]
-    assert [float(s) for s in found] == pytest.approx(chain, rel=1e-12)
+        close(moved, 0.02, 0.1)
+    rays = f64([[0.3, -0.2]]), f64([[0.5, 0.1]])
+    figure = figure_of(thin, lambda thin: thin.camera_rays(*rays).direction[0, 0], variables)
+    check_gradient(figure, *(torch.full_like(v, 0.3) for v in variables), step=1e-3)
 
 
 def test_a_pinhole_has_one_variable():
@@ -243,22 +210,7 @@ def test_a_pinhole_has_one_variable():
     fill(pinhole.variables("efl", step_mm=0.01), 1.0)
     assert pinhole.image_distance_mm.item() == pinhole.efl_mm.item()
     rms = math.sqrt(sum(math.tan(f) ** 2 for f in (0.0, 0.25, 0.35)) / 3)
-    assert pinhole.efl_mm.item() - 5.0 == pytest.approx(0.01 / rms, rel=1e-3)
-
-
-def test_variables_are_replaced_by_a_functional_call():
-    # what a certificate of a Module does: plain tensors stand where Parameters were
-    geo = lens.load("cooke-triplet")
-    geo.variables("curvature", "focus")
-    name = next(n for n, _ in geo.named_parameters() if n.endswith("focus"))
-    step = torch.tensor([3.0], dtype=D, requires_grad=True)
-    before = geo.thickness_mm[-1].item()
-    asked = Asked(geo, lambda g: g.thickness_mm[-1])
-    moved = torch.func.functional_call(asked, {f"geo.{name}": step}, ())
-    (slope,) = torch.autograd.grad(moved, step)
-    # a bound far away bends it a little
-    assert moved.item() - before == pytest.approx(3 * float(slope), rel=0.05)
-    assert geo.thickness_mm[-1].item() == before
+    close(pinhole.efl_mm.item() - 5.0, 0.01 / rms, 1e-3)
 
 
 def fill(variables, value):
