@@ -58,7 +58,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name == "System":
         return importlib.import_module("codesign.system").System
-    if name in __all__:
+    if name in __all__ or name in ("place", "task"):  # the latter are former names of mount
         return importlib.import_module(f"codesign.{name}")
     if name == "__version__":
         try:

@@ -17,6 +17,7 @@ FLOORS = (
     {"lens", "render", "events"},  # none imports another: what one needs is passed in
     {"flow"},
     {"mount"},
+    {"place", "task"},
     {"system"},
     {"report"},
     {"optimise"},

@@ -1,5 +1,6 @@
 """`import codesign`: quick, without LLVM, with everything behind it."""
 
+import importlib
 import subprocess
 import sys
 from importlib.metadata import version
@@ -8,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import codesign
+from codesign import mount
 
 ROOT = Path(__file__).resolve().parents[1]
 PRIVATE = {
@@ -20,8 +22,10 @@ PRIVATE = {
     "doors",
     "interrupt",
     "optional",
+    "place",
     "plain_yaml",
     "reading",
+    "task",
 }  # for the toolkit itself
 
 
@@ -64,3 +68,11 @@ def test_a_name_that_is_not_there_is_an_attribute_error():
 
 def test_annotations_are_announced():
     assert (ROOT / "codesign" / "py.typed").read_text() == ""
+
+
+@pytest.mark.parametrize(("room", "name"), [("place", "Mount"), ("task", "EgoVelocity")])
+def test_the_former_rooms_of_mounts_still_import_and_say_the_new_one(room, name):
+    sys.modules.pop(f"codesign.{room}", None)
+    with pytest.warns(FutureWarning, match=f"codesign.{room} is codesign.mount now"):
+        found = importlib.import_module(f"codesign.{room}")
+    assert getattr(found, name) is getattr(mount, name)
