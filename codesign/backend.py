@@ -289,9 +289,8 @@ class _Kernel(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         with dr.suspend_grad():
             outputs = [dr.detach(o) for o in kernel(ctx.arrays, *[load(ctx.arrays.Float, x) for x in inputs])]
-            owned = [
-                o.state != dr.VarState.Evaluated for o in outputs
-            ]  # memory that was there before may belong to something the kernel captured
+            # memory that was there before may belong to something the kernel captured
+            owned = [o.state != dr.VarState.Evaluated for o in outputs]
             dr.eval(outputs)
         dr.sync_thread()
         seen = list(inputs)

@@ -99,7 +99,9 @@ def check_number(
 ) -> float:
     """A finite number as a float, also of a tensor of one element. Raises: DomainError for anything else.
 
-    Args: least, most: smallest and largest that is allowed. above, below: the same, themselves not allowed.
+    Args:
+      least, most: smallest and largest that is allowed.
+      above, below: the same, themselves not allowed.
     """
     number = _number(value)
     if not (math.isfinite(number) and least <= number <= most and above < number < below):

@@ -26,9 +26,8 @@ def written_out() -> Iterator[None]:
     except BrokenPipeError:
         if not _reader_gone(sys.stdout.fileno()):
             raise
-        os.dup2(
-            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
-        )  # for the last flush of the interpreter
+        # for the last flush of the interpreter
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(128 + 13) from None
 
 
@@ -68,9 +67,8 @@ class Interruption:
         self._earlier = {}
 
     def _handle(self, signum, frame):
-        if (
-            signum == signal.SIGTERM and os.getpid() != self._process
-        ):  # a worker that was forked: its pool ends it
+        # a worker that was forked: its pool ends it
+        if signum == signal.SIGTERM and os.getpid() != self._process:
             signal.signal(signum, signal.SIG_DFL)
             os.kill(os.getpid(), signum)
             return

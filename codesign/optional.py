@@ -7,10 +7,11 @@ from typing import Any
 
 from codesign.errors import MissingPackageError
 
+# where the name to install is not that of the module
 DISTRIBUTIONS = {
     "PIL": "pillow",
     "collada": "pycollada",
-}  # where the name to install is not that of the module
+}
 
 
 def require(module: str, extra: str, purpose: str) -> ModuleType:

@@ -61,7 +61,8 @@ for _kind, _pattern in SCALARS.items():
 def dump(page: Mapping[str, Any], comment: str = "") -> str:
     """Text of nested mappings of numbers, text, booleans, None, and lists of these.
 
-    Args: comment: lines for the top of the file.
+    Args:
+      comment: lines for the top of the file.
     Raises: DomainError for keys that are no text, values that are not finite, or of other kinds.
 
     >>> print(dump({"pose": {"z": 0.25, "tiny": 1e-7, "frame": "base_link"}, "box": [0.1, 2]}), end="")

@@ -20,8 +20,9 @@ Poses: TypeAlias = Tensor | np.ndarray | Sequence[Any]
 def se3_exp(twist: Tensor) -> Tensor:
     """Rigid transform of a twist.
 
-    Args: twist [..., 6]: translation part (m) then rotation vector (rad), in the frame on the right of the
-      product.
+    Args:
+      twist [..., 6]: translation part (m) then rotation vector (rad), in the frame on the right of the
+        product.
     Returns: [..., 4, 4]. Gradient: exact, also at zero. Source: kornia.geometry.liegroup.Se3.
 
     >>> se3_exp(torch.tensor([1.0, 2.0, 3.0, 0.0, 0.0, 0.0]))[:3, 3].tolist()
@@ -32,9 +33,8 @@ def se3_exp(twist: Tensor) -> Tensor:
             f"a twist has 6 components (3 of translation, 3 of rotation), got {tuple(twist.shape)}."
         )
     transform = Se3.exp(twist.reshape(-1, 6)).matrix().reshape(*twist.shape[:-1], 4, 4)
-    return (
-        transform if twist.requires_grad else transform.detach()
-    )  # kornia wraps constants in parameters that would ask for gradients
+    # kornia wraps constants in parameters that would ask for gradients
+    return transform if twist.requires_grad else transform.detach()
 
 
 def inverse(transform: Tensor) -> Tensor:
@@ -65,7 +65,8 @@ def look_at(
     """T_world_cam of a camera (x right, y down, z forward) at ``origin_m`` facing ``target_m``; ``down`` is
     the image's down direction in the world.
 
-    Args: sequences of three numbers. Returns: [4, 4] float64, without gradient.
+    Args: sequences of three numbers.
+    Returns: [4, 4] float64, without gradient.
     Raises: DomainError when the two points are one, the view is along ``down``, or a number is not finite.
 
     >>> look_at((0.0, 0.0, 1.0), (2.0, 0.0, 1.0))[:3, 2].tolist()  # the camera's z axis, in the world

@@ -29,7 +29,10 @@ def reading(
 ) -> Iterator[None]:
     """Turn whatever a library raises for bytes it did not expect into one sentence.
 
-    Args: what: file, or part of one, that the sentence begins with. remedy: what it ends with. kind: of the error.
+    Args:
+      what: file, or part of one, that the sentence begins with.
+      remedy: what it ends with.
+      kind: of the error.
     Raises: FileFormatError, or ``kind``; errors of ours pass unchanged, and so does Ctrl-C.
     """
     try:
@@ -57,7 +60,8 @@ def building(what: str | Path, remedy: str = "it is damaged, or of another versi
 def open_regular(path: str | Path, most_bytes: int | None = None) -> BinaryIO:
     """Open a regular file for reading bytes.
 
-    Args: most_bytes: refuse a longer one.
+    Args:
+      most_bytes: refuse a longer one.
     Raises: FileFormatError where there is none, where it may not be read, where it is a folder, a pipe (which is not
       waited for) or a device, or where it is too long.
     """

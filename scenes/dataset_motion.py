@@ -104,7 +104,9 @@ STAGES = {
 def make_world(name: str, light: str = "emissive") -> tuple[MitsubaScene, Stage]:
     """Scene and Stage of a world.
 
-    Args: name: one of scenes.worlds.WORLDS. light: one of scenes.build.LEVELS.
+    Args:
+      name: one of scenes.worlds.WORLDS.
+      light: one of scenes.build.LEVELS.
     Raises: DomainError when there is no such world, or none with lamps.
     """
     if name not in worlds.WORLDS:

@@ -170,7 +170,9 @@ def view_of(
 ) -> FileView:
     """The sensor of a Mitsuba scene as a pose and a field of view to start from.
 
-    Args: source, unit_m, up, parameters: as for ``from_mitsuba``. number: which of its sensors.
+    Args:
+      source, unit_m, up, parameters: as for ``from_mitsuba``.
+      number: which of its sensors.
     Returns: FileView. Near and far clipping, an aperture, the film's window and filter are left out.
     Raises: as ``from_mitsuba``; DomainError when there is no such sensor, or it is not a perspective one, mirrors,
       or has its principal point off the film's middle.

@@ -14,7 +14,9 @@ DATA = (".mtl", ".bin", "")  # what is no picture
 class Folder:
     """What trimesh asks for the files that a mesh names.
 
-    Args: mesh: path of the mesh file. root: the folder that named files must lie in; None is that of the mesh.
+    Args:
+      mesh: path of the mesh file.
+      root: the folder that named files must lie in; None is that of the mesh.
     ``check`` raises for whatever was asked for and could not be given, since trimesh goes on without it.
     """
 

@@ -224,8 +224,10 @@ def picture(source, blur_texels=2.0, encoding=None):
     """What a world's surface is given: an array [H, W], a path, one of PHOTOS, or "speckle-3" (seed 3); files
     and photographs softened by ``blur_texels``.
 
-    Args: encoding: of an array: None or "linear" takes it as radiance 0..255, "srgb" as pixels [H, W] or [H, W, 3], whole
-      numbers or 0..1, coded as those of a PNG. Whole numbers of 8 or 16 bits are refused without it.
+    Args:
+      encoding: of an array: None or "linear" takes it as radiance 0..255, "srgb" as pixels [H, W] or [H, W,
+        3], whole numbers or 0..1, coded as those of a PNG. Whole numbers of 8 or 16 bits are refused without
+        it.
     """
     if encoding not in (None, "linear", "srgb"):
         raise DomainError(f"encoding = {encoding!r} is not known; give 'linear' or 'srgb'.")

@@ -36,8 +36,9 @@ print("ended well")"""
 def check(mi: Any, state: Any, file: Path | None = None, parameters: Iterable[tuple[str, Any]] = ()) -> None:
     """Refuse a parsed scene (mi.parser.ParserState) that Mitsuba would not survive.
 
-    Args: file, parameters: where it was parsed from, if from a file; that is loaded as a whole, and what a dictionary
-      names one by one.
+    Args:
+      file, parameters: where it was parsed from, if from a file; that is loaded as a whole, and what a
+        dictionary names one by one.
     Raises: FileFormatError for a bitmap without a file, for a damaged .hdr, .exr or mesh that is named, and whatever
       else ends Mitsuba, or takes it more than LONGEST_S.
     """

@@ -35,7 +35,9 @@ HEADER = "# timestamp tx ty tz qx qy qz qw"
 def write_tum(path, t_s, poses):
     """Write poses as text with all digits; the file appears whole or not at all.
 
-    Args: t_s: [n] increasing seconds. poses: [n, 4, 4] rigid, for example T_world_cam.
+    Args:
+      t_s: [n] increasing seconds.
+      poses: [n, 4, 4] rigid, for example T_world_cam.
     Raises: ShapeError, DomainError for anything else; FileFormatError when the folder is not writable.
     """
     t_s, poses = _checked(t_s, poses)
@@ -106,7 +108,9 @@ class Recorded(Trajectory):
 
     Continuous, with a velocity that jumps at the recorded times; there the segment behind counts.
 
-    Args: t_s: [n >= 2] increasing seconds. poses: [n, 4, 4] rigid.
+    Args:
+      t_s: [n >= 2] increasing seconds.
+      poses: [n, 4, 4] rigid.
     Raises: ShapeError; DomainError, also when the body turns by more than 3 rad between two poses, where the
       way is not clear.
     """

@@ -14,8 +14,9 @@ def hint(
     """A sentence when a box of these two corners, sequences of three numbers in metres, is too large or too small
     for a room or a robot, also given as a UserWarning; None when it is not.
 
-    Args: what: name of what the box holds, with its file. unit_m: metres per unit of the file that the corners
-      were reckoned with.
+    Args:
+      what: name of what the box holds, with its file.
+      unit_m: metres per unit of the file that the corners were reckoned with.
 
     >>> hint((0, 0, 0), (4, 5, 2.6)) is None
     True

@@ -171,8 +171,9 @@ def outdoor(
 ):
     """Open ground with crates, balls and posts under a sky; a clear lane along x = 0 to drive or fly in.
 
-    Args: clutter: how many things. environment: path of an equirectangular .hdr or .exr map; None is a
-      procedural sky with a sun.
+    Args:
+      clutter: how many things.
+      environment: path of an equirectangular .hdr or .exr map; None is a procedural sky with a sun.
       meshes: robot bodies as (path, x, y, turn_deg) or (path, x, y, turn_deg, scale), each resting on the
         ground. Where it is lit, the sky lights it, with a sun of its own when the sky is procedural. The sky
         lies at infinity: no point of it has a depth.

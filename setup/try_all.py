@@ -26,9 +26,8 @@ MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
 TARGETS = re.findall(r"^([a-z][a-z-]*):", MAKEFILE, re.M)
 LISTED = re.search(r"^STUDIES := ((?:.*\\\n)*.*)", MAKEFILE, re.M)
 STUDIES = LISTED[1].replace("\\\n", " ").split() if LISTED else []
-NAMES = dict(
-    re.findall(r"^([a-z-]+): STUDY := (\w+)", MAKEFILE, re.M)
-)  # of modules that differ from the target's
+# of modules that differ from the target's
+NAMES = dict(re.findall(r"^([a-z-]+): STUDY := (\w+)", MAKEFILE, re.M))
 MODULES = {NAMES.get(target, target.replace("-", "_")): target for target in STUDIES}
 COMMAND = re.compile(r"(?:\.venv/bin/)?python -m studies\.[a-z].*|make [a-z].*|codesign [a-z].*")
 INSTEAD = {"NAME_OR_FILE": "cooke-triplet", "--lens NAME": "--lens cooke-triplet"}

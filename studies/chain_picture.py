@@ -50,9 +50,8 @@ def study(run: Run[Config]):
         scene=worlds.room(),
     )
     t_s = torch.linspace(0, DURATION_S, 33, dtype=torch.float64)
-    twist = torch.tensor(
-        [0.5, -0.1, 1.0, 0.0, 0.1, 0.25], dtype=torch.float64
-    )  # m/s and rad/s in camera axes
+    # m/s and rad/s in camera axes
+    twist = torch.tensor([0.5, -0.1, 1.0, 0.0, 0.1, 0.25], dtype=torch.float64)
     batch = Batch(trajectories.body_twist(pose.look_at((0.1, -1.5, 0.7), (0.0, 1.0, 0.35)), twist, t_s), t_s)
     with run.progress(1, "one pass") as bar, torch.no_grad():
         seen = system.begin(batch)

@@ -10,6 +10,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 # a room or package that is done is added by one line
+# rooms of codesign where this holds in every file
 WHOLE = (
     "atomic",
     "backend",
@@ -26,7 +27,7 @@ WHOLE = (
     "system",
     "train",
     "types",
-)  # rooms of codesign where this holds in every file
+)
 EXPORTED = (  # packages where it holds of what their __all__ names
     "codesign.events",
     "codesign.flow",

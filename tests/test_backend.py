@@ -57,9 +57,10 @@ def test_gradient_equals_torch(inputs):
     got = torch.autograd.grad(call(*inputs)[:2], inputs, seeds)
     want = torch.autograd.grad(same_in_torch(*inputs)[:2], inputs, seeds)
     for g, w in zip(got, want, strict=True):
+        # sums of ten terms of order one
         torch.testing.assert_close(
             g, w, rtol=20 * torch.finfo(w.dtype).eps, atol=20 * torch.finfo(w.dtype).eps
-        )  # sums of ten terms of order one
+        )
 
 
 @pytest.mark.bits

@@ -12,6 +12,7 @@ import codesign
 from codesign import mount
 
 ROOT = Path(__file__).resolve().parents[1]
+# for the toolkit itself
 PRIVATE = {
     "arrays",
     "__init__",
@@ -26,7 +27,7 @@ PRIVATE = {
     "plain_yaml",
     "reading",
     "task",
-}  # for the toolkit itself
+}
 
 
 def test_the_import_alone_loads_nothing_heavy():

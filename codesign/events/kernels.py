@@ -97,9 +97,12 @@ def recursion(
 ) -> tuple[Tensor, Tensor]:
     """Carry states over time.
 
-    Args: step: (drjit, value, numbers, states) -> (output, states), of arrays of all pixels; it may hold no
-      others.
-      values: [T, N] one per step. numbers: [K, N] that stay. start: [S, N] states; all of one floating type.
+    Args:
+      step: (drjit, value, numbers, states) -> (output, states), of arrays of all pixels; it may hold no
+        others.
+      values: [T, N] one per step.
+      numbers: [K, N] that stay.
+      start: [S, N] states; all of one floating type.
     Returns: outputs [T, N]; states [S, N] after the last step. Gradient: values, numbers, start.
     """
     return _Recursion.apply(step, values, numbers, start)

@@ -58,8 +58,10 @@ def finer(frames: Tensor, t_s: Times, longest_s: float, *, log_input: bool = Fal
 def parts(times_s: Tensor, longest_s: float, values: int = 1) -> tuple[Tensor, Tensor, Tensor]:
     """Intervals cut into equal parts no longer than asked for.
 
-    Args: times_s: [T] float64, strictly increasing, as from ``check_times``. longest_s: > 0. values: that
-      will be made of each part.
+    Args:
+      times_s: [T] float64, strictly increasing, as from ``check_times``.
+      longest_s: > 0.
+      values: that will be made of each part.
     Returns: of each of the K parts the interval it lies in [K] and the share of it [K] at which it ends;
       times [K + 1] float64 of all ends, the given ones among them exactly.
     Raises: DomainError for a length that is not positive, or so short that the parts would fill the memory.

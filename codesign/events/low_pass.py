@@ -42,7 +42,9 @@ def passed(filtered: Any, before: Any, now: Any, fade: Any, mean: Any) -> Any:
     """The filter behind an interval over which its input runs from ``before`` to ``now``: the exact answer
     to y' = (L - y)/tau, stable for every pace.
 
-    Args: filtered: y at the start of the interval. fade, mean: from ``coefficients``.
+    Args:
+      filtered: y at the start of the interval.
+      fade, mean: from ``coefficients``.
     """
     return now + (filtered - before) * fade - (now - before) * mean
 

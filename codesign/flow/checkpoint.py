@@ -30,11 +30,12 @@ if TYPE_CHECKING:
     Network = Refiner | FlowNetEvents | SpikeFlowNet  # the classes of NETWORKS
 
 VERSION = 1
+# name -> module:class, imported when asked for; a study adds its own
 NETWORKS = {
     "refiner": "codesign.flow.refiner:Refiner",
     "flownet-events": "codesign.flow.baselines:FlowNetEvents",
     "spike-flownet": "codesign.flow.baselines:SpikeFlowNet",
-}  # name -> module:class, imported when asked for; a study adds its own
+}
 DELIVERED = {"refiner": Path(__file__).with_name("refiner.safetensors")}
 
 

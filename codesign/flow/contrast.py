@@ -253,9 +253,10 @@ def _number(at):
 
 
 def _entered(flow_px, shape):
+    # places in half precision would be half a pixel off
     return check_flow(flow_px, shape, "the flow of these events").to(
         torch.promote_types(flow_px.dtype, torch.float32)
-    )  # places in half precision would be half a pixel off
+    )
 
 
 def _carried(flow, own, x, y, time, steps):

@@ -93,8 +93,9 @@ def normalise(counts: Tensor) -> Tensor:
     """Counts of each sample over the mean count that an event finds in its own bin: about 1 where there are
     events, whatever contrast and threshold.
 
-    Args: counts [B, ...]. Returns: the same shape. Gradient: counts. One added event keeps it smooth down to
-      an empty sample.
+    Args: counts [B, ...].
+    Returns: the same shape.
+    Gradient: counts. One added event keeps it smooth down to an empty sample.
     """
     flat = counts.flatten(1)
     usual = (flat.square().sum(1) + 1) / (flat.sum(1) + 1)

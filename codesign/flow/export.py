@@ -60,9 +60,8 @@ def export(network: nn.Module, path: str | Path, height_px: int, width_px: int, 
         if path.suffix == ".pt2":
             buffer = io.BytesIO()
             with warnings.catch_warnings():
-                warnings.filterwarnings(
-                    "ignore", message="No complete tensor"
-                )  # weights in channels-last order
+                # weights in channels-last order
+                warnings.filterwarnings("ignore", message="No complete tensor")
                 torch.export.save(program, buffer)
             temporary.write_bytes(buffer.getvalue())
         else:
@@ -133,12 +132,13 @@ def eliminate(matrix: Tensor, right: Tensor) -> Tensor:
 def _solve_ex(matrix, right, *, left=True, check_errors=False):
     column = right.ndim == matrix.ndim - 1
     found = eliminate(matrix, right[..., None] if column else right)
+    # factors and flags: never used
     return (
         found[..., 0] if column else found,
         matrix,
         matrix[..., 0, :].to(torch.int32),
         matrix[..., 0, 0].to(torch.int32),
-    )  # factors and flags: never used
+    )
 
 
 def _inverse_ex(matrix, *, check_errors=False):
@@ -147,10 +147,11 @@ def _inverse_ex(matrix, *, check_errors=False):
     ].to(torch.int32)
 
 
+# ONNX has neither
 PLAIN = {
     torch.ops.aten._linalg_solve_ex.default: _solve_ex,
     torch.ops.aten.linalg_inv_ex.default: _inverse_ex,
-}  # ONNX has neither
+}
 
 
 def _onnx(program, name):
@@ -160,10 +161,11 @@ def _onnx(program, name):
         require(module, "export", "writing .onnx (.pt2 needs nothing more)")
     log = logging.getLogger("torch.onnx")
     level = log.level
+    # the exporter's own progress and deprecations
     with (
         contextlib.redirect_stdout(io.StringIO()),
         warnings.catch_warnings(),
-    ):  # the exporter's own progress and deprecations
+    ):
         warnings.simplefilter("ignore")
         log.setLevel(logging.ERROR)
         try:

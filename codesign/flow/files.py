@@ -142,9 +142,8 @@ def _to_png(flow, valid):
     pixels = np.concatenate([np.where(valid, value, 0), valid[None]]).transpose(1, 2, 0).astype(">u2")
     rows = pixels.reshape(flow.shape[1], -1).view(np.uint8)
     above = np.vstack([np.zeros_like(rows[:1]), rows[:-1]])
-    filtered = np.hstack(
-        [np.full((len(rows), 1), 2, np.uint8), rows - above]
-    )  # every row as its difference from the one above (PNG filter 2), modulo 256
+    # every row as its difference from the one above (PNG filter 2), modulo 256
+    filtered = np.hstack([np.full((len(rows), 1), 2, np.uint8), rows - above])
     header = struct.pack(">IIBBBBB", flow.shape[2], flow.shape[1], 16, 2, 0, 0, 0)
     return (
         PNG_START + _chunk(b"IHDR", header) + _chunk(b"IDAT", zlib.compress(filtered.tobytes(), 3)) + PNG_END

@@ -25,11 +25,12 @@ from codesign.flow.contrast import (
 from codesign.flow.warp import pixel_grid, read_at
 from codesign.types import EventVolume, FlowField
 
+# (time, weight): start, middle and end of the window, as in Shiba et al., ECCV 2022, sec. 3.2
 REFERENCES = (
     (0.0, 0.25),
     (0.5, 0.5),
     (1.0, 0.25),
-)  # (time, weight): start, middle and end of the window, as in Shiba et al., ECCV 2022, sec. 3.2
+)
 PUBLISHED = (1e-3, 0.45)  # epsilon and exponent of EV-FlowNet's losses
 PRIOR_PX = 8.0  # of a prediction that claims a confidence only
 FLOOR_PX = 0.05  # deviation added to every claim, in squares

@@ -162,9 +162,10 @@ def rsat(stream: EventStream, flow_px: Tensor, t0_us: int, t1_us: int, carry_ste
     """Ratio of the squared average time stamps, warped to t1 over unwarped. Below 1 the flow aligns the
     events.
 
-    Args: as fwl. Returns: float; of either image, the sum over pixels and polarities of the squared mean time
-      (0 at t0, 1 at t1) over the number of pixels with events of any polarity. Every event on its nearest
-      pixel; events that leave the image are lost from the warped one.
+    Args: as fwl.
+    Returns: float; of either image, the sum over pixels and polarities of the squared mean time (0 at t0, 1
+      at t1) over the number of pixels with events of any polarity. Every event on its nearest pixel; events
+      that leave the image are lost from the warped one.
     Gradient: none. Raises: DomainError for an interval without events, or when all leave the image, or lie at
       t0. Source: Hagenaars et al., NeurIPS 2021.
     """

@@ -25,8 +25,9 @@ def by_autograd(residuals: Callable[[Tensor], Tensor], variables: Tensor, value:
 def by_differences(step: float | Tensor, central: bool = False) -> Jacobian:
     """A Jacobian by differences of the variables: V more evaluations, 2 V when ``central``.
 
-    Args: step: a number or [V]; the error is about step (step^2 when central) times curvature, plus rounding
-      over step.
+    Args:
+      step: a number or [V]; the error is about step (step^2 when central) times curvature, plus rounding over
+        step.
     Where the far side is not finite the other side is used; where neither is, the Jacobian is not finite.
 
     >>> x = torch.tensor([1.0, 2.0], dtype=torch.float64)

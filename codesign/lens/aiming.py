@@ -118,8 +118,8 @@ def aimed_rays(
 ) -> tuple[Tensor, Tensor]:
     """Parallel rays of one field angle (in +y) that meet the real stop at points of its disc.
 
-    Args: field_rad scalar; pupil [M, 2] on the unit disc, in units of the stop's paraxial radius. Returns:
-      origins and directions [M, 3], lens axes, in the lens's precision; solved in float64.
+    Args: field_rad scalar; pupil [M, 2] on the unit disc, in units of the stop's paraxial radius.
+    Returns: origins and directions [M, 3], lens axes, in the lens's precision; solved in float64.
     Gradient: origins to the lens. Warns: when some rays cannot be aimed.
     """
     dtype = lens.dtype

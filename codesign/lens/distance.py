@@ -18,9 +18,10 @@ PARALLEL = math.inf
 def vergence_per_mm(lens: ParaxialLens, at_m: Distances, origin_z_mm: Tensor | None = None) -> Tensor:
     """1 / distance of an object plane, per mm.
 
-    Args: at_m: metres before the camera's origin, the entrance pupil of the d line; one number, or [D] of
-      them; inf is parallel light. origin_z_mm: that pupil's place behind the first vertex, where it is known
-      already.
+    Args:
+      at_m: metres before the camera's origin, the entrance pupil of the d line; one number, or [D] of them;
+        inf is parallel light.
+      origin_z_mm: that pupil's place behind the first vertex, where it is known already.
     Returns: scalar, or [D], in the precision of the lens. Gradient: to at_m where it is a tensor.
     Raises: DomainError for a distance that is not positive, lies in the lens or is NaN; ShapeError for more
       than one axis or none given.

@@ -223,9 +223,12 @@ class GeoLens(Replaceable):
         >>> bool(near.thickness_mm[-1] > far.thickness_mm[-1])
         True
 
-        Args: distance_m: number or scalar tensor, metres before the camera's origin (the entrance pupil of
-          the d line); inf is allowed. wavelength_um: whose paraxial rays meet on the film. spot_grid: pupil
-          samples across, for the film of the least RMS spot of the point in place of the paraxial one.
+        Args:
+          distance_m: number or scalar tensor, metres before the camera's origin (the entrance pupil of the d
+            line); inf is allowed.
+          wavelength_um: whose paraxial rays meet on the film.
+          spot_grid: pupil samples across, for the film of the least RMS spot of the point in place of the
+            paraxial one.
         Returns: a lens as from ``replace``; this one stays as it is. Its last thickness is the image
           distance.
         Gradient: to every lens tensor that bends or moves light, and to the distance.
@@ -243,8 +246,9 @@ class GeoLens(Replaceable):
         >>> round(geo.index()[3].item(), 5)
         1.64769
 
-        Args: surface: counted from 0, from the last when negative. glass: a Glass, a name or code as
-          ``Glass.named`` takes, None for air.
+        Args:
+          surface: counted from 0, from the last when negative.
+          glass: a Glass, a name or code as ``Glass.named`` takes, None for air.
         Returns: a lens as from ``replace``, without Parameters and variables of its own; this one stays as
           it is.
         Gradient: to every tensor of this lens but the index offset of that surface, which belonged to the

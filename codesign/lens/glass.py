@@ -200,7 +200,8 @@ class Glass:
         and C; 6e-5, 1.7e-4, 7e-4 from 0.45 to 0.70 um; 9e-5, 2.8e-4, 6e-4 at g (0.4358 um); 1.1e-4, 3.7e-4,
         2.2e-3 at 0.85 um. The normal line P_gF = 0.6438 - 0.001682 Vd in its place has the same medians, but
         3.0e-4 and 1.5e-3 from 0.45 to 0.70 um: dense flints lie far from it.
-        Args: nd in (1, 5); Vd from 10 to 150. Raises: DomainError.
+        Args: nd in (1, 5); Vd from 10 to 150.
+        Raises: DomainError.
         """
         if not (_is_number(nd) and _is_number(Vd) and LEAST_INDEX < nd < INDEX_LIMIT and 10 <= Vd <= 150):
             raise DomainError(

@@ -212,10 +212,12 @@ def paraxial_rays(
 ) -> ParaxialRays:
     """ParaxialRays of an object plane.
 
-    Args: field_rad: half field, whose tangent is the slope of the d line's chief ray in object space; a
-      number or scalar tensor, below 90 degrees. vergence_per_mm: 1 / distance of the object from the
-      entrance pupil of the d line, a number or scalar tensor (see ``distance.vergence_per_mm``); 0 is
-      parallel light. The diameter of the entrance pupil is the lens's at every distance.
+    Args:
+      field_rad: half field, whose tangent is the slope of the d line's chief ray in object space; a number or
+        scalar tensor, below 90 degrees.
+      vergence_per_mm: 1 / distance of the object from the entrance pupil of the d line, a number or scalar
+        tensor (see ``distance.vergence_per_mm``); 0 is parallel light. The diameter of the entrance pupil is
+        the lens's at every distance.
     Gradient: to every lens tensor that bends or moves light, and to the vergence. Raises: DomainError for a
       field of 90 degrees and more, or an entrance pupil at infinity.
     """
@@ -258,7 +260,8 @@ def focused_image(
     """Height and reduced angle (n u) behind the last vertex of the ray of an axial point that crosses the
     first vertex plane at height 1, so that its image lies -height n / angle behind the last vertex.
 
-    Args: vergence_per_mm: 1 / distance of the point from the entrance pupil of the d line, scalar or [D].
+    Args:
+      vergence_per_mm: 1 / distance of the point from the entrance pupil of the d line, scalar or [D].
     Returns: two tensors of the shape of the vergence. Gradient: to it, and to every lens tensor that bends or
       moves light.
     """

@@ -25,9 +25,10 @@ class ThinLens(Replaceable):
     52.631578947368425
     >>> optimiser = torch.optim.Adam(thin.variables("efl", "focus"), lr=0.1)
 
-    Args: efl_mm, image_distance_mm: numbers, or tensors that gradients flow to. A number becomes a Parameter
-      that asks for no gradient until ``requires_grad_()`` or ``variables``; a tensor with a gradient is kept
-      as given. image_distance_mm follows efl_mm when it is None.
+    Args:
+      efl_mm, image_distance_mm: numbers, or tensors that gradients flow to. A number becomes a Parameter that
+        asks for no gradient until ``requires_grad_()`` or ``variables``; a tensor with a gradient is kept as
+        given. image_distance_mm follows efl_mm when it is None.
     Raises: DomainError for lengths that are not positive, or a diameter below 0.
     """
 

@@ -60,8 +60,11 @@ def seidel_sums(
     Spheres, conics, the r^2 and r^4 asphere terms, mirrors, and the first two diffractive terms; decentres
     and tilts do not count.
 
-    Args: field_rad: half field. wavelength_um: of the monochromatic sums; those of colour are between F and C. at_m: metres from the entrance pupil to the object, inf for parallel light; the pupil's
-      diameter is the lens's at every distance.
+    Args:
+      field_rad: half field.
+      wavelength_um: of the monochromatic sums; those of colour are between F and C.
+      at_m: metres from the entrance pupil to the object, inf for parallel light; the pupil's diameter is the
+        lens's at every distance.
     Gradient: to every lens tensor and to at_m. Raises: DomainError, see ``paraxial_rays`` and
       ``distance.vergence_per_mm``.
     """

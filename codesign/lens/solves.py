@@ -53,8 +53,9 @@ def holding_surface(lens: TracedLens) -> int:
 def hold_efl(lens: L, efl_mm: float | Tensor, surface: int | None = None) -> L:
     """The lens with one curvature solved so that the focal length is ``efl_mm`` exactly.
 
-    Args: efl_mm: not 0, at the d line. surface: index of the curvature to solve; ``holding_surface(lens)``
-      when left out.
+    Args:
+      efl_mm: not 0, at the d line.
+      surface: index of the curvature to solve; ``holding_surface(lens)`` when left out.
     Gradient: the solved curvature carries that of all others, of thicknesses and of indices; efl_mm too when
       it is a tensor.
     Raises: DomainError when that curvature cannot do it.
@@ -103,7 +104,9 @@ def least_spot_shift(position: Tensor, slope: Tensor, weight: Tensor) -> tuple[T
 
     Straight rays make the squared spot a parabola in z: with d the distance of a ray from its spot's mean
     and s the same of its slope, the least of sum |d + z s|^2 lies at z = -sum(d.s) / sum(s.s).
-    Args: position, slope: [spots, M, 2]; weight: [spots, M, 1] >= 0, with a positive sum for every spot.
+    Args:
+      position, slope: [spots, M, 2].
+      weight: [spots, M, 1] >= 0, with a positive sum for every spot.
     """
     total = weight.sum(1, keepdim=True)
     position, slope = (
@@ -125,8 +128,9 @@ def focus_paraxial(lens: L, defocus_mm: float | Tensor = 0.0, at_m: float | Tens
     """The lens with its image plane at the paraxial image of an axial point, or ``defocus_mm`` (number or
     scalar tensor) behind it. Differentiable.
 
-    Args: at_m: metres from the entrance pupil to the point, inf for parallel light. ``GeoLens.focus_at``
-      does the same and refuses images that are not real.
+    Args:
+      at_m: metres from the entrance pupil to the point, inf for parallel light. ``GeoLens.focus_at`` does the
+        same and refuses images that are not real.
     Raises: DomainError for light that leaves the lens parallel, or a distance inside the lens. A focus
       inside the lens gives a negative last thickness, which constraints must push back.
     """
@@ -152,9 +156,11 @@ def focus_rays(
 
     Spots of one object point share their mean over the wavelengths; see ``focus.least_spot_shift``.
 
-    Args: fields_rad: angles; wavelengths_um; grid: pupil samples across, without clipping by apertures.
-      Failed rays are left out. at_m: metres from the entrance pupil to the object plane, or several that
-      share the image plane; inf for parallel light.
+    Args:
+      fields_rad: angles; wavelengths_um.
+      grid: pupil samples across, without clipping by apertures. Failed rays are left out.
+      at_m: metres from the entrance pupil to the object plane, or several that share the image plane; inf for
+        parallel light.
     Gradient: through the rays to every lens tensor and to at_m. Raises: DomainError when no ray of a field
       arrives, none converges, or a distance lies inside the lens.
 

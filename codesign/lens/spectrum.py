@@ -126,9 +126,10 @@ class Spectrum:
         The product of the curves (linear between their points, over the range they share) is cut into
         ``count`` strata of equal signal; each is represented by its signal-weighted mean wavelength, so the
         mean wavelength of the whole is exact.
-        Args: response, illuminant: pairs (wavelength_um [N], value [N]), increasing wavelengths, values >= 0
-          of any scale; the response per unit of radiant energy (A/W) when the illuminant is in energy. count:
-          1 to 1000.
+        Args:
+          response, illuminant: pairs (wavelength_um [N], value [N]), increasing wavelengths, values >= 0 of
+            any scale; the response per unit of radiant energy (A/W) when the illuminant is in energy.
+          count: 1 to 1000.
         Raises: ShapeError, DomainError.
         """
         # they take a second to import, which who traces in given lines need not wait for
@@ -207,7 +208,8 @@ def blackbody(temperature_k: float) -> Curve:
     """Planck's radiance per wavelength, 0.30 to 1.20 um in steps of 5 nm, largest value 1: (wavelength_um,
     value).
 
-    Args: temperature_k from 500 to 100000. Raises: DomainError.
+    Args: temperature_k from 500 to 100000.
+    Raises: DomainError.
     """
     check_number(
         temperature_k,
@@ -235,7 +237,8 @@ def silicon_response(depth_um: float = 5.0) -> Curve:
     An approximation: every photon absorbed within ``depth_um`` counts, w (1 - exp(-4 pi k depth / w));
     reflection, the cover glass and losses at the surface are left out, so a real sensor falls faster in the
     blue. Five micrometres is a usual epitaxial layer.
-    Args: depth_um from 0.01 to 1000. Raises: DomainError.
+    Args: depth_um from 0.01 to 1000.
+    Raises: DomainError.
     Source: Beer and Lambert's law with the extinction coefficient of Green, 2008.
     """
     check_number(depth_um, "depth_um", 0.01, 1000, remedy="sensors have about 2 to 10 um")

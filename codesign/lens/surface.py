@@ -240,8 +240,10 @@ def with_medium(
 ) -> tuple[Surface, ...]:
     """The surfaces with another medium behind one of them; see ``GeoLens.replace_glass``.
 
-    Args: name: the lens's, for errors. surface: counted from 0, from the last when negative. glass: a Glass,
-      a name or code as ``Glass.named`` takes, None for air.
+    Args:
+      name: the lens's, for errors.
+      surface: counted from 0, from the last when negative.
+      glass: a Glass, a name or code as ``Glass.named`` takes, None for air.
     Raises: DomainError for a surface that is not there or a mirror, glass passed twice, and a name the
       catalogue does not know.
     """

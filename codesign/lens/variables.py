@@ -106,7 +106,8 @@ def ray_motion(ahead: tuple[Tensor, Tensor], behind: tuple[Tensor, Tensor]) -> t
     """How rays move on the film between two states of a lens: [fields, M, 2] mm, and [fields, M] 1 for rays
     that arrive in both, else 0.
 
-    Args: ahead, behind: positions [fields, M, 2] and weights [fields, M], as from ``spots``.
+    Args:
+      ahead, behind: positions [fields, M, 2] and weights [fields, M], as from ``spots``.
     """
     weight = ahead[1] * behind[1]
     return (ahead[0] - behind[0]) * weight[..., None], weight
@@ -118,7 +119,8 @@ def natural_units(
     """Change of each number [K] that moves the rays by ``step_mm`` RMS over the bundle, at most its
     ``reach``; and whether it moves them at all, [K] bool.
 
-    Args: land: numbers [K] -> (positions [fields, M, 2] mm, weights [fields, M]).
+    Args:
+      land: numbers [K] -> (positions [fields, M, 2] mm, weights [fields, M]).
     """
     moves = torch.zeros_like(values)
     for i in range(values.numel()):

@@ -60,7 +60,8 @@ class Body:
     >>> box.distance_m(torch.tensor([[0.5, 0.0, 0.05], [0.0, 0.0, 0.05]])).round(decimals=6).tolist()
     [0.3, -0.05]
 
-    Args: meshes: pairs of vertices [V, 3] in metres and faces [F, 3] of their indices.
+    Args:
+      meshes: pairs of vertices [V, 3] in metres and faces [F, 3] of their indices.
     solids: tuple of triangles [F, 3, 3] float64, those of one solid together.
     Raises: DomainError where there is no triangle, a vertex is not finite, or a face names one that is not
       there; ShapeError.

@@ -190,8 +190,9 @@ def attitude(yaw_rad: float | Tensor, pitch_rad: float | Tensor, roll_rad: float
     """Rotations [..., 3, 3] float64 from camera to body axes: Rz(yaw) Ry(pitch) Rx(roll) after the axes of a
     level camera.
 
-    Args: numbers or tensors [...] that broadcast. Gradient: exact, to the angles. Raises: DomainError when
-      not finite.
+    Args: numbers or tensors [...] that broadcast.
+    Gradient: exact, to the angles.
+    Raises: DomainError when not finite.
     """
     turn = torch.eye(3, dtype=torch.float64)
     for axis, angle, name in (
@@ -243,9 +244,10 @@ class MountRanges:
     >>> ranges.share_at(middle).round(decimals=12).tolist()
     [0.5, 0.5, 0.5, 0.5, 0.5, 0.5]
 
-    Args: low, high: six finite numbers each, in the order of NAMES, metres and radians. Equal bounds hold a
-      number; its share means nothing and is given as 0.5. Pitch is strictly between straight up and down,
-      where yaw and roll would be one; yaw and roll have a turn at most.
+    Args:
+      low, high: six finite numbers each, in the order of NAMES, metres and radians. Equal bounds hold a
+        number; its share means nothing and is given as 0.5. Pitch is strictly between straight up and down,
+        where yaw and roll would be one; yaw and roll have a turn at most.
     low, high: [6] float64. held: [6] bool.
     Raises: DomainError for bounds that are not finite, in the wrong order, or too wide; ShapeError.
     """

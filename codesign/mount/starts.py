@@ -75,7 +75,8 @@ def check_mount(
 ) -> None:
     """Look at box, requirements and camera before anything is rendered.
 
-    Args: reach_m: how far from the body a bracket may hold a camera.
+    Args:
+      reach_m: how far from the body a bracket may hold a camera.
     Raises: DomainError, in a sentence that says what to change, for a box that is farther from the robot than
       ``reach_m`` or has no room beside it, a start that does not keep a requirement, or a camera whose lens
       has a smaller image circle than its film (where the camera has ``check``).

@@ -27,11 +27,12 @@ from codesign.render.world import MitsubaScene
 # of (1 m + distance from the origin): height over the surface from which a texel is looked at; about half of
 # Mitsuba's own ray offset
 LIFT = 5e-5
+# of launches: a new size is a new kernel, so points are padded to one of these
 SIZES = (
     1 << 14,
     1 << 17,
     1 << 20,
-)  # of launches: a new size is a new kernel, so points are padded to one of these
+)
 DARK = 1e-4  # an albedo below this shows no light worth measuring
 SHINE = 0.2  # least albedo that light is divided by where part of it is not coloured by the albedo
 GRAZING = 0.05  # cosine of the flattest direction that shiny surfaces are looked at from
@@ -295,9 +296,8 @@ class Bake:
             light = mi.Float(0)
             if paths:
                 sampler = mi.load_dict({"type": "independent"})
-                sampler.seed(
-                    dr.opaque(mi.UInt32, int(self.random.integers(2**31))), width
-                )  # opaque: one kernel for all calls
+                # opaque: one kernel for all calls
+                sampler.seed(dr.opaque(mi.UInt32, int(self.random.integers(2**31))), width)
                 radiance = self.integrator.sample(self.scene, sampler, ray)[0][0]
                 light = dr.maximum(radiance - emission, 0) / dr.maximum(albedo, DARK)
             dr.eval(light, albedo, emission, seen)

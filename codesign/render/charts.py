@@ -43,8 +43,10 @@ class Chart:
 def chart_of(mi: Any, shape: Any, texel: float, detail: float | None) -> Chart | Nodes:
     """The chart of a Mitsuba shape, or nodes for a mesh that is finer than its texels.
 
-    Args: texel: of light; detail: of the pictures on it, None where there are none. Raises: DomainError for a
-      shape that has no chart here.
+    Args:
+      texel: of light.
+      detail: of the pictures on it, None where there are none.
+    Raises: DomainError for a shape that has no chart here.
     """
     parameters = mi.traverse(shape)
     for kind in ("Rectangle", "Disk", "Sphere", "Cylinder"):

@@ -131,10 +131,11 @@ def coarse_pixels(film: Film, every_px: int) -> Tensor:
 def film_pupil_pattern(samples, seed):
     """Scrambled Sobol points over pixel x pupil.
 
-    Args: samples per pixel, seed. Returns: offset [samples, 2] in pixels, within [-1/2, 1/2); pupil [samples,
-      2] on the unit disc; float64. The same pattern in every pixel makes the sampled point spread the same
-      everywhere: a static scene gives equal frames and a moving one no sampling flicker. A single sample is
-      the pixel centre through the pupil centre.
+    Args: samples per pixel, seed.
+    Returns: offset [samples, 2] in pixels, within [-1/2, 1/2); pupil [samples, 2] on the unit disc; float64.
+      The same pattern in every pixel makes the sampled point spread the same everywhere: a static scene gives
+      equal frames and a moving one no sampling flicker. A single sample is the pixel centre through the pupil
+      centre.
     """
     if samples == 1:
         return torch.zeros(1, 2, dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64)

@@ -24,9 +24,10 @@ class Hits(Rows):
 def first_hits(origin_cam_m: Tensor, direction_cam: Tensor, lit: Tensor, scene: Any, cameras: Tensor) -> Hits:
     """The nearest surface of all parts of a scene along rays given in camera space.
 
-    Args: origin_cam_m, direction_cam: [P, 3], the same rays in every frame, or [F, P, 3]. lit: [P] or [F, P]
-      bool; rays that carry no light meet nothing. cameras: [parts, F, 4, 4], poses of the camera in the axes
-      of every part.
+    Args:
+      origin_cam_m, direction_cam: [P, 3], the same rays in every frame, or [F, P, 3].
+      lit: [P] or [F, P] bool; rays that carry no light meet nothing.
+      cameras: [parts, F, 4, 4], poses of the camera in the axes of every part.
     Gradient: to rays and poses, surfaces taken as their tangent planes.
     A frame's values do not depend on the frames beside it: every product is written out by element.
     """

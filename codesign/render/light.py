@@ -92,9 +92,8 @@ class PathScene(MitsubaScene):
         ray = dr.arange(mi.UInt32, count * self.samples) // self.samples
         o, d = (dr.gather(mi.Point3f, mi.Point3f(part), ray) for part in (origin, direction))
         sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(
-            dr.opaque(mi.UInt32, self.seed), count * self.samples
-        )  # opaque: another seed needs no new kernel
+        # opaque: another seed needs no new kernel
+        sampler.seed(dr.opaque(mi.UInt32, self.seed), count * self.samples)
         light, _, _ = self.integrator.sample(self.scene, sampler, mi.RayDifferential3f(o, mi.Vector3f(d)))
         return dr.block_sum(light[0], self.samples) / self.samples
 
@@ -205,7 +204,9 @@ def choose(
     """The cheapest light level whose RMS radiance error against the last one stays within a tolerance in
     every frame.
 
-    Args: levels: dictionary name -> scene, the last of them the reference. tolerance: share of the radiance.
+    Args:
+      levels: dictionary name -> scene, the last of them the reference.
+      tolerance: share of the radiance.
       after_gain: whether one brightness factor per frame is forgiven, as by a sensor of log intensity.
     Returns: Choice. Costs are CPU seconds of rendering these frames once, kernels compiled before.
     Raises: DomainError without levels or for a tolerance that is not positive.

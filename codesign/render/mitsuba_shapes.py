@@ -19,9 +19,8 @@ from codesign.render.triangles import across
 FILES_UNCHECKED = ("ply", "serialized")  # Mitsuba itself follows their faces to vertices that are not there
 RADIANCE = ("value", "data", "scale")  # last part of the names of what an emitter shines with
 OWN = ("positions", "normals", "texcoords")  # of a mesh, beside the attributes its user has given it
-MOST_TEXELS = (
-    2.0**22
-)  # from the origin of texture coordinates: beyond, float32 knows a texel to a quarter at best
+# from the origin of texture coordinates: beyond, float32 knows a texel to a quarter at best
+MOST_TEXELS = 2.0**22
 THINNEST = (
     1e-5  # squared sine of the angle at a face's corner, below which Mitsuba's weights of corners are noise
 )
@@ -64,11 +63,12 @@ def check_description(mi: Any, description: Any) -> None:
         if isinstance(entry, Mapping) and entry.get("type") in FILES_UNCHECKED:
             try:
                 shape = mi.load_dict({**_file_of(entry), "face_normals": True})
+            # what cannot be read at all is told where the scene is built
             except (
                 RuntimeError,
                 TypeError,
                 ValueError,
-            ):  # what cannot be read at all is told where the scene is built
+            ):
                 continue
             _check_shape(mi, name, shape)
         elif isinstance(entry, mi.Mesh):

@@ -88,9 +88,13 @@ def ray_gradients(
 ) -> tuple[Any, ...]:
     """Gradients of origin (3), direction (3) and weight of N rays before the camera: drjit arrays [N].
 
-    Args: arr: drjit types. kept: slopes of ``frames`` frames. seed: gradient of the pixel means, [F x
-      pixels]. weight:
-      [N]. poses: [parts x F x 12], rows of the camera's poses in the parts. samples: rays per pixel.
+    Args:
+      arr: drjit types.
+      kept: slopes of ``frames`` frames.
+      seed: gradient of the pixel means, [F x pixels].
+      weight: [N].
+      poses: [parts x F x 12], rows of the camera's poses in the parts.
+      samples: rays per pixel.
     """
     import drjit as dr
 
@@ -124,7 +128,9 @@ def pose_gradients(
 ) -> list[Any]:
     """Gradients of the 12 numbers of the camera's pose in every part, part after part: drjit arrays [F] each.
 
-    Args: as for ``ray_gradients``. rays: origin (3) and direction (3) before the camera and weight, [N] each.
+    Args:
+      as for ``ray_gradients``.
+      rays: origin (3) and direction (3) before the camera and weight, [N] each.
     """
     import drjit as dr
 
@@ -300,8 +306,9 @@ def _gradients(ctx, grad, origin, direction, weight, poses):
 def lanes(arr: Any, line: Sequence[Any], poses: Sequence[Any]) -> tuple[Any, Any, Any, list[Any]]:
     """Every ray in every frame, frame after frame (drjit arrays).
 
-    Args: line: origin (3) and direction (3) before the camera, [N] each. poses: of the camera in every part,
-      rows [F x 12] each.
+    Args:
+      line: origin (3) and direction (3) before the camera, [N] each.
+      poses: of the camera in every part, rows [F x 12] each.
     Returns: number of the ray of every lane, its origin and direction before the camera, and those in each
       part.
     """

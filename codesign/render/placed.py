@@ -46,7 +46,9 @@ class Placement:
 class PlacedScene:
     """A scene in axes and units of its own, seen by cameras in the world's metres.
 
-    Args: scene: with ``radiance``, ``radiance_and_distance`` and ``hit``, such as a PathScene. placement: of
+    Args:
+      scene: with ``radiance``, ``radiance_and_distance`` and ``hit``, such as a PathScene.
+      placement: of
     it. Nothing of the scene is changed, so what depends on its size (media, bumps, point lamps) looks as in
     itself.
     Gradient: that of the scene.
@@ -100,8 +102,9 @@ class PlacedScene:
 class SidedScene(MitsubaScene):
     """A MitsubaScene of which some shapes show light from behind too.
 
-    Args: description: as for MitsubaScene. backs: area emitter of the back of each shape that has one, by its
-      name.
+    Args:
+      description: as for MitsubaScene.
+      backs: area emitter of the back of each shape that has one, by its name.
       placement: turn of the scene's sky and factor on all its radiance; its shapes stand in the world
         already.
     """

@@ -112,9 +112,8 @@ class ProjectionTable:
             return None
         base, _ = lines(self.camera.chief_rays(pixels))
         values = torch.cat([pixels, base], 1).double().reshape(count, count, 4)
-        basis = _chebyshev(nodes[None], count)[0].T * (
-            2 / count
-        )  # interpolation at the nodes: discrete orthogonality
+        # interpolation at the nodes: discrete orthogonality
+        basis = _chebyshev(nodes[None], count)[0].T * (2 / count)
         basis[:, 0] /= 2
         return torch.einsum("ik,jl,ijc->klc", basis, basis, values).contiguous()
 

@@ -44,7 +44,8 @@ def psf_frames(
     >>> near.shape, bool((near - traced).abs().max() < 1e-3 * traced.std())
     (torch.Size([3, 16, 16]), True)
 
-    Args: camera, scene, T_world_cam: as for ``render.frames``; the camera's samples and seed do not count.
+    Args:
+      camera, scene, T_world_cam: as for ``render.frames``; the camera's samples and seed do not count.
       psf: ``psf_map(camera)``, made once for many calls while the lens stays as it is; None makes one.
     Returns: [..., T, *film.shape].
     Gradient: to lens, poses and poses of objects, through the sharp picture, its depth and the point spread

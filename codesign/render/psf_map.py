@@ -102,9 +102,10 @@ class PsfMap:
         >>> [round(float(part.max()), 2) for part in blur[:, 0]]  # sharp at 1 m
         [0.02, 1.0, 0.02]
 
-        Args: distance_m: [D] along the camera's axis from the entrance pupil, inf allowed. size_px: rows and
-          columns, odd; None is as many as the widest blur needs. A ray is shared bilinearly among four
-          pixels.
+        Args:
+          distance_m: [D] along the camera's axis from the entrance pupil, inf allowed.
+          size_px: rows and columns, odd; None is as many as the widest blur needs. A ray is shared bilinearly
+            among four pixels.
         Gradient: to every tensor of the lens and to the distances, piecewise linear in the rays' positions.
         Raises: DomainError for distances nearer than ``nearest_m``, or a size that does not hold the blur.
         """
@@ -146,11 +147,11 @@ class PsfMap:
 def psf_map(camera: Camera, nearest_m: float = 0.3, cell_px: int = 64, rays_per_px: int = 4) -> PsfMap:
     """Trace what the point spread functions of a camera at all distances from ``nearest_m`` on follow from.
 
-    Args: camera: before any lens with ``camera_rays``; its spectrum, falloff and aim count, its samples do
-      not.
-      nearest_m: metres from the entrance pupil. cell_px: largest spacing of the film points between which
-      point spread functions are interpolated. rays_per_px: 4, or for scenes full of hard edges 16, 36, 64,
-      ...
+    Args:
+      camera: before any lens with ``camera_rays``; its spectrum, falloff and aim count, its samples do not.
+      nearest_m: metres from the entrance pupil.
+      cell_px: largest spacing of the film points between which point spread functions are interpolated.
+      rays_per_px: 4, or for scenes full of hard edges 16, 36, 64, ...
     Gradient: to the lens. To be made anew for every state of the lens.
     Raises: DomainError when the blur is wider than LARGEST_PX, or no light reaches the film.
     """

@@ -151,10 +151,11 @@ def adaptive_times(
     """Frame times between which no pixel's point moves by more than a given distance in the image, on any of
     the trajectories.
 
-    Args: camera, scene, trajectory: see the top of this file. largest_px: largest displacement between
-      frames, > 0. every_px: spacing of the pixels that
-      are looked at, the film's border included; 1 looks at all, more is faster and may miss what is narrower
-      or moves more between them.
+    Args:
+      camera, scene, trajectory: see the top of this file.
+      largest_px: largest displacement between frames, > 0.
+      every_px: spacing of the pixels that are looked at, the film's border included; 1 looks at all, more is
+        faster and may miss what is narrower or moves more between them.
     Returns: [n] float64 times, increasing, the first start_s and the last end_s. No gradient.
     Every step is judged by the displacement itself, through the lens: of the points seen at its start, and of
     the points seen at its end. Steps grow at

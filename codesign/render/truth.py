@@ -70,7 +70,9 @@ def world_points(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """World points under rays given in camera space, from one pose.
 
-    Args: rays: Rays [N] (chief rays). scene: anything with ``hit``, or a MovingScene of one frame.
+    Args:
+      rays: Rays [N] (chief rays).
+      scene: anything with ``hit``, or a MovingScene of one frame.
       T_world_cam: [4, 4].
     Returns: points [N, 3] metres, depth [N] along the camera's z axis, valid [N].
     Gradient: to rays and poses, the surface taken as its tangent plane at the hit.
@@ -174,9 +176,12 @@ def truth_of_frames(
     """Truth of the first ``count`` frames of a long sequence, without gradients: images are read from a table
     of the camera's lens (to 1e-6 px) instead of traced.
 
-    Args: table: ProjectionTable of the camera. scene: as for ``true_flow``. T_world_cam: [T >= count, 4, 4];
-      flow where there is a frame behind (of ``count`` - 1 frames where T = count). rays: the camera's chief
-      rays through all pixel centres, where they are traced already.
+    Args:
+      table: ProjectionTable of the camera.
+      scene: as for ``true_flow``.
+      T_world_cam: [T >= count, 4, 4]; flow where there is a frame behind (of ``count`` - 1 frames where T =
+        count).
+      rays: the camera's chief rays through all pixel centres, where they are traced already.
     """
     camera = table.camera
     shape = camera.film.shape
@@ -246,7 +251,9 @@ def follow(optics: Camera | ProjectionTable, hits: Hits, later: Tensor, pixels: 
 def later_points(rays: Rays, scene: Any, T_world_cam: Poses) -> tuple[Tensor, Tensor]:
     """Points under rays at the first pose of each trajectory, as they lie before the camera at its last.
 
-    Args: rays: Rays [P] (chief rays). scene: as for ``true_flow``; points move with their object.
+    Args:
+      rays: Rays [P] (chief rays).
+      scene: as for ``true_flow``; points move with their object.
       T_world_cam: [..., T, 4, 4].
     Returns: points [B, P, 3] metres in the axes of the last camera, B trajectories; seen [B, P] bool: it met
       a surface, and lies before the last camera (the point is (0, 0, 1) elsewhere).
@@ -332,7 +339,9 @@ SMALL = 1e-4  # squared angle below which series are used; their next term is 1e
 def camera_velocity(T_world_cam: Poses, t_s: Tensor | Sequence[float]) -> tuple[Tensor, Tensor]:
     """Mean velocity of a camera between its poses: the constant twist that leads from each pose to the next.
 
-    Args: T_world_cam: [..., T >= 2, 4, 4]. t_s: [T] times, increasing, the same for all trajectories.
+    Args:
+      T_world_cam: [..., T >= 2, 4, 4].
+      t_s: [T] times, increasing, the same for all trajectories.
     Returns: two twists [..., T - 1, 6], translation of the camera's origin (m/s) then rotation (rad/s): in
       the camera's own axes, where it is the same all
       through the interval, and in world axes, as it is at the middle of the interval.

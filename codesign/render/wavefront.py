@@ -18,8 +18,10 @@ from codesign.types import Rays
 def shade(rays: Rays, scene: Scene | MovingScene, T_world_cam: Poses, samples_per_pixel: int) -> Tensor:
     """Pixel means [..., T, P] of the radiance along rays given in camera space, seen from every pose.
 
-    Args: rays: Rays with N = P x samples_per_pixel. scene: anything with ``radiance`` and ``dtype``, or a
-      MovingScene with T poses per object. T_world_cam: [..., T, 4, 4]; all trajectories are one launch.
+    Args:
+      rays: Rays with N = P x samples_per_pixel.
+      scene: anything with ``radiance`` and ``dtype``, or a MovingScene with T poses per object.
+      T_world_cam: [..., T, 4, 4]; all trajectories are one launch.
     Gradient: to the rays (weights included), the poses and the poses of moving objects; the motion of
       silhouettes is not in it.
     """

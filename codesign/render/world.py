@@ -30,10 +30,12 @@ from codesign.render.silhouettes.shapes import Bodies, read
 class MitsubaScene:
     """A Mitsuba scene whose radiance is read directly from its emitters.
 
-    Args: description: a Mitsuba scene dictionary; every shape carries an area emitter (of radiance 0 where it
-      is black). Also an mi.Scene that is loaded already. device: "cpu" or "cuda".
-      merge: whether Mitsuba may join meshes that look alike into one. emissive: whether every shape must have
-      an emitter; False for a scene whose geometry alone is asked for.
+    Args:
+      description: a Mitsuba scene dictionary; every shape carries an area emitter (of radiance 0 where it is
+        black). Also an mi.Scene that is loaded already.
+      device: "cpu" or "cuda".
+      merge: whether Mitsuba may join meshes that look alike into one.
+      emissive: whether every shape must have an emitter; False for a scene whose geometry alone is asked for.
     Computes in float32. Raises: DomainError when Mitsuba refuses the description, a shape has no emitter, a
       mesh has no faces, vertices that are not finite or faces of vertices that are not there, a radiance is
       negative or not finite.
@@ -228,9 +230,8 @@ class MitsubaScene:
 
         mi = self.mi
         shapes = self.scene.shapes()
-        if any(
-            shape.class_name() == "Instance" for shape in shapes
-        ):  # met are shapes of its group, not in the list
+        # met are shapes of its group, not in the list
+        if any(shape.class_name() == "Instance" for shape in shapes):
             return found.compute_surface_interaction(ray, mi.RayFlags.Minimal).n
 
         def of(shape):

@@ -24,8 +24,11 @@ def mount_sphere(
     """Figure of a sphere of directions in equal areas (Mollweide), as seen from the body: ahead is the middle, left is
     left, down is below.
 
-    Args: yaw_rad: [columns], pitch_rad: [rows] middles of cells of equal angles, as of ``mount.sight_map``. values: [rows,
-      columns] > 0, on a logarithmic scale; label: of them. marked: name -> yaw and pitch of directions to mark.
+    Args:
+      yaw_rad: [columns], pitch_rad: [rows] middles of cells of equal angles, as of ``mount.sight_map``.
+      values: [rows, columns] > 0, on a logarithmic scale.
+      label: of them.
+      marked: name -> yaw and pitch of directions to mark.
     """
     rows, columns = values.shape
     figure = plt.figure(figsize=(8.6, 4.8), layout="constrained")
@@ -38,9 +41,8 @@ def mount_sphere(
         across, upwards, shown, norm=LogNorm(shown.min(), shown.max()), cmap="viridis_r", shading="flat"
     )
     axes.grid(color="white", lw=0.5, alpha=0.4)
-    axes.set_xticks(
-        [math.radians(a) for a in (-90, 0, 90)], ["left", "ahead", "right"]
-    )  # as the body looks: yaw to the left
+    # as the body looks: yaw to the left
+    axes.set_xticks([math.radians(a) for a in (-90, 0, 90)], ["left", "ahead", "right"])
     axes.set_yticks([math.radians(a) for a in (-60, -30, 0, 30, 60)])
     bar = figure.colorbar(mesh, shrink=0.8, label=label)
     bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

@@ -34,9 +34,12 @@ def check(
 
     What a stage passes on is proven: one vector-Jacobian product from what it makes to what it gets, and where that is
     nothing, differences (the stage three times more). What that cost is ``check_passes`` of the Result, in passes.
-    Args: variables: what will be optimised: an optimiser, or its tensors; the system's parameters that ask for
-      gradients when None. objectives: names of those in use; all when None. recorded: as for the System. may_cut: stages
-      that pass no gradient on, or not all of it, on purpose.
+    Args:
+      variables: what will be optimised: an optimiser, or its tensors; the system's parameters that ask for
+        gradients when None.
+      objectives: names of those in use; all when None.
+      recorded: as for the System.
+      may_cut: stages that pass no gradient on, or not all of it, on purpose.
     Returns: the probed Result of the pass.
     Raises: ShapeError, DomainError where stages, batch and scene do not fit, or a stage changes in place what it is given;
       GradientError for a stage that cuts the gradient of what is optimised, tensors that a function hides from the
@@ -118,10 +121,11 @@ def _check_reach(run: Pass, objectives: dict[str, Tensor], wanted, names, given:
     if still:  # beside the point as well? Layers behind a zero-initialised one wake up there
         beside = run.system.begin(run["batch"], run.recorded)
         totals = []
+        # a point that stages refuse tells nothing
         with (
             nudged(wanted, NUDGE),
             contextlib.suppress(CodesignError),
-        ):  # a point that stages refuse tells nothing
+        ):
             totals = [_gradients(beside.objective(name), wanted) for name in objectives]
         still = [n for n in still if not any(g[n] is not None and bool(g[n].any()) for g in totals)]
     if still:

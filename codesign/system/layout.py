@@ -28,8 +28,9 @@ LONGEST_S = 2.0  # a window of flow that lasts longer is in milliseconds
 def check_layout(by: str, value: Any, kind: type, shape: str | tuple[int, ...] = "", **sizes: int) -> None:
     """Raise unless a value is of a kind and its tensors have their layouts, with the sizes that letters stand for.
 
-    Args: by: subject and verb of the sentence, such as "stage 'flow' returned". shape: of a plain tensor, as ``check``
-      takes it.
+    Args:
+      by: subject and verb of the sentence, such as "stage 'flow' returned".
+      shape: of a plain tensor, as ``check`` takes it.
     Raises: DomainError for kinds, dtypes and devices; ShapeError for shapes.
     """
     check_kind(value, kind, f"what {by}")

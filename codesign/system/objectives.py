@@ -16,8 +16,10 @@ def angular_error_mrad(
     """Mean angle by which the flow misses the world points that it started on, over the interval.
 
     A flow error in task units, which neither focal length nor distortion can flatter.
-    Args: field: flow_px [N, 2, H, W], on the pixels of the first pose. camera, scene, T_world_cam [..., T, 4, 4]:
-      as for the System; N trajectories times windows of the film. every_px: spacing of the pixels looked at.
+    Args:
+      field: flow_px [N, 2, H, W], on the pixels of the first pose.
+      camera, scene, T_world_cam [..., T, 4, 4]: as for the System; N trajectories times windows of the film.
+      every_px: spacing of the pixels looked at.
     Returns: [N] mrad, over the pixels that see a surface.
     Gradient: flow, lens and poses.
     Raises: DomainError when a sample sees no surface at any of the pixels.

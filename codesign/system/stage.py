@@ -91,7 +91,9 @@ def label(part: Any) -> str:
 class Stage:
     """A Module or function, and the names that it asks for.
 
-    Args: name: of the stage, which says what its input is (``INPUT``). call: Module or function.
+    Args:
+      name: of the stage, which says what its input is (``INPUT``).
+      call: Module or function.
     Raises: DomainError when the stage asks for something that a system does not have, or cannot take its input.
     """
 

@@ -24,7 +24,8 @@ def save(folder: Path, learner: Learner, progress: Progress, facts: dict[str, An
     """Write a checkpoint: tensors under a new name first, then checkpoint.json, which names them; a run cut
     short in between keeps the earlier one.
 
-    Args: facts: plain values that say what the run is (network, seed, schedule, versions).
+    Args:
+      facts: plain values that say what the run is (network, seed, schedule, versions).
     Raises: CodesignError when the folder cannot be written.
     """
     try:

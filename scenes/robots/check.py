@@ -22,8 +22,9 @@ LEAST_FOLLOWED = 0.05  # of the pixels that show a surface: the pairs have 0.7 a
 def check_pair(pair: RobotPair, camera: render.Camera | None = None, numbers: Sequence[int] = (0,)) -> None:
     """Look at bounds, mount, drives and worlds of a pair.
 
-    Args: camera: to judge by; None is that of the pair's design. numbers: of the worlds and drives looked at;
-      each world is made and one frame of six drives rendered.
+    Args:
+      camera: to judge by; None is that of the pair's design.
+      numbers: of the worlds and drives looked at; each world is made and one frame of six drives rendered.
     Raises: DomainError, in a sentence that says what to change, for a design outside its bounds, one that
       does not keep the pair's requirements, a box inside or far from the robot, a lens whose image circle is
       smaller than the sensor (``mount.check_mount``) or that is wider than the camera's housing, a box that

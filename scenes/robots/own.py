@@ -42,7 +42,8 @@ def own_pair(settings: OwnRobot | str | Path) -> RobotPair:
     wherever its origin is. Windows of a trajectory begin at random places, for training in its first two
     thirds, for judging in the rest. A world from a file is the same for all numbers.
 
-    Args: settings: or the path of their page (``page.read_own``).
+    Args:
+      settings: or the path of their page (``page.read_own``).
     Raises: FileFormatError for files that are missing or damaged; DomainError, naming the entry, for what is
       unknown, missing, out of range, or does not go together: a robot without room in the world, a trajectory
       that stands still or is shorter than three windows.

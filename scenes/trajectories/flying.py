@@ -53,7 +53,8 @@ class Polynomials:
 def minimum_snap(points, t_s):
     """The path of least snap that is at rest at both ends.
 
-    Args: points: [K >= 2, D] to pass, t_s: [K] when, strictly increasing seconds.
+    Args:
+      points: [K >= 2, D] to pass, t_s: [K] when, strictly increasing seconds.
     Returns: Polynomials, float64.
     Raises: ShapeError; DomainError for values that are not finite, times that do not increase, durations that
       differ more than 100 times, more than 200 points.

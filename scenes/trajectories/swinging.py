@@ -58,8 +58,10 @@ class Swinging(Trajectory):
     """start + direction * amplitude * sin(2 pi frequency t), with the attitude of the start; the speed is at
     most 2 pi frequency amplitude.
 
-    Args: T_world_start: [4, 4] body pose. direction: [3] unit vector in the world. amplitude_m, frequency_hz:
-      above 0.
+    Args:
+      T_world_start: [4, 4] body pose.
+      direction: [3] unit vector in the world.
+      amplitude_m, frequency_hz: above 0.
     """
 
     def __init__(self, T_world_start, direction, amplitude_m, frequency_hz):

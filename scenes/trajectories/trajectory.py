@@ -28,7 +28,8 @@ class Trajectory(ABC):
     def __call__(self, t_s) -> Tensor:
         """Poses at times.
 
-        Args: t_s: [n] seconds, in any order.
+        Args:
+          t_s: [n] seconds, in any order.
         Returns: [n, 4, 4] float64, without gradient to the time.
         Raises: ShapeError for anything but a list of times; DomainError for times that are not finite or lie
           outside ``span_s``.
@@ -87,8 +88,9 @@ def mounted(trajectory, T_body_cam):
     """The path of a camera on a body: T_world_cam = T_world_body T_body_cam, with the camera's velocity in
     its own axes.
 
-    Args: trajectory: anything with a call, ``velocity`` and ``span_s``. T_body_cam: [4, 4], for example of
-      codesign.mount.Mount.
+    Args:
+      trajectory: anything with a call, ``velocity`` and ``span_s``.
+      T_body_cam: [4, 4], for example of codesign.mount.Mount.
     Returns: a trajectory of the camera (x right, y down, z forward). Gradient: to T_body_cam.
     Raises: ShapeError, DomainError when T_body_cam is not one rigid transform.
     """

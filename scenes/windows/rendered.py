@@ -146,7 +146,9 @@ class Sample:
 class RenderedWindows(Windows):
     """Truth is exact and valid everywhere (also where the point gets hidden).
 
-    Args: draws: Draws. height_px, width_px: size. Others as Windows.
+    Args:
+      draws: Draws.
+      height_px, width_px: size. Others as Windows.
     """
 
     def __init__(self, draws=None, *, seed=0, height_px=64, width_px=64, bins=8, intervals=32):

@@ -18,13 +18,14 @@ LARGE_PX = 128
 NOISE_SHARE = (0.01, 0.15)  # noise events over those of the scene
 WEAK = (0.12, 0.35)  # thresholds
 STRONG = (0.05, 0.15)
+# events of the scene per pixel -> thresholds, factors on log radiance of single planes and of layers
 CONTRASTS = {
     0.05: (WEAK, (0.2, 0.6), (0.1, 0.3)),
     0.1: (WEAK, (0.3, 0.8), (0.12, 0.4)),
     0.3: (WEAK, (0.6, 1.2), (0.25, 0.7)),
     1.0: (STRONG, (0.8, 1.6), (0.3, 0.6)),
     3.0: (STRONG, (1.8, 3.5), (0.6, 1.2)),
-}  # events of the scene per pixel -> thresholds, factors on log radiance of single planes and of layers
+}
 EVERYDAY = Draws("everyday", flow_px=(2.0, 12.0), mismatch=0.05, scale=(1.0, 2.0), on_over_off=(0.8, 1.25))
 MOVED = replace(EVERYDAY, theta=(0.1, 0.25), contrast=(0.8, 1.6), noise=(0.0005, 0.01))
 

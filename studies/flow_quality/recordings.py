@@ -20,6 +20,7 @@ from codesign.types import EventStream
 from scenes.windows.streams import sliding, turning
 from studies.flow_quality import sharpest
 
+# figure -> title and note of its table, what its worst value is called, and which that is
 MEASURES = {
     "distance_px": (
         "Distance to the contrast maximisation, px",
@@ -35,7 +36,7 @@ MEASURES = {
         max,
     ),
     "fwl": ("Flow warp loss (FWL)", "Above 1 is sharper; mean over packets (least).", "least", min),
-}  # figure -> title and note of its table, what its worst value is called, and which that is
+}
 JUDGED = "refiner"
 REFERENCE = "closed_form_quadratic"  # whose distance the network's is compared with
 CONTEXT = 30_000  # events around the middle of a packet that the contrast maximisation sees at least

@@ -37,7 +37,9 @@ def rotation(packet, focal_px) -> Sharpest:
     """The turn of a pinhole camera, its axis in the image's middle, that makes the events of a packet
     sharpest.
 
-    Args: packet: with stream, t0_us, t1_us. focal_px: focal length, px.
+    Args:
+      packet: with stream, t0_us, t1_us.
+      focal_px: focal length, px.
     """
     events = _Events(packet)
 

@@ -79,8 +79,12 @@ def prepare(
 ) -> Job:
     """Everything a design by gradients needs before its first step.
 
-    Args: config: Config of lens_opt. task: where to start from, by default the detuned lens. objective: "flow" or
-      "edge", by default that of config. stage: flow stage to share; part: of the step size.
+    Args:
+      config: Config of lens_opt.
+      task: where to start from, by default the detuned lens.
+      objective: "flow" or "edge", by default that of config.
+      stage: flow stage to share.
+      part: of the step size.
     Raises: DomainError for an event layer and an estimator that make no sense together, with the reason.
     """
     layer = event_layer(config.events)

@@ -86,7 +86,9 @@ def shrink_spots(
 
     The even weights are optimised from ``starts`` starts, the detuned lens and others around it; the other weights go
     on from the best of them.
-    Args: judge: mean flow error on development cases. steps: most steps of a run.
+    Args:
+      judge: mean flow error on development cases.
+      steps: most steps of a run.
     Returns: the start itself, with a complaint, when no start gives a smaller spot than it had.
     """
     generator = torch.Generator().manual_seed(seed)

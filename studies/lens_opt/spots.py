@@ -61,8 +61,9 @@ def spot_rays(
 ) -> SpotRays:
     """Rays from points of a wall across the axis, ``distance_m`` before the entrance pupil, to the film.
 
-    Args: fields_rad: angles of the points' chief rays. grid: pupil cells across; one half of the pupil is traced, the
-      other is its mirror image.
+    Args:
+      fields_rad: angles of the points' chief rays.
+      grid: pupil cells across; one half of the pupil is traced, the other is its mirror image.
     Gradient: positions and slopes to every lens tensor. Raises: DomainError when no ray of a point arrives.
     """
     pupil = pupil_grid(grid, optics.dtype)

@@ -37,9 +37,8 @@ LIGHT = lens.Spectrum.from_curves(silicon_response(), daylight_d65(), 4)
 TRAINING = ("gravel", "grass", "gravel:2", "grass:2", "speckle-1")
 DEVELOPMENT = ("coffee", "chelsea", "rocket")  # on which settings are chosen
 HELD_OUT = ("brick", "astronaut", "hubble_deep_field")
-MOTION = torch.tensor(
-    [0.012, 0.012, 0.02, 0.001, 0.001, 0.006], dtype=torch.float64
-)  # m and rad over the interval, standard deviations
+# m and rad over the interval, standard deviations
+MOTION = torch.tensor([0.012, 0.012, 0.02, 0.001, 0.001, 0.006], dtype=torch.float64)
 
 
 @cache
@@ -144,8 +143,10 @@ def make_task(source, seed, detuned_px=1.5):
     """Load a lens, scale it so that its published field fills the sensor's diagonal, focus it on the wall, and
     detune its curvatures by ``seed``.
 
-    Args: source: catalogue name or file. detuned_px: mean RMS spot of the detuned lens in pixels, at its best focus
-      (above one, so that the flow suffers).
+    Args:
+      source: catalogue name or file.
+      detuned_px: mean RMS spot of the detuned lens in pixels, at its best focus (above one, so that the flow
+        suffers).
     """
     published = lens.load(source)
     half_field = math.radians(published.half_field_deg or NO_FIELD_DEG)

@@ -331,9 +331,8 @@ def sampled(geo, field, light, at_m):
     wavelength."""
     try:
         for wavelength_um in light:
-            analysis.pupil_function(
-                geo, field, wavelength_um, MOST_CELLS // 2, True, at_m=at_m
-            )  # half the cells: a lens that just passes has room
+            # half the cells: a lens that just passes has room
+            analysis.pupil_function(geo, field, wavelength_um, MOST_CELLS // 2, True, at_m=at_m)
     except DomainError:
         return False
     return True

@@ -29,8 +29,9 @@ LOSS_CHANGE = 1e-6  # a stage ends when a step gains less than this share
 def search(method: str, seed: int, goal_um: float, shorten: int = 1) -> dict[str, Any]:
     """The design of the first attempt that succeeds, else of the last one, and what it took.
 
-    Args: goal_um: mean RMS spot that counts as success, together with all limits and all rays. shorten: divides
-      the steps of every stage.
+    Args:
+      goal_um: mean RMS spot that counts as success, together with all limits and all rays.
+      shorten: divides the steps of every stage.
     Returns: variables [11] of the design, and how it came about, as plain numbers.
     """
     began = time.monotonic()

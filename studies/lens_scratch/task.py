@@ -120,13 +120,11 @@ def residuals_of(stage, fields=4):
         rays = [field_rays(geo, a, pupil) for a in angles]
         origin, direction = (torch.cat(part) for part in zip(*rays, strict=True))
         traced = [geo.trace(origin, direction, WAVELENGTH_UM[line]) for line in stage.lines]
-        position = torch.stack(
-            [out.position_mm[:, :2].reshape(fields, -1, 2) for out in traced], 1
-        )  # [fields, lines, M, 2]
+        # [fields, lines, M, 2]
+        position = torch.stack([out.position_mm[:, :2].reshape(fields, -1, 2) for out in traced], 1)
         arrived = torch.stack([(out.status == 0).reshape(fields, -1) for out in traced], 1)
-        centre = position[..., 1].mean(
-            (1, 2), keepdim=True
-        )  # x is symmetric, so its mean over the whole pupil is 0
+        # x is symmetric, so its mean over the whole pupil is 0
+        centre = position[..., 1].mean((1, 2), keepdim=True)
         error = (
             torch.stack([position[..., 0], position[..., 1] - centre], -1)
             * arrived[..., None]

@@ -91,7 +91,10 @@ def parts_done(folder: Path):
 def join(folder: Path, count: int, t_s, extra: dict[str, np.ndarray]):
     """Write events.h5 and frames.h5 of a sequence from its parts, chunk by chunk.
 
-    Args: count: number of parts. t_s: [T] frame times. extra: further arrays for frames.h5 (poses, ...).
+    Args:
+      count: number of parts.
+      t_s: [T] frame times.
+      extra: further arrays for frames.h5 (poses, ...).
     """
     times_us = np.rint(np.asarray(t_s) * 1e6).astype(np.int64)
     with _whole(folder / "frames.h5") as file:

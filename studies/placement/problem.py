@@ -231,7 +231,9 @@ def _of(parts, which, count):
 def traced_camera(pair: RobotPair, name: str, focal_mm: float | None = None) -> render.Camera:
     """The pair's windows behind a traced lens.
 
-    Args: name: in the catalogue, or a lens file. focal_mm: to which the lens is scaled; None: that of the
+    Args:
+      name: in the catalogue, or a lens file.
+      focal_mm: to which the lens is scaled; None: that of the
     pair's design. The lens is focused where the pair's is. Raises: as ``lens.load``; DomainError for a focal
     length that is not positive.
     """

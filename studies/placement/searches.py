@@ -60,7 +60,8 @@ def descend(
 ) -> Trail:
     """Normalised momentum descent in the cube, its steps ever shorter.
 
-    Args: slope: (share [V], number of the step) -> value and gradient [V], of other samples in every step.
+    Args:
+      slope: (share [V], number of the step) -> value and gradient [V], of other samples in every step.
       start: [V].
     Returns: Trail of the points whose slopes were asked for, and last the mean of the end of the way, which
       is the answer and has the error of the last step. Raises: NonFiniteError.

@@ -45,8 +45,9 @@ def default_path():
 def load(path):
     """Read a recording.
 
-    Args: path: .aedat4 with frames, or .npz with t (us), x, y, p (0 or 1), frames [T, H, W] uint8 and
-      exposure [T, 2] (us, start and end).
+    Args:
+      path: .aedat4 with frames, or .npz with t (us), x, y, p (0 or 1), frames [T, H, W] uint8 and exposure
+        [T, 2] (us, start and end).
     Returns: Recording.
     Raises: FileFormatError when the file is missing or of another kind; ShapeError for fewer than five frames
       or frames of another size than the events'.
@@ -86,9 +87,8 @@ def _read_npz(path):
 def _read_aedat4(path):
     recorded = read_frames(path)
     stream = events.read(path)
-    start_us = min(
-        int(stream.t_us.min()), int(recorded.exposure_start_us.min())
-    )  # epoch times to times since the start
+    # epoch times to times since the start
+    start_us = min(int(stream.t_us.min()), int(recorded.exposure_start_us.min()))
     exposure_us = torch.stack((recorded.exposure_start_us, recorded.exposure_end_us), dim=1) - start_us
     return (
         recorded.frames,

@@ -81,9 +81,8 @@ def _surfaces(generator, form):
 
     found = []
     glass = None
-    diffracts = chance(
-        0.3
-    )  # a phase anywhere makes the kernel bend rays by their grating equation everywhere
+    # a phase anywhere makes the kernel bend rays by their grating equation everywhere
+    diffracts = chance(0.3)
     for i, letter in enumerate(form):
         if letter == "g":
             n = uniform(1.45, 1.85)

@@ -92,9 +92,8 @@ def only(data, pixels, width):
         if name in data:
             found[name] = data[name].reshape(-1)[pixels].reshape(SIDE, SIDE)
     if "per_frame" in data:
-        frame = np.ceil(np.round(found["t"].astype(np.float64) * 1e6) / 1e3).astype(
-            int
-        )  # frames are 1 ms apart
+        # frames are 1 ms apart
+        frame = np.ceil(np.round(found["t"].astype(np.float64) * 1e6) / 1e3).astype(int)
         found["per_frame"] = np.bincount(frame, minlength=len(data["per_frame"]))
     return found
 

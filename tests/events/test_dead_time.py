@@ -78,7 +78,12 @@ def test_regular_events_pass_one_in_ceil_of_rate_times_dead_time(load):
 def written_out(level, centre, thetas, interval_s, dead_s):
     """Kept counts [T, 2, P], the play's centre [P] after them, and position [P].
 
-    Args: level: [T + 1, P]. centre: [P]. thetas: two, 0-dim or [P]. interval_s: [T]. dead_s: 0-dim tensor.
+    Args:
+      level: [T + 1, P].
+      centre: [P].
+      thetas: two, 0-dim or [P].
+      interval_s: [T].
+      dead_s: 0-dim tensor.
     """
     fixed_s = float(dead_s.detach())
     ends_s = torch.cat((interval_s.new_zeros(1), interval_s.cumsum(0)))

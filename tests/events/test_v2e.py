@@ -123,9 +123,8 @@ def test_counts_under_mismatch_are_those_of_v2e(shared, timing, sigma):
 
 
 @pytest.mark.parametrize("start_s", [0.0, 1_700_000_000.0])
-@pytest.mark.parametrize(
-    "gap_s", [1e-3, 20.0]
-)  # beyond 8 s single precision no longer resolves a microsecond
+# beyond 8 s single precision no longer resolves a microsecond
+@pytest.mark.parametrize("gap_s", [1e-3, 20.0])
 def test_slots_keep_microseconds_at_epoch_times_and_late(start_s, gap_s):
     frames = torch.tensor([50.0, 80.0, 50.0, 120.0])[:, None, None]
     events = simulate(frames, start_s + torch.arange(4, dtype=D) * gap_s, SensorModel(timing="v2e"))

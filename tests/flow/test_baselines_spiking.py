@@ -47,9 +47,8 @@ def by_hand(net, halves):
         )
     for level in range(4):
         neck = conv_transpose2d(x, net.necks[level].weight, stride=2, padding=1)
-        coarser = (
-            2 * interpolate(flows[-1], scale_factor=2.0, mode="bilinear") if flows else 0.0
-        )  # twice the pixels, twice the vectors
+        # twice the pixels, twice the vectors
+        coarser = 2 * interpolate(flows[-1], scale_factor=2.0, mode="bilinear") if flows else 0.0
         flows.append(coarser + conv2d(neck, net.heads[level].weight))
         if level < 3:
             up = leaky_relu(conv_transpose2d(x, net.decoder[level].weight, stride=2, padding=1), 0.1)

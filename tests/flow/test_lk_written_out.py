@@ -138,9 +138,8 @@ def one_step(volume, terms, sigma_px):
 @pytest.mark.parametrize(("model", "terms"), [("constant", 1), ("affine", 3), ("quadratic", 6)])
 @pytest.mark.parametrize("per_pixel", [8.0, 0.01])
 def test_one_step_is_that_of_the_formulas_written_out(model, terms, sigma_px, per_pixel, monkeypatch):
-    monkeypatch.setattr(
-        cells, "SIZES", (1e-9,)
-    )  # the polynomial by itself: see test_lk_local for what it leaves
+    # the polynomial by itself: see test_lk_local for what it leaves
+    monkeypatch.setattr(cells, "SIZES", (1e-9,))
     # plenty of events and large motion, where the step is limited; a hundredth of an event per pixel,
     # where the prior and the few events of the start decide
     volume, _ = moving(3, ((0.02, -0.03), (0.01, 0.04)), (5.0, -4.0), per_pixel, steps=20)

@@ -136,9 +136,8 @@ def test_events_that_leave_count_in_the_denominator_only():
     assert metrics.fwl(stream, constant(8.0, 12), 0, end_us) == pytest.approx(1)
     # u = 40: to 42 - 9 k = 42, 33, 24, 15, 6: one stays. Variances 1/12 - 1/144 and 5/12 - 25/144
     assert metrics.fwl(stream, constant(40.0, 12), 0, end_us) == pytest.approx(11 / 35)
-    assert metrics.rsat(stream, constant(40.0, 12), 0, end_us) == pytest.approx(
-        1 / (9 / 24)
-    )  # the last, at time 1; before, 9 / 24
+    # the last, at time 1; before, 9 / 24
+    assert metrics.rsat(stream, constant(40.0, 12), 0, end_us) == pytest.approx(1 / (9 / 24))
     with pytest.raises(DomainError, match="every event out of the image"):
         metrics.rsat(stream, constant(40.0, 12), 0, end_us + 1000)  # at 4/5 of the window it leaves too
 

@@ -102,9 +102,8 @@ def test_the_deficit_falls_when_its_gradient_is_followed(name):
     step = 1e-6
     nearer = geo.trace((x - step * slope / slope.norm()).detach(), f64([direction])).deficit
     drop = step * float(slope.norm())
-    assert (
-        abs(deficit.item() - nearer.item() - drop) <= 1e-5 * drop
-    )  # bends by the step over 10 mm; rounding 1e-16 over 1e-6
+    # bends by the step over 10 mm; rounding 1e-16 over 1e-6
+    assert abs(deficit.item() - nearer.item() - drop) <= 1e-5 * drop
 
 
 def mixed_lenses():
@@ -201,9 +200,8 @@ def test_single_precision_from_ten_kilometres_away(name):
     truth = lens.load(name).trace(near.double(), direction.double())
     out = lens.load(name, torch.float32).trace(far, direction)
     assert not out.status.any()
-    assert (
-        float((out.position_mm - truth.position_mm).detach().abs().max()) <= 3e-5
-    )  # no worse than from 5 mm
+    # no worse than from 5 mm
+    assert float((out.position_mm - truth.position_mm).detach().abs().max()) <= 3e-5
 
 
 def test_a_ball_lens_has_its_textbook_focal_length():
@@ -214,9 +212,8 @@ def test_a_ball_lens_has_its_textbook_focal_length():
     ball = GeoLens([Surface(R, 2 * R, GLASS, 4.99), Surface(-R, n * R / (2 * (n - 1)) - R, None, 4.99)], 2.0)
     height = 1e-4
     out = ball.trace(f64([[height, 0, -9.0], [4.0, 0.0, -9.0]]), f64([[0, 0, 1.0]] * 2))
-    assert (
-        abs(out.position_mm[0, 0].item()) <= 1e-8 * height
-    )  # spherical aberration at this height: (1e-4 / 5)^2 of it
+    # spherical aberration at this height: (1e-4 / 5)^2 of it
+    assert abs(out.position_mm[0, 0].item()) <= 1e-8 * height
     # 4 mm off the axis: sin i = 0.8, bent by 2 (i - i') altogether; crosses the axis at R sin i / sin(2 (i -
     # i')) from the centre
     turn = 2 * (math.asin(0.8) - math.asin(0.8 / n))

@@ -144,9 +144,8 @@ def measure(count: int, seed: int, say=print, studies=tuple(STUDIES)) -> tuple[d
                 if code == 0:
                     break
                 story.append(f"{kind} at {after_s:.1f} s")
-                late = (folder / "metrics.json").exists() and code == -KINDS.get(
-                    kind, 0
-                )  # behind the run's end
+                # behind the run's end
+                late = (folder / "metrics.json").exists() and code == -KINDS.get(kind, 0)
                 if code not in ENDS[kind] and not late:
                     findings.append(f"{study}, {', '.join(story)}: ends with {code}: {said}")
                 if _kept(folder):

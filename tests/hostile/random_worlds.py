@@ -188,9 +188,8 @@ class _World:
         """A shape of about unit radius, ``placed`` [4, 4] in the axes of the first camera."""
         rng, mi = self.rng, self.mi
         size = float(np.linalg.norm(placed[:3, 0]))
-        slim = max(
-            0.03, float(np.linalg.norm(placed[:3, 3])) / ROUNDEST / size
-        )  # of a pole: radius over length
+        # of a pole: radius over length
+        slim = max(0.03, float(np.linalg.norm(placed[:3, 3])) / ROUNDEST / size)
         placed = self.T_world_first @ placed
         unit = np.eye(4)
         plugin = {"ball": "sphere", "cube": "cube", "disc": "disk", "card": "rectangle"}.get(kind, "cylinder")

@@ -40,12 +40,13 @@ def resumed(path: Path):
         (path.parent / "config.json").write_bytes(made("config.json", run)())
     again = open_run("hostile", Config(resume=path.parent, device="cpu"))
     state = again.load_state()
+    # a state may hold an infinite best
     return [
         again.config.limit,
         again.config.sizes,
         again.metrics,
         sorted(state.tensors) if state else None,
-    ]  # a state may hold an infinite best
+    ]
 
 
 class Learner:

@@ -146,9 +146,8 @@ def run(threads: int, rounds: int, kinds: tuple[str, ...] = tuple(KINDS)) -> dic
       serially and threaded. Hangs or ends the process where threads are not safe: call it in a process with a time limit.
     Raises: what the first thread raised.
     """
-    torch.set_num_threads(
-        1
-    )  # else every thread gets a pool of torch's, and they wait for one another's cores
+    # else every thread gets a pool of torch's, and they wait for one another's cores
+    torch.set_num_threads(1)
     serial = {(kind, seed): KINDS[kind](seed) for kind in kinds for seed in range(SEEDS)}
     serial_s = min(timeit.repeat(lambda: [KINDS[kind](0) for kind in kinds], number=1, repeat=3))
     worst = dict.fromkeys(kinds, 0.0)

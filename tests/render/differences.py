@@ -6,7 +6,9 @@ import torch
 def assert_gradients(loss, at, steps, within, seed=0):
     """Gradients of loss(*at) are its central differences within a share, each along two random directions.
 
-    Args: at: tensors. steps: of each, small enough that the function bends by less than ``within`` over them.
+    Args:
+      at: tensors.
+      steps: of each, small enough that the function bends by less than ``within`` over them.
     """
     leaves = [value.detach().clone().requires_grad_() for value in at]
     found = torch.autograd.grad(loss(*leaves), leaves)

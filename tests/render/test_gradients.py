@@ -89,7 +89,6 @@ def test_gradients_are_the_same_at_the_second_backward(room):
     loss = frames(*at).square().mean()
     first = [g.clone() for g in torch.autograd.grad(loss, at, retain_graph=True)]
     second = torch.autograd.grad(loss, at)
-    for a, b in zip(
-        first, second, strict=True
-    ):  # threads add 1152 float32 terms in any order; a re-used tape was wrong by factors
+    # threads add 1152 float32 terms in any order; a re-used tape was wrong by factors
+    for a, b in zip(first, second, strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=1e-5 * float(a.abs().max()))

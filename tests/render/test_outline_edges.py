@@ -63,9 +63,8 @@ def test_edges_whose_faces_both_turn_away_are_black_on_both_sides():
     eye = torch.tensor([[3.0, 4, 5]], dtype=F64)
     # where two seen sides meet
     assert torch.equal(curve.face_slope(index, middle, eye).isfinite(), facing)
-    edges = mesh_edges(
-        CORNERS, CUBE[:2]
-    )  # a square at x = 0, its normal along -x: black from here, and in the way
+    # a square at x = 0, its normal along -x: black from here, and in the way
+    edges = mesh_edges(CORNERS, CUBE[:2])
     index, _ = Segments.of(edges).pieces(torch.tensor([3.0, 4, 5], dtype=F64), 10.0)
     assert len(index) == 4
 
@@ -187,9 +186,8 @@ def test_a_pole_and_its_lid_have_one_rim():
     turned = np.array([[0.0, 0.0, 1.0]] * 3)
     u = np.array([[1.0, 0, 0], [0.6, 0.8, 0], [0.5, 0, 0]])
     v = np.array([[0.0, 1, 0], [0.8, -0.6, 0], [0.0, 0.5, 0]])
-    assert (
-        len(rims_once(turned, u, v, 0 * u, np.zeros(3), 1e-4)[0]) == 2
-    )  # the same circle turned and mirrored, and a smaller one
+    # the same circle turned and mirrored, and a smaller one
+    assert len(rims_once(turned, u, v, 0 * u, np.zeros(3), 1e-4)[0]) == 2
 
 
 def test_the_far_end_of_a_tube_is_hidden_by_its_near_wall():

@@ -99,7 +99,6 @@ def test_waves_stay_inside_their_band():
     period = 1 / frequency.norm(dim=1)
     assert 0.02 <= float(period.min()) < 0.022
     assert 0.27 < float(period.max()) <= 0.3
-    assert float(amplitude.square().sum() / 2) == pytest.approx(
-        0.25, rel=1e-12
-    )  # variance of the log radiance is contrast squared
+    # variance of the log radiance is contrast squared
+    assert float(amplitude.square().sum() / 2) == pytest.approx(0.25, rel=1e-12)
     assert isinstance(worlds.smooth_plane(2, finest_period_m=0.1), TexturedPlane)

@@ -129,9 +129,8 @@ def test_a_wall_is_as_traced(optics):
     cam = camera(optics)
     pose = (FRONT @ se3_exp(torch.tensor([0.1, 0.05, 0, 0.1, 0.05, 0.2], dtype=D)))[None]
     found = render.psf_frames(cam, waves(), pose)
-    assert (
-        rms_share(found, render.frames(cam, waves(), pose)) < 0.005
-    )  # 2 % are asked where blur changes slowly
+    # 2 % are asked where blur changes slowly
+    assert rms_share(found, render.frames(cam, waves(), pose)) < 0.005
 
 
 def test_windows_trajectories_and_lists_of_scenes_are_as_traced():

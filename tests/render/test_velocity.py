@@ -46,9 +46,8 @@ def test_logarithm_is_that_of_the_matrix(angle, generator):
     axis = torch.nn.functional.normalize(torch.randn(3, dtype=D, generator=generator), dim=0)
     twist = torch.cat([torch.randn(3, dtype=D, generator=generator), angle * axis])
     found = se3_log(se3_exp(twist)[None])[0]
-    torch.testing.assert_close(
-        found, twist, rtol=0, atol=2e-15 / max(math.sin(angle), 0.1)
-    )  # the angle comes of a sine that is small near half a turn
+    # the angle comes of a sine that is small near half a turn
+    torch.testing.assert_close(found, twist, rtol=0, atol=2e-15 / max(math.sin(angle), 0.1))
     L = torch.from_numpy(np.real(logm(se3_exp(twist).numpy())))
     torch.testing.assert_close(found, torch.stack([*L[:3, 3], L[2, 1], L[0, 2], L[1, 0]]), rtol=0, atol=1e-12)
 
@@ -56,6 +55,5 @@ def test_logarithm_is_that_of_the_matrix(angle, generator):
 @pytest.mark.parametrize("scale", [0.0, 1e-9, 1e-5, 4e-3, 0.5])
 def test_gradcheck(scale, generator):
     twist = (scale * torch.randn(2, 6, dtype=D, generator=generator)).requires_grad_()
-    assert torch.autograd.gradcheck(
-        lambda w: se3_log(se3_exp(w)), twist, atol=1e-8
-    )  # the identity, by way of the group
+    # the identity, by way of the group
+    assert torch.autograd.gradcheck(lambda w: se3_log(se3_exp(w)), twist, atol=1e-8)

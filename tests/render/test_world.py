@@ -10,9 +10,8 @@ from codesign.render import Camera
 from scenes import textures, worlds
 
 D = torch.float64
-CORNERS = np.array(
-    [[10.0, 60.0], [120.0, 200.0]], dtype=np.float32
-)  # top left, top right; bottom left, bottom right
+# top left, top right; bottom left, bottom right
+CORNERS = np.array([[10.0, 60.0], [120.0, 200.0]], dtype=np.float32)
 
 
 def quadrants(size=64):
@@ -123,9 +122,8 @@ def test_a_photograph_is_linearised_as_srgb(tmp_path):
     colour = np.zeros((2, 2, 3), dtype=np.uint8)
     colour[..., 1] = 255
     imageio.imwrite(tmp_path / "green.png", colour)
-    np.testing.assert_allclose(
-        textures.photo(tmp_path / "green.png"), 2 + 253 * 0.7152, rtol=2e-6
-    )  # luminance is a sum of linear light
+    # luminance is a sum of linear light
+    np.testing.assert_allclose(textures.photo(tmp_path / "green.png"), 2 + 253 * 0.7152, rtol=2e-6)
 
 
 @pytest.mark.parametrize(("size_px", "shape"), [(4, (2, 4)), (9, (4, 9)), (10, (5, 10)), (12, (6, 12))])
@@ -168,9 +166,8 @@ def test_speckle_keeps_its_band_and_contrast():
     inside = (radius >= 1 / 32) & (radius <= 1 / 4)
     assert power[inside].sum() / power.sum() > 1 - 1e-9  # float32 rounding of the radiance
     low = power[(radius >= 1 / 32) & (radius < 1 / 16)].sum()
-    assert low / power[(radius >= 1 / 8) & (radius <= 1 / 4)].sum() == pytest.approx(
-        1, abs=0.25
-    )  # equal power per octave; some 300 random modes
+    # equal power per octave; some 300 random modes
+    assert low / power[(radius >= 1 / 8) & (radius <= 1 / 4)].sum() == pytest.approx(1, abs=0.25)
 
 
 def test_faded_pictures_end_in_the_level():

@@ -407,9 +407,8 @@ def test_pictures_are_textures_in_one_line(tmp_path):
     row = bytes([128, 128, 128, 129]) * 2 + bytes([192, 192, 192, 130]) * 2
     header = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 4\n"
     (tmp_path / "a.hdr").write_bytes(header + row * 2)  # 1 1 3 3, twice
-    np.testing.assert_allclose(
-        textures.photo(tmp_path / "a.hdr"), [[40.0, 40, 120, 120]] * 2, rtol=1e-5
-    )  # mean 80
+    # mean 80
+    np.testing.assert_allclose(textures.photo(tmp_path / "a.hdr"), [[40.0, 40, 120, 120]] * 2, rtol=1e-5)
 
 
 def test_real_robot_bodies_are_read(shared):

@@ -26,13 +26,14 @@ def test_the_examples_run(tmp_path, monkeypatch):
 
 def test_the_page_names_every_function():
     missing = [name for name in analysis.__all__ if name[0].islower() and name not in PAGE]
+    # what the others are made of
     assert missing == [
         "chief_height_mm",
         "chief_ray",
         "field_rays",
         "pupil_grid",
         "spectral_lines",
-    ]  # what the others are made of
+    ]
     named = re.findall(r"`(paraxial|seidel)\.(\w+)\(", PAGE)
     assert named
     assert all(

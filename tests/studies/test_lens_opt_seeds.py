@@ -10,11 +10,12 @@ from studies import lens_opt_seeds
 from studies.frame.run import main
 
 LENSES = ("nominal", "detuned", "refocused", "spots", "edge", "optimised", "after_spots")
+# of flow errors, over those of the spot designer
 RATIO = {
     "optimised": 0.9,
     "after_spots": 0.97,
     "edge": 1.0,
-}  # of flow errors, over those of the spot designer
+}
 WOBBLE = {0: (0.99, 1.01, 1.0), 1: (1.01, 0.99, 1.0)}  # of the flow design, by seed and case
 
 

@@ -128,9 +128,8 @@ def test_controls_see_nothing(problem):
     assert found["as_found"] < 0.8 * found["always_zero"]
     back = looking_back(problem)
     assert torch.linalg.det(back[:3, :3]) == pytest.approx(1.0)
-    assert all(
-        looking_back(Problem(each(), range(1)))[2, 2] < 0.5 for each in PAIRS.values()
-    )  # view not upwards
+    # view not upwards
+    assert all(looking_back(Problem(each(), range(1)))[2, 2] < 0.5 for each in PAIRS.values())
 
 
 @pytest.mark.parametrize(

@@ -47,9 +47,10 @@ def test_the_fit_recovers_thresholds_that_are_known():
         (drifting(fine_s) + dark_offset).log(), fine_s, events.SensorModel(*thetas), log_input=True
     )
     recorded = events.to_counts(stream, fine_s[::40])
+    # 0.1 noise events per pixel and second
     recorded += torch.poisson(
         torch.full_like(recorded, 0.04 * 0.1), generator=torch.Generator().manual_seed(7)
-    )  # 0.1 noise events per pixel and second
+    )
     seen = drifting(fine_s[::40]).float(), fine_s[::40]
     sensor = FittedSensor(blur_odds=1e-3, time_constant_s=1e-4, noise_on_hz=0.1, noise_off_hz=0.1)
     fit = Fit(sensor, seen[0][:9], seen[1][:9], recorded[:8], 120)
@@ -73,10 +74,11 @@ def test_noise_fades_with_light_and_is_poisson():
     sensor = FittedSensor(dark_offset=10.0, noise_on_hz=4.0, noise_off_hz=8.0)
     counts = sensor.draw(frames, t_s, torch.Generator().manual_seed(1))
     for polarity, expected in ((0, 1.0), (1, 2.0)):
+        # (10/(10 + 10))^2
         for half, share in (
             (counts[:, polarity, :, :90], 1.0),
             (counts[:, polarity, :, 110:], 0.25),
-        ):  # (10/(10 + 10))^2
+        ):
             assert float(half.mean()) == pytest.approx(
                 expected * share, abs=5 * math.sqrt(expected * share / half.numel())
             )

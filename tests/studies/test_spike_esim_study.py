@@ -170,9 +170,8 @@ def test_saccades_go_round_an_equilateral_triangle_at_the_speed_of_their_closed_
         assert torch.allclose(at, (corners[leg] + corners[leg + 1]) / 2, atol=1e-12)
         assert float((after - before).norm()) / 2e-6 == pytest.approx(15 / 8 * SIDE_PX / LEG_S, rel=1e-6)
     still = position_px(LEG_S + torch.tensor([-1e-5, 1e-5], dtype=D))
-    assert (
-        float((still[1] - still[0]).norm()) < 1e-9
-    )  # at rest at the corners: 10 u^3 of 4 px with u = 1.7e-4 is 2e-10 px
+    # at rest at the corners: 10 u^3 of 4 px with u = 1.7e-4 is 2e-10 px
+    assert float((still[1] - still[0]).norm()) < 1e-9
 
 
 def test_frames_of_waves_are_those_waves_moved():

@@ -372,7 +372,8 @@ class RecordedFrames:
 def read_frames(path: str | Path) -> RecordedFrames:
     """Read the frames of an AEDAT 4.0 file.
 
-    Args: path: file ending in .aedat4.
+    Args:
+      path: file ending in .aedat4.
     Returns: RecordedFrames.
     Raises: FileFormatError when the file is missing, damaged, cut short, without a single stream of frames,
       or has frames in colour or of several sizes.

@@ -110,8 +110,9 @@ class Asked:
 class Arrival:
     """The events of one file, on their way to EventColumns.
 
-    Args: path: for messages. size, size_from: (height_px, width_px) by the file, or None, and what in it says
-      so.
+    Args:
+      path: for messages.
+      size, size_from: (height_px, width_px) by the file, or None, and what in it says so.
       place: what the events are numbered by.
     Raises: FileFormatError for sizes that disagree.
     """
@@ -139,7 +140,9 @@ class Arrival:
     def add(self, t_us, x, y, p, places=None):
         """Take the events that follow.
 
-        Args: t_us, x, y, p: [N] numbers; p above 0 for ON, else 0, or -1. places: [N] line numbers, or None.
+        Args:
+          t_us, x, y, p: [N] numbers; p above 0 for ON, else 0, or -1.
+          places: [N] line numbers, or None.
         Raises: FileFormatError naming the first that is no event, lies outside the sensor or more than
           DISORDER_US before an earlier one.
         """

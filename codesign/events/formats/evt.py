@@ -43,7 +43,9 @@ def unwrapped(ticks, loop):
     caller judges. (A single wrong bit changes a reading by at most half a loop, so it never passes for a new
     one.)
 
-    Args: ticks: [N] int64 readings, 0 to loop - 1. loop: number of readings.
+    Args:
+      ticks: [N] int64 readings, 0 to loop - 1.
+      loop: number of readings.
     Returns: [N] int64 readings plus ``loop`` for each new loop so far.
     """
     falls = np.zeros(len(ticks), np.int64)
@@ -54,8 +56,10 @@ def unwrapped(ticks, loop):
 def held(starts, values, count):
     """The last value given before each event; and how many events precede them all.
 
-    Args: starts: [M] rising numbers of the events that follow each value. values: [M]. count: number of
-      events.
+    Args:
+      starts: [M] rising numbers of the events that follow each value.
+      values: [M].
+      count: number of events.
     """
     first = int(starts[0]) if len(starts) else count
     return np.repeat(values, np.diff(starts, append=count)), first
@@ -76,7 +80,9 @@ def evt2_decoded(path, words):
     """Events of EVT 2.0: 32-bit words, one event each, with the low six bits of its time; time-high words
     carry the other 28.
 
-    Args: path: for messages. words: [N] uint32.
+    Args:
+      path: for messages.
+      words: [N] uint32.
     Returns: t_us, x, y, p (0 or 1) in file order, and the number of events before the first time-high word,
       which have no time and are left out.
     Raises: FileFormatError for a word of a reserved type.
@@ -109,7 +115,9 @@ def evt2_encoded(t_us, x, y, p):
 def evt3_decoded(path, words):
     """Events of EVT 3.0 words.
 
-    Args: path: for messages. words: [N] uint16.
+    Args:
+      path: for messages.
+      words: [N] uint16.
     Returns: t_us, x, y, p (0 or 1) in file order, and the number of events before the first word that gives
       their time, row or column base; they are left out.
     Raises: FileFormatError for a word of a reserved type, and for a vector that leaves the 11 bits of a
@@ -169,9 +177,8 @@ def _columns(kind, load, is_vector, where, emitted):
     vector = is_vector[where]
     kind_there = kind[where]
     load_there = load[where]
-    passed = np.concatenate(
-        ([0], np.cumsum(STEP[kind_there]))
-    )  # columns that vectors have moved the base by, before each emitting word
+    # columns that vectors have moved the base by, before each emitting word
+    passed = np.concatenate(([0], np.cumsum(STEP[kind_there])))
     at = np.flatnonzero(kind == BASE_X)
     base, baseless = held(emitted[at], (load[at] & 0x7FF) - passed[emitted[at]], len(where))
     on, _ = held(emitted[at], load[at] >> 11, len(where))

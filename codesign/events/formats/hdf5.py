@@ -61,7 +61,9 @@ def pixels(path, attributes, name):
 class Hdf5Events:
     """The events of a file in any of the layouts, by number or by time.
 
-    Args: path: file. asked: see Asked.
+    Args:
+      path: file.
+      asked: see Asked.
     size_px: (height, width) where the file tells, else None. rows: of t, x, y, p, or of all four together
       ("rows").
     Raises: FileFormatError for another layout, damage, and data kept in other files.

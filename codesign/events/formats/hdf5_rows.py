@@ -105,9 +105,8 @@ def undone(path, name, kind, options, data, limit_bytes):
         return np.frombuffer(data, np.uint8).reshape(width, -1).T.tobytes()
     if len(data) < 4:
         raise damaged(path, name, "fletcher32")
-    words = np.frombuffer(data[:-4] + bytes(len(data) % 2), ">u2").astype(
-        np.int64
-    )  # an odd last byte is the high half of a word
+    # an odd last byte is the high half of a word
+    words = np.frombuffer(data[:-4] + bytes(len(data) % 2), ">u2").astype(np.int64)
     low, high = struct.unpack("<HH", data[-4:])
     if (int(words.sum()) - low) % 65535 or (
         int((words * np.arange(len(words), 0, -1) % 65535).sum()) - high
@@ -169,8 +168,11 @@ class Rows:
     """A dataset of numbers in a file, read by ranges of its first axis. The file is open only while it is
     read.
 
-    Args: path: the file. name: the dataset. columns: shape of a row (None: any). count: number of rows that
-      it must have (None: any).
+    Args:
+      path: the file.
+      name: the dataset.
+      columns: shape of a row (None: any).
+      count: number of rows that it must have (None: any).
     Raises: FileFormatError when it is absent, of another shape, cut, packed by a filter that is not trusted,
       or kept in other files.
     """

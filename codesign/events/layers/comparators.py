@@ -51,9 +51,10 @@ class LastDraw:
     def __call__(self, asked, generators, draw):
         """What ``draw()`` returns, and the generators as it leaves them.
 
-        Args: asked: all that the draw depends on but its generators, to be compared by ==. generators: in the
-          order in which they are drawn from, also several times. draw: without arguments; what it returns, a
-          tuple of tensors or None, is not changed afterwards.
+        Args:
+          asked: all that the draw depends on but its generators, to be compared by ==.
+          generators: in the order in which they are drawn from, also several times.
+          draw: without arguments; what it returns, a tuple of tensors or None, is not changed afterwards.
         """
         own = list(dict.fromkeys(generators))
         place = {generator: number for number, generator in enumerate(own)}

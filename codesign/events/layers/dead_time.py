@@ -266,8 +266,10 @@ class _Run(Lanes):
     def forward(self, centre, position, heading, begun, rows):
         """Kept counts [T, 2, ...] of levels [T + 1, ...]; the state after them; the stored states.
 
-        Args: centre, position, heading: [...]. begun: [PHASES, ...]. rows: [reach, PHASES, ...], the last one
-          now.
+        Args:
+          centre, position, heading: [...].
+          begun: [PHASES, ...].
+          rows: [reach, PHASES, ...], the last one now.
         """
         steps, *pixels = self.shape
         target = self.zeros(2 * (steps - 1))

@@ -131,8 +131,10 @@ class EventLayer(nn.Module):
     ) -> tuple[Tensor, Any]:
         """The same in chunks of time.
 
-        Args: as for ``forward``. state: what the chunk before returned, which brings its own generators; then
-          T frames give T intervals. None: the first chunk.
+        Args:
+          as for ``forward``.
+          state: what the chunk before returned, which brings its own generators; then T frames give T
+            intervals. None: the first chunk.
         Returns: counts [..., T-1, 2, H, W] ([..., T, 2, H, W] with a state); state to carry on, with its
           graph.
         """
@@ -160,7 +162,9 @@ class EventLayer(nn.Module):
         A layer that can (``refines``) is asked on the way of the log level between frames (``events.finer``);
         another one has the events of an interval spread evenly over it.
 
-        Args: as for ``forward``. longest_s: length of the longest interval, seconds, > 0.
+        Args:
+          as for ``forward``.
+          longest_s: length of the longest interval, seconds, > 0.
         Returns: counts [..., T'-1, 2, H, W], times [T'] float64, those of the frames among them. Frames that
           are dense enough are taken as they are: then these are the counts of ``forward``.
         Gradient: as ``forward``, also for when events come.
@@ -187,7 +191,9 @@ class EventLayer(nn.Module):
     ) -> EventVolume:
         """Events of the frames in time bins, each near its own time however few the frames are (``finely``).
 
-        Args: as for ``forward``. bins: number of bins.
+        Args:
+          as for ``forward``.
+          bins: number of bins.
         Returns: EventVolume of counts [B, 2, bins, H, W], see ``events.from_counts``; several batch axes come
           as one.
         Gradient: as ``forward``, also for when events come.
@@ -221,7 +227,9 @@ class EventLayer(nn.Module):
     ) -> Tensor:
         """Time surface at every frame but the first, each event near its own time (``finely``).
 
-        Args: as for ``forward``. tau_s: time in which the surface fades to 1/e, seconds, > 0.
+        Args:
+          as for ``forward``.
+          tau_s: time in which the surface fades to 1/e, seconds, > 0.
         Returns: [..., T-1, 2, H, W] in 0 to 1, ON first.
         Gradient: of layers that count whole events as ``surface_from_hard_counts`` of these counts, of others
           as ``surface_from_counts``.
@@ -273,8 +281,9 @@ class Settled(nn.Module):
 
     A few time constants of the sensor's bandwidth are enough, and as much motion as makes an event or two.
 
-    Args: layer: of ``events.layer``. lead_s: length of a whole number of intervals between frames, seconds,
-      >= 0.
+    Args:
+      layer: of ``events.layer``.
+      lead_s: length of a whole number of intervals between frames, seconds, >= 0.
 
     >>> import torch
     >>> from codesign import events
@@ -307,8 +316,10 @@ def check_lead(lead_s: float) -> float:
 class HardSensor(nn.Module):
     """``events.simulate`` and ``events.from_stream`` called like an event layer.
 
-    Args: sensor: SensorModel. bins: time bins of the volume. lead_s: events before it are not read
-      (``Settled``).
+    Args:
+      sensor: SensorModel.
+      bins: time bins of the volume.
+      lead_s: events before it are not read (``Settled``).
     """
 
     def __init__(self, sensor: SensorModel, bins: int, lead_s: float = 0.0):

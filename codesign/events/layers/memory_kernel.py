@@ -121,8 +121,9 @@ def play_adjoint(
     """Adjoint of ``count``: gradients of the frames [first + T, ...] (rows before ``first`` are left to the
     caller), start, theta_on, theta_off [...] (zero unless wanted).
 
-    Args: grad_end: [...] of the memorised level and the play's centre together; the start's is theirs
-      together, too.
+    Args:
+      grad_end: [...] of the memorised level and the play's centre together; the start's is theirs together,
+        too.
     """
     loop = Loop(frames, theta_on, theta_off)
     dr = loop.dr

@@ -157,9 +157,8 @@ def _mean_count(distance, theta, spread):
     count = torch.zeros_like(many)
     moved = torch.zeros_like(many)
     close = many.detach()[~far.detach()]
-    last = (
-        math.ceil(float(close.max()) * math.exp(6 * float(spread.detach()))) if close.numel() else 0
-    )  # six deviations: what is left out is below 1e-9
+    # six deviations: what is left out is below 1e-9
+    last = math.ceil(float(close.max()) * math.exp(6 * float(spread.detach()))) if close.numel() else 0
     for k in range(1, last + 1):
         place = (near - math.log(k)) / spread
         count = count + torch.special.ndtr(place)

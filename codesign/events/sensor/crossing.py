@@ -25,6 +25,7 @@ from codesign.events.low_pass import coefficients, passed
 
 # of a pixel in one interval: beyond it a unit is wrong, and single precision would soon stop counting
 MOST_EVENTS = 1e6
+# what changes from frame to frame
 CARRIED = (
     "reference",
     "reference_rest",
@@ -35,7 +36,7 @@ CARRIED = (
     "last_event_s",
     "hazard",
     "shots",
-)  # what changes from frame to frame
+)
 
 
 def hashed(bits):
@@ -187,10 +188,14 @@ class DenseCounts:
 def run(lanes, frames, front_end, dt_s, interval_key, sensor, state, sink):
     """Run the sensor over a chunk.
 
-    Args: lanes: of a frame's pixels. frames: [T, ...] float32 or float64, not yet checked. front_end:
-      FrontEnd.
+    Args:
+      lanes: of a frame's pixels.
+      frames: [T, ...] float32 or float64, not yet checked.
+      front_end: FrontEnd.
       dt_s: [T] length of the interval that ends with each frame.
-      interval_key: [T] int32, random. sensor: SensorModel. state: SensorState (read only).
+      interval_key: [T] int32, random.
+      sensor: SensorModel.
+      state: SensorState (read only).
       sink: ``EventKeys`` or ``DenseCounts`` of the lanes; takes every event.
     Returns: dict of the carried tensors after the chunk; what was wrong: 0 nothing, 1 a value that is not
       finite or negative, 2 a pixel with more than ``MOST_EVENTS`` events in an interval (then everything else

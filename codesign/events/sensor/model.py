@@ -177,7 +177,8 @@ def check_sensor(sensor: object) -> SensorModel:
 def with_design(sensor: SensorModel, design: Mapping[str, Tensor | float]) -> SensorModel:
     """The sensor with the numbers of design variables in place of its own.
 
-    Args: design: numbers or 0-dim tensors by name, of DESIGN.
+    Args:
+      design: numbers or 0-dim tensors by name, of DESIGN.
     Raises: DomainError for another name, a value that is no number or outside the sensor's domain, and one of
       0
       that requires a gradient: what is switched off has none.

@@ -87,7 +87,9 @@ def begin(state, sensor, frame, level, time_s, generator):
 
     Draws, in this order and only what the sensor has: thresholds, leak rates, hot pixels, first noise
     hazards, keys.
-    Args: frame: [H, W] intensity. level: [H, W] its log level.
+    Args:
+      frame: [H, W] intensity.
+      level: [H, W] its log level.
     """
     pixels = level.shape
     place = {"dtype": level.dtype, "device": level.device}

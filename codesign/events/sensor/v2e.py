@@ -30,7 +30,10 @@ def levels(frames, front_end):
 def interval(frame, level, time_s, sensor, generator, state):
     """Events of the interval that ends with ``frame``; moves the state on.
 
-    Args: frame: [H, W] intensity 0 to 255. level: [H, W] from ``levels``. time_s: its time.
+    Args:
+      frame: [H, W] intensity 0 to 255.
+      level: [H, W] from ``levels``.
+      time_s: its time.
     Returns: t_us, x, y, p: int64 [N] each, unsorted.
     """
     dt_s = time_s - state.time_s

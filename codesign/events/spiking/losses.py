@@ -13,8 +13,9 @@ def van_rossum(found: Tensor, target: Tensor, *, tau_s: Tensor | float, dt: floa
     """Van Rossum distance 1/2 int (eps * (s - s^))^2 dt with eps(t) = t/tau exp(1 - t/tau), summed over
     pixels and polarities.
 
-    Args: found, target: [T, 2, ...] counts or spikes per step of length ``dt``, ON first. tau_s: time
-      constant, in the unit of dt.
+    Args:
+      found, target: [T, 2, ...] counts or spikes per step of length ``dt``, ON first.
+      tau_s: time constant, in the unit of dt.
     Returns: 0-dim loss, in the unit of dt; a lone wrong event costs 1/2 sum_k (k h)^2 exp(2 - 2 k h) dt,
       about e^2 tau/8.
     Gradient: found, target.
@@ -31,8 +32,9 @@ def count_loss(found: Tensor, target: Tensor, *, side_px: int = 8, steps: int = 
     """Half the chi-square of counts pooled over blocks of space and time: 1/2 sum (n - n^)^2 / (n^ + 1), per
     polarity.
 
-    Args: found, target: [T, 2, ..., H, W] counts, ON first. side_px, steps: size of a block; what fills no
-      block at the far ends is left out.
+    Args:
+      found, target: [T, 2, ..., H, W] counts, ON first.
+      side_px, steps: size of a block; what fills no block at the far ends is left out.
     Returns: 0-dim loss >= 0, about 1/2 per block where the counts differ by counting noise alone.
     Gradient: found.
     Raises: ShapeError when the two differ in shape or hold no whole block.

@@ -194,8 +194,10 @@ def count_spikes(level: Tensor, theta: Tensor, state: Any) -> tuple[Tensor, Any]
     """At most one event per step and polarity: a layer with step kernels and coupled polarities, which
     memorises a level.
 
-    Args: level: [T, ...]. theta: [2], or [2, ...] of every pixel. state: what an earlier call returned, or
-      None.
+    Args:
+      level: [T, ...].
+      theta: [2], or [2, ...] of every pixel.
+      state: what an earlier call returned, or None.
     Returns: counts [T-1, 2, ...] ([T, 2, ...] with a state); state to carry on.
     Gradient: of the mean count over places inside the threshold, with the cap of one event per step.
     """
@@ -218,8 +220,9 @@ def alpha_response(
     """The alpha kernel applied to a signal, exactly: y_t = sum over k >= 1 of (k h) exp(1 - k h) signal_{t-k}
     with h = dt / tau_s.
 
-    Args: as for ``srm``. signal: [T, ...], for example spikes (their difference to a target gives the van
-      Rossum loss).
+    Args:
+      as for ``srm``.
+      signal: [T, ...], for example spikes (their difference to a target gives the van Rossum loss).
     Returns: y [T, ...] and the SrmState to carry on.
     Gradient: signal, tau_s, state.
     Raises: as ``srm``.

@@ -273,7 +273,8 @@ class _Loops(Lanes):
     def forward(self, states, spikes, potential):
         """Run all steps, which fill flat arrays of spikes and, behind STAGGER, potentials.
 
-        Args: states: per channel, of response and reset.
+        Args:
+          states: per channel, of response and reset.
         Returns: the states after the last step, and per lane whether something became NaN or infinite.
         """
         dr, setup = self.dr, self.setup
@@ -342,8 +343,9 @@ class _Loops(Lanes):
     def backward(self, carried, flat):
         """Run all steps, the last one first.
 
-        Args: carried: loop variables after the last step. flat: arrays by name; grad_drive is filled. None:
-          no such gradient.
+        Args:
+          carried: loop variables after the last step.
+          flat: arrays by name; grad_drive is filled. None: no such gradient.
         Returns: loop variables before the first step.
         """
         dr, setup = self.dr, self.setup

@@ -73,8 +73,10 @@ def mean_spikes(
 ) -> tuple[Tensor, Tensor]:
     """Mean spikes of the noisy neurons.
 
-    Args: response: [T, ...] of the drive, before any reset. theta, h_reset: threshold and dt / tau_r,
-      positive, broadcasting over [...]. before: [1 + states, ages, ...] of the chunk before, or None.
+    Args:
+      response: [T, ...] of the drive, before any reset.
+      theta, h_reset: threshold and dt / tau_r, positive, broadcasting over [...].
+      before: [1 + states, ages, ...] of the chunk before, or None.
     Returns: [T, ...] in 0 to 1; shares and states of the ages to carry on, with their graph. Gradient:
       response, theta, h_reset, before.
     """
@@ -155,7 +157,8 @@ def _mixed(shares, carried):
 def with_play(spikes, level, theta_on, theta_off, state):
     """The spikes with the gradient of the mean count.
 
-    Args: spikes: [T-1, 2, ...] of a level [T, ...], or [T, 2, ...] with a state of the chunk before.
+    Args:
+      spikes: [T-1, 2, ...] of a level [T, ...], or [T, 2, ...] with a state of the chunk before.
     Returns: the same spikes; state to carry on, with its graph: that of ``events.memory``, and the centre [...]
       of the play that holds the level back. Gradient: level, thetas, state.
     """

@@ -48,8 +48,11 @@ def places(field):
 def sampled(pictures, displacement_px, mode="bicubic"):
     """Pictures read at every pixel plus its displacement; outside, the nearest edge.
 
-    Args: pictures: [B, C, H, W]. displacement_px: [B, 2, H, W], +x right, +y down. mode: "bicubic" (Keys'
-      kernel with -0.75: sharp, and off by at most 0.048 px on a slope), "bilinear" or "nearest".
+    Args:
+      pictures: [B, C, H, W].
+      displacement_px: [B, 2, H, W], +x right, +y down.
+      mode: "bicubic" (Keys' kernel with -0.75: sharp, and off by at most 0.048 px on a slope), "bilinear" or
+        "nearest".
     Gradient: pictures (linear in them), and the displacement.
     """
     height, width = pictures.shape[-2:]
@@ -76,7 +79,9 @@ def splatted(values, displacement_px):
     """Sum of what lands on every pixel when each value moves by its displacement and is shared among the four
     pixels around its place.
 
-    Args: values: [H, W, C]. displacement_px: [2, H, W].
+    Args:
+      values: [H, W, C].
+      displacement_px: [2, H, W].
     Returns: [H, W, C]; what lands outside is gone.
     """
     height, width, channels = values.shape
@@ -143,8 +148,9 @@ def median_of_nine(field):
 def _iterate(flow, dual_x, dual_y, data, buffers):
     """One step of the data term, one of the smoothness, in place.
 
-    Args: data: of the brightness difference constant + gradient . flow, these two, the step along it, and
-      its bounds.
+    Args:
+      data: of the brightness difference constant + gradient . flow, these two, the step along it, and its
+        bounds.
       buffers: five tensors to work in; the last column and row of the last two stay 0.
     """
     constant, gradient, step, most, least = data
@@ -174,8 +180,9 @@ def _gradient(picture):
 def with_matches(levels, flow):
     """The flow, with matches where they fit much better.
 
-    Args: levels: [2, 1, H, W] log levels of both frames. flow: [2, 2, H, W] from the first to the second, and
-      back, pixels of this scale.
+    Args:
+      levels: [2, 1, H, W] log levels of both frames.
+      flow: [2, 2, H, W] from the first to the second, and back, pixels of this scale.
     Returns: [2, 2, H, W].
     Source: the idea of Xu, Jia and Matsushita, Motion detail preserving optical flow estimation, 2012.
     """
@@ -213,7 +220,8 @@ def _mean(field):
 def flow_both_ways(first, second):
     """Dense flow between two frames.
 
-    Args: first, second: [H, W] linear intensity on the 0-255 scale.
+    Args:
+      first, second: [H, W] linear intensity on the 0-255 scale.
     Returns: [2, 2, H, W]: from the first to the second, and from the second to the first; pixels, +x right,
       +y down. Exactly 0 for equal frames.
     Gradient: none.

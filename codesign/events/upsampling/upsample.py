@@ -83,7 +83,8 @@ def _weighted_median(values, weights):
 def visibility(flows):
     """How well a pixel of either frame is seen in the other, from the agreement of both flows.
 
-    Args: flows: [2, 2, H, W] from the first to the second frame, and back.
+    Args:
+      flows: [2, 2, H, W] from the first to the second frame, and back.
     Returns: [2, H, W] in HIDDEN..1.
     """
     gap = (flows + sampled(flows.flip(0), flows, "bilinear")).square().sum(1)
@@ -213,8 +214,9 @@ def upsample_stream(
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """``upsample`` of frames that come one after the other, in the memory of one interval.
 
-    Args: frames: anything that yields frames [H, W]. t_s: anything that yields as many times. The rest as for
-      ``upsample``.
+    Args:
+      frames: anything that yields frames [H, W].
+      t_s: anything that yields as many times. The rest as for ``upsample``.
     Returns: iterator over (frames [n, H, W], times [n] float64): first the first frame alone, then for each
       later frame those that lead to it, and itself. Joined they are what ``upsample`` gives, bit for bit.
     Raises: as ``upsample``; bounds at once, frames and times when they come.

@@ -13,10 +13,11 @@ from matplotlib.ticker import MaxNLocator
 from codesign.checks import check_whole
 from codesign.errors import ShapeError
 
+# vermilion and blue of Okabe and Ito, told apart by every kind of colour vision
 ON_COLOUR, OFF_COLOUR = (
     "#d55e00",
     "#0072b2",
-)  # vermilion and blue of Okabe and Ito, told apart by every kind of colour vision
+)
 PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
 
 

@@ -55,7 +55,9 @@ def gray_picture(counts: Tensor, full_scale: float | None = None) -> Tensor:
 def rates(counts: Tensor, t_s: Times) -> tuple[Tensor, Tensor]:
     """Event rate of the whole picture over time, per polarity.
 
-    Args: counts: [T-1, 2, H, W]. t_s: [T] seconds, strictly increasing.
+    Args:
+      counts: [T-1, 2, H, W].
+      t_s: [T] seconds, strictly increasing.
     Returns: middle of each interval [T-1], seconds, and rate [T-1, 2], events per second, ON first.
     """
     check_counts(counts)

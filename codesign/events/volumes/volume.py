@@ -112,9 +112,8 @@ def from_stream(
     node = torch.div(scaled, duration_us, rounding_mode="floor")
     share = (scaled - node * duration_us).to(torch.float64) / duration_us
     cell = (((p < 0).long() * bins + node) * height + y) * width + x
-    counts = torch.zeros(
-        2 * bins * height * width + height * width, dtype=torch.float64, device=cell.device
-    )  # one spare node: an event at the end gives it 0
+    # one spare node: an event at the end gives it 0
+    counts = torch.zeros(2 * bins * height * width + height * width, dtype=torch.float64, device=cell.device)
     counts.index_add_(0, cell, 1 - share)
     if bins > 1:
         counts.index_add_(0, cell + height * width, share)

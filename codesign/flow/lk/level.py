@@ -170,9 +170,8 @@ class Level:
     def _noise(self, explained, events, energy):
         """Variance [B] of the temporal slopes: what the fit leaves of their energy, on a floor, per sample of
         the grid."""
-        left = torch.sqrt(
-            (energy - explained).square() + (1e-6 * energy).square() + TINY
-        )  # positive and smooth
+        # positive and smooth
+        left = torch.sqrt((energy - explained).square() + (1e-6 * energy).square() + TINY)
         few = FEW_EVENTS / self.stride**2 * self.slope_noise
         expected = events * self.slope_noise
         return self.slope_noise * (left + self.noise_floor * expected + few) / (expected + few)

@@ -106,9 +106,8 @@ def _mirror(signed, weight):
     sizes = (products.diagonal(dim1=1, dim2=2) + TINY).sqrt()
     sizes = sizes[:, :, None] * sizes[:, None]
     at = torch.arange(bins, device=signed.device)
-    twice = torch.arange(
-        3, 2 * bins - 4, device=signed.device
-    )  # place of the turn: two pairs of bins at least
+    # place of the turn: two pairs of bins at least
+    twice = torch.arange(3, 2 * bins - 4, device=signed.device)
     if not len(twice):
         return torch.ones_like(products[:, 0])
     pairs = (at[:, None] + at == twice[:, None, None]) & (at[:, None] != at)

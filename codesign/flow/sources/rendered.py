@@ -176,7 +176,8 @@ class CameraFit:
     Pixels are fitted as a polynomial of the rays' slopes, and the rays' origins as one of the pixels, so
     that points between pixels, and a little beside the picture, can be projected without the lens. The
     worst error of the fit is known, and what is worse than asked is refused.
-    Args: direction, origin_m: [H, W, 3] of the chief rays in camera axes (x right, y down, z forward).
+    Args:
+      direction, origin_m: [H, W, 3] of the chief rays in camera axes (x right, y down, z forward).
     name: for messages.
 
     error_px: largest distance between a pixel and where its own ray is projected to.
@@ -229,9 +230,8 @@ class CameraFit:
         points = np.asarray(points_m, np.float64)
         origin = np.zeros_like(points)
         with np.errstate(invalid="ignore", divide="ignore"):
-            for _ in range(
-                STEPS
-            ):  # the pupil moves little over the field, so each step gains orders of magnitude
+            # the pupil moves little over the field, so each step gains orders of magnitude
+            for _ in range(STEPS):
                 ray = points - origin
                 slope = np.where(ray[:, 2:] > 0, ray[:, :2] / ray[:, 2:], np.nan)
                 pixel = _value((slope - self.middle) / self.half, self.to_pixel)
@@ -256,12 +256,10 @@ def _value(unit, coefficients):
     degree = coefficients.shape[0] - 1
     count = coefficients.shape[2]
     unit = np.where(np.abs(unit) <= BEYOND, unit, np.nan)
-    one, two = (
-        np.ascontiguousarray(chebyshev.chebvander(unit[:, k], degree).T) for k in (0, 1)
-    )  # [n, N]: rows are long, which is fast
-    half = torch.from_numpy(coefficients.reshape(degree + 1, -1).T.copy()) @ torch.from_numpy(
-        one
-    )  # torch's threads are the caller's choice, NumPy's are not
+    # [n, N]: rows are long, which is fast
+    one, two = (np.ascontiguousarray(chebyshev.chebvander(unit[:, k], degree).T) for k in (0, 1))
+    # torch's threads are the caller's choice, NumPy's are not
+    half = torch.from_numpy(coefficients.reshape(degree + 1, -1).T.copy()) @ torch.from_numpy(one)
     half = half.numpy().reshape(degree + 1, count, -1)
     return np.stack([(half[:, k] * two).sum(0) for k in range(count)], -1)
 

@@ -42,8 +42,9 @@ def depth_of_field(
 ) -> DepthOfField:
     """DepthOfField where the paraxial blur disc of an axial point is at most ``blur_mm`` across.
 
-    Args: blur_mm: diameter on the film, > 0; see ``GeoLens.focus_at`` for where the film stands. A near limit
-      before the lens is its first vertex.
+    Args:
+      blur_mm: diameter on the film, > 0; see ``GeoLens.focus_at`` for where the film stands. A near limit
+        before the lens is its first vertex.
     Gradient: to every lens tensor that bends or moves light, and to the blur.
     Raises: DomainError for a limit that is not positive, and when nothing before the lens is that sharp.
 

@@ -82,10 +82,11 @@ def distortion_percent(
 ) -> Tensor:
     """100 (y / (f m(field)) - 1) of the real chief ray, [F] percent, [D, F] for D distances; 0 on the axis.
 
-    Args: mapping: "f-tan" (a picture without distortion) or "f-theta" (a scan lens or fisheye). at_m: metres
-      to the object plane. f is the height of the paraxial image of that plane per tangent: the focal length
-      for parallel light. On a film that is not focused there (``GeoLens.focus_at``) the change of scale by
-      defocus is part of the figure.
+    Args:
+      mapping: "f-tan" (a picture without distortion) or "f-theta" (a scan lens or fisheye).
+      at_m: metres to the object plane. f is the height of the paraxial image of that plane per tangent: the
+        focal length for parallel light. On a film that is not focused there (``GeoLens.focus_at``) the change
+        of scale by defocus is part of the figure.
     Gradient: to every lens tensor and to at_m. Raises: DomainError for another mapping, or when a chief ray
       does not arrive.
     """
@@ -114,7 +115,9 @@ def focus_shift_mm(
     equations; four points cancel the terms of third order in the reach, so what is left is rounding (below
     1e-8 of the focal length).
 
-    Args: fields_rad: F angles. at_m: metres to the object plane, or D of them.
+    Args:
+      fields_rad: F angles.
+      at_m: metres to the object plane, or D of them.
     Returns: [F, 2] or [D, F, 2] mm, tangential (rays displaced in y) then sagittal (in x); positive behind
       the image plane. Computed in float64, as the rays lie so close together, and given in the lens's
       precision.
@@ -250,7 +253,9 @@ def through_focus_mtf(
 def relative_illumination(lens: GeoLens, fields_rad: Sequence[float], grid: int = 24) -> Tensor:
     """Irradiance of the image of a uniform world at each field, relative to the axis, vignetting included.
 
-    Args: fields_rad: angles from the axis; grid: pupil points across the stop.
+    Args:
+      fields_rad: angles from the axis.
+      grid: pupil points across the stop.
     Returns: [fields], computed in float64 and given in the lens's precision. For an ideal lens of small
       aperture without distortion it is cos^4 of the field angle.
     Gradient: to every lens tensor.

@@ -45,8 +45,9 @@ def diffraction_mtf(
     Several wavelengths add as complex transfer functions about one image point, so that lateral colour
     counts.
 
-    Args: frequency_per_mm: [K] line pairs per mm in the image. light, grid, vignetting, at_m: see
-      ``psf_on_pixels``.
+    Args:
+      frequency_per_mm: [K] line pairs per mm in the image.
+      light, grid, vignetting, at_m: see ``psf_on_pixels``.
     Returns: [2, K] tangential, sagittal, in [0, 1]; exactly 0 beyond the cut-off.
     Gradient: to every lens tensor. Raises: DomainError for a negative frequency, and see ``pupil_function``.
     """

@@ -46,8 +46,9 @@ def diffraction_psf(
     Airy scale wavelength times f-number per unit of padding 4. The picture repeats with n wavelength times
     f-number. Energy sums to 1.
 
-    Args: grid, vignetting, at_m: see ``pupil_function``. padding: >= 2, so that the
-      energy is not aliased.
+    Args:
+      grid, vignetting, at_m: see ``pupil_function``.
+      padding: >= 2, so that the energy is not aliased.
     Gradient: energy and pitch to every lens tensor. Raises: DomainError, see ``pupil_function``.
     """
     padding = check_whole(padding, "padding", 2)
@@ -81,8 +82,11 @@ def psf_on_pixels(
     and their lateral colour is in it. The energy of a pixel is the density at its centre times its area; the
     sum tells the share that falls on the grid.
 
-    Args: pixel_mm: size of a square pixel. pixels: rows and columns. light: see ``spectral_lines``. at_m:
-      metres to the object plane, see ``wavefront``.
+    Args:
+      pixel_mm: size of a square pixel.
+      pixels: rows and columns.
+      light: see ``spectral_lines``.
+      at_m: metres to the object plane, see ``wavefront``.
     Gradient: to every lens tensor. Raises: DomainError, see ``pupil_function``, and when the grid is wider
       than the sampled pupil's period.
     """
@@ -116,8 +120,10 @@ def geometric_psf(
     """Psf by rays: each ray's weight is shared bilinearly among the four pixel centres around it. About the
     chief ray of the first wavelength.
 
-    Args: grid: pupil cells across. at_m: metres to the object plane, see ``wavefront``. Rays beyond the grid
-      are lost: the sum of ``energy`` is the share that falls on it.
+    Args:
+      grid: pupil cells across.
+      at_m: metres to the object plane, see ``wavefront``. Rays beyond the grid are lost: the sum of
+        ``energy`` is the share that falls on it.
     Gradient: energy to every lens tensor, piecewise linear in the ray positions.
     """
     pixel_mm, pixels = _pixels(pixel_mm, pixels)

@@ -66,8 +66,11 @@ def source_rays(
     field angle from the pupil's centre. Its light reaches the pupil point q along (q / distance + (0, tan
     field), 1), which holds for parallel light too.
 
-    Args: fields_rad: an angle in +y, or F of them. pupil: [M, 2] on the unit disc. at_m: a distance, or D of
-      them; see ``vergence_per_mm``. start_z_mm: plane on which the rays are given, from the first vertex.
+    Args:
+      fields_rad: an angle in +y, or F of them.
+      pupil: [M, 2] on the unit disc.
+      at_m: a distance, or D of them; see ``vergence_per_mm``.
+      start_z_mm: plane on which the rays are given, from the first vertex.
     Returns: SourceRays with the axes [D, F], as far as several were given.
     Gradient: to the lens, whose pupil moves, and to at_m. Raises: DomainError for a distance inside the lens.
     """
@@ -106,7 +109,8 @@ def field_rays(
     """Rays of one object point, at one field angle (in +y), through points of the paraxial entrance pupil.
 
     Args: field_rad scalar; pupil [M, 2] on the unit disc (placed at the pupil of the d line for every
-      wavelength); at_m: see ``source_rays``. Returns: origins and directions [M, 3].
+      wavelength); at_m: see ``source_rays``.
+    Returns: origins and directions [M, 3].
     Gradient: to the lens, since the pupil moves with it, and to at_m.
     """
     rays = source_rays(lens, field_rad, pupil, at_m, start_z_mm)

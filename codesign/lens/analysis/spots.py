@@ -33,8 +33,9 @@ def spots(
     for failed rays). All fields and distances are one trace.
 
     Equal weights over a square pupil grid, no clipping by apertures.
-    Args: at_m: metres from the entrance pupil to the object plane, inf for parallel light; of D distances the
-      results are [D, fields, M, 2] and [D, fields, M].
+    Args:
+      at_m: metres from the entrance pupil to the object plane, inf for parallel light; of D distances the
+        results are [D, fields, M, 2] and [D, fields, M].
     Gradient: positions to every lens tensor and to at_m. Raises: DomainError for a distance inside the lens.
     """
     pupil = pupil_grid(grid, lens.curvature_per_mm.dtype, lens.curvature_per_mm.device)
@@ -81,8 +82,10 @@ def polychromatic_spot(
 ) -> tuple[Tensor, Tensor]:
     """Spot of one object point in light of several wavelengths, lateral colour included.
 
-    Args: light: see ``spectral_lines``. grid: pupil cells across. vignetting, at_m (one
-      distance): see ``trace_field``.
+    Args:
+      light: see ``spectral_lines``.
+      grid: pupil cells across.
+      vignetting, at_m (one distance): see ``trace_field``.
     Returns: positions [W, M, 2] mm on the image plane, and weights [W, M] that sum to 1 (rays of one
       wavelength share its weight as far as they arrive).
     Gradient: positions (with vignetting also weights) to every lens tensor and to at_m. Raises: DomainError
@@ -139,8 +142,10 @@ def encircled_energy(
 ) -> Tensor:
     """Share of rays within circles about the spot's mean point (or the chief ray of the first wavelength).
 
-    Args: radii_mm: [K] increasing or not; the others as for ``polychromatic_spot``. Returns: [K] in [0, 1],
-      geometric, without diffraction. Gradient: none (a count).
+    Args:
+      radii_mm: [K] increasing or not; the others as for ``polychromatic_spot``.
+    Returns: [K] in [0, 1], geometric, without diffraction.
+    Gradient: none (a count).
     """
     distance, reached = _distances(lens, field_rad, light, grid, vignetting, about_chief, at_m)
     radii = torch.as_tensor(radii_mm, dtype=distance.dtype, device=distance.device).reshape(-1)

@@ -55,7 +55,9 @@ def path_difference_mm(
 ) -> Tensor:
     """Optical path of the chief ray minus that of each ray, both up to the reference sphere, [M] mm.
 
-    Args: rays, chief: ImageRays of the lens. reference_mm: [2] centre of the sphere.
+    Args:
+      rays, chief: ImageRays of the lens.
+      reference_mm: [2] centre of the sphere.
     Raises: DomainError when the exit pupil lies in the image, or a sphere is too small for the rays.
     """
     return _on_sphere(lens, rays, chief, wavelength_um, reference_mm)[0]

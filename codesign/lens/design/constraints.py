@@ -132,8 +132,9 @@ def gap_mm(lens: GeoLens, heights: Tensor, semi_aperture_mm: Tensor | None = Non
 def evaluate(lens: GeoLens, limits: Limits, semi_aperture_mm: Tensor | None = None) -> list[Constraint]:
     """All constraints that ``limits`` asks for, a list of Constraint.
 
-    Args: semi_aperture_mm: [S] where edges and gaps are measured (may carry a gradient); the lens's own when
-      left out. See hits for semi-apertures sized by rays.
+    Args:
+      semi_aperture_mm: [S] where edges and gaps are measured (may carry a gradient); the lens's own when left
+        out. See hits for semi-apertures sized by rays.
     Gradient: to every lens tensor the figure depends on. A least gap has that of its narrowest place.
     """
     apertures = lens.semi_aperture_mm if semi_aperture_mm is None else semi_aperture_mm

@@ -117,8 +117,9 @@ def fit_apertures(
     """The lens with the semi-apertures that its rays need, so that edges and gaps of a design that changed
     are judged, and its light clipped, where its glass would really end.
 
-    Args: fields_rad, at_m: whose full pupil passes; give both signs of a field for a lens with decentres or
-      tilts.
+    Args:
+      fields_rad, at_m: whose full pupil passes; give both signs of a field for a lens with decentres or
+        tilts.
       margin: share added to the highest ray, as far as the surface reaches.
     Returns: a lens as from ``replace``. Gradient: semi_aperture_mm follows the highest rays.
     Raises: DomainError when a rim ray fails, or for a margin below 0.

@@ -89,8 +89,10 @@ def make_design(
     thickness by more than a tenth of its size. Defocus, coma, astigmatism and so on then have separate step
     sizes, which a step per curvature has not.
 
-    Args: fields_rad: angles at which ray motion is measured. floors: another LensDesign whose thickness
-      floors to keep; by default they are ``floor_share`` of today's centre and edge thicknesses.
+    Args:
+      fields_rad: angles at which ray motion is measured.
+      floors: another LensDesign whose thickness floors to keep; by default they are ``floor_share`` of
+        today's centre and edge thicknesses.
     """
     # the caller's lens keeps its gradients
     lens = lens.replace(**{name: getattr(lens, name).detach().clone() for name in LEARNABLES})

@@ -54,7 +54,8 @@ def without_element(lens: GeoLens, element: int) -> GeoLens:
 
     An element that is cemented to another leaves the cemented face to that one. Where the stop was on a face
     that goes, a plane stop stays in its place.
-    Args: element: its number in ``elements(lens)``, counted from 0; from the last when negative.
+    Args:
+      element: its number in ``elements(lens)``, counted from 0; from the last when negative.
     Returns: a lens of its own, built from today's values. Its focal length is the old one, held by
       ``hold_efl``. A semi-aperture beyond the reach of its surface becomes that reach.
     Raises: DomainError for an element that is not there, is the only one, or touches a mirror; and when the
@@ -108,7 +109,8 @@ def with_glass(lens: GeoLens, surface: int, medium: Glass | str) -> GeoLens:
     """The lens with another glass behind a surface (counted from 0), focal length, f-number and defocus as
     before; ``GeoLens.replace_glass`` leaves them as they come.
 
-    Args: medium: a Glass, or a name of the catalogue.
+    Args:
+      medium: a Glass, or a name of the catalogue.
     Returns, Raises: as ``without_element``; DomainError for a gap that holds no glass, and for air in its
       place.
     """
@@ -133,8 +135,10 @@ def neighbour_glasses(
     """The catalogue's glasses nearest to one on the (nd, Vd) map, the nearest first.
 
     The distance is hypot(nd difference, Vd difference / 100), see VD_PER_ND.
-    Args: medium: a Glass, or a name of the catalogue. apart: least distance; other makers' versions of the
-      same glass lie closer and are left out. among: names of the catalogue to choose from, None for all.
+    Args:
+      medium: a Glass, or a name of the catalogue.
+      apart: least distance; other makers' versions of the same glass lie closer and are left out.
+      among: names of the catalogue to choose from, None for all.
     Returns: at most ``count`` glasses. Raises: DomainError for a name the catalogue does not know, or a
       medium without dispersion.
 

@@ -184,8 +184,8 @@ def linear_figures(half_field_rad: float, at_m: float = PARALLEL) -> Figures:
     """Figures that errors change in proportion: the function lens -> [5] of EFL, BFL, distortion at the field
     (relative), and the x and y of the axial spot's mean point; lengths in mm. Names: LINEAR_FIGURES.
 
-    Args: at_m: metres from the (faulty) lens's entrance pupil to the object of the spots and of the
-      distortion.
+    Args:
+      at_m: metres from the (faulty) lens's entrance pupil to the object of the spots and of the distortion.
     """
     one_distance(at_m)
 
@@ -227,9 +227,12 @@ def sensitivities(
     """Change of every figure per standard deviation of every error, [K, P]. The columns are in the order of
     ``errors_of``.
 
-    Args: figures: lens -> [K]. jacobian: optimise.by_autograd for analytic gradients (K backward passes, best
-      for few figures), or optimise.by_differences(step), step in standard deviations; central differences of
-      0.1 when left out (2 P evaluations). compensate: applied to the faulty lens first.
+    Args:
+      figures: lens -> [K].
+      jacobian: optimise.by_autograd for analytic gradients (K backward passes, best for few figures), or
+        optimise.by_differences(step), step in standard deviations; central differences of 0.1 when left out
+        (2 P evaluations).
+      compensate: applied to the faulty lens first.
     Gradient: none.
     """
     errors = errors_of(lens, tolerances)
@@ -270,7 +273,9 @@ def monte_carlo(
 ) -> Trials:
     """Trials of ``count`` lenses with random errors.
 
-    Args: generator: torch.Generator (CPU). compensate: applied to every faulty lens, and to the nominal one.
+    Args:
+      generator: torch.Generator (CPU).
+      compensate: applied to every faulty lens, and to the nominal one.
     A lens that raises DomainError (no ray arrives, no focal length) is a failed trial: counted, never dropped
     in silence.
     """
@@ -377,8 +382,8 @@ def spot_errors(
     """The figure lens -> [F * M * 2]: ray errors about the mean point of their field over all wavelengths,
     mm, divided by the root of the ray count.
 
-    Args: at_m: metres to the object plane; of D distances each counts as so many more fields, [D * F * M *
-      2].
+    Args:
+      at_m: metres to the object plane; of D distances each counts as so many more fields, [D * F * M * 2].
     Raises: DomainError when a ray fails.
     """
 

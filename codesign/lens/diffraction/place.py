@@ -29,7 +29,9 @@ def with_plate(lens: GeoLens, plate: Plate | None, surface: int | None = None, z
     >>> plated = diffraction.with_plate(geo, plate)
     >>> optimiser = torch.optim.Adam([*plate.parameters(), *geo.variables("focus")], lr=0.1)
 
-    Args: plate: None takes the lens's plate out. surface: from 0; None is the stop, -1 the last surface.
+    Args:
+      plate: None takes the lens's plate out.
+      surface: from 0; None is the stop, -1 the last surface.
       z_mm: distance of the plate's plane from that surface's vertex, negative before the stop.
     Returns: a lens as from ``replace``, which shares tensors and plate (a converted one has a plate of its
       own); everything that traces rays sees the plate.

@@ -34,8 +34,9 @@ def noll(term: int) -> tuple[int, int]:
 def zernike(terms: Sequence[int], points: Tensor) -> tuple[Tensor, Tensor]:
     """Values and slopes of Zernike terms.
 
-    Args: terms: K of Noll's indices, from 1. points: [N, 2] (x, y) in units of the disc's radius; beyond 1
-      the polynomials go on.
+    Args:
+      terms: K of Noll's indices, from 1.
+      points: [N, 2] (x, y) in units of the disc's radius; beyond 1 the polynomials go on.
     Returns: values [N, K]; slopes [N, K, 2] along x and y, per radius. Gradient: both to the points.
     """
     x, y = points.unbind(1)
@@ -123,8 +124,9 @@ class ZernikePlate(Plate):
     >>> plate.coefficients_rad.tolist()
     [0.0, 1.5]
 
-    Args: coefficients_rad: {Noll's index: radians RMS}. radius_mm: of the disc; the polynomials go on beyond
-      it.
+    Args:
+      coefficients_rad: {Noll's index: radians RMS}.
+      radius_mm: of the disc; the polynomials go on beyond it.
       wavelength_um, diffractive: see ``Plate``.
     coefficients_rad: [K] Parameter, in the order given.
     """
@@ -168,9 +170,10 @@ class GridPlate(Plate):
     >>> from codesign.lens import diffraction
     >>> plate = diffraction.GridPlate(torch.zeros(16, 16, dtype=torch.float64), pitch_mm=0.5)  # 7.5 mm x 7.5 mm
 
-    Args: phase_rad: [N, N] unwrapped, rows along +y, columns along +x, point (N - 1) / 2 on the axis.
-      pitch_mm: distance of the points. wavelength_um, diffractive: see ``Plate``. Light beyond the outer
-        points is stopped.
+    Args:
+      phase_rad: [N, N] unwrapped, rows along +y, columns along +x, point (N - 1) / 2 on the axis.
+      pitch_mm: distance of the points.
+      wavelength_um, diffractive: see ``Plate``. Light beyond the outer points is stopped.
     phase_rad: [N, N] Parameter.
     """
 

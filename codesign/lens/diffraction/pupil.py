@@ -79,8 +79,9 @@ def pupil_function(
     about 1e-3 of MTF at 64 cells and 3e-4 at 128. A phase plate adds its phase where the rays of the bare
     lens meet it, as a thin element does to a field.
 
-    Args: grid: cells across; None picks a power of two from the aberration. reference_mm, at_m: see
-      ``wavefront``.
+    Args:
+      grid: cells across; None picks a power of two from the aberration.
+      reference_mm, at_m: see ``wavefront``.
     Gradient: to every lens tensor and to at_m. Raises: DomainError when neighbouring cells differ by more
       than half a wave, a phase plate is finer than the cells, or no ray arrives.
     """

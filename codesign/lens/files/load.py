@@ -33,8 +33,10 @@ def load(source: str | Path, dtype: torch.dtype = torch.float64) -> GeoLens:
     """Lens from a catalogue name (cooke-triplet, double-gauss, la1509) or a file; docs/lens_files.md says
     what is read of each.
 
-    Args: source: name, or path with the extension .json (native, DeepLens or optiland), .zmx, .seq, or .txt
-      (DiffOptics). dtype: precision of the lens.
+    Args:
+      source: name, or path with the extension .json (native, DeepLens or optiland), .zmx, .seq, or .txt
+        (DiffOptics).
+      dtype: precision of the lens.
     Returns: GeoLens. Files are parsed, never executed; at most 2 MB and 500 surfaces are read.
     Warns: when coordinate breaks of a .zmx file put the stop beside the axis.
     Raises: FileFormatError or DomainError, one sentence naming file, place, fault and remedy; nothing is half

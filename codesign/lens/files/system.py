@@ -73,8 +73,9 @@ def unfold(lens: FileLens) -> list[FileSurface]:
     """The surfaces with lengths in millimetres and all signs along the light; dummy planes at which the light
     steps back are folded away.
 
-    Args: lens: FileLens. Returns: list of FileSurface; the last thickness is 0 where the paraxial focus is to
-      be solved for.
+    Args:
+      lens: FileLens.
+    Returns: list of FileSurface; the last thickness is 0 where the paraxial focus is to be solved for.
     Raises: FileFormatError when the light would have to travel backwards.
     """
     found = []

@@ -199,9 +199,8 @@ def _crossing(triangles, pairs, noise):
     along = np.cross(*normals)
     size = np.linalg.norm(along, axis=1)
     along /= np.maximum(size, 1e-300)[:, None]
-    ends = [
-        _on_plane(side.corners[rows], h[rows]) for side, h in zip(pair, height, strict=True)
-    ]  # [n, 2, 3] each
+    # [n, 2, 3] each
+    ends = [_on_plane(side.corners[rows], h[rows]) for side, h in zip(pair, height, strict=True)]
     origin = ends[0][:, :1]
     at = [np.sort(((end - origin) * along[:, None]).sum(2), axis=1) for end in ends]
     first = np.maximum(at[0][:, 0], at[1][:, 0])

@@ -60,7 +60,8 @@ def segments(start: np.ndarray, end: np.ndarray) -> Edges:
 def mesh_edges(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray | None = None) -> Edges:
     """Edges of a mesh of vertices [V, 3] and faces [F, 3] that may part two radiances.
 
-    Args: values: [F, 3, k] by which radiance is looked up at the corners of every face; None for one
+    Args:
+      values: [F, 3, k] by which radiance is looked up at the corners of every face; None for one
     radiance. Vertices at one place are one. An edge of two faces counts from every side where they are
     creased sharply or their values differ along it, as a silhouette where they are creased at all; an edge of
     one face, or of three and more, counts always, and so does one between faces wound against each other, of

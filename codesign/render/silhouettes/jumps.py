@@ -194,10 +194,11 @@ def sliver_radiance(
     """(side [k], row [k], radiance [k]) where the face that is seen beside a straight edge is a sliver: read
     along its normal, since radiance is the same in all directions.
 
-    Args: cameras: [parts, F, 4, 4]. y, on: [n, 3], the points and the same curves a little further on, in
-      camera axes.
-      origin: [n, 3] of the rays to the points; sides: [2, n, 3], directions of the rays before and behind
-        them.
+    Args:
+      cameras: [parts, F, 4, 4].
+      y, on: [n, 3], the points and the same curves a little further on, in camera axes.
+      origin: [n, 3] of the rays to the points.
+      sides: [2, n, 3], directions of the rays before and behind them.
     """
     known = torch.nonzero(points.apex_m.isfinite().all(2).any(1))[:, 0]
     points, y, on, origin, sides = points[known], y[known], on[known], origin[known], sides[:, known]

@@ -69,8 +69,10 @@ class Judge:
     def mean(self, frames: Tensor, t_s: Tensor, observe: Callable[[Tensor], Tensor]) -> Tensor:
         """Mean of ``observe(counts)`` over beginnings.
 
-        Args: frames: [T, H, W], 0-255 scale. t_s: [T]. observe: counts [T-1, 2, B, H, W] of some
-          beginnings to what is wanted [K, B, H, W].
+        Args:
+          frames: [T, H, W], 0-255 scale.
+          t_s: [T].
+          observe: counts [T-1, 2, B, H, W] of some beginnings to what is wanted [K, B, H, W].
         Returns: [K, H, W].
         """
         places = offsets(tuple(frames.shape[1:]), self.count, self.seed).to(frames)

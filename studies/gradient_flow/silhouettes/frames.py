@@ -13,10 +13,11 @@ SIZE_PX = 32
 PITCH_MM = 0.25
 SAMPLES = 16  # per pixel of one estimate as an optimiser takes it
 LENSES = ("pinhole", "thin", "traced")
+# metres and radians; curvatures per mm, thicknesses mm
 STEPS = {
     "pose": (2e-3,) * 6,
     "lens": (2e-4,) * 3 + (2e-2,) * 3,
-}  # metres and radians; curvatures per mm, thicknesses mm
+}
 ROWS = (0, 2, 4), (1, 3, 5)  # curvatures, and thicknesses of which the last is the focus
 
 
