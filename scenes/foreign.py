@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from codesign import backend, lens
-from codesign.checks import check_choice, check_whole
+from codesign.checks import check_choice, check_positive, check_whole
 from codesign.errors import DomainError, FileFormatError
 from codesign.exclusive import exclusive
 from codesign.reading import building, reading
@@ -216,10 +216,7 @@ def view_of(
 def _axes(up, unit_m):
     """R_world_file [3, 3]."""
     check_choice(up, "up", UP)
-    if not 0 < unit_m < float("inf"):
-        raise DomainError(
-            f"unit_m = {unit_m} must be positive and finite: metres per unit of the file, 0.01 for centimetres."
-        )
+    check_positive(unit_m, "unit_m", remedy="it is metres per unit of the file, 0.01 for centimetres")
     return torch.tensor(UP[up], dtype=torch.float64)
 
 
