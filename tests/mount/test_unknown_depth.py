@@ -182,6 +182,16 @@ def test_depths_are_found_where_the_body_moves_across(camera):
     assert float(ratio.mean().abs()) < 0.2
 
 
+def test_a_point_without_a_surface_is_nowhere(camera):
+    mount, poses, _, field = drives(camera, 1, 0.3, 5.0, 3)
+    ours = estimator(0.3, 5.0)
+    with torch.no_grad():
+        read = ours.read(field, camera, None, mount, poses)
+        read.share[0, 5] = 0.0
+        nowhere = ours.solve(read).depth_m[0].isinf()
+    assert nowhere.nonzero().tolist() == [[5]]
+
+
 @pytest.mark.parametrize("outlier", [None, 3.0])
 def test_gradient_is_that_of_differences(camera, outlier):
     mount, poses, _, field = drives(camera, 3, 0.3, 5.0, 9)
