@@ -197,10 +197,14 @@ def _read(axes):
 
 
 def _number(value):
-    """A real number as a float, NaN for what is none."""
-    value = value.detach() if isinstance(value, Tensor) else value
+    """A real number as a float, NaN for what is none: text and truth values, also inside arrays."""
+    kind = getattr(getattr(value, "dtype", None), "kind", "f")  # NumPy's
+    if isinstance(value, (str, bytes, bool)) or kind not in "iuf":
+        return math.nan
+    if isinstance(value, Tensor):
+        value = math.nan if value.dtype == torch.bool else value.detach()
     try:
-        return math.nan if isinstance(value, (str, bytes, bool)) else float(value)
+        return float(value)
     except (TypeError, ValueError, RuntimeError, OverflowError):
         return math.nan
 

@@ -211,7 +211,10 @@ REFUSED = [
     ),
     *(
         (lambda value=value: check_whole(value, "x"), "x must be a whole number")
-        for value in (1.5, 0, -1, "2", True, None, math.inf, 2**62 + 1)
+        for value in (
+            *(1.5, 0, -1, "2", True, None, math.inf, 2**62 + 1),
+            *(np.array("3"), np.True_, torch.tensor(True)),
+        )
     ),
     (lambda: check_whole(0.5, "x", None), "x must be a whole number, got 0.5."),
     (lambda: check_whole(9, "x", 1, 8, "split it"), "x must be a whole number from 1 to 8, got 9; split it."),

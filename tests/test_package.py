@@ -1,6 +1,7 @@
 """`import codesign`: quick, without LLVM, with everything behind it."""
 
 import importlib
+import pickle
 import subprocess
 import sys
 from importlib.metadata import version
@@ -77,3 +78,11 @@ def test_the_former_rooms_of_mounts_still_import_and_say_the_new_one(room, name)
     with pytest.warns(FutureWarning, match=f"codesign.{room} is codesign.mount now"):
         found = importlib.import_module(f"codesign.{room}")
     assert getattr(found, name) is getattr(mount, name)
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+def test_a_mount_pickled_under_its_former_name_is_read():
+    written = pickle.dumps(mount.Mount((0.2, 0, 0.45), (0.1, 0.1, 0.15)), protocol=0)
+    former = written.replace(b"ccodesign.mount.pose\n", b"ccodesign.place.mount\n")
+    assert former != written
+    assert isinstance(pickle.loads(former), mount.Mount)

@@ -39,7 +39,7 @@ BUDGETS = {
     "studies/stability": 4_700,
     "studies/train_flow": 5_000,
     "studies/video_to_events": 4_300,
-    "tests": 11_300,
+    "tests": 11_400,
     "tests/data": 1_000,
     "tests/events": 33_500,
     "tests/flow": 29_200,

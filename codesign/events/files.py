@@ -79,10 +79,9 @@ def read(
     >>> events.read("brighter.npz").t_us.tolist()
     [2885, 5771, 8656]
     """
-    for name, size in (("height_px", height_px), ("width_px", width_px)):
-        if size is not None:
-            check_whole(size, name, 1, LIMIT_PX)
-    asked = Asked(height_px, width_px, columns=columns, time_unit=time_unit)
+    sides = (("height_px", height_px), ("width_px", width_px))
+    size_px = (None if side is None else check_whole(side, name, 1, LIMIT_PX) for name, side in sides)
+    asked = Asked(*size_px, columns=columns, time_unit=time_unit)
     return read_columns(check_path(path), asked).stream()
 
 

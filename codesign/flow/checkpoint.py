@@ -58,6 +58,10 @@ def network_class(name: str) -> type[Any]:
     """
     if ":" in name:
         raise DomainError(f"'{name}' is a class of your own; hand it over: flow.load(path, kind=...).")
+    if name in ("ecn", "idnet") and name not in NETWORKS:
+        raise DomainError(
+            f"'{name}' stands with the study that races it: import studies.train_flow.peers first."
+        )
     check_choice(name, "the network", sorted(NETWORKS))
     module, kind = NETWORKS[name].split(":")
     return getattr(importlib.import_module(module), kind)

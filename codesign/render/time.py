@@ -68,7 +68,7 @@ def exposed_frames(
       gradient, per_px: as ``frames`` takes them, for every time sample; "boundary" has the motion of
         silhouettes in it.
       line_s: rolling shutter: row r of the sensor is exposed r * line_s later than row 0, whose middle is
-        t_s; each row is a launch of its own.
+        t_s; each row is a launch of its own, and wants a larger ``per_px`` for silhouettes as quiet.
     Returns: [..., T, *film.shape], the mean of the irradiance over the exposure, in the scene's units.
     Gradient: lens, and whatever the trajectory's poses depend on; what it holds says ``gradient``.
     Raises: DomainError on a negative exposure, a line time that is not finite, fewer than one sample, poses
