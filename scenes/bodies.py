@@ -37,8 +37,7 @@ class Body:
     """Triangles in the world: vertices_m [V, 3], faces [F, 3].
 
     uv: [V, 2] where its paint is laid out by texture coordinates (v up). tint: what the paint's level is
-      times
-    where it has none: one number, [F], or [V] where ``smooth``.
+    times where it has none: one number, [F], or [V] where ``smooth``.
     """
 
     vertices_m: np.ndarray

@@ -67,8 +67,7 @@ def supervised_loss(
       unit_per_px: what one pixel is worth, a number or [B]: 1 for an error in px,
         ``relative_unit(truth)`` for parts of the motion of the sample.
     Returns: scalar. Only valid pixels of the truth count. A sample without any counts 0, its place in the
-      mean of the batch included, so that the denominator
-      does not depend on how a batch is split.
+      mean of the batch included, so that the denominator does not depend on how a batch is split.
     Gradient: flow_px of the predictions.
     Raises: ShapeError.
     Source: the weights are those of Teed and Deng, RAFT, ECCV 2020, sec. 3.4.

@@ -145,9 +145,8 @@ class Tracker:
         return self._cut(self._start_us, last=False)
 
     def finish(self) -> list[TrackedWindow]:
-        """Return the last window, which ends at the last event (a microsecond later where that is its
-        start), and
-        forget stream and clock: what is added next is another stream."""
+        """Return the last window, which ends at the last event (a microsecond later where that is its start),
+        and forget stream and clock: what is added next is another stream."""
         found = [] if self._start_us is None else self._cut(self._start_us, last=True)
         self._forget()
         return found

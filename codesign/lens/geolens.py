@@ -45,9 +45,9 @@ class GeoLens(Replaceable):
     tensor(True)
 
     Learnables (nn.Parameter, one row per surface): curvature_per_mm [S], thickness_mm [S], conic [S], asphere
-      [S, A],
-    index_offset [S] (added to the index of the glass behind each surface, dimensionless, zero at first; rows
-    of air and of mirrors do nothing and have no gradient), phase [S, P] (radians per mm^2, mm^4, ...).
+    [S, A], index_offset [S] (added to the index of the glass behind each surface, dimensionless, zero at
+    first; rows of air and of mirrors do nothing and have no gradient), phase [S, P] (radians per mm^2, mm^4,
+    ...).
     ``variables`` turns the named ones into functions of dimensionless variables and holds the others.
     Errors of assembly (buffers, with gradients after ``requires_grad_`` or through ``replace``): decentre_mm
     [S, 2], tilt_rad [S, 2]; and semi_aperture_mm [S], the same way.
@@ -252,11 +252,9 @@ class GeoLens(Replaceable):
         Returns: a lens as from ``replace``, without Parameters and variables of its own; this one stays as
           it is.
         Gradient: to every tensor of this lens but the index offset of that surface, which belonged to the
-          glass
-          that went: the new one has 0.
-        Raises: DomainError for a surface that is not there or a mirror, for glass that the light passes
-          again behind a mirror, and for a name the catalogue does not know,
-          with the nearest it knows.
+          glass that went: the new one has 0.
+        Raises: DomainError for a surface that is not there or a mirror, for glass that the light passes again
+          behind a mirror, and for a name the catalogue does not know, with the nearest it knows.
         """
         surfaces = with_medium(self.name, self.surfaces, surface, glass)
         row = torch.arange(len(surfaces), device=self.glass.device) == range(len(surfaces))[surface]

@@ -29,8 +29,7 @@ def settled(method: Callable[Concatenate[Any, P], R]) -> Callable[Concatenate[An
 
 class Replaceable(nn.Module):
     """Base of the lenses. A lens as it was built owns its numbers as Parameters; what ``replace`` returns
-    owns
-    none: its tensors are buffers, shared or given, through which gradients reach where they came from.
+    owns none: its tensors are buffers, shared or given, through which gradients reach where they came from.
 
     tensor_names: the tensors that ``replace`` takes. parameter_names: those of them that are Parameters of a
       lens as it was built.

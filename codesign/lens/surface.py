@@ -64,9 +64,8 @@ class Surface:
     asphere: coefficients of r^2, r^4, r^6, ... in mm^-1, mm^-3, mm^-5, ...
     is_stop: whether this surface is the aperture stop.
     mirror: whether it reflects. The axis is unfolded at a mirror: light travels along +z behind it too, so
-      lengths and curvatures
-      that follow count along the light (a file's signs are turned by its reader); its medium is the one in
-      front of it.
+      lengths and curvatures that follow count along the light (a file's signs are turned by its reader); its
+      medium is the one in front of it.
     phase: a diffractive phase, or None.
     decentre_mm: (x, y) of the vertex; tilt_deg: about x, then about y, around that vertex. Later surfaces
       stay where they were.

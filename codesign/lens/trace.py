@@ -332,8 +332,8 @@ def joined(front: TraceResult, rest: TraceResult, surfaces: int) -> TraceResult:
 
 def trace(prescription: Prescription, origin_mm: Tensor, direction: Tensor) -> TraceResult:
     """Trace rays through a lens that may hold a plate, see ``trace_surfaces``. At the plate a ray gains its
-    phase as optical path, and
-    its direction across the axis, times index, gains the slope of that path: the local grating equation.
+    phase as optical path, and its direction across the axis, times index, gains the slope of that path: the
+    local grating equation.
 
     Gradient: also to the plate. Rays that leave a plate beyond its rim MISS; those it turns beyond a right
       angle are TOTAL_REFLECTION.

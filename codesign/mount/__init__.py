@@ -1,8 +1,7 @@
 """A camera on a robot's body, and what the body reads off event flow from there.
 
 Where it sits and what it has to keep: ``Mount``, ``MountRanges``, the requirements. What flow tells of the
-  body's
-velocity: ``body_flow``, ``Surroundings``, ``sight_table``. Reading it, as a stage of a system:
+body's velocity: ``body_flow``, ``Surroundings``, ``sight_table``. Reading it, as a stage of a system:
   ``EgoVelocity``.
 Read first: pose.py, then ego_velocity.py.
 """

@@ -39,8 +39,8 @@ class Evidence:
 
     information: [N, W, K, K] of the velocities without prior, outliers weighted down. pull: [N, W, K], so
     that a window alone says inverse(information) pull. energy: [N, W], the squared flow in units of its
-    deviation. rows: [N, W, 2, K]
-    and flow_px: [N, W, 2], means over the window of what velocities make and of what was read, px.
+    deviation. rows: [N, W, 2, K] and flow_px: [N, W, 2], means over the window of what velocities make and of
+    what was read, px.
     told: [N, W, 11], the window's surface, depth, confidence, claim, flow and residuals. lens: [N, W, 6], its
     direction in body axes, focal length and blur. mount: [N, 9], position in metres, camera z and y in body
     axes. prior: [N, K].

@@ -214,8 +214,7 @@ def yaw_pitch_roll_rad(T_body_cam: Tensor) -> Tensor:
     pi/2].
 
     Yaw and pitch are where the camera's axis points. Looking straight up or down only yaw and roll together
-    mean
-    something: yaw is then both, and roll 0.
+    mean something: yaw is then both, and roll 0.
     Gradient: the matrix; straight up or down, where pitch has its largest or smallest value, 0 for pitch and
       roll.
     """

@@ -243,8 +243,8 @@ class OwnBody:
     codesign.mount).
 
     The slack's gradient is that of a rendered picture in which the body glows and nothing else does, with the
-    motion of
-    its silhouettes: it is 0 where nothing of the body is in view. The exact answer counts chief rays.
+    motion of its silhouettes: it is 0 where nothing of the body is in view. The exact answer counts chief
+    rays.
 
     >>> from codesign import lens, render
     >>> from codesign.mount import Body, Mount, OwnBody

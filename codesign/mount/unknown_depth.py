@@ -8,9 +8,8 @@ as likely, the likelihood of v takes in all depths,
 whose integrand is a Gaussian in rho, cut off at the bounds: nodes laid over where it is not nothing give it
 and its moments. Slope and curvature in v follow from the moments (Fisher's and Louis' identities: the mean of
 the slope at known depth; the mean of its curvature less the covariance of that slope). The likelihood has
-other maxima, where points stand
-at a bound: flow is believed a thousandth at first, and the maximum is followed while the belief grows (Rose,
-Deterministic annealing, 1998).
+other maxima, where points stand at a bound: flow is believed a thousandth at first, and the maximum is
+followed while the belief grows (Rose, Deterministic annealing, 1998).
 """
 
 import math

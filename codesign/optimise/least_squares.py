@@ -2,10 +2,9 @@
 bounds.
 
 Each step solves (J^T J + damping D^2) step = -J^T r with D the largest column norms of J seen so far, so the
-units of the variables
-do not matter. The gain ratio (what the sum of squares lost over what the linear model promised) multiplies
-the damping down after a
-good step and up after a bad one. Constraints beyond bounds are residual rows of their own, such as weight *
+units of the variables do not matter. The gain ratio (what the sum of squares lost over what the linear model
+promised) multiplies the damping down after a good step and up after a bad one. Constraints beyond bounds are
+residual rows of their own, such as weight *
 max(0, shortfall).
 
 A variable the residuals hardly see (a null mode) has a column about 0, hence a D about 0 and a step of any

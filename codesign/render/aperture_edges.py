@@ -2,11 +2,9 @@
 
 Within the pupil the share of light W that passes falls from one to nothing over the soft edge of an aperture,
 and only there does it change with the lens. Samples spread over the whole pupil meet that edge now and then,
-each with a large
-derivative: most of the noise of a gradient to the lens. Points of the edge alone, weighted by its width, have
-  the same
-mean: d/dp of the mean of W L over the disc is the mean over angles of 2 (b - a) r dW/dp L with r uniform in
-[a, b], where b - a is the edge at that angle and field point.
+each with a large derivative: most of the noise of a gradient to the lens. Points of the edge alone, weighted
+by its width, have the same mean: d/dp of the mean of W L over the disc is the mean over angles of 2 (b - a) r
+dW/dp L with r uniform in [a, b], where b - a is the edge at that angle and field point.
 """
 
 import math

@@ -228,8 +228,7 @@ class Camera:
 
     def rays_through(self, pixels: Tensor, pupil: Tensor, wavelength_um: float | None = None) -> Rays:
         """Rays of pixel coordinates [N, 2] through points [N, 2] of the pupil, of one colour (the d line when
-        none is
-        given): Rays, float64. The axial ray goes along: only a lens that passes nothing at all is an
+        none is given): Rays, float64. The axial ray goes along: only a lens that passes nothing at all is an
         error."""
         line = {} if wavelength_um is None else {"wavelength_um": wavelength_um}
         at = torch.cat([self.film.middle_px[None].to(pixels), pixels])

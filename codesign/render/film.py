@@ -20,8 +20,8 @@ class Film:
     """Pixels of a sensor, or of rectangular windows on it.
 
     windows_px: tuple of (left, top); each window has height_px rows and width_px columns. A pixel's
-      coordinate is that of its
-    centre: column 0 of the full sensor is x = 0, and the lens axis is at the sensor's middle.
+    coordinate is that of its centre: column 0 of the full sensor is x = 0, and the lens axis is at the
+    sensor's middle.
     """
 
     sensor_width_px: int

@@ -144,8 +144,8 @@ class Views:
     """A scene as all frames of all trajectories see it, N frames one after the other.
 
     scene: with the poses of its objects in these frames. T_world_part: [parts, N, 4, 4], the identity for the
-      static
-    part. cameras: [parts, N, 4, 4], poses of the camera in the axes of every part. batch: (..., T). float64.
+    static part. cameras: [parts, N, 4, 4], poses of the camera in the axes of every part. batch: (..., T).
+    float64.
     """
 
     scene: Any
@@ -165,8 +165,7 @@ class Views:
 
 def views_of(scene: Any, T_world_cam: Poses, rays: Rays | None = None) -> Views:
     """Views of a scene from trajectories [..., T, 4, 4]: the one place where poses are checked and brought
-    into the
-    axes of every part. rays: of the camera, which must be on one device with them.
+    into the axes of every part. rays: of the camera, which must be on one device with them.
 
     Raises: DomainError for what is no scene or no poses; ShapeError unless every object has a pose for every
       frame.

@@ -48,9 +48,8 @@ class PlacedScene:
 
     Args:
       scene: with ``radiance``, ``radiance_and_distance`` and ``hit``, such as a PathScene.
-      placement: of
-    it. Nothing of the scene is changed, so what depends on its size (media, bumps, point lamps) looks as in
-    itself.
+      placement: of it. Nothing of the scene is changed, so what depends on its size (media, bumps, point
+    lamps) looks as in itself.
     Gradient: that of the scene.
     """
 

@@ -74,8 +74,8 @@ def psf_frames(
 
 def _layers(psf, per_m, lit):
     """Layers of depth for what is seen, as numbers (near to far) of a step in 1 / distance: the map's, halved
-    while
-    there are few. Raises: DomainError for surfaces nearer than the map's, or a film without chief rays."""
+    while there are few. Raises: DomainError for surfaces nearer than the map's, or a film without chief
+    rays."""
     if not bool(lit.any()):
         raise DomainError(
             "psf frames: no chief ray passes the lens; open its apertures or make the film smaller."

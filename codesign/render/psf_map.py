@@ -41,8 +41,7 @@ class PsfMap:
       ``grid`` = (windows, rows, columns) of them, N in all, cells of ``cell_px`` (rows, columns) pixels
       between.
     transmission: [windows, H, W] share of the light that passes, as in the traced frames. radius_px: how far
-      the
-      light of a pixel comes from. step_per_m: of 1 / distance, over which blur grows by LAYER_PX at most.
+      the light of a pixel comes from. step_per_m: of 1 / distance, over which blur grows by LAYER_PX at most.
       sharp: chief rays of the film's pixels and a margin of radius_px around them, window after window, SIDE
       x SIDE values a pixel of ``fine`` x ``fine`` rays each.
       transfers: what ``psf_frames`` keeps for its next call.

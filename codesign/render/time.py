@@ -2,9 +2,8 @@
 once for a whole sequence.
 
 A trajectory is a function of times [n] in seconds to poses T_world_cam [n, 4, 4], or [..., n, 4, 4] for
-several in one batch. Where objects move, the
-scene is a function too: of times [n] to a
-MovingScene with n poses per object.
+several in one batch. Where objects move, the scene is a function too: of times [n] to a MovingScene with n
+poses per object.
 """
 
 import math
@@ -114,8 +113,7 @@ def frame_chunks(
 
     Joined, the chunks are what ``frames`` gives, bit for bit: every frame is the same sum in the same order.
     Gradient: as ``frames`` has it (interior term). All chunks share one trace of the lens, so going backward
-      from one chunk at a time needs
-    ``retain_graph=True`` where the lens is learned.
+    from one chunk at a time needs ``retain_graph=True`` where the lens is learned.
     """
     T_world_cam = check_poses(T_world_cam)
     each = check_whole(frames_per_chunk, "frames_per_chunk")
@@ -158,9 +156,8 @@ def adaptive_times(
         faster and may miss what is narrower or moves more between them.
     Returns: [n] float64 times, increasing, the first start_s and the last end_s. No gradient.
     Every step is judged by the displacement itself, through the lens: of the points seen at its start, and of
-    the points seen at its end. Steps grow at
-    most twofold and are judged at their middle too (on a coarser grid), so that a motion that comes back
-    within a step is met by its parts.
+    the points seen at its end. Steps grow at most twofold and are judged at their middle too (on a coarser
+    grid), so that a motion that comes back within a step is met by its parts.
     Linear interpolation between the frames then times a crossing of a pattern of wave number k to within k
     largest_px^2 / (8 s) pixels of motion, s the slope there as a share of the largest: a chord misses by h^2
     max|L''| / 8 at most.

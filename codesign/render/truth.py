@@ -158,9 +158,8 @@ def flow_and_occlusion(
     (True, True)
 
     A point is hidden when the later chief ray through its image meets a surface before it by more than
-    rounding: 32 units in the last place of float32
-    geometry, divided by the cosine at which the ray meets the point's own surface, since a ray aside by as
-    much meets it earlier or later by that.
+    rounding: 32 units in the last place of float32 geometry, divided by the cosine at which the ray meets the
+    point's own surface, since a ray aside by as much meets it earlier or later by that.
     """
     return _flow_truth(camera, scene, T_world_cam, stride, occlusion=True)
 
@@ -343,8 +342,8 @@ def camera_velocity(T_world_cam: Poses, t_s: Tensor | Sequence[float]) -> tuple[
       T_world_cam: [..., T >= 2, 4, 4].
       t_s: [T] times, increasing, the same for all trajectories.
     Returns: two twists [..., T - 1, 6], translation of the camera's origin (m/s) then rotation (rad/s): in
-      the camera's own axes, where it is the same all
-      through the interval, and in world axes, as it is at the middle of the interval.
+      the camera's own axes, where it is the same all through the interval, and in world axes, as it is at the
+      middle of the interval.
     Gradient: to the poses.
     Raises: DomainError when times do not increase or the camera turns by more than 3 rad from one pose to the
       next; ShapeError.

@@ -202,8 +202,7 @@ class RobotPair:
         """Camera, mount, sensor, flow and estimate of a design; objective "error" is the mean bounded one.
 
         layer: "memory" (hard counts, straight-through gradient), "counts" (smooth, without noise) or "sensor"
-          (single
-          events, no gradient: the judge).
+          (single events, no gradient: the judge).
         """
         mount = self.check(design).mount()
 

@@ -130,8 +130,8 @@ class Run(Generic[Config]):
         self._interruption.save = save
 
     def save_state(self, tensors: dict[str, torch.Tensor], numbers: dict[str, Any]):
-        """Store what is needed to go on, exactly, in one atomic write (see
-        codesign.state.write_state), with the times of the loops and of the run."""
+        """Store what is needed to go on, exactly, in one atomic write (see codesign.state.write_state), with
+        the times of the loops and of the run."""
         times = {
             "seconds": self.seconds,
             "loops": {name: pace.to_json() for name, pace in self._paces.items()},

@@ -233,9 +233,8 @@ def traced_camera(pair: RobotPair, name: str, focal_mm: float | None = None) -> 
 
     Args:
       name: in the catalogue, or a lens file.
-      focal_mm: to which the lens is scaled; None: that of the
-    pair's design. The lens is focused where the pair's is. Raises: as ``lens.load``; DomainError for a focal
-    length that is not positive.
+      focal_mm: to which the lens is scaled; None: that of the pair's design. The lens is focused where the
+    pair's is. Raises: as ``lens.load``; DomainError for a focal length that is not positive.
     """
     design = pair.design
     wanted = design.efl_mm if focal_mm is None else focal_mm

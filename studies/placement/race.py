@@ -175,8 +175,7 @@ class Race:
 
     def chosen(self, count: int) -> int | None:
         """Number of the descent whose answer errs least on training samples, None where the pair's own mount
-        errs less than
-        all of them: what is judged on unseen samples has not been chosen by them."""
+        errs less than all of them: what is judged on unseen samples has not been chosen by them."""
         if "chosen" not in self.tensors:
             problem = self.problem
             draws = [problem.draw(-1 - k) for k in range(FINAL_DRAWS)]

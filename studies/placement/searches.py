@@ -2,9 +2,8 @@
 gradients that are noisy but right in the mean, and searches without gradients.
 
 A search without gradients is a generator that gives a point and is sent its error, so that budget, bounds and
-records are
-the same for all: ``count`` points, one call of the judge each, the start first. What can be refused without a
-look costs none. The same seed and judge give the same points.
+records are the same for all: ``count`` points, one call of the judge each, the start first. What can be
+refused without a look costs none. The same seed and judge give the same points.
 """
 
 import math

@@ -1,6 +1,5 @@
-"""The refiner against a plain, a spiking, a cascaded and a deblurring network of as many weights,
-and networks of your
-own: the same windows, the same budget, several seeds.
+"""The refiner against a plain, a spiking, a cascaded and a deblurring network of as many weights, and
+networks of your own: the same windows, the same budget, several seeds.
 
 Every training is a run of this study in a folder below; those that are done are kept when the race
 goes on with --resume. Then all networks are judged on the same windows.

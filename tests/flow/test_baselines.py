@@ -142,9 +142,8 @@ def test_the_recurrent_unit_written_out():
 
 
 def test_the_second_iteration_reads_what_the_first_one_deblurred():
-    """With a head that always says 8 px to the right on cells of 8, each bin is read where its points
-    have got
-    to: 8 t px further; a bar that moves so stands still."""
+    """With a head that always says 8 px to the right on cells of 8, each bin is read where its points have
+    got to: 8 t px further; a bar that moves so stands still."""
     net = small(IDNet, iterations=2)
     with torch.no_grad():
         for parameter in net.head.parameters():

@@ -121,10 +121,9 @@ def optics_of(kind: str, scale: float = 1.0, focus_m: float = 2.0) -> Any:
 
 
 def judge(case: Case, way: Way = "boundary", effort: Effort = USUAL) -> Judged:
-    """The verdict on one way to the pose gradient: right within RIGHT + 2 x noise, wrong beyond WRONG + noise, near
-    between the two, noisy where that of the gradient stays above HIGHEST, doubtful where that of the differences
-    does, refused with the sentence, empty where nothing
-    in view changes."""
+    """The verdict on one way to the pose gradient: right within RIGHT + 2 x noise, wrong beyond WRONG +
+    noise, near between the two, noisy where that of the gradient stays above HIGHEST, doubtful where that of
+    the differences does, refused with the sentence, empty where nothing in view changes."""
     began = time.process_time()
     plain = gradient(case, effort, 0, "interior")
     truth = torch.zeros(0, len(plain), dtype=torch.float64)

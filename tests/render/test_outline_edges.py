@@ -155,8 +155,7 @@ def test_edges_that_count_as_one_are_read_from_beyond_both():
 
 def test_boxes_of_different_sizes_that_touch_share_their_edges():
     """Two boxes side by side, fronts and floors flush: along the lower's edges every stretch once. Total
-    length by
-    hand: two boxes' edges less what both have."""
+    length by hand: two boxes' edges less what both have."""
     mi = backend.mitsuba()
     T = mi.ScalarTransform4f
     low = {

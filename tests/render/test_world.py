@@ -129,8 +129,7 @@ def test_a_photograph_is_linearised_as_srgb(tmp_path):
 @pytest.mark.parametrize(("size_px", "shape"), [(4, (2, 4)), (9, (4, 9)), (10, (5, 10)), (12, (6, 12))])
 def test_a_large_picture_is_averaged_not_cut(tmp_path, size_px, shape):
     """Every texel repeated as often as the new picture has rows (columns), and means of as many as the old
-    one
-    has: averages over areas without a fraction of a texel."""
+    one has: averages over areas without a fraction of a texel."""
     import imageio.v3 as imageio
 
     values = np.random.default_rng(3).integers(0, 256, (6, 12), dtype=np.uint8)

@@ -59,8 +59,7 @@ def memory(
       the gradient of the whole with "play"; with "exact" each begins evenly around the play's centre. Second
       derivatives raise.
     Numerics: the count is the exact floor of the quotient of the two floats. In float32 a level within about
-      1e-7 |L| of a crossing may fall
-      to either side; it is then counted in a later frame, never lost.
+      1e-7 |L| of a crossing may fall to either side; it is then counted in a later frame, never lost.
     Raises: ShapeError for too few frames or shapes that do not fit; DomainError for theta <= 0, NaN, infinite
       or negative input.
     Warns: RuntimeWarning where a gradient may be asked for and thresholds differ by more than a factor of 4.

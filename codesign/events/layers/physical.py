@@ -70,13 +70,11 @@ def sensor_counts(
       With a dead time, over a step, cosine (scale) by rate x dead time of the average event, 240 frames per
       second:
         0.7: contrast 1.00 (0.99), focus 0.98 (0.92), shift by a pixel 0.93 (0.92), thresholds 1.00 (1.02),
-          dead time 1.00 (0.89)
-        2.9: contrast 1.00 (0.99), focus 0.98 (0.98), shift 0.90 (0.92), thresholds 0.96 (0.93), dead time
-        1.00 (0.98)
-        8.8: contrast 0.98 (0.89), focus 0.86 (0.99), shift 0.45 (0.84)
-    Warns: UserWarning where rate x dead time exceeds 5, or 2 with gradients to thresholds: one threshold
-      alone had cosine 0.11 to 0.96 at 2.6 to 2.9, by signal (the play of the mean width does not follow fast
-      turns).
+        dead time 1.00 (0.89) 2.9: contrast 1.00 (0.99), focus 0.98 (0.98), shift 0.90 (0.92), thresholds 0.96
+        (0.93), dead time 1.00 (0.98) 8.8: contrast 0.98 (0.89), focus 0.86 (0.99), shift 0.45 (0.84) Warns:
+        UserWarning where rate x dead time exceeds 5, or 2 with gradients to thresholds: one threshold alone
+        had cosine 0.11 to 0.96 at 2.6 to 2.9, by signal (the play of the mean width does not follow fast
+        turns).
     Raises: DomainError for other names in ``design`` (they have no gradient) or values outside the sensor's
       domain, or a dead time that its gradient cannot follow over thousands of intervals; and as ``simulate``.
     """

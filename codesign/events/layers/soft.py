@@ -1,7 +1,6 @@
 """The layers beside ``memory``: the sigmoid per frame pair (the named baseline), a comparator that looks once
-per frame, with a
-surrogate slope, and mean counts under threshold mismatch: smooth, without ghosts, hard counts as the spread
-  falls.
+per frame, with a surrogate slope, and mean counts under threshold mismatch: smooth, without ghosts, hard
+counts as the spread falls.
 """
 
 import math

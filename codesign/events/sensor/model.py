@@ -33,19 +33,18 @@ class SensorModel:
       the leak from frame to frame, relative.
     rate_cov_decades: spread of the leak rate over pixels, standard deviation of its base-10 logarithm.
     shot_rate_hz: noise events per pixel and second in the dark, both polarities together; a quarter at full
-      light (1 - 0.75 (I + 20)/275). It scales
-      inversely with the pixel's threshold, and a noise event sets the memorised level to the level seen.
+      light (1 - 0.75 (I + 20)/275). It scales inversely with the pixel's threshold, and a noise event sets
+      the memorised level to the level seen.
     refractory_s: dead time of a pixel after an event, seconds.
     photoreceptor_noise: noise of the log level before the comparator instead of separate noise events, of the
-      strength that v2e's fit assigns to
-      shot_rate_hz; the rate that comes out depends on bandwidth and frame rate (measured in docs/events.md).
+      strength that v2e's fit assigns to shot_rate_hz; the rate that comes out depends on bandwidth and frame
+      rate (measured in docs/events.md).
       Needs cutoff_hz and shot_rate_hz above 0.
     hot_pixel_share: share of pixels that fire by themselves. hot_pixel_rate_hz: their rate (ON, as a leak),
       events per second.
     timing: "interpolated": each event at the time its pixel crosses the threshold, log level linear in time
-      between frames; events inside the dead time
-      are lost (ESIM). "v2e": the frame-wide time slots of v2e, where events inside the dead time are
-      deferred.
+      between frames; events inside the dead time are lost (ESIM). "v2e": the frame-wide time slots of v2e,
+      where events inside the dead time are deferred.
     Source: v2e (Hu, Liu, Delbruck, CVPR-W 2021); Rebecq et al., ESIM, CoRL 2018.
 
     Example:
@@ -180,8 +179,7 @@ def with_design(sensor: SensorModel, design: Mapping[str, Tensor | float]) -> Se
     Args:
       design: numbers or 0-dim tensors by name, of DESIGN.
     Raises: DomainError for another name, a value that is no number or outside the sensor's domain, and one of
-      0
-      that requires a gradient: what is switched off has none.
+      0 that requires a gradient: what is switched off has none.
     """
     values = {}
     for name, value in design.items():

@@ -37,9 +37,8 @@ def simulate(
     """Events of a sensor that sees the frames one after the other; log level runs linearly between them.
 
     Per interval a pixel fires each time its level crosses its memorised level by one more threshold, as many
-    times as it does so. Low-pass, mismatch,
-    leak, noise, dead time and hot pixels come with the fields of the sensor. Without them the counts are
-    those of ``memory``.
+    times as it does so. Low-pass, mismatch, leak, noise, dead time and hot pixels come with the fields of the
+    sensor. Without them the counts are those of ``memory``.
 
     Args:
       frames: [T, H, W] linear intensity on the 0-255 scale (lin-log is applied here; brighter values are
@@ -48,11 +47,10 @@ def simulate(
       sensor: SensorModel.
       generator: torch.Generator for all that is random. None: the one in ``state``, which starts at seed 0.
       state: SensorState carried over chunks, changed in place; empty for the first. Later chunks start with
-        the frame after the last one seen, and may
-        hold a single frame. Any chunking gives the events of the whole. A later chunk may have another sensor
-        (biases that change in a recording): its pixels keep the numbers drawn for them, and those that stand
-        beyond their new thresholds fire at once. What the first sensor had not, and needs draws or a memory,
-        is refused.
+        the frame after the last one seen, and may hold a single frame. Any chunking gives the events of the
+        whole. A later chunk may have another sensor (biases that change in a recording): its pixels keep the
+        numbers drawn for them, and those that stand beyond their new thresholds fire at once. What the first
+        sensor had not, and needs draws or a memory, is refused.
       log_input: frames are natural-log levels, such as ln(I + eps) of linear frames of high dynamic range
         (ESIM: eps 1e-3 with frames 0 to 1; of the 0-255 scale where the sensor's speed or noise depends on
         intensity).

@@ -19,9 +19,8 @@ class SensorState:
       [H, W] thresholds as they are now.
     start_s, time_s: times of the first and the last frame. generator: used when none is passed; starts at
       seed 0. Only where the sensor needs them: reference_rest: [H, W] what rounding took from the memorised
-      level (not for timing "v2e"); input_level, input: [H, W] last log level before the low-pass,
-      last intensity; noise: [H, W] photoreceptor noise; leak_hz: [H, W] as it is now; deviate_on,
-      deviate_off,
+      level (not for timing "v2e"); input_level, input: [H, W] last log level before the low-pass, last
+      intensity; noise: [H, W] photoreceptor noise; leak_hz: [H, W] as it is now; deviate_on, deviate_off,
       leak_spread, leak_heat: [H, W] numbers drawn for thresholds and leaks; last_event_s: [H, W] time of the
       last event (since the first frame for timing "v2e", since the last frame otherwise, so <= 0); hazard:
       [H, W] noise still to pass until the next noise event; key, shots: [H, W] int32 random key and noise

@@ -87,9 +87,8 @@ def srm(
       response: "none"; "alpha": kernel (k dt / tau_s) exp(1 - k dt / tau_s), k >= 1, not multiplied by dt;
         "step": the sum of all drives so far.
       coupled: drive is [T, 2, ...], ON first, and the reset of one polarity is added with the other sign to
-        the other. With ``kernel="step"``,
-        ``response="step"``, ``reset_scale=1`` and log-intensity steps as drive (ON +, OFF -) this is the
-        memorised-reference event model.
+        the other. With ``kernel="step"``, ``response="step"``, ``reset_scale=1`` and log-intensity steps as
+        drive (ON +, OFF -) this is the memorised-reference event model.
       gradient: "surrogate"; for resets that fade "mean": the exact gradient of a smooth mean response, of many
         neurons with noise at the threshold that spiked last at a random time. It points better than a surrogate;
         docs/srm.md says how well. (That of the event model's mean count: ``events.layer("srm")``.)
@@ -105,13 +104,12 @@ def srm(
       state: SrmState to carry on. The recursion runs in float64 whatever the drive, and chunks equal the
         whole bit for bit.
     Gradient: drive, theta, tau_s, tau_r, state; spikes by the surrogate. theta and tau_r act through the
-      reset amplitude with spikes held, also when
-      through_reset is "off". With ``gradient="mean"`` spikes carry one to drive, theta, tau_s, tau_r,
-      state.response and state.mean, and the potential none. Second derivatives raise.
+      reset amplitude with spikes held, also when through_reset is "off". With ``gradient="mean"`` spikes
+      carry one to drive, theta, tau_s, tau_r, state.response and state.mean, and the potential none. Second
+      derivatives raise.
     Raises: ShapeError for T = 0, no pixel, shapes that do not fit; DomainError for thresholds, time constants
-      or dt that are not positive, unknown
-      names, NaN or infinite drive; NonFiniteError when a finite drive overflows. Warns (RuntimeWarning) when
-      "full" breaks max rho * sum|nu| < 1.
+      or dt that are not positive, unknown names, NaN or infinite drive; NonFiniteError when a finite drive
+      overflows. Warns (RuntimeWarning) when "full" breaks max rho * sum|nu| < 1.
     Source: Gerstner and Kistler, Spiking Neuron Models, 2002, section 4.2; Shrestha and Orchard, SLAYER,
       NeurIPS 2018.
 

@@ -10,8 +10,7 @@ Its kernels are linear recursions with one decay a, one amplitude m and at most 
 
 The adjoint is written by hand, since it needs no state of the layer, only its potential: letting drjit
 differentiate one step after the other (``events.kernels.recursion``) keeps or computes again the states of
-every
-step: 1.8 times as long, forward and backward, 2 x 128 x 128 pixels, T = 200.
+every step: 1.8 times as long, forward and backward, 2 x 128 x 128 pixels, T = 200.
 """
 
 import math

@@ -7,9 +7,9 @@ the mean states of its resets. Where u = v + reset comes near theta a neuron spi
 ln(1 + exp(x)), x = (u - theta) / (WIDTH theta): of each age the share F = 1 - exp(-dt rate) spikes in a step
 and goes to age 0; the others grow older, into a last age that holds all that are older still. The mean
 spikes, sum_k P_k F_k, are a smooth function of the response, and their gradient is exact. The equations are
-those of a population of neurons with
-escape noise: Gerstner and Kistler, Spiking Neuron Models, 2002, section 6.2, with the resets of earlier
-spikes as a mean per age. For dt = tau_r / PACE the share is a logistic function of x.
+those of a population of neurons with escape noise: Gerstner and Kistler, Spiking Neuron Models, 2002, section
+6.2, with the resets of earlier spikes as a mean per age. For dt = tau_r / PACE the share is a logistic
+function of x.
 
 **Play**, of coupled polarities with step kernels: that of the mean count of ``events.memory``, for a level
 that runs no faster than one threshold per step. Such a layer fires at most once a step and polarity; what is

@@ -3,10 +3,10 @@ t_last) / tau); 0 where none was yet. Traces, which grow by one with every event
 
 The gradient of the surface of hard counts is that of its mean over where pixels stand inside their
 thresholds. In the mean over places inside a threshold C it is (1/C) times the integral of exp(-age/tau) over
-the last C of level
-that the pixel went through: later crossings hide what fired more than a threshold before. One hard pixel does
-not know where that window ends, but its own last event lies evenly in it and the one before evenly in the
-threshold behind, so the mean of the windows that begin at either is right to first order in their length.
+the last C of level that the pixel went through: later crossings hide what fired more than a threshold before.
+One hard pixel does not know where that window ends, but its own last event lies evenly in it and the one
+before evenly in the threshold behind, so the mean of the windows that begin at either is right to first order
+in their length.
 """
 
 import math

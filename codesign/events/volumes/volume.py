@@ -35,12 +35,11 @@ def from_counts(counts: Tensor, t_s: Times, bins: int) -> EventVolume:
       bins: number of bins, >= 1.
     Returns: EventVolume of counts [B, 2, bins, H, W]; the total is conserved.
       centroid_s: [bins] float64, seconds from t_s[0]: mean time of what a bin collects when events come at an
-        even rate. It does not depend on the
-      counts, so a rate that changes linearly with time is read off at the centroid exactly.
+        even rate. It does not depend on the counts, so a rate that changes linearly with time is read off at
+        the centroid exactly.
     Gradient: counts.
     Raises: ShapeError when axes or the number of times do not fit; DomainError for times that do not
-      increase, counts that are not finite, bins < 1,
-      and for fewer intervals than fill every bin.
+      increase, counts that are not finite, bins < 1, and for fewer intervals than fill every bin.
 
     Example:
     >>> from codesign import events
@@ -81,8 +80,8 @@ def from_stream(
         Events outside are not asked for.
       bins: number of bins, >= 1.
     Returns: EventVolume of counts [1, 2, bins, H, W] whose total is the number of events in the interval, and
-      centroid_s [bins] float64, seconds from
-      t0: (t1 - t0)/(3 (bins - 1)) inside at the ends, the nodes between (even event rate).
+      centroid_s [bins] float64, seconds from t0: (t1 - t0)/(3 (bins - 1)) inside at the ends, the nodes
+      between (even event rate).
     Gradient: none (timestamps are integers).
     Raises: DomainError for t1 <= t0 or bins < 1.
 

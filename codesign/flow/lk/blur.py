@@ -1,9 +1,8 @@
 """A symmetric kernel along both axes, mirrored at the border: in drjit, and as operations of torch.
 
-A lane goes down a column: it takes the horizontal sum of each row and keeps the last ones for the
-vertical sum, so nothing is stored between the two. An even continuation makes the blur A self-adjoint
-for a product in which the
-outermost samples count half: A^T = E A E^-1, E = 1/2 at the ends of an axis, 1 within.
+A lane goes down a column: it takes the horizontal sum of each row and keeps the last ones for the vertical
+sum, so nothing is stored between the two. An even continuation makes the blur A self-adjoint for a product in
+which the outermost samples count half: A^T = E A E^-1, E = 1/2 at the ends of an axis, 1 within.
 """
 
 from collections.abc import Sequence

@@ -82,10 +82,9 @@ class Form(NamedTuple):
 
 
 def recorded(kernel: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of hashable settings and then drjit arrays or lists of them, which is traced once for
-    each of the
-    settings and replayed after that: small images cost mostly tracing. Widths of arrays must follow
-      from the settings.
+    """A function of hashable settings and then drjit arrays or lists of them, which is traced once for each
+    of the settings and replayed after that: small images cost mostly tracing. Widths of arrays must follow
+    from the settings.
 
     While drjit looks at what a recording is given, or at what its closure holds, it holds its own
     lock. Where that runs anything in Python, as for a dataclass, another thread may get Python's lock

@@ -150,9 +150,8 @@ class Level:
         return mean, self.gain[:, None, None] * slope, seen
 
     def evidence(self, products: Tensor) -> tuple[Tensor, Tensor]:
-        """Precision [B, 2K, 2K] that the data add where their products were taken, and their pull [B,
-        2K] on the
-        parameters: precision times the distance to the best fit."""
+        """Precision [B, 2K, 2K] that the data add where their products were taken, and their pull [B, 2K] on
+        the parameters: precision times the distance to the best fit."""
         side = 2 * self.shape.terms
         slopes, scattered, right, energy, events = (
             self.moments.sums(products).double() @ self.shape.equations

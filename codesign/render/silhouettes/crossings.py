@@ -47,8 +47,7 @@ class Crossings(Rows):
 @dataclass(frozen=True)
 class Overlaps(Curve):
     """A line start, end [n, 3] across every overlap; normal: [n, 3] of both faces; names: of their shapes
-    [n]. No
-    radiance can be read there: where it is asked how, the scene is refused."""
+    [n]. No radiance can be read there: where it is asked how, the scene is refused."""
 
     start: Tensor
     end: Tensor

@@ -66,8 +66,8 @@ def curve_points(
     """Points on all curves that may fall on the film, about ``per_px`` per pixel length; None for none.
 
     Args: field: of the camera. curves: of every part of the scene, in its own axes. cameras [parts, F, 4, 4]:
-      the camera
-      in the axes of every part. frames_each: frames of a trajectory; every trajectory draws the same numbers.
+      the camera in the axes of every part. frames_each: frames of a trajectory; every trajectory draws the
+      same numbers.
     """
     count = cameras.shape[1]
     found = []
@@ -85,8 +85,8 @@ def curve_points(
 @dataclass(frozen=True)
 class _Pieces(Rows):
     """Pieces of one curve that touch a window in a frame: index [n], bounds [n, 2], what is left of their
-    length on
-    the film: start and end share [n], length px [n], depths of their ends [n, 2]; frame and window [n]."""
+    length on the film: start and end share [n], length px [n], depths of their ends [n, 2]; frame and window
+    [n]."""
 
     index: Tensor
     bounds: Tensor

@@ -47,8 +47,8 @@ class Curve:
 
     def face_slope(self, index: Tensor, y: Tensor, viewpoint: Tensor) -> Tensor:
         """Tangent [n] of the angle between view and normal of the steeper of the faces on both sides of
-        points y [n, 3],
-        where both are seen: a reading from farther away than they lie has missed them. Infinite elsewhere."""
+        points y [n, 3], where both are seen: a reading from farther away than they lie has missed them.
+        Infinite elsewhere."""
         return torch.full(index.shape, torch.inf, dtype=torch.float64)
 
     def apex_m(self, index: Tensor) -> Tensor:

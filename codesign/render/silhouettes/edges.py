@@ -26,9 +26,8 @@ BITS = 10  # of each coordinate in the order along a space-filling curve
 @dataclass(frozen=True)
 class Edges(Rows):
     """start, end: [E, 3]. normals: [E, 2, 3] of the two faces, the side that shines. always: [E], True where
-    an
-    edge counts from every side. free: [E], True where not just two faces of one mesh meet. width_m: [E], how
-    far apart edges lie that count as this one. apexes: [E, 2, 3], third corners of the two faces, NaN for
+    an edge counts from every side. free: [E], True where not just two faces of one mesh meet. width_m: [E],
+    how far apart edges lie that count as this one. apexes: [E, 2, 3], third corners of the two faces, NaN for
     none and where more than two meet."""
 
     start: np.ndarray

@@ -28,10 +28,9 @@ FOUND = 1e-9  # share of the radius by which a point may miss the surfaces
 @dataclass(frozen=True)
 class Intersections(Curve, Rows):
     """Pieces start, end [n, 3] of curves on two surfaces each, f(x) = (x - c) A (x - c) + b (x - c) + k = 0
-    with
-    gradients of length one: c, b, axis [n, 2, 3], A [n, 2, 3, 3], k [n, 2], axis that of a tube from c to its
-    other end, 0 for others; curve: [n], which pieces are one curve; radius: [n], the lesser one of the two
-    surfaces."""
+    with gradients of length one: c, b, axis [n, 2, 3], A [n, 2, 3, 3], k [n, 2], axis that of a tube from c
+    to its other end, 0 for others; curve: [n], which pieces are one curve; radius: [n], the lesser one of the
+    two surfaces."""
 
     start: Tensor
     end: Tensor
