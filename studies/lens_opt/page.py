@@ -213,11 +213,11 @@ def _lenses(run, task, shown):
 
 def _seen_by_the_sensor(run, job, shown):
     case = job.probe
-    rows = {}
+    rows, seen = {}, {}
     for title, optics in shown.items():
         with torch.no_grad():
             camera = job.task.camera(optics, run.config.samples, case.seed)
-            frames = render.frames(camera, case.scene, case.T_world_body)
+            frames = seen[title] = render.frames(camera, case.scene, case.T_world_body)
             on, off = events.memory(frames, SENSOR.theta_on, SENSOR.theta_off)[0].sum(0)
         for h, frame, count in zip(FIELDS, frames[0].numpy(), (on - off).numpy(), strict=True):
             rows.setdefault(title, {}).update({f"field {h:g}": frame, f"events {h:g}": count})
@@ -230,19 +230,15 @@ def _seen_by_the_sensor(run, job, shown):
         "frames_and_events",
         "Frames, and ON minus OFF events (red minus blue).",
     )
-    _fading_events(run, job, shown[label("optimised", run.config.objective)])
+    _fading_events(run, seen[label("optimised", run.config.objective)], case.t_s)
 
 
-def _fading_events(run, job, optics):
-    """The same scene's events as a frame-difference emulator makes them: a CSV file, and a video in which they fade."""
-    case = job.probe
-    with torch.no_grad():
-        camera = job.task.camera(optics, run.config.samples, case.seed)
-        frames = render.frames(camera, case.scene, case.T_world_body)
-    stream = events.naive(frames.flatten(1, 2), case.t_s, SENSOR.theta_on)
+def _fading_events(run, frames, t_s):
+    """Events as a frame-difference emulator makes them of frames: a CSV file, and a video in which they fade."""
+    stream = events.naive(frames.flatten(1, 2), t_s, SENSOR.theta_on)
     events.write(run.path("events_naive.csv"), stream)
     try:
-        events.decay_video(run.path("events_decay.mp4"), stream, case.t_s, 0.015, fps=8)
+        events.decay_video(run.path("events_decay.mp4"), stream, t_s, 0.015, fps=8)
     except MissingPackageError as error:
         run.text(f"**Left out**: the video of fading events. {error}")
         return
