@@ -1,19 +1,7 @@
-"""The former name of ``codesign.mount``: it imports for one version, with a warning."""
-
-import sys
-import warnings
+"""The former name of ``codesign.mount``."""
 
 from codesign import mount
+from codesign.former import stands_for
 
-# pickles name the file in which a class stood
-for _file in ("body", "criterion", "mount", "observability", "ranges", "requirements", "starts"):
-    sys.modules[f"{__name__}.{_file}"] = mount
-
-
-def __getattr__(name):
-    return getattr(mount, name)
-
-
-warnings.warn(
-    "codesign.place is codesign.mount now, with the same names; import that.", FutureWarning, stacklevel=2
-)
+FILES = ("body", "criterion", "mount", "observability", "ranges", "requirements", "starts")
+stands_for(__name__, FILES, mount)

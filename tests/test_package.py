@@ -22,6 +22,7 @@ PRIVATE = {
     "checks",
     "doctor",
     "doors",
+    "former",
     "interrupt",
     "optional",
     "place",
