@@ -24,13 +24,17 @@ from codesign.errors import CodesignError, DomainError, ShapeError, shown
 P = ParamSpec("P")
 T = TypeVar("T")
 HOME = str(Path(__file__).parent) + os.sep
+# packages that have doors, which are beside each other wherever they are installed
+PACKAGES = ("codesign.", "scenes.")
+OURS = tuple(str(Path(__file__).parents[1] / package[:-1]) + os.sep for package in PACKAGES)
 LIBRARIES = (sysconfig.get_path("stdlib"), sysconfig.get_path("purelib"), sysconfig.get_path("platlib"), "<")
 FAILS = (ArithmeticError, AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError)
 # what torch and NumPy say of tensors that do not fit
 UNFIT = re.compile(
     "shape|size|dimension|dtype|device|broadcast|meta|layout|sparse|complex|scalar|one element|out of range|index|linalg"
     "|too large|must match|must be|not supported|operand|0-d|determinant|null byte|assignment failed|cannot be converted"
-    "|overflow|division|negative|NaN|infinit|expected|invalid combination|Long|Half|Double|Float|not implemented for",
+    "|overflow|division|negative|NaN|infinit|expected|invalid combination|invalid data type"
+    "|Long|Half|Double|Float|not implemented for",
     re.IGNORECASE,
 )
 # classes that have doors, for annotations whose names are imported only when types are checked
@@ -51,7 +55,7 @@ def explain(room: dict[str, Any]) -> None:
         public = room[name]
         if inspect.isclass(public):
             for base in public.__mro__:
-                if base.__module__.startswith("codesign.") and "__explained__" not in vars(base):
+                if base.__module__.startswith(PACKAGES) and "__explained__" not in vars(base):
                     _class(base)
         elif isinstance(public, types.FunctionType) and not hasattr(public, "__explained__"):
             room[name] = door(public, f"{home.removeprefix('codesign.')}.{name}")
@@ -131,7 +135,7 @@ def _sentence(function, name, args, kwargs, error):
             return DomainError(f"{name}: {argument} = {value}, but a finite number is needed.")
     for argument, value in given.items():
         parts = value if isinstance(value, (list, tuple)) else ()
-        blamed = {f"'{type(each).__name__}' object" for each in (value, *parts)}
+        blamed = {f"{type(each).__name__}' object" for each in (value, *parts)}
         if isinstance(error, (AttributeError, TypeError)) and any(words in said for words in blamed):
             return DomainError(f"{name}: {argument} = {shown(value)} does not fit ({said}).")
         name_of = f"has no attribute '{value}'" if isinstance(value, str) else None
@@ -163,10 +167,12 @@ def is_ours(trace: types.TracebackType | None) -> bool:
     last = ""
     while trace is not None:
         file = trace.tb_frame.f_code.co_filename
-        if file.startswith(HOME) or not file.startswith(LIBRARIES):  # it may be installed among them
+        library = file.startswith(LIBRARIES) or file.endswith(".pyx")
+        # ours may be installed among libraries
+        if file.startswith(OURS) or not library:
             last = file
         trace = trace.tb_next
-    return last.startswith(HOME)
+    return last.startswith(OURS)
 
 
 @functools.cache

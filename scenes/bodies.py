@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from codesign.doors import explain
 from codesign.errors import DomainError
 from scenes import mesh_files
 
@@ -122,3 +123,6 @@ def cylinder(radius_m: float, length_m: float, centre_m: Sequence[float], along:
         ]
     )
     return Body(vertices @ ALONG[along].T + np.asarray(centre_m, dtype=float), faces)
+
+
+explain(globals())

@@ -1,12 +1,13 @@
 """A table with many small things on it, seen from near: silhouettes everywhere."""
 
 import math
+from typing import Any
 
 import numpy as np
 
 from codesign import backend
 from scenes import textures
-from scenes.build import GAP_M, Paint, World, ball, block, emissive, pole, sides
+from scenes.build import GAP_M, Light, Paint, World, ball, block, emissive, pole, sides
 
 # height and thickness of the table top
 TOP_M = 0.75
@@ -19,7 +20,7 @@ POLES = 8
 POSTS = 14  # of the fence
 
 
-def tabletop(seed=0, device="cpu", light=emissive):
+def tabletop(seed: int = 0, device: str = "cpu", light: Light = emissive) -> Any:
     """A table of 1.4 m x 0.9 m in a room, with cubes, spheres, thin poles and a fence, placed at random
     without touching.
 

@@ -10,6 +10,7 @@ import PIL.Image
 import torch
 from scipy.ndimage import gaussian_filter
 
+from codesign.doors import explain
 from codesign.errors import DomainError, FileFormatError
 from codesign.reading import read_bytes, reading
 from scenes import rgbe
@@ -37,7 +38,7 @@ MOST_BYTES = 1 << 30
 HDR_MEAN = 80.0
 
 
-def photo(source, size_px=512):
+def photo(source: str | Path, size_px: int = 512) -> np.ndarray:
     """A photograph as linear luminance.
 
     Args:
@@ -142,7 +143,7 @@ def _radiance(linear, name):
     return check_texture(LIFT + (255 - LIFT) * linear, name)
 
 
-def shrunk(texture, factor):
+def shrunk(texture: np.ndarray, factor: int) -> np.ndarray:
     """The texture averaged over factor x factor texels, so that a few samples per pixel see no detail between
     them."""
     height, width = (n // factor * factor for n in texture.shape)
@@ -154,7 +155,7 @@ def shrunk(texture, factor):
     )
 
 
-def softened(texture, texels, mode="nearest"):
+def softened(texture: np.ndarray, texels: float, mode: str = "nearest") -> np.ndarray:
     """The texture blurred by a Gaussian of this standard deviation, so that the kinks between bilinear texels
     become small; beside its border it goes on as SciPy's ``mode`` says."""
     return gaussian_filter(check_texture(texture, "to soften").astype(np.float64), texels, mode=mode).astype(
@@ -162,7 +163,13 @@ def softened(texture, texels, mode="nearest"):
     )
 
 
-def speckle(seed, size_px=512, finest_px=6.0, coarsest_px=64.0, contrast=0.5):
+def speckle(
+    seed: int,
+    size_px: int = 512,
+    finest_px: float = 6.0,
+    coarsest_px: float = 64.0,
+    contrast: float = 0.5,
+) -> np.ndarray:
     """Random pattern with equal power per octave between two periods (texels), exp of a Gaussian field:
     [size, size] float32."""
     frequency = np.fft.fftfreq(size_px)
@@ -174,13 +181,15 @@ def speckle(seed, size_px=512, finest_px=6.0, coarsest_px=64.0, contrast=0.5):
     return check_texture(60.0 * np.exp(contrast * field / field.std()), f"speckle {seed}")
 
 
-def checkerboard(squares=8, square_px=32, dark=10.0, bright=200.0):
+def checkerboard(
+    squares: int = 8, square_px: int = 32, dark: float = 10.0, bright: float = 200.0
+) -> np.ndarray:
     """Black and white squares, [H, W] float32."""
     row = np.arange(squares * square_px) // square_px
     return np.where((row[:, None] + row) % 2 == 0, bright, dark).astype(np.float32)
 
 
-def faded_to(texture, level, margin=0.12):
+def faded_to(texture: np.ndarray, level: float, margin: float = 0.12) -> np.ndarray:
     """The texture with its borders fading smoothly to a constant, so that adjoining walls meet without a
     jump."""
     texture = check_texture(texture, "to fade")
@@ -220,7 +229,9 @@ def check_texture(values, name):
     return values
 
 
-def picture(source, blur_texels=2.0, encoding=None):
+def picture(
+    source: str | Path | np.ndarray, blur_texels: float = 2.0, encoding: str | None = None
+) -> np.ndarray:
     """What a world's surface is given: an array [H, W], a path, one of PHOTOS, or "speckle-3" (seed 3); files
     and photographs softened by ``blur_texels``.
 
@@ -254,11 +265,7 @@ def picture(source, blur_texels=2.0, encoding=None):
     return softened(photo(source), blur_texels)
 
 
-def sky(
-    seed=0,
-    height_px=256,
-    sun_azimuth_deg=SUN_AZIMUTH_DEG,
-):
+def sky(seed: int = 0, height_px: int = 256, sun_azimuth_deg: float = SUN_AZIMUTH_DEG) -> np.ndarray:
     """A procedural sky as an equirectangular picture [height, 2 height], first row at the zenith: a gradient,
     soft clouds, a broad soft sun; 255 at most."""
     width = 2 * height_px
@@ -280,7 +287,7 @@ def sky(
     return check_texture(np.clip(bright + (BELOW - bright) * below, 0, 255), "of the procedural sky")
 
 
-def environment(path, mean=80.0):
+def environment(path: str | Path, mean: float = 80.0) -> np.ndarray:
     """Luminance of an equirectangular HDR file (.hdr, .exr, or any picture Mitsuba reads), scaled to a mean
     radiance over the sphere: [H, W] float32.
 
@@ -311,7 +318,13 @@ def _scaled(values, weight, mean, name):
     return check_texture(values * (mean / level), name)
 
 
-def waves(seed, count=24, finest_period_m=0.05, coarsest_period_m=0.5, log_contrast=0.4):
+def waves(
+    seed: int,
+    count: int = 24,
+    finest_period_m: float = 0.05,
+    coarsest_period_m: float = 0.5,
+    log_contrast: float = 0.4,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Random plane waves for TexturedPlane: frequency [K, 2] (per metre), amplitude [K], phase [K]; periods
     spread evenly in octaves."""
     generator = torch.Generator().manual_seed(seed)
@@ -324,3 +337,6 @@ def waves(seed, count=24, finest_period_m=0.05, coarsest_period_m=0.5, log_contr
         torch.full((count,), log_contrast * (2 / count) ** 0.5, dtype=torch.float64),
         2 * math.pi * u[2],
     )
+
+
+explain(globals())

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from codesign.atomic import replacing
 from codesign.checks import check_finite
+from codesign.doors import explain
 from codesign.errors import DomainError, FileFormatError, ShapeError
 from codesign.pose import check_poses, inverse, se3_exp
 from codesign.reading import read_text
@@ -24,7 +25,6 @@ from scenes.trajectories.trajectory import Trajectory
 
 MOST_BYTES = 64_000_000
 MOST_POSES = 1_000_000
-BOM = "\ufeff"  # that some editors put before a text
 LONGEST_LINE = 400
 UNIT_TOLERANCE = 1e-3  # of a quaternion's length: files with four digits stay within 1e-4
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,4})?")
@@ -32,7 +32,7 @@ NAMES = re.compile(r"(timestamp|time|t)(_s)? t?x(_m)? t?y(_m)? t?z(_m)? qx qy qz
 HEADER = "# timestamp tx ty tz qx qy qz qw"
 
 
-def write_tum(path, t_s, poses):
+def write_tum(path: str | Path, t_s: torch.Tensor, poses: torch.Tensor) -> None:
     """Write poses as text with all digits; the file appears whole or not at all.
 
     Args:
@@ -49,7 +49,7 @@ def write_tum(path, t_s, poses):
         )
 
 
-def read_tum(path):
+def read_tum(path: str | Path) -> tuple[torch.Tensor, torch.Tensor]:
     """Read a trajectory.
 
     Returns: t_s [n] float64 seconds, poses [n, 4, 4] float64. Quaternions are normalised.
@@ -60,7 +60,7 @@ def read_tum(path):
     path = Path(path)
     rows = []
     numbers = []
-    for number, line in enumerate(read_text(path, MOST_BYTES).removeprefix(BOM).split("\n"), start=1):
+    for number, line in enumerate(read_text(path, MOST_BYTES).split("\n"), start=1):
         line = line.strip(" \t\r")
         if not line or line.startswith("#"):
             continue
@@ -161,3 +161,6 @@ def _checked(t_s, poses):
     if bool((t_s.diff() <= 0).any()):
         raise DomainError("the times of poses must increase strictly; sort them and drop doubles.")
     return t_s, poses
+
+
+explain(globals())

@@ -9,15 +9,20 @@ bilinear texels have kinks and gradients, though right, are as rough as the grai
 """
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from codesign import backend
+from codesign.doors import explain
 from codesign.render import MitsubaScene, TexturedPlane
 from scenes import bodies, textures
 from scenes.build import (
     GAP_M,
+    Light,
     Paint,
     World,
     ball,
@@ -34,6 +39,7 @@ from scenes.foreign import from_mitsuba, view_of
 from scenes.from_mesh import from_mesh
 from scenes.tabletop import tabletop
 
+Picture = str | Path | np.ndarray
 PAINT = 60.0  # the wall colour that pictures fade to
 ROOM_M = (4.0, 4.0, 2.6)
 CORRIDOR_M = (14.0, 2.2, 2.6)  # length, width, height
@@ -60,18 +66,26 @@ __all__ = [
 ]
 
 
-def wall(texture, texel_m=0.002, half_width_m=8.0, wrap="mirror", device="cpu") -> MitsubaScene:
+def wall(
+    texture: Picture,
+    texel_m: float = 0.002,
+    half_width_m: float = 8.0,
+    wrap: str = "mirror",
+    device: str = "cpu",
+) -> MitsubaScene:
     """One endless-looking wall, the plane y = 0 seen from y < 0, tiled (wrap "mirror" or "repeat") with a
     picture (an array, a path such as "photo.jpg", or a name) at ``texel_m`` per texel."""
     return _plane("wall", texture, texel_m, half_width_m, (0, -1, 0), (0, 0, 1), wrap, device)
 
 
-def checkerboard(square_m=0.1, device="cpu"):
+def checkerboard(square_m: float = 0.1, device: str = "cpu") -> MitsubaScene:
     """The seed project's scene: a checkerboard wall, to be seen by a camera that translates."""
     return wall(textures.checkerboard(), square_m / 32, wrap="repeat", device=device)
 
 
-def ground(texture, texel_m=0.004, half_width_m=12.0, device="cpu"):
+def ground(
+    texture: Picture, texel_m: float = 0.004, half_width_m: float = 12.0, device: str = "cpu"
+) -> MitsubaScene:
     """Textured ground, the plane z = 0 seen from above."""
     return _plane("ground", texture, texel_m, half_width_m, (0, 0, 1), (0, 1, 0), "mirror", device)
 
@@ -96,12 +110,12 @@ def _walls(mi, paints, size_m):
 
 
 def room(
-    photos=("brick", "gravel", "grass", "camera", "coffee", "astronaut"),
-    size_m=ROOM_M,
-    objects=True,
-    device="cpu",
-    light=emissive,
-):
+    photos: Sequence[Picture] = ("brick", "gravel", "grass", "camera", "coffee", "astronaut"),
+    size_m: Sequence[float] = ROOM_M,
+    objects: bool = True,
+    device: str = "cpu",
+    light: Light = emissive,
+) -> Any:
     """A room with photographs on its four walls, floor and ceiling, and two crates and a ball when
     ``objects``.
 
@@ -120,7 +134,9 @@ def room(
     return light(World(shapes), device)
 
 
-def blank_room(level=PAINT, size_m=ROOM_M, device="cpu", light=emissive):
+def blank_room(
+    level: float = PAINT, size_m: Sequence[float] = ROOM_M, device: str = "cpu", light: Light = emissive
+) -> Any:
     """A closed room whose every surface has one radiance: the negative control, in which no motion makes an
     event.
 
@@ -135,7 +151,7 @@ def blank_room(level=PAINT, size_m=ROOM_M, device="cpu", light=emissive):
     return light(World(_walls(backend.mitsuba(device), [even] * 6, size_m)), device)
 
 
-def corridor(device="cpu", light=emissive):
+def corridor(device: str = "cpu", light: Light = emissive) -> Any:
     """A corridor along +y, entered at y = 0, with pillars on both sides. Luminous ceiling where it is lit."""
     mi = backend.mitsuba(device)
     length_m, width_m, height_m = CORRIDOR_M
@@ -162,13 +178,13 @@ def corridor(device="cpu", light=emissive):
 
 
 def outdoor(
-    seed=0,
-    clutter=48,
-    environment=None,
-    meshes=(),
-    device="cpu",
-    light=emissive,
-):
+    seed: int = 0,
+    clutter: int = 48,
+    environment: str | Path | None = None,
+    meshes: Sequence[tuple[Any, ...]] = (),
+    device: str = "cpu",
+    light: Light = emissive,
+) -> Any:
     """Open ground with crates, balls and posts under a sky; a clear lane along x = 0 to drive or fly in.
 
     Args:
@@ -223,7 +239,7 @@ def outdoor(
     return light(World(shapes, {"sky": sky(mi, above)}, lamps, texel_m=0.08), device)
 
 
-def dark_room(seed=0, device="cpu", light=emissive):
+def dark_room(seed: int = 0, device: str = "cpu", light: Light = emissive) -> Any:
     """A room near darkness (mean radiance DARK) with a few small bright balls in the air, placed at
     random without touching."""
     mi = backend.mitsuba(device)
@@ -253,7 +269,7 @@ def dark_room(seed=0, device="cpu", light=emissive):
     return light(World(shapes), device)
 
 
-def smooth_plane(seed=0, T_world_plane=None, **options):
+def smooth_plane(seed: int = 0, T_world_plane: Tensor | None = None, **options: Any) -> TexturedPlane:
     """A band-limited analytic wall in the plane z = 0 of its frame; options go to textures.waves."""
     return TexturedPlane(*textures.waves(seed, **options), T_world_plane=T_world_plane)
 
@@ -277,3 +293,5 @@ VIEWS = {
     "blank-room": ((0.4, -1.5, 1.3), (-0.1, 1.0, 0.7)),
     "dark-room": ((0.0, -1.5, 1.3), (0.0, 1.0, 1.1)),
 }
+
+explain(globals())

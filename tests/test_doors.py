@@ -12,6 +12,7 @@ from torch import Tensor
 
 from codesign import doors, events, flow, lens, pose, render
 from codesign.errors import CodesignError, DomainError, ShapeError
+from scenes import robots, textures, worlds
 from tests.hostile import calls
 
 
@@ -39,6 +40,11 @@ from tests.hostile import calls
             lambda: list(render.frame_chunks(None, None, pose.look_at((0, 0, 0), (1, 0, 0))[None], 2)),
             "render.frame_chunks: camera = None",
         ),
+        (lambda: worlds.from_mesh(None), "worlds.from_mesh: path = None, but a str or a path is needed"),
+        (lambda: worlds.from_mesh("a.stl", unit_m="mm"), "unit_m = 'mm', but a number or None is needed"),
+        (lambda: robots.from_urdf(None), "robots.from_urdf: path = None, but a str or a path is needed"),
+        (lambda: textures.photo("gravel", "512"), "textures.photo: size_px = '512', but a whole number"),
+        (lambda: textures.speckle("a"), "textures.speckle: seed = 'a', but a whole number is needed"),
     ],
 )
 def test_arguments_that_do_not_fit_are_named(call, sentence):
@@ -106,8 +112,10 @@ def test_functions_with_doors_can_be_pickled_and_asked_for_their_signature():
 
 def test_wrong_calls_end_in_sentences():
     """The quickest of ``python -m tests.hostile calls``."""
-    figures, findings = calls.measure(paths=("tests/test_pose.py",), say=lambda line: None)
-    assert figures["made"] > 500
+    figures, findings = calls.measure(
+        paths=("tests/test_pose.py", "tests/scenes/test_tum.py"), say=lambda line: None
+    )
+    assert figures["made"] > 600
     assert findings == []
 
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from codesign import render
+from codesign.doors import explain
 from codesign.errors import CodesignError, DomainError, FileFormatError
 from codesign.mount import FREE, PLANAR
 from codesign.pose import se3_exp
@@ -249,3 +250,6 @@ def _designs(own):
 def _in_radians(numbers):
     turns = {name.replace("_deg", "_rad"): math.radians(v) for name, v in numbers.items() if "_deg" in name}
     return turns | {name: value for name, value in numbers.items() if name.endswith("_m")}
+
+
+explain(globals())

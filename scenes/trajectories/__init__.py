@@ -6,6 +6,7 @@ Functions (``translation``, ``body_twist``) give poses T_world_cam at times. Tra
 on one.
 """
 
+from codesign.doors import explain
 from scenes.trajectories.driving import Driving, Waves
 from scenes.trajectories.flying import Flying, Polynomials, minimum_snap
 from scenes.trajectories.swinging import Orbital, Swinging
@@ -26,3 +27,5 @@ __all__ = [
     "times",
     "translation",
 ]
+
+explain(globals())

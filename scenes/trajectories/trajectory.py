@@ -7,6 +7,8 @@ radians per second, so that T(t + dt) is T(t) exp(dt velocity(t)) to first order
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -84,7 +86,7 @@ class _Mounted:
         )
 
 
-def mounted(trajectory, T_body_cam):
+def mounted(trajectory: Any, T_body_cam: Tensor) -> Any:
     """The path of a camera on a body: T_world_cam = T_world_body T_body_cam, with the camera's velocity in
     its own axes.
 
@@ -124,7 +126,7 @@ def positive(name, value, least=0.0, most=float("inf"), inclusive=False):
     return float(value)
 
 
-def times(count, rate_hz):
+def times(count: int, rate_hz: float) -> Tensor:
     """Frame times [count] in seconds, starting at 0."""
     if count < 2:
         raise DomainError(f"a trajectory needs at least 2 frames, got {count}.")
@@ -133,12 +135,12 @@ def times(count, rate_hz):
     return torch.arange(count, dtype=torch.float64) / rate_hz
 
 
-def body_twist(start, twist_per_s, t_s):
+def body_twist(start: Tensor, twist_per_s: Tensor, t_s: Tensor) -> Tensor:
     """Constant velocity in the camera's own axes: start [4, 4], twist_per_s [..., 6] (m/s, rad/s), t_s [T] ->
     [..., T, 4, 4]."""
     return start @ se3_exp(t_s[:, None] * twist_per_s[..., None, :])
 
 
-def translation(start, velocity_m_s, t_s):
+def translation(start: Tensor, velocity_m_s: Sequence[float], t_s: Tensor) -> Tensor:
     """Straight motion along camera axes: velocity_m_s three numbers."""
     return body_twist(start, torch.tensor([*velocity_m_s, 0.0, 0.0, 0.0], dtype=torch.float64), t_s)

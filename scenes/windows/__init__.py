@@ -6,6 +6,7 @@ that all differ; ``sets``: the named mixes and sets; ``worlds``: out of the 3-D 
 ``motion`` (how) and ``textures``.
 """
 
+from codesign.doors import explain
 from scenes.windows.rendered import Draws, PacketWindows, RenderedWindows, planes
 from scenes.windows.sensors import Sensors, SensorWindows
 from scenes.windows.sets import HARSH, SETS, TRAINING, UNSEEN, VALIDATION, Shape
@@ -30,3 +31,5 @@ __all__ = [
     "sliding",
     "turning",
 ]
+
+explain(globals())

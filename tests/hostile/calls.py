@@ -33,7 +33,14 @@ import torch
 from codesign import doors
 from codesign.errors import CodesignError
 
-ROOMS = "pose state types events flow grad lens mount optimise render system train".split()  # noqa: SIM905
+ROOMS = [
+    *(f"codesign.{room}" for room in ("pose", "state", "types", "events", "flow", "grad", "lens", "mount")),
+    *(f"codesign.{room}" for room in ("optimise", "render", "system", "train")),
+    *(
+        f"scenes.{room}"
+        for room in ("bodies", "robots", "textures", "trajectories", "tum", "windows", "worlds")
+    ),
+]
 KEPT = 2  # calls of a function
 SECONDS = 10  # of a wrong call
 RIGHT_S = 2.0  # of a right one that is worth repeating
@@ -64,12 +71,12 @@ class Calls:
         self.inside = False
         self.journal = journal.open("a", buffering=1)
         for room in ROOMS:
-            module = importlib.import_module(f"codesign.{room}")
+            module = importlib.import_module(room)
             for name in doors.public_names(vars(module)):
                 self._watch(module, name, getattr(module, name))
 
     def _watch(self, module, name, public):
-        if not getattr(public, "__module__", "").startswith("codesign"):
+        if not getattr(public, "__module__", "").startswith(doors.PACKAGES):
             return
         full = f"{module.__name__.removeprefix('codesign.')}.{name}"
         if inspect.isclass(public):
@@ -204,8 +211,8 @@ def place(error: BaseException) -> str:
     trace, last = error.__traceback__, ""
     while trace:
         name = trace.tb_frame.f_code.co_filename
-        if "/codesign/" in name:
-            last = f"{name.rsplit('/codesign/', 1)[-1]}:{trace.tb_lineno}"
+        if name.startswith(doors.OURS):
+            last = f"{Path(name).relative_to(ROOT)}:{trace.tb_lineno}"
         trace = trace.tb_next
     return last
 
