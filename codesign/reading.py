@@ -101,10 +101,10 @@ def read_json(path: str | Path, most_bytes: int = 50_000_000) -> Any:
 
 
 def read_text(path: str | Path, most_bytes: int = 50_000_000) -> str:
-    """The text of a regular file in UTF-8. Raises: FileFormatError, as ``open_regular``, and where it is no text."""
+    """The text of a regular file in UTF-8, without a byte order mark. Raises: FileFormatError, as ``open_regular``, and where it is no text."""
     content = read_bytes(path, most_bytes)
     with reading(path, "it is no text in UTF-8"):
-        return content.decode("utf-8").replace("\r\n", "\n")
+        return content.decode("utf-8-sig").replace("\r\n", "\n")
 
 
 def check_room(

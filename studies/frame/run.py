@@ -87,7 +87,10 @@ class Run(Generic[Config]):
         self._paces: dict[str, Pace] = {}
         self._began = time.monotonic()
         self._earlier_s = 0.0
-        if resumed and (stored := self._stored()) is not None:
+        stored = self._stored() if resumed else None
+        # read by none of the study's code: of an earlier version, which kept its progress there
+        self.state_unread = stored is not None
+        if stored is not None:
             self._earlier_s = stored.numbers[TIMES]["seconds"]
             self._paces = {name: Pace(**pace) for name, pace in stored.numbers[TIMES]["loops"].items()}
             self._continue_from(stored.numbers[TIMES].get("commit", "unknown"))
@@ -147,6 +150,7 @@ class Run(Generic[Config]):
         Raises: FileFormatError when the file is damaged.
         """
         stored = self._stored()
+        self.state_unread = False
         return stored and state.State(stored.tensors, stored.numbers["numbers"])
 
     def record(self, **numbers: float):

@@ -52,9 +52,14 @@ def sweep(
         has the label. The last axis changes fastest.
     Returns: the long table, in the order of the axes: a row has the axes' values, then the figures.
     Raises: DomainError when a figure is not plain and finite, or named as an axis; FileFormatError when the
-      table in the folder is of other axes or damaged.
+      table in the folder is of other axes or damaged, or an earlier version kept another kind of progress there.
     """
     path = run.path(f"{name}.jsonl")
+    if run.state_unread and not path.exists():
+        raise FileFormatError(
+            f"the run in '{run.folder}' was begun by an earlier version of this study, which kept its progress in "
+            "state.npz instead of a table; start a new run."
+        )
     known = _read(path, {*axes, "turn"} if turns > 1 else set(axes))
     cells = [dict(zip(axes, point, strict=True)) for point in itertools.product(*map(list, axes.values()))]
     asked = cells if turns == 1 else [{**point, "turn": turn} for turn in range(turns) for point in cells]

@@ -81,6 +81,8 @@ def in_rows(*columns):
 SAME = {
     "header.csv": b"t,x,y,p\n7,3,0,-1\n1400000,0,5,1\n2000000,9,2,1\n",
     "other_programs.csv": b"t,x,y,p\r\n7, 3,0,0\r\n\r\n1400000,0,5,1\r\n2000000,9,2,1",
+    "marked.csv": b"\xef\xbb\xbft,x,y,p\n7,3,0,-1\n1400000,0,5,1\n2000000,9,2,1\n",
+    "marked_headerless.csv": b"\xef\xbb\xbf7,3,0,0\n1400000,0,5,1\n2000000,9,2,1\n",
     "headerless.csv": b"7,3,0,0\n1400000,0,5,1\n2000000,9,2,1\n",
     "seconds.csv": b"0.000007,3,0,0\n1.4,0,5,1\n2.0,9,2,1\n",
     "named_unit.csv": b"x,y,p,t_ns\n3,0,0,7000\n0,5,1,1400000000\n9,2,1,2000000000\n",

@@ -68,6 +68,16 @@ def test_an_interrupted_sweep_goes_on_where_it_ended(run, cut):
     assert len(path.read_text().splitlines()) == 5
 
 
+def test_a_run_of_an_earlier_version_is_refused_and_not_begun_anew(run):
+    run.save_state({}, {"searches": [1, 2]})
+    again = open_run("test_frame", StudyConfig(resume=run.folder))
+    with pytest.raises(FileFormatError, match=r"begun by an earlier version .*start a new run"):
+        sweep(again, power, base=(2,), exponent=(1,))
+    # a study that reads its state may sweep as well
+    again.load_state()
+    assert column(sweep(again, power, base=(2,), exponent=(1,)), "power") == [2]
+
+
 def test_cells_in_processes_give_the_same_table(run):
     found = sweep(run, power, processes=2, given={"base": 3}, exponent=(0, 5))
     assert column(found, "power") == [1, 243]

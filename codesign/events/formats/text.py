@@ -6,6 +6,7 @@ by blanks or commas. A first line of two whole numbers is the sensor's width and
 Source: Mueggler et al., IJRR 2017 (layout of events.txt).
 """
 
+import codecs
 import contextlib
 import io
 import re
@@ -42,6 +43,9 @@ def read_text(path, asked):
     Raises: FileFormatError naming the line that is not four numbers, and what tables and arrival refuse.
     """
     with open(path, "rb") as file:
+        # a mark that some editors put before a text
+        if file.read(3) != codecs.BOM_UTF8:
+            file.seek(0)
         number, names, size = _head(path, file)
         arrival = Arrival(path, asked, size, "its first line", "line")
         order, unit = "".join(LETTERS[name] for name in names), asked.time_unit
