@@ -32,7 +32,7 @@ BUDGETS = {
     "studies/lens_report": 2_300,
     "studies/lens_scratch": 1_900,
     "studies/make_dataset": 3_800,
-    "studies/placement": 8_000,
+    "studies/placement": 7_600,
     "studies/sensor_fit": 2_000,
     "studies/speed_error": 7_600,
     "studies/spike_esim": 5_100,

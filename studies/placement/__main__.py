@@ -1,6 +1,6 @@
-"""Where to mount the camera on a robot: gradient steps in the six numbers of its pose, beside random and
-coordinate search, CMA-ES and TPE at equal renders; with --look only the robot, what its camera sees, and what
-it is blind to.
+"""Where to mount the camera on a robot: gradient steps in the six numbers of its pose, beside random
+search, CMA-ES and TPE at equal renders; with --look only the robot, what its camera sees, and what it is blind
+to.
 
 A robot drives through its worlds and reads its velocity off event flow (scenes/robots/pair.py, or a robot of
 your own: --robot). The gradient is that of the error to be expected: from the covariance that the flow's

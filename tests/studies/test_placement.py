@@ -203,7 +203,7 @@ def test_searches_look_only_at_what_is_allowed_and_free(problem):
     watched.error = error
     race = Race(FakeRun(), watched)
     race.tensors["gradient/2/samples"] = torch.tensor(8)
-    for name in ("random", "coordinate"):
+    for name in ("random", "CMA-ES"):
         looked.clear()
         race.search(2, name, watched.start)
         found = race.trail(2, name).share
