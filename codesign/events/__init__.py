@@ -32,7 +32,6 @@ from codesign.events.volumes.surface import (
     decay,
     decay_from_stream,
     surface_from_counts,
-    surface_from_hard_counts,
     surface_from_stream,
 )
 from codesign.events.volumes.volume import from_counts, from_stream, spikes_from_stream
@@ -91,7 +90,6 @@ __all__ = [
     "spikes_from_stream",
     "srm",
     "surface_from_counts",
-    "surface_from_hard_counts",
     "surface_from_stream",
     "to_counts",
     "upsample",

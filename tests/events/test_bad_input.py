@@ -56,7 +56,6 @@ TAKE_TIMES = (
 TAKE_COUNTS = (
     lambda counts: events.from_counts(counts, T_S, 2),
     lambda counts: events.surface_from_counts(counts, T_S, 0.1),
-    lambda counts: events.surface_from_hard_counts(counts, T_S, T_S, 0.1),
 )
 TAKE_STREAMS = (
     check_stream,
@@ -152,7 +151,6 @@ WRONG = [
     (lambda: events.HardSensor(SENSOR, 5)(FRAMES, T_S), r"\[N, T, H, W\]"),
     (lambda: events.from_counts(COUNTS, T_S, 20), "fewer bins"),
     (lambda: events.from_stream(STREAM, 5, 2, 2), "t1_us must be a whole number >= 6"),
-    (lambda: events.surface_from_hard_counts(COUNTS / 2, T_S, T_S, 0.1), r"counts hold 0\.5; whole numbers"),
     (lambda: events.surface_from_stream(STREAM, [5, 5], 1.0), "whole microseconds"),
     (lambda: events.decay(COUNTS, T_S, 1e-200), "tau_s must be .*, got 1e-200"),
     (lambda: events.decay_from_stream(STREAM, [10], 0.1, start=(COUNTS[0], 2**40)), "the trace is of"),

@@ -1,7 +1,6 @@
 """When events come between two frames, against curves known in closed form and the hard sensor at 10 kHz; a
 sensor that ran before its window, against the closed form of a ramp."""
 
-import itertools
 import math
 from dataclasses import replace
 from functools import cache
@@ -45,8 +44,8 @@ def waves(intervals, amplitude=0.0, shift=0.0):
 MOVES = ["amplitude", "shift"]
 
 
-def way(move, intervals, step=STEP):
-    return (waves(intervals, **{move: step}) - waves(intervals, **{move: -step})) / (2 * step)
+def way(move, intervals):
+    return (waves(intervals, **{move: STEP}) - waves(intervals, **{move: -STEP})) / (2 * STEP)
 
 
 def steered(found, level, move):
@@ -57,17 +56,14 @@ def steered(found, level, move):
 
 
 @cache
-def difference(move, name, step):
-    """Derivative of the stream's volume or surface, event by event, the mean over beginnings."""
+def difference(move):
+    """Derivative of the stream's volume, event by event, the mean over beginnings."""
     ends = []
     for sign in (1, -1):
-        stream = events.simulate(waves(1000, **{move: sign * step}), times(1000), SENSOR, log_input=True)
-        if name == "volume":
-            found = events.from_stream(stream, 0, round(SPAN_S * 1e6), BINS, dtype=D).counts[0, :, :, 0]
-        else:
-            found = events.surface_from_stream(stream, [50_000, 100_000], 0.03, dtype=D)[:, :, 0]
+        stream = events.simulate(waves(1000, **{move: sign * STEP}), times(1000), SENSOR, log_input=True)
+        found = events.from_stream(stream, 0, round(SPAN_S * 1e6), BINS, dtype=D).counts[0, :, :, 0]
         ends.append((found @ GROUPS.T).flatten())
-    return (ends[0] - ends[1]) / (2 * step)
+    return (ends[0] - ends[1]) / (2 * STEP)
 
 
 @pytest.mark.parametrize("move", MOVES)
@@ -75,25 +71,10 @@ def difference(move, name, step):
 def test_eight_intervals_steer_a_volume_as_the_stream_at_10_khz_does(name, move):
     level = waves(8).requires_grad_()
     volume = events.layer(name, SENSOR, log_input=True).volume(level, times(8), BINS).counts[0, :, :, 0]
-    cosine, scale = cosine_and_scale(
-        steered(volume @ GROUPS.T, level, move), difference(move, "volume", STEP)
-    )
+    cosine, scale = cosine_and_scale(steered(volume @ GROUPS.T, level, move), difference(move))
     # what is asked of eight intervals
     assert cosine >= 0.97
     assert 0.9 <= scale <= 1.1
-
-
-@pytest.mark.parametrize("move", MOVES)
-def test_a_surface_steers_as_the_mean_over_beginnings(move):
-    """Against the stream of single events, from forty intervals: what the gradient of the surface itself is
-    worth."""
-    level = waves(40).requires_grad_()
-    found = events.layer("memory", SENSOR, log_input=True).surface(level, times(40), 0.03)[[19, 39]]
-    # a wide step: a surface is the last event alone, so pixels are few for its noise
-    truth = difference(move, "surface", 0.2)
-    cosine, scale = cosine_and_scale(steered(found[:, :, 0] @ GROUPS.T, level, move), truth)
-    assert cosine >= 0.9
-    assert 0.8 <= scale <= 1.25
 
 
 def test_events_of_one_long_interval_lie_where_the_level_crosses():
@@ -160,7 +141,7 @@ def test_rounded_times_make_no_part_more(t_s, generator):
 
 
 @pytest.mark.parametrize("name", events.LAYERS)
-def test_every_layer_gives_volumes_and_surfaces_from_few_frames(name):
+def test_every_layer_gives_volumes_from_few_frames(name):
     level = waves(8)[..., :40].expand(2, 9, 1, 40)
     layer = events.layer(name, SENSOR, log_input=True)
     counts, times_s = layer.finely(level, times(8), SPAN_S / 16)
@@ -168,9 +149,6 @@ def test_every_layer_gives_volumes_and_surfaces_from_few_frames(name):
     volume = layer.volume(level, times(8), BINS)
     assert volume.counts.shape == (2, 2, BINS, 1, 40)
     torch.testing.assert_close(volume.counts.sum((0, 2)), counts.sum((0, 1)))
-    surface = layer.surface(level, times(8), 0.02).detach()
-    assert surface.shape == (2, 8, 2, 1, 40)
-    assert 0 <= float(surface.min()) <= float(surface.max()) <= 1
     if not layer.refines:  # events of an interval come evenly
         halves = counts.unflatten(1, (8, 2))
         torch.testing.assert_close(halves, (layer(level, times(8)) / 2)[:, :, None].expand_as(halves))
@@ -192,33 +170,6 @@ def test_a_system_asks_a_layer_for_its_volume_and_sets_plain_counts_at_middles()
     assert torch.equal(found[0], layer.volume(frames, times(8), 5).counts)
     assert torch.equal(found[1], events.from_counts(counts, times(8), 5).counts)
     assert not torch.equal(*found)
-
-
-def test_the_gradient_of_a_surface_is_that_of_the_two_windows_behind_its_events(generator):
-    intervals, tau_s = 25, 2.0
-    t_s = (0.05 + torch.rand(intervals + 1, generator=generator, dtype=D)).cumsum(0)
-    counts = (torch.rand(intervals, 2, 1, 3, generator=generator, dtype=D) * 1.7).square().floor()
-    # before the first interval ends, two in one interval, at an end, and behind all
-    at_s = [
-        t_s[0] + 0.01,
-        *torch.lerp(t_s[6], t_s[7], torch.tensor([0.2, 0.7], dtype=D)),
-        t_s[18],
-        t_s[-1] + 1,
-    ]
-    weight = torch.randn(len(at_s), 2, 1, 3, generator=generator, dtype=D)
-    middle_s = (t_s[1:] + t_s[:-1]) / 2
-    wanted = torch.zeros_like(counts)
-    for number, time_s in enumerate(at_s):
-        for cell in itertools.product(*map(range, counts.shape[1:])):
-            seen = [k for k in range(intervals) if t_s[k + 1] <= time_s]
-            fired = [k for k in seen for _ in range(int(counts[(k, *cell)]))]
-            for begun in [-1, -1, *fired][-2:]:
-                base = math.exp((middle_s[begun] - time_s) / tau_s) if begun >= 0 else 0
-                for k in range(begun + 1, len(seen)):
-                    shown = math.exp((middle_s[k] - time_s) / tau_s)
-                    wanted[(k, *cell)] += weight[(number, *cell)] * (shown - base) / 2
-    surface = events.surface_from_hard_counts(counts.requires_grad_(), t_s, at_s, tau_s)
-    torch.testing.assert_close(torch.autograd.grad(surface, counts, weight)[0], wanted)
 
 
 RATE = 25.0  # of the log level, per second

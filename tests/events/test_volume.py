@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from codesign.events import decay, from_counts, from_stream, surface_from_counts, surface_from_hard_counts
+from codesign.events import decay, from_counts, from_stream, surface_from_counts
 from codesign.events.stream import ordered
 from codesign.events.volumes.surface import decay_from_stream, surface_from_stream
 from codesign.events.volumes.volume import spikes_from_stream
@@ -122,8 +122,6 @@ def test_whole_counts_give_the_surface_of_events_at_the_middles_of_their_interva
     t_s = times_us.to(D) * 1e-6
     # twelve products and roots of float64
     torch.testing.assert_close(surface_from_counts(counts.to(D), t_s, TAU_S), truth, rtol=1e-12, atol=0)
-    found = surface_from_hard_counts(counts.to(D), t_s, t_s[[5, 6, 12]], TAU_S)
-    torch.testing.assert_close(found, truth[[4, 5, 11]], rtol=1e-12, atol=0)
 
 
 def test_a_share_of_an_event_mixes_the_surfaces_with_and_without_it():

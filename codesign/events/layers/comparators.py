@@ -6,7 +6,6 @@ first, and with a state of an earlier call [T, 2, ...]. theta_on, theta_off: 0-d
 ``mismatched`` says whether it takes the thresholds of every pixel, or the nominal ones. ``refines`` says
 whether it may be asked between frames, for the times of events: whether it counts the same events, or more of
 the sensor's, the more often it looks. Without it the events of an interval are spread evenly.
-``whole`` says whether it counts whole events.
 """
 
 import difflib
@@ -79,7 +78,6 @@ class Sigmoid:
     sharpness: float | None = None
     mismatched = False
     refines = False
-    whole = False
 
     def __call__(self, frames, theta_on, theta_off, state, log_input):
         frames = _with_last(frames, state)
@@ -94,7 +92,6 @@ class SoftCounts:
 
     mismatched = True
     refines = True
-    whole = False
 
     def __call__(self, frames, theta_on, theta_off, state, log_input):
         frames = _with_last(frames, state)
@@ -108,7 +105,6 @@ class Dense:
     sharpness: float = 5.0
     mismatched = True
     refines = False
-    whole = True
 
     def __call__(self, frames, theta_on, theta_off, state, log_input):
         return dense(frames, theta_on, theta_off, sharpness=self.sharpness, state=state, log_input=log_input)
@@ -122,7 +118,6 @@ class Memory:
     gradient: str | None = None
     mismatched = True
     refines = True
-    whole = True
 
     def __call__(self, frames, theta_on, theta_off, state, log_input):
         return memory(frames, theta_on, theta_off, state=state, log_input=log_input, gradient=self.gradient)
@@ -136,7 +131,6 @@ class Expected:
     spread: float = 0.15
     mismatched = False
     refines = False
-    whole = False
 
     def __call__(self, frames, theta_on, theta_off, state, log_input):
         return expected(frames, theta_on, theta_off, self.spread, state=state, log_input=log_input)
@@ -152,7 +146,6 @@ class Spikes:
     steps: int = 1
     mismatched = True
     refines = True
-    whole = True
 
     def __post_init__(self):
         self.steps = check_whole(self.steps, "steps", 1, MOST_STEPS)
@@ -249,7 +242,6 @@ class ComparatorLayer(EventLayer):
         self.comparator = comparator
         self._last_draw = LastDraw()
         self.refines = getattr(comparator, "refines", False)
-        self.whole = getattr(comparator, "whole", False)
 
     def _count(self, frames, t_s, state, generators):
         check_state(state, LayerState)

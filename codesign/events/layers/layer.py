@@ -21,7 +21,6 @@ from codesign.events.sensor.model import (
     check_sensor,
 )
 from codesign.events.sensor.simulate import simulate
-from codesign.events.volumes.surface import check_tau, surface_from_counts, surface_from_hard_counts
 from codesign.events.volumes.volume import check_bins, from_counts, from_stream
 from codesign.types import EventVolume
 
@@ -30,7 +29,6 @@ THRESHOLDS = ("theta_on", "theta_off")
 PARTS_PER_BIN = 4  # intervals, from one node of a volume to the next, from which on finer ones change nothing
 MOST_LEAD_S = 1e9
 NEAR = 1e-6  # of the lead, by which a frame may miss its end
-PARTS_PER_TAU = 8  # the same for the time in which a surface fades
 
 
 class PositiveValues(nn.Module):
@@ -70,7 +68,6 @@ class EventLayer(nn.Module):
 
     learnable: tuple[str, ...] = ()
     refines = False  # whether it may be asked between frames, see ``events.layers.comparators``
-    whole = False  # whether it counts whole events
 
     def __init__(
         self,
@@ -217,34 +214,6 @@ class EventLayer(nn.Module):
         counts, times_s = self.finely(frames, t_s, longest_s, generator)
         first = int((times_s - start_s).abs().argmin())
         return from_counts(counts.movedim((-4, -3), (0, 1))[first:], times_s[first:], bins)
-
-    def surface(
-        self,
-        frames: Tensor,
-        t_s: Tensor,
-        tau_s: float,
-        generator: Generator | Sequence[Generator] | None = None,
-    ) -> Tensor:
-        """Time surface at every frame but the first, each event near its own time (``finely``).
-
-        Args:
-          as for ``forward``.
-          tau_s: time in which the surface fades to 1/e, seconds, > 0.
-        Returns: [..., T-1, 2, H, W] in 0 to 1, ON first.
-        Gradient: of layers that count whole events as ``surface_from_hard_counts`` of these counts, of others
-          as ``surface_from_counts``.
-        Raises: as ``forward``; DomainError for tau.
-        """
-        tau_s = check_tau(tau_s)
-        counts, times_s = self.finely(frames, t_s, tau_s / PARTS_PER_TAU, generator)
-        counts = counts.movedim((-4, -3), (0, 1))
-        given_s = check_times(t_s, frames.shape[-3])[1:]
-        if self.refines and self.whole:
-            surface = surface_from_hard_counts(counts, times_s, given_s, tau_s)
-        else:
-            at = torch.searchsorted(times_s, given_s) - 1  # parts end at frames
-            surface = surface_from_counts(counts, times_s, tau_s)[at.to(counts.device)]
-        return surface.movedim((0, 1), (-4, -3))
 
     def _count(self, frames, t_s, state, generators):
         """Counts [T-1, 2, ..., H, W] of frames [T, ..., H, W], and the state to carry on."""

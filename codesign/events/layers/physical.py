@@ -139,7 +139,6 @@ class PhysicalLayer(EventLayer):
 
     learnable = DESIGN
     refines = True
-    whole = True
 
     def _count(self, frames, t_s, state, generators):
         samples = frames.reshape(len(frames), -1, *frames.shape[-2:]).unbind(1)
