@@ -130,7 +130,7 @@ class Camera:
         return getattr(self.lens, "entrance_pupil_diameter_mm", 0.0) * 1e-3 / 2
 
     def light(self, rays: Rays, colour: Tensor) -> Tensor:
-        """Light [N] that rays in the colours of their numbers [N] bring, less what falls off towards the
+        """Light [N] that rays in the colours of their numbers ([N], or one of all) bring, less what falls off towards the
         corners.
         Raises: DomainError for a lens that does not say how it does."""
         light = rays.weight
@@ -191,29 +191,38 @@ class Camera:
         in the lens's dtype. Gradient: to the lens."""
         offset, pupil = film_pupil_pattern(self.samples_per_pixel, self.seed)
         pixels = self.film.pixels()
-        points = (pixels[:, None] + offset).reshape(-1, 2)
-        each = torch.arange(len(self.colours)).repeat_interleave(self.samples_per_pixel // len(self.colours))
-        colour = each.repeat(len(pixels))
-        rays = self._coloured(self._rays, points, pupil.repeat(len(pixels), 1), colour)
-        return replace(rays, weight=self.light(rays, colour))
+        points = pixels[:, None] + offset
+        colours = len(self.colours)
+        # samples of one colour stand side by side in every pixel, so no ray is looked up
+        shares = zip(points.chunk(colours, 1), pupil.chunk(colours), strict=True)
+        parts = [self._rays(number, *share) for number, share in enumerate(shares)]
+        if colours == 1:
+            return parts[0]
 
-    def _rays(self, pixels, pupil, **colour):
+        def joined(*column):
+            return torch.cat([part.unflatten(0, (len(pixels), -1)) for part in column], 1).flatten(0, 1)
+
+        return _columns(joined, *parts)
+
+    def _rays(self, number, points, pupil):
+        """Rays of one colour from points [P, n, 2] of the film, through the same points [n, 2] of the pupil."""
         dtype = getattr(self.lens, "dtype", torch.float64)
-        return self.lens.camera_rays(self.film_mm(pixels).to(dtype), pupil.to(dtype), aim=self.aim, **colour)
-
-    def _coloured(self, trace, pixels, pupil, colour):
-        if self.spectrum is None:
-            return trace(pixels, pupil)
-        rows = [torch.nonzero(colour == number)[:, 0] for number in range(len(self.colours))]
-        parts = [trace(pixels[k], pupil[k], **line) for k, (line, _) in zip(rows, self.colours, strict=True)]
-        order = torch.cat(rows)
-        back = torch.empty_like(order).scatter_(0, order, torch.arange(len(order)))
-        return _columns(lambda *column: torch.cat(column).index_select(0, back), *parts)
+        film_mm = self.film_mm(points).reshape(-1, 2).to(dtype)
+        line, _ = self.colours[number]
+        rays = self.lens.camera_rays(film_mm, pupil.repeat(len(points), 1).to(dtype), aim=self.aim, **line)
+        return replace(rays, weight=self.light(rays, torch.tensor(number)))
 
     def coloured_rays(self, pixels: Tensor, pupil: Tensor, colour: Tensor) -> Rays:
         """As ``rays_through``, each in the colour of its number [N]."""
-        rays = self._coloured(self.rays_through, pixels, pupil, colour)
-        return _columns(lambda column: column.double(), rays)
+        if self.spectrum is None:
+            return self.rays_through(pixels, pupil)
+        rows = [torch.nonzero(colour == number)[:, 0] for number in range(len(self.colours))]
+        parts = [
+            self.rays_through(pixels[row], pupil[row], **line)
+            for row, (line, _) in zip(rows, self.colours, strict=True)
+        ]
+        back = torch.cat(rows).argsort()
+        return _columns(lambda *column: torch.cat(column)[back], *parts)
 
     def chief_rays(self, pixels: Tensor) -> Rays:
         """Rays through the pupil's centre for pixel coordinates [N, 2]: Rays, float64."""
