@@ -6,6 +6,7 @@ from codesign.lens.aiming import aimed_rays
 from codesign.lens.analysis import pupil_grid, rms_spot_mm, spots
 from codesign.lens.analysis.field_curves import relative_illumination
 from codesign.lens.catalogue import half_field_deg
+from codesign.lens.families import Family, family, family_names
 from codesign.lens.files import load, save
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM, Glass
@@ -17,6 +18,7 @@ from codesign.lens.trace import Status, TraceResult, sum_over_chunks
 
 __all__ = [
     "WAVELENGTH_UM",
+    "Family",
     "GeoLens",
     "Glass",
     "Phase",
@@ -30,6 +32,8 @@ __all__ = [
     "analysis",
     "catalogue",
     "design",
+    "family",
+    "family_names",
     "half_field_deg",
     "load",
     "pupil_grid",

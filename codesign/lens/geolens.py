@@ -73,6 +73,7 @@ class GeoLens(Replaceable):
     decentre_mm: torch.Tensor
     tilt_rad: torch.Tensor
     glass: torch.Tensor
+    pupil_mm: torch.Tensor | None
 
     def __init__(
         self,
@@ -105,6 +106,8 @@ class GeoLens(Replaceable):
                 self.register_buffer(tensor, value)
         glass = [s.medium not in (None, AIR) and not s.mirror for s in surfaces]
         self.register_buffer("glass", torch.tensor(glass), persistent=False)
+        # the pupil's diameter where gradients go to it: ``with_pupil``
+        self.register_buffer("pupil_mm", None, persistent=False)
 
     @property
     def dtype(self) -> torch.dtype:
@@ -264,6 +267,13 @@ class GeoLens(Replaceable):
         twin.glass = torch.where(row, surfaces[surface].medium is not None, self.glass)
         return twin
 
+    def with_pupil(self, diameter_mm: float | torch.Tensor) -> "GeoLens":
+        """The lens with another entrance pupil, all else as it is; gradients reach a tensor."""
+        twin = self._with(self._now())
+        twin.entrance_pupil_diameter_mm = check_positive(diameter_mm, f"{self.name}: pupil diameter, mm,")
+        twin.pupil_mm = torch.as_tensor(diameter_mm).to(self.semi_aperture_mm)
+        return twin
+
     def scaled(self, factor: float) -> "GeoLens":
         """A new lens with all lengths multiplied by ``factor`` (same f-number and angles), from the current
         values."""
@@ -361,7 +371,7 @@ class GeoLens(Replaceable):
             self.thickness_mm,
             self.index(wavelength_um),
             self.stop_index,
-            self.entrance_pupil_diameter_mm,
+            self.entrance_pupil_diameter_mm if self.pupil_mm is None else self.pupil_mm,
         )
 
     @settled

@@ -112,13 +112,13 @@ def first_order(
         nu = nu + y * power[i]
     entrance_z = -y * index[0] / nu
     # magnification of a pupil: reduced angle at the stop over reduced angle outside
-    semi_stop = entrance_pupil_diameter_mm / 2 * nu.abs()
+    diameter = torch.as_tensor(entrance_pupil_diameter_mm, dtype=one.dtype, device=one.device) * one
+    semi_stop = diameter / 2 * nu.abs()
     heights, angles = yu_trace(power, thickness_mm, index, zero, one, first=stop)
     y = heights[-1]
     nu = angles[-1]
     exit_z = -y * index[-1] / nu
     exit_diameter = 2 * semi_stop / nu.abs()
-    diameter = torch.as_tensor(entrance_pupil_diameter_mm, dtype=one.dtype, device=one.device) * one
     return FirstOrder(efl, bfl, efl / diameter, entrance_z, diameter, exit_z, exit_diameter, semi_stop)
 
 
