@@ -34,7 +34,7 @@ def check_pair(pair: RobotPair, camera: render.Camera | None = None, numbers: Se
       varies by more than the sensor's threshold.
     """
     pair.check(pair.design)
-    camera = pair.design.camera() if camera is None else camera
+    camera = pair.camera(pair.design) if camera is None else camera
     requirements = pair.requirements()
     _check_width(pair, camera)
     check_mount(robot_pair.mount_at(pair.ranges, pair.design.mount()), requirements, camera)

@@ -77,7 +77,7 @@ PHOTOS = {False: ("gravel", "grass", "coffee"), True: ("brick", "astronaut", "ch
 @dataclass(frozen=True)
 class Design:
     """A lens and where it looks from: focal length, f-number, 1 / distance in focus; position, yaw to the
-    left, pitch downwards and roll in body axes."""
+    left, pitch downwards and roll in body axes; bending of a family's lens."""
 
     efl_mm: float
     fno: float
@@ -88,6 +88,7 @@ class Design:
     yaw_rad: float
     pitch_rad: float
     roll_rad: float
+    bending: float = 0.0
 
     def mount(self) -> Tensor:
         """T_body_cam [4, 4]."""
@@ -95,11 +96,16 @@ class Design:
         attitude = {name: getattr(self, name) for name in ("yaw_rad", "pitch_rad", "roll_rad")}
         return Mount(at, (0.0, 0.0, 0.0), **attitude)().detach()
 
-    def camera(self) -> render.Camera:
-        """Nine windows behind a thin lens."""
-        image_mm = 1 / (1 / self.efl_mm - 1e-3 * self.focus_per_m)
-        optics = lens.ThinLens(self.efl_mm, self.efl_mm / self.fno, image_mm)
-        return render.Camera(optics, WINDOW_PX, WINDOW_PX, PITCH_MM, RAYS_PER_PX, 0, FILM)
+    def camera(self, family: str | None = None) -> render.Camera:
+        """Nine windows behind a thin lens, or behind a traced one of a family (``lens.family``), whose image is darker
+        and less sharp towards the corners; numbers of the lens may then be tensors, whose gradients its rays carry."""
+        if family is None:
+            image_mm = 1 / (1 / self.efl_mm - 1e-3 * self.focus_per_m)
+            optics = lens.ThinLens(self.efl_mm, self.efl_mm / self.fno, image_mm)
+        else:
+            optics = lens.family(family).lens(self.efl_mm, self.fno, self.focus_per_m, self.bending)
+        falloff = family is not None
+        return render.Camera(optics, WINDOW_PX, WINDOW_PX, PITCH_MM, RAYS_PER_PX, 0, FILM, falloff=falloff)
 
 
 @dataclass(frozen=True)
@@ -128,6 +134,7 @@ class RobotPair:
       ground in body axes.
     frame: name of the body's axes (REP 105). one_world: whether all numbers are the same world, with other
       drives. files: of which the pair was made, where a user gave them; page: what they wrote of it.
+    family: of traced lenses (``lens.family``), which every design has its camera from; None is a thin lens.
     """
 
     name: str
@@ -150,6 +157,7 @@ class RobotPair:
     one_world: bool = False
     files: tuple[Path, ...] = ()
     page: str = ""
+    family: str | None = None
 
     def check(self, design: Design) -> Design:
         """The design. Raises: DomainError where a number of it lies outside the bounds."""
@@ -160,6 +168,10 @@ class RobotPair:
                     f"pair '{self.name}': {field.name} = {value:g} lies outside its bounds, {low:g} to {high:g}."
                 )
         return design
+
+    def camera(self, design: Design) -> render.Camera:
+        """That of a design, with a lens of the pair's family."""
+        return design.camera(self.family)
 
     @property
     def ranges(self) -> MountRanges:
@@ -210,7 +222,7 @@ class RobotPair:
             return self.errors(estimate, batch).bounded().mean()
 
         return System(
-            camera=design.camera(),
+            camera=self.camera(design),
             mount=lambda: mount,
             events=LAYERS[layer],
             flow=closed_form,

@@ -76,7 +76,7 @@ def study(run: Run[Config]) -> None:
     pair = own_pair(size.robot) if size.robot else PAIRS[size.pair]()
     if size.robot:
         run.say(size_in_words(pair))
-    camera = traced_camera(pair, size.lens, size.focal_mm) if size.lens else pair.design.camera()
+    camera = traced_camera(pair, size.lens, size.focal_mm) if size.lens else pair.camera(pair.design)
     if size.look:
         look(run, pair, camera)
         return

@@ -72,7 +72,7 @@ class Problem:
         self.trend = PrecisionTrend()
         self.rendered = 0  # samples so far
         if self.camera is None:
-            self.camera = self.pair.design.camera()
+            self.camera = self.pair.camera(self.pair.design)
 
     @property
     def samples(self) -> int:

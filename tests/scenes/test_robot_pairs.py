@@ -11,9 +11,10 @@ from codesign import lens, pose, render
 from codesign.errors import DomainError
 from codesign.mount import FREE, Body, EgoVelocity, ground_depth, judge
 from codesign.mount.depth import scene_depth
-from scenes import bodies
+from scenes import bodies, worlds
 from scenes.robots import pair as robot_pair
 from scenes.robots.pairs import PAIRS
+from tests.render.differences import assert_gradients
 from tests.scenes.solids import volume_m3
 
 D = torch.float64
@@ -173,3 +174,26 @@ def slowed(drives, share):
     middle = drives.T_world_body[:, :, robot_pair.FRAMES // 2]
     twist = share * drives.twist.unflatten(0, middle.shape[:2])
     return robot_pair.moved(middle.flatten(0, 1), twist.flatten(0, 1)).unflatten(0, middle.shape[:2])
+
+
+def test_a_pair_sees_through_a_family_of_traced_lenses():
+    """What the lens of a family costs reaches the frames: the corner windows are darker than behind a thin lens, and
+    its variables carry gradients, as differences say."""
+    family_pair = replace(PAIRS["corridor"](), family="retrofocus-4")
+    assert family_pair.system(family_pair.design).camera.lens.name == "retrofocus-4"
+    start, scene = family_pair.design, worlds.smooth_plane(5)
+    pose_at = pose.look_at((0.2, 0.1, 1.0), (0, 0, 0), down=(0, 1, 0))[None]
+
+    def frames(efl_mm, fno):
+        return render.frames(family_pair.camera(replace(start, efl_mm=efl_mm, fno=fno)), scene, pose_at)
+
+    at = [torch.tensor(v, dtype=D) for v in (start.efl_mm, 1.6)]
+    weights = torch.randn(frames(*at).shape, generator=torch.Generator().manual_seed(0), dtype=D)
+    assert_gradients(lambda *v: (frames(*v) * weights).sum(), at, (1e-5, 1e-5), 1e-5)
+    whole = render.Film(*robot_pair.SENSOR_PX, *robot_pair.SENSOR_PX, robot_pair.PITCH_MM)
+    for efl_mm in (family_pair.low.efl_mm, family_pair.high.efl_mm):
+        family_pair.camera(replace(start, efl_mm=efl_mm)).with_film(whole).check()
+    traced = family_pair.camera(start).rays().weight.reshape(9, -1).mean(1)
+    thin = start.camera().rays().weight.reshape(9, -1).mean(1)
+    assert float(thin.min()) == 1.0
+    assert 0.3 < float(traced[0] / traced[4]) < 0.85

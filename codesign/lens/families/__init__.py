@@ -142,11 +142,16 @@ def family(name: str, image_radius_mm: float | None = None) -> Family:
     """
     if name not in family_names():
         raise DomainError(f"no lens family is called {name!r}; choose one of {', '.join(family_names())}.")
-    found = read_family(name, TABLES.joinpath(f"{name}.txt").read_text("utf-8"))
+    found = _published(name)
     if image_radius_mm is None:
         return found
     check_positive(image_radius_mm, "family: image_radius_mm")
     return _scaled(found, image_radius_mm / found.image_radius_mm)
+
+
+@cache
+def _published(name):
+    return read_family(name, TABLES.joinpath(f"{name}.txt").read_text("utf-8"))
 
 
 @cache
