@@ -161,5 +161,6 @@ def _filled(read, header):
     room = np.empty(header.end - header.start, np.uint8)
     for first in range(0, len(room), BLOCK_BYTES):
         part = room[first : first + BLOCK_BYTES]
-        part[:] = np.frombuffer(read(len(part)), np.uint8)  # of another length where the file is cut
+        # of another length where the file is cut
+        part[:] = np.frombuffer(read(len(part)), np.uint8)
     return room.view(header.dtype).reshape(header.shape, order="F" if header.by_columns else "C")

@@ -45,7 +45,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):  # after a failure the sentence above matters more
             temporary.unlink(missing_ok=True)
-    with contextlib.suppress(OSError):  # some file systems cannot sync a folder; the file itself is whole
+    # some file systems cannot sync a folder; the file itself is whole
+    with contextlib.suppress(OSError):
         _sync(path.parent, os.O_RDONLY)
 
 

@@ -21,9 +21,8 @@ from codesign.doors import explain
 from codesign.errors import BackendError, DomainError, FileFormatError, GradientError
 from codesign.exclusive import exclusive
 
-MINIMUM_LLVM = (
-    19  # 15 and 16 abort the process while compiling Mitsuba 3.9 kernels; 14 is refused; 19 and 22 work
-)
+# 15 and 16 abort the process while compiling Mitsuba 3.9 kernels; 14 is refused; 19 and 22 work
+MINIMUM_LLVM = 19
 INSTALL_LLVM = {
     "Linux": "install LLVM 19 or newer: 'apt-get install libllvm19' (Debian, Ubuntu), 'dnf install llvm-libs' (Fedora) or 'conda install -c conda-forge libllvm19'",
     "Darwin": "install LLVM 19 or newer: 'brew install llvm', then set DRJIT_LIBLLVM_PATH=$(brew --prefix llvm)/lib/libLLVM.dylib",

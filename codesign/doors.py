@@ -79,7 +79,8 @@ def _class(kind):
             inner = made.__func__ if isinstance(made, (staticmethod, classmethod)) else made
             if isinstance(inner, types.FunctionType):
                 full = kind.__name__ if name == "__init__" else f"{kind.__name__}.{name}"
-                told = door(inner, full, nan_fits=name == "__init__")  # results that are held may be NaN
+                # results that are held may be NaN
+                told = door(inner, full, nan_fits=name == "__init__")
                 setattr(kind, name, told if inner is made else type(made)(told))
 
 

@@ -22,7 +22,8 @@ PHOTOS = {
 }
 TILE_PX = 64  # the window of the sensor is its middle; the rest moves in and out of sight
 WINDOW_PX = 32
-BORDER_PX = 8  # here a tile fades to its mean, so that it can be repeated without a seam; never in sight
+# here a tile fades to its mean, so that it can be repeated without a seam; never in sight
+BORDER_PX = 8
 FINE = 4  # raster points of a digit per pixel and axis
 CLUTTER = 0.15  # exponent of the photograph: 1 leaves it as it is, 0 makes it even
 BLUR_PX = 0.7  # of the lens

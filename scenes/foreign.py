@@ -199,7 +199,8 @@ def view_of(
             "have not; place the camera with pose.look_at."
         )
     T_file_sensor = torch.tensor(np.array(values["to_world"].matrix, dtype=float)).reshape(4, 4)
-    u, _, v = torch.linalg.svd(T_file_sensor[:3, :3])  # the nearest rotation: float32 has rounded it
+    # the nearest rotation: float32 has rounded it
+    u, _, v = torch.linalg.svd(T_file_sensor[:3, :3])
     T = torch.eye(4, dtype=torch.float64)
     T[:3, :3] = R_world_file @ u @ v * torch.tensor([-1.0, -1.0, 1.0])
     T[:3, 3] = unit_m * R_world_file @ T_file_sensor[:3, 3]

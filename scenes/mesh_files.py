@@ -278,7 +278,8 @@ def _vertex_colour(values, is_linear):
 def _surface(material: Any) -> gltf.Surface:
     """Of an .obj, .ply or .dae: a picture in sRGB times a linear factor."""
     picture = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
-    said = getattr(material, "kwargs", {}).get("kd")  # as the .mtl has it, before it is rounded to 8 bits
+    # as the .mtl has it, before it is rounded to 8 bits
+    said = getattr(material, "kwargs", {}).get("kd")
     if said is None:
         rounded = getattr(material, "baseColorFactor", None)
         said = None if rounded is None else np.asarray(rounded, dtype=np.float64)[:3] / 255

@@ -69,7 +69,8 @@ def study(run: Run[Config]) -> None:
     lessons, held_out = zip(*(samples(run, PAIRS[name]()) for name in config.pair), strict=True)
     torch.manual_seed(config.seed)
     head = VelocityHead(EgoVelocity(tuple(range(6)), (1.0,) * 6), config.width)
-    plain = [typical_error(head, each) for each in held_out]  # fresh weights are least squares as it is
+    # fresh weights are least squares as it is
+    plain = [typical_error(head, each) for each in held_out]
     fit(head, lessons, held_out, config)
     content = {name: str(value) for name, value in asdict(config).items()}
     head.save(run.path("head.safetensors"), {"config": content, "run": "studies.velocity_head"})

@@ -15,7 +15,8 @@ from codesign.checks import FLOATS, check, check_positive
 from codesign.events.entry import Times, check_room, check_times
 from codesign.events.intensity import FrontEnd, log_levels
 
-ROUNDING = 1e-3  # of a part: what rounding of times (float32, or seconds since 1970) adds makes no part more
+# of a part: what rounding of times (float32, or seconds since 1970) adds makes no part more
+ROUNDING = 1e-3
 
 
 def finer(frames: Tensor, t_s: Times, longest_s: float, *, log_input: bool = False) -> tuple[Tensor, Tensor]:

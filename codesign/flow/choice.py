@@ -30,7 +30,8 @@ SOME = 0.02  # variance of a pixel's share, squared events, where nothing was se
 WIDE: dict[str, Any] = {"prior_px": 20.0, "levels_px": (8.0, 4.0, 2.0, 1.0)}
 COARSE: dict[str, Any] = {"model": "affine", "prior_px": 8.0, "levels_px": (8.0, 4.0, 2.0)}
 NARROW: dict[str, Any] = {"model": "affine"}
-OPTIONS: dict[bool, dict[str, Any]] = {False: {}, True: WIDE}  # local fields, by whether to reach far
+# local fields, by whether to reach far
+OPTIONS: dict[bool, dict[str, Any]] = {False: {}, True: WIDE}
 CLOCKS = {False: "time", True: "turn"}
 TURNED = 0.95  # factor on 1 - r from which on events are the clock
 FAR = 0.9  # and the wide prior is taken

@@ -267,7 +267,8 @@ def _covariance(field):
         return variance, torch.zeros_like(variance), variance
     claim = check(field.covariance_px2, (batch, 3, height, width), "covariance_px2 of a prediction")
     xx, xy, yy = claim.to(full).unbind(1)
-    slack = 1e-4 * xx * yy if xx.dtype == torch.float32 else 1e-9 * xx * yy  # rounding of the products
+    # rounding of the products
+    slack = 1e-4 * xx * yy if xx.dtype == torch.float32 else 1e-9 * xx * yy
     if bool((xx < 0).any() | (yy < 0).any() | (xy.square() > xx * yy + slack).any()):
         raise DomainError(
             "covariance_px2 is not positive semidefinite somewhere (xx, yy >= 0 and xy^2 <= xx yy are "

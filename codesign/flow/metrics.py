@@ -18,7 +18,8 @@ from codesign.types import EventStream, EventVolume, FlowField
 def endpoint_error(flow: Tensor, truth: Tensor) -> Tensor:
     """Length of the difference of two flows [..., 2, H, W] -> [..., H, W] px."""
     flow, truth = _check(flow, truth)
-    return torch.linalg.vector_norm(flow - truth, dim=-3)  # its gradient at zero error is 0, not NaN
+    # its gradient at zero error is 0, not NaN
+    return torch.linalg.vector_norm(flow - truth, dim=-3)
 
 
 def _check(flow, truth):

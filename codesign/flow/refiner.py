@@ -109,7 +109,8 @@ class Refiner(nn.Module):
 
     def start(self, volume: EventVolume, start_px: Tensor | None = None, clock: str = "time") -> FlowField:
         """The closed form that is corrected."""
-        with torch.autocast(volume.counts.device.type, enabled=False):  # its solves need full precision
+        # its solves need full precision
+        with torch.autocast(volume.counts.device.type, enabled=False):
             return estimate_lk(volume, model="local", start_px=start_px, clock=clock)
 
     def refined(

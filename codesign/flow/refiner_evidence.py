@@ -29,9 +29,11 @@ POOL = 2  # px a side over which the bins that are read are averaged
 CELL = 4  # px a side of the cells on which flow is corrected
 BLURS = (1, 2, 4)  # standard deviations in px, and spacing of the samples
 WINDOWS = ((3, 9), (3, 9), (9,))  # cells a side, for each blur
-MISFIT = 4.0  # variance expected of what is missing where the claim is believed, over the claimed one
+# variance expected of what is missing where the claim is believed, over the claimed one
+MISFIT = 4.0
 SOLVED = 2 * sum(len(sizes) for sizes in WINDOWS)
-AROUND = ((3, 0), (-3, 0), (0, 3), (0, -3), (5, 5), (5, -5), (-5, 5), (-5, -5))  # cells down and right
+# cells down and right
+AROUND = ((3, 0), (-3, 0), (0, 3), (0, -3), (5, 5), (5, -5), (-5, 5), (-5, -5))
 TRIED_IN = (3, 7)  # cells a side of the windows in which their flows are tried
 TRIED_AT = 1  # of BLURS
 TOLD = 5 * SOLVED  # channels told by ``Evidence.at``

@@ -4,7 +4,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-EDGE_PX = 0.75  # flows of the four pixels around a place that differ by more belong to different surfaces
+# flows of the four pixels around a place that differ by more belong to different surfaces
+EDGE_PX = 0.75
 
 
 def pixel_grid(height: int, width: int, like: Tensor) -> Tensor:

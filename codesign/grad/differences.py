@@ -18,10 +18,12 @@ from codesign.errors import NonFiniteError
 Scalar = Callable[[torch.Tensor], torch.Tensor]
 EPS = torch.finfo(torch.float64).eps
 POINTS = 16  # roundings of a parameter between points where noise is measured
-SHRINK = 10**0.5  # of their spacing; differences of fourth to sixth order of what is smooth then fall
+# of their spacing; differences of fourth to sixth order of what is smooth then fall
+SHRINK = 10**0.5
 SMOOTH = (20.0, 1e4)  # by 1e2 to 1e3, more or less: noise does not
 FIRM = 1 / 30  # of their noise: three rungs that agree so well are no noise, whatever made it
-NEIGHBOURS = 5.0  # standard deviations by which neighbouring rungs may differ before it counts against them
+# standard deviations by which neighbouring rungs may differ before it counts against them
+NEIGHBOURS = 5.0
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,8 @@ class Ladder:
         self.noise = noise
         self.eps = eps
         self.grad = None if grad is None else grad.double()
-        self.rungs: list[tuple[float, float, float]] = []  # step, difference, standard deviation by rounding
+        # step, difference, standard deviation by rounding
+        self.rungs: list[tuple[float, float, float]] = []
         self.left_out: list[float] = []
 
     def take(self, steps: Sequence[float]) -> None:

@@ -53,7 +53,8 @@ def _slope(residuals, variables, value, at, step, central):
     def moved(by):
         shifted = variables.clone()
         shifted[at] += by
-        return residuals(shifted), float(shifted[at] - variables[at])  # the step that rounding leaves
+        # the step that rounding leaves
+        return residuals(shifted), float(shifted[at] - variables[at])
 
     plus, plus_step = moved(step)
     if finite(plus) and not central:

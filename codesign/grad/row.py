@@ -10,7 +10,8 @@ from codesign.grad.differences import Difference
 
 SIGMAS = 3.0  # standard deviations between what may be noise and what may not
 EXCLUDED = 10.0  # tolerances: an error that a pass has excluded,
-MOST_EXCLUDED = 0.1  # and never more than this relative error (or the tolerance, where that is larger)
+# and never more than this relative error (or the tolerance, where that is larger)
+MOST_EXCLUDED = 0.1
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,8 @@ from codesign.lens.traced import TracedLens, in_float64
 NEWTON_STEPS = 12
 HALVINGS = 6
 FIELD_STEPS = 16
-REACHED = 1e-11  # miss at the stop, relative to the stop's radius: where rounding of a float64 trace begins
+# miss at the stop, relative to the stop's radius: where rounding of a float64 trace begins
+REACHED = 1e-11
 SINGULAR = 1e-12  # determinant at the stop of rays that stay where they are
 # step of the derivative that goes into the irradiance, relative to the pupil's size; its error is the square
 DIFFERENCE = 1e-3

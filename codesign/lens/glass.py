@@ -12,7 +12,8 @@ from typing import Any
 from codesign.errors import DomainError
 
 WAVELENGTH_UM = {"F": 0.4861327, "d": 0.5875618, "C": 0.6562725}
-D_UM = WAVELENGTH_UM["d"]  # whose figures are those of a lens, unless another wavelength is asked for
+# whose figures are those of a lens, unless another wavelength is asked for
+D_UM = WAVELENGTH_UM["d"]
 LONGEST_NAME = 80
 LONGEST_SOURCE = 200
 LEAST_INDEX = 1.0

@@ -17,7 +17,8 @@ from codesign.backend import widen
 NEWTON_STEPS = 8
 FLAT = 1e-12  # per mm; a surface flatter than this has no far side
 FORWARD = 1e-6  # smallest z component of a direction that counts as forward
-GRAZING = 1e-8  # smallest radicand taken as a hit; below it the derivative of the square root exceeds 5e3
+# smallest radicand taken as a hit; below it the derivative of the square root exceeds 5e3
+GRAZING = 1e-8
 
 
 class Status(IntEnum):

@@ -13,7 +13,8 @@ from codesign.checks import check_positive
 from codesign.errors import DomainError, ShapeError
 from codesign.lens.traced import TracedLens
 
-BOUND_BEND = 5.0  # a bound on one side bends the map within about this part of the room that the start leaves
+# a bound on one side bends the map within about this part of the room that the start leaves
+BOUND_BEND = 5.0
 TRIAL = 1e-4  # of a reach: the step of the differences that measure how rays move
 DEAD = 1e-6  # of the natural step: a number whose whole reach moves the rays by less is no variable
 

@@ -194,7 +194,8 @@ def _components(corners):
     """Which connected component each face [F, 3] belongs to, and whether each of them is closed."""
     count = int(corners.max()) + 1
     edges = np.stack([corners, np.roll(corners, -1, 1)], -1)
-    whole = np.repeat((edges[..., 0] != edges[..., 1]).all(1), 3)  # of faces that are not folded to a line
+    # of faces that are not folded to a line
+    whole = np.repeat((edges[..., 0] != edges[..., 1]).all(1), 3)
     edges = edges.reshape(-1, 2)
     ones = np.ones(len(edges))
     of_vertex = connected_components(coo_matrix((ones, edges.T), (count, count)), directed=False)[1]

@@ -24,7 +24,8 @@ from codesign.mount.unknown_depth import UnknownDepth
 from codesign.types import ChiefRayCamera, FlowField
 
 INDEPENDENT = 3.0  # points that a window counts as
-UNSEEN_PX = 1e3  # standard deviation of flow where a field comes without covariance and nothing was seen
+# standard deviation of flow where a field comes without covariance and nothing was seen
+UNSEEN_PX = 1e3
 PLAIN_PX = 0.3  # of flow where it comes without covariance
 INNER = 4  # steps after each reweighting where depth is not known
 DEPTHS = {"ground": ground_depth, "scene": scene_depth}

@@ -306,7 +306,8 @@ class VelocityHead(nn.Module):
             [seen.mount, self._six(torch.asinh(velocity / seen.prior)), self._six(deviation)], -1
         )
         dtype = self.say[0].weight.dtype
-        windows = (windows * self.of_window[:, None, None]).to(dtype)  # [2, N, W, ...], as is and in a mirror
+        # [2, N, W, ...], as is and in a mirror
+        windows = (windows * self.of_window[:, None, None]).to(dtype)
         body = (body * self.of_body[:, None]).to(dtype)
         heard = self.window(windows)
         core = self.body(torch.cat([heard.mean(2), heard.amax(2), body], -1))

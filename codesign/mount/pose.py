@@ -19,7 +19,8 @@ from codesign.mount.observability import chief_lines, flow_of_points
 from codesign.pose import check_poses, se3_exp
 from codesign.types import ChiefRayCamera
 
-UPRIGHT = 1e-12  # sine of the angle to the vertical below which the view has no direction over ground
+# sine of the angle to the vertical below which the view has no direction over ground
+UPRIGHT = 1e-12
 NEAREST_M = 1e-6  # of what moves in the image
 MOST_PIXELS = 255  # of a film, spread over it, at which the motion of the image is measured
 # of a mount, by its bounds
@@ -179,7 +180,8 @@ class Mount(nn.Module):
         base, slope, base_step, slope_step = chief_lines(camera, pixels)
         point = torch.cat([base + slope * depth, depth, torch.ones_like(depth)], 1)
         pose = self()
-        change = torch.autograd.functional.jacobian(self.forward, self.numbers.detach())  # [4, 4, 6]
+        # [4, 4, 6]
+        change = torch.autograd.functional.jacobian(self.forward, self.numbers.detach())
         # X_cam = T^-1 X_body, so dX_cam = -T^-1 dT X_cam
         velocity = -torch.einsum("ij,jkn,pk->pin", torch.linalg.inv(pose), change, point)[:, :3]
         motion = flow_of_points(velocity, slope, base_step + slope_step * depth[..., None])

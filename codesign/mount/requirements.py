@@ -285,7 +285,8 @@ class OwnBody:
 
     def covered(self, T_body_cam: Tensor, camera: Camera) -> Tensor:
         """[..., windows] share of every window of the film that the body covers. Gradient: mount and lens."""
-        way = "boundary" if torch.is_grad_enabled() else "interior"  # of which the pictures are the same
+        # of which the pictures are the same
+        way = "boundary" if torch.is_grad_enabled() else "interior"
         found = frames(camera, self.scene, T_body_cam.reshape(-1, 4, 4), way, self.per_px).double()
         return found.flatten(-2).mean(-1).reshape(*T_body_cam.shape[:-2], -1)
 

@@ -17,7 +17,8 @@ from codesign.types import ChiefRayCamera
 
 NAMES = ("forward", "left", "up", "roll", "pitch", "yaw")
 LINEAR = 3  # of the six, m/s; the others rad/s
-NOTHING = 1e-12  # share of the largest eigenvalue below which a motion leaves all flow as it is, in float64
+# share of the largest eigenvalue below which a motion leaves all flow as it is, in float64
+NOTHING = 1e-12
 
 
 def expected_error(

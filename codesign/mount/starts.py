@@ -100,7 +100,8 @@ def _check_box(mount, clearance, reach_m):
     high = mount.nominal_m + mount.half_range_m
     corners = torch.cartesian_prod(*torch.tensor([[0.0, 1.0]] * 3, dtype=torch.float64))
     draw = torch.cat([corners, SobolEngine(3).draw(PLACES, dtype=torch.float64)])
-    for count in (len(corners), len(draw)):  # meshes of many faces take their time: mostly the corners say it
+    # meshes of many faces take their time: mostly the corners say it
+    for count in (len(corners), len(draw)):
         places = low + (high - low) * draw[:count]
         distance = clearance.body.distance_m(places)
         room = float(distance.max()) - clearance.housing.radius_m - clearance.margin_m

@@ -32,10 +32,10 @@ from codesign.grad.jacobian import Jacobian, by_autograd, finite
 
 __all__ = ["DampedLeastSquares", "StopRules"]
 
-FLOOR = (
-    1e-3  # of the largest D: a variable 1000 times weaker than the strongest is damped like one that is not
-)
-REJECTED = 3  # failures in a row raise the damping 64-fold, which a step of the right shape does not need
+# of the largest D: a variable 1000 times weaker than the strongest is damped like one that is not
+FLOOR = 1e-3
+# failures in a row raise the damping 64-fold, which a step of the right shape does not need
+REJECTED = 3
 
 
 @dataclass(frozen=True)

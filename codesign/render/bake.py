@@ -77,7 +77,8 @@ def bake(
     """
     check_positive(texel_m, "bake: texel_m")
     check_whole(samples, "bake: samples")
-    world = MitsubaScene(description, device, merge=False, emissive=False)  # every shape keeps its name
+    # every shape keeps its name
+    world = MitsubaScene(description, device, merge=False, emissive=False)
     mi = world.mi
     if lit and integrator is None:
         integrator = mi.load_dict({"type": "path", "max_depth": int(max_depth), "rr_depth": 64})
@@ -254,7 +255,8 @@ class Bake:
         chart = surface.chart
         coarse = np.array(self._coarse(chart))
         pictures = np.array(surface.texels_per_uv)
-        if chart.atlas is not None:  # the same factor both ways, since its cells lie in all directions
+        # the same factor both ways, since its cells lie in all directions
+        if chart.atlas is not None:
             per_uv = float(np.sqrt(pictures.prod()))
             per_texel = (
                 per_uv * chart.uv_per_unit * chart.size[0] / coarse[1] if np.isfinite(per_uv) else per_uv

@@ -19,7 +19,8 @@ from codesign.render.world import MitsubaScene
 
 # texels of a finished texture per light-map texel along each side, unless its picture is coarser than that
 FINE = 10
-FINE_MESH = 0.5  # of a texel: meshes whose pieces are smaller on the average have their light at vertices
+# of a texel: meshes whose pieces are smaller on the average have their light at vertices
+FINE_MESH = 0.5
 MAX_FACES = 400_000  # of a mesh that is cut into cells
 LAMBERTIAN = ("DiffuseReflection", "FrontSide", "BackSide", "SpatiallyVarying")
 

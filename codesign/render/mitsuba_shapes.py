@@ -16,14 +16,15 @@ import numpy as np
 from codesign.errors import DomainError, ShapeError
 from codesign.render.triangles import across
 
-FILES_UNCHECKED = ("ply", "serialized")  # Mitsuba itself follows their faces to vertices that are not there
+# Mitsuba itself follows their faces to vertices that are not there
+FILES_UNCHECKED = ("ply", "serialized")
 RADIANCE = ("value", "data", "scale")  # last part of the names of what an emitter shines with
-OWN = ("positions", "normals", "texcoords")  # of a mesh, beside the attributes its user has given it
+# of a mesh, beside the attributes its user has given it
+OWN = ("positions", "normals", "texcoords")
 # from the origin of texture coordinates: beyond, float32 knows a texel to a quarter at best
 MOST_TEXELS = 2.0**22
-THINNEST = (
-    1e-5  # squared sine of the angle at a face's corner, below which Mitsuba's weights of corners are noise
-)
+# squared sine of the angle at a face's corner, below which Mitsuba's weights of corners are noise
+THINNEST = 1e-5
 NAMED = 3  # shapes that a sentence names
 ROOM = 1e-3  # of a box's diagonal, around it
 

@@ -203,7 +203,8 @@ class Wavefront:
         light = dr.detach(light)
         kept = Slopes(slopes, part, light if keeps_light else None)
         carried = light * dr.gather(arr.Float, weight, ray)
-        dr.eval(carried, kept.slopes, kept.part, kept.light)  # at once: each sum would trace for itself
+        # at once: each sum would trace for itself
+        dr.eval(carried, kept.slopes, kept.part, kept.light)
         return dr.block_sum(carried, self.samples) / self.samples, kept
 
     def _seen(self, arr, placed):
@@ -240,7 +241,8 @@ class _PixelMeans(torch.autograd.Function):
         size = NUMBERS * len(poses[0]) // 12 * len(rays[0]) * wavefront.dtype.itemsize
         with dr.suspend_grad():
             if wanted and size <= ROOM.left():
-                with suppress(GradientError):  # of a scene without gradient: it says so when one is asked for
+                # of a scene without gradient: it says so when one is asked for
+                with suppress(GradientError):
                     image, ctx.kept = wavefront.sloped(arr, rays, poses, ctx.needs_input_grad[4])
                     ROOM.take(ctx.kept, size)
             if ctx.kept is None:

@@ -150,7 +150,8 @@ def _convolved(psf, layers, depths_per_m):
     right = _between(film.width_px, wide, columns).to(layers)
     strips = []
     for row in range(rows):
-        spectrum = torch.fft.rfft2(cells[:, :, :, :, row], s=size)  # [J, 2, S, windows, columns, ...]
+        # [J, 2, S, windows, columns, ...]
+        spectrum = torch.fft.rfft2(cells[:, :, :, :, row], s=size)
         strip = 0
         for i, j in itertools.product((0, 1), (0, 1)):
             corner = transfer[..., row + i, j : j + columns, :, :]

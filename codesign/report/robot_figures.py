@@ -11,9 +11,8 @@ from codesign import pose
 from codesign.render import Camera
 
 MOST_DRAWN = 6000  # triangles: of more, the largest
-SMALL = (
-    0.08  # of the robot's size: longer edges are cut in half, since drawing sorts whole triangles by depth
-)
+# of the robot's size: longer edges are cut in half, since drawing sorts whole triangles by depth
+SMALL = 0.08
 
 
 def draw_robot(axis: Any, triangles: np.ndarray, shade: np.ndarray, lines: np.ndarray) -> None:

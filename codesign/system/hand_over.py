@@ -21,7 +21,8 @@ from codesign.reading import building, read_bytes, read_text
 
 FORMAT = "codesign mount 1"
 MOST_BYTES = 50_000_000  # of a lens file
-AGREES = 1e-9  # metres, and entries of the rotation, between the transform and the mount's own numbers
+# metres, and entries of the rotation, between the transform and the mount's own numbers
+AGREES = 1e-9
 COMMENT = """Pose of a camera on a robot, p_parent = R p_child + t: metres, unit quaternion (x, y, z, w).
 Axes of the parent as in REP 103: x forward, y left, z up. The child is an optical frame (suffix _optical_frame): z along
 the view, x right, y down in the image; its origin is the centre of the lens's entrance pupil. urdf_origin has the same
@@ -112,7 +113,8 @@ def _check_frame(name):
 
 
 def _transform(pose, handed):
-    quaternion = Rotation.from_matrix(pose[:3, :3].numpy()).as_quat(canonical=True)  # x, y, z, w >= 0
+    # x, y, z, w >= 0
+    quaternion = Rotation.from_matrix(pose[:3, :3].numpy()).as_quat(canonical=True)
     return {
         "parent_frame": handed.parent_frame,
         "child_frame": handed.child_frame,

@@ -32,7 +32,8 @@ def angular_error_mrad(
     windows = pixels.shape[0]
     pixels = pixels.reshape(-1, 2)
     motion = field.flow_px[..., every_px // 2 :: every_px, every_px // 2 :: every_px].double()
-    motion = motion.movedim(1, -1).reshape(-1, pixels.shape[0], 2)  # [trajectories, pixels of all windows, 2]
+    # [trajectories, pixels of all windows, 2]
+    motion = motion.movedim(1, -1).reshape(-1, pixels.shape[0], 2)
     rays = camera.chief_rays(pixels)
     found = [render.truth.later_points(rays, *pair) for pair in scenes_of(scene, T_world_cam)]
     points = torch.cat([points for points, _ in found])  # [trajectories, pixels of all windows, 3]

@@ -166,7 +166,8 @@ class Stage:
             return self.call(*placed, **named)
         except RuntimeError as error:
             if not isinstance(error, CodesignError):
-                self._check_kinds(tensors_in((inputs, named))[:1], error)  # counts, flow: the first of a kind
+                # counts, flow: the first of a kind
+                self._check_kinds(tensors_in((inputs, named))[:1], error)
             raise
 
     def _check_kinds(self, given: list[Tensor], error: RuntimeError) -> None:

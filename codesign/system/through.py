@@ -20,9 +20,8 @@ from codesign.system.result import tensors_of
 from codesign.system.run import Pass
 from codesign.system.stage import label, modules_of
 
-STEP = (
-    1e-3  # relative; metres and radians for poses. Over twice the step a smooth output changes twice as much
-)
+# relative; metres and radians for poses. Over twice the step a smooth output changes twice as much
+STEP = 1e-3
 STRAIGHT = 0.2  # by how much, relative, it may differ from that
 FAR = 0.5  # a step in which hard stages show, too, that they follow
 STAGES = {

@@ -12,7 +12,8 @@ from scenes.robots.pair import RobotPair
 
 DRIVES = 6  # looked at in each world
 BLOCK_PX = 8
-LEAST_TEXTURE = 0.15  # of the blocks: the horizon over blank ground makes 0.08, the pairs have 0.4 and more
+# of the blocks: the horizon over blank ground makes 0.08, the pairs have 0.4 and more
+LEAST_TEXTURE = 0.15
 STILL = 1e-6  # m/s and rad/s
 LEAST_MOVED_PX = 0.1  # median flow over the window: the pairs have 6 and more
 LEAST_FOLLOWED = 0.05  # of the pixels that show a surface: the pairs have 0.7 and more

@@ -58,7 +58,8 @@ FILM = render.Film(
 RAYS_PER_PX = 8
 DURATION_S = 0.02
 FRAMES = 9
-LEAD_S = 2 * DURATION_S / (FRAMES - 2)  # before the window, for the sensor to settle: its events are not read
+# before the window, for the sensor to settle: its events are not read
+LEAD_S = 2 * DURATION_S / (FRAMES - 2)
 MIDDLE_S = LEAD_S + DURATION_S / 2
 BINS = 5
 SENSOR = events.SensorModel(
@@ -71,7 +72,8 @@ CONTRAST = 0.6  # exponent of radiance
 LIGHT = (70.0, 180.0)  # mean radiance of surfaces
 UNSEEN_FROM = 1_000_000
 INSIDE = 1 - 1e-9  # of a box that a mount approaches by a hyperbolic tangent
-PHOTOS = {False: ("gravel", "grass", "coffee"), True: ("brick", "astronaut", "chelsea")}  # by whether unseen
+# by whether unseen
+PHOTOS = {False: ("gravel", "grass", "coffee"), True: ("brick", "astronaut", "chelsea")}
 
 
 @dataclass(frozen=True)

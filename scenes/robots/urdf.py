@@ -148,7 +148,8 @@ def _model(path):
         raise FileFormatError(f"robot '{path}' is a xacro; expand it first: xacro {path.name} > robot.urdf")
     data = read_bytes(path, MOST_BYTES)
     with building(f"robot '{path}'", "it is no whole URDF; correct or export it anew"):
-        tree = etree.fromstring(data)  # whole or not at all: yourdfpy would go on with what it can read
+        # whole or not at all: yourdfpy would go on with what it can read
+        tree = etree.fromstring(data)
         if tree.tag != "robot":
             raise ValueError(f"its first element is <{tree.tag}> instead of <robot>")
         with np.errstate(all="ignore"):  # what is not finite, or has no axis, is refused below

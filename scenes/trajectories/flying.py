@@ -24,7 +24,8 @@ MOST_POINTS = 200
 LARGEST_RATIO = 100.0  # of segment durations: beyond, the spline loses too many digits
 GRAVITY_M_S2 = 9.81
 LEAST_THRUST = 0.1  # of gravity: below, the thrust hardly says where up is
-LEVEL_ENOUGH = 0.05  # sine of the angle between thrust and heading below which the heading says little
+# sine of the angle between thrust and heading below which the heading says little
+LEVEL_ENOUGH = 0.05
 SAMPLES = 64  # per segment, at which flights are checked
 
 

@@ -35,7 +35,8 @@ Make = Callable[[int, int], Windows]
 def packets(events_per_px: float, layers: tuple[int, int]) -> Make:
     """Packets of so many events of the scene per pixel, and noise on top. layers: planes before the
     background."""
-    noise = tuple(share * events_per_px / 16 for share in NOISE_SHARE)  # two polarities, eight eighths
+    # two polarities, eight eighths
+    noise = tuple(share * events_per_px / 16 for share in NOISE_SHARE)
     theta, *contrast = CONTRASTS[events_per_px]
     return _packets(
         events_per_px, (SIDE_PX, SIDE_PX), layers, theta=theta, contrast=contrast[layers[1] > 0], noise=noise

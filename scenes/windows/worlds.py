@@ -15,7 +15,8 @@ LONGEST_S = 0.4
 FOCAL_MM = 4.0
 # least and most of what is drawn
 THETA = (0.1, 0.2)
-NOISE = (0.0005, 0.005)  # events per pixel, polarity and eighth of the window, evenly in the logarithm
+# events per pixel, polarity and eighth of the window, evenly in the logarithm
+NOISE = (0.0005, 0.005)
 FOV_DEG = (45.0, 80.0)  # horizontal
 ALL = tuple(name for name in worlds.WORLDS if not name.startswith(("blank", "dark")))
 

@@ -13,10 +13,12 @@ from codesign.types import EventVolume, FlowField, FlowWindows
 from studies.frame.compare import ratio_of_means
 
 SHARES = np.linspace(0, 0.95, 20)  # of the pixels left out of a sparsification curve
-HONEST_MEDIAN = np.log(2) ** 0.5  # of error over claimed deviation, when errors are Gaussian as claimed
+# of error over claimed deviation, when errors are Gaussian as claimed
+HONEST_MEDIAN = np.log(2) ** 0.5
 ELLIPSE = -2 * np.log(0.1)  # normalised square of two Gaussian errors that 90 % stay below
 MUCH = 1.05  # error over that of zero flow from which on a window is worse than by chance
-MARGIN_PX = 0.05  # windows without information give next to no flow, which loses by less every second time
+# windows without information give next to no flow, which loses by less every second time
+MARGIN_PX = 0.05
 
 Rows = dict[str, np.ndarray]
 """Of N windows: error_px, zero_px: [N] mean endpoint error over valid pixels of the estimate and of

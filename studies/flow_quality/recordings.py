@@ -39,7 +39,8 @@ MEASURES = {
 }
 JUDGED = "refiner"
 REFERENCE = "closed_form_quadratic"  # whose distance the network's is compared with
-CONTEXT = 30_000  # events around the middle of a packet that the contrast maximisation sees at least
+# events around the middle of a packet that the contrast maximisation sees at least
+CONTEXT = 30_000
 EDGE = 0.05  # of the events of a recording left out at either end
 
 

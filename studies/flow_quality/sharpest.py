@@ -21,7 +21,8 @@ COARSE_PX = 2  # a side of the cells of its images
 FINE_PX = 1
 BLUR = 0.7  # cells
 STARTS = 3  # of its best that are refined
-STEEPEST = 0.3  # slope of an affine flow, per window: steeper ones could squeeze all events together
+# slope of an affine flow, per window: steeper ones could squeeze all events together
+STEEPEST = 0.3
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,8 @@ def affine(packet) -> Sharpest:
     x, y = events.pixels()
     at = np.stack([x, y])
     flow = np.stack(speed(best, x, y))
-    for _ in range(8):  # from the middle of the packet, where the fit lives, to the pixels of its start
+    # from the middle of the packet, where the fit lives, to the pixels of its start
+    for _ in range(8):
         flow = np.stack(speed(best, *(at + flow / 2)))
     return Sharpest(flow, events.relative(best, speed))
 

@@ -89,7 +89,8 @@ def held(folder: Path) -> Iterator[None]:
             raise CodesignError(
                 f"another process works on the run in '{folder}'; wait for it, or stop it first."
             ) from error
-        with contextlib.suppress(FileNotFoundError):  # removed by the one who held it: take the new one
+        # removed by the one who held it: take the new one
+        with contextlib.suppress(FileNotFoundError):
             if os.fstat(handle).st_ino == path.stat().st_ino:
                 break
         os.close(handle)

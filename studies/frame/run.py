@@ -259,7 +259,8 @@ def open_run(
         remove_unfinished(config.resume)
         return Run(study, stored, config.resume, _device(stored.device), True, interruption)
     device = _device(config.device)
-    config = dataclasses.replace(config, device=device.type)  # the same device when the run is resumed
+    # the same device when the run is resumed
+    config = dataclasses.replace(config, device=device.type)
     text = to_json(study, config)
     folder = folders.fresh(study, config.out)
     _hold(folder, held)

@@ -25,7 +25,8 @@ MISS_WEIGHT = 1.0  # of rays that fail
 FIRST = "even"  # the weights that the others go on from
 SPREAD = 0.05  # relative standard deviation of curvatures and thicknesses in further starts
 DIFFERENCE = 1e-6  # relative step of the Jacobian's differences
-SETTLED = 1e-3  # relative decrease of the squared spot in a step, below which the design has converged
+# relative decrease of the squared spot in a step, below which the design has converged
+SETTLED = 1e-3
 
 
 @dataclass(frozen=True)

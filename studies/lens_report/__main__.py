@@ -27,7 +27,8 @@ from studies.lens_report.depth import depth
 SHARES = (0.0, 0.7, 1.0)
 WIDEST_DEG = 10.0  # where a lens does not say
 FEWEST = 0.05  # share of the rays of a field that must arrive for it to be shown
-MOST_CELLS = 512  # across the pupil; where a wavefront or a picture asks for more, rays tell nearly the same
+# across the pupil; where a wavefront or a picture asks for more, rays tell nearly the same
+MOST_CELLS = 512
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,8 @@ LIMITS = Limits(
     steepness=0.85,
 )
 JUDGED_LIMITS = dataclasses.replace(LIMITS, incidence_deg=60.0, rays=True, fields_rad=JUDGED_FIELDS)
-SPARE_MM = 0.05  # a penalty gives way a little, so the optimiser holds limits that are tighter by this much
+# a penalty gives way a little, so the optimiser holds limits that are tighter by this much
+SPARE_MM = 0.05
 LEAST = ("glass_centre_mm", "glass_edge_mm", "air_gap_mm", "back_focus_mm")
 MOST = ("glass_centre_most_mm", "track_mm")
 CONSTRAINT_WEIGHT = 3.0

@@ -39,7 +39,8 @@ from studies.make_dataset import store
 from studies.make_dataset.segments import Segments
 
 FIELD_SHARE = 0.95  # of the lens's field that the picture's diagonal takes
-PIXELS_PER_CHUNK = 2**19  # fewer frames than asked for are worked on together where pictures are large
+# fewer frames than asked for are worked on together where pictures are large
+PIXELS_PER_CHUNK = 2**19
 PIXELS_PER_TRUTH = 2**16  # worked on together in float64
 LONGEST_S = 4000.0  # event times are 32-bit microseconds
 

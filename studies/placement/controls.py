@@ -59,7 +59,8 @@ def looking_back(problem: Problem) -> Tensor:
     meshes = problem.pair.bodies.values()
     faces = torch.cat([torch.as_tensor(mesh.vertices_m[mesh.faces]) for mesh in meshes]).double()
     across = torch.linalg.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
-    downward = across[:, 2] < -DOWN * across.norm(dim=1)  # beneath them there may be no room over the ground
+    # beneath them there may be no room over the ground
+    downward = across[:, 2] < -DOWN * across.norm(dim=1)
     largest = int(across.norm(dim=1).masked_fill(downward, 0).argmax())
     view = -across[largest] / across[largest].norm()
     right = (faces[largest, 1] - faces[largest, 0]) / (faces[largest, 1] - faces[largest, 0]).norm()

@@ -68,7 +68,8 @@ def train(voxels, labels, epochs, seed, device="cpu"):
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 4e-3, total_steps=epochs * batches)
     for _ in range(epochs):
         for chosen in torch.randperm(len(voxels), generator=generator).tensor_split(batches):
-            row, column = torch.randint(5, (2,), generator=generator).tolist()  # moved by up to 2 pixels
+            # moved by up to 2 pixels
+            row, column = torch.randint(5, (2,), generator=generator).tolist()
             moved = F.pad(voxels[chosen].to(device) / scale, (2,) * 4)
             moved = moved[..., row : row + voxels.shape[-2], column : column + voxels.shape[-1]]
             optimiser.zero_grad()

@@ -12,7 +12,8 @@ CELL_PX = 8
 BLOCK_PX = 16  # of the bootstrap
 MEDIAN_PX = 5
 LAGS_S = 0.03
-HIGH_HZ = 50.0  # flicker is the power of the rate above; half of what the steps can show where that is less
+# flicker is the power of the rate above; half of what the steps can show where that is less
+HIGH_HZ = 50.0
 
 
 def judge(pairs, resamples, seed):

@@ -30,7 +30,8 @@ from studies.train_flow import peers  # noqa: F401  which networks files know
 
 # the last window in so many of a data set is judged on: whole stretches, since neighbours look alike
 HELD_OUT = 10
-FOREIGN = 0.2  # share of the windows on which a network that refines begins from another flow than its own
+# share of the windows on which a network that refines begins from another flow than its own
+FOREIGN = 0.2
 POOL = 64  # batches shown in turn before windows come again
 LOSSES = {
     "supervised": lambda config: Supervised(config.unit, config.claim_weight),

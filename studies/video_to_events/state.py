@@ -14,7 +14,8 @@ from codesign.types import EventStream
 
 RECORD = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])  # 13 bytes
 LARGEST = 64  # steps of more thresholds are counted as this many
-LARGE = 3  # thresholds: an event in the middle of such a step is placed by interpolation over several others
+# thresholds: an event in the middle of such a step is placed by interpolation over several others
+LARGE = 3
 WORRYING = 0.1  # share of the moving pixels
 
 
@@ -48,7 +49,8 @@ class EventLog:
         for name, values in (("t", stream.t_us), ("x", stream.x), ("y", stream.y), ("p", stream.p)):
             records[name] = values.cpu().numpy()
         try:
-            with self.path.open("ab") as file:  # closed before the number of events is stored elsewhere
+            # closed before the number of events is stored elsewhere
+            with self.path.open("ab") as file:
                 file.write(records.tobytes())
         except OSError as error:
             raise CodesignError(

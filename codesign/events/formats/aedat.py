@@ -246,7 +246,8 @@ def _places(path, data, at, stop):
 def _stream(path, text, kind):
     """(number, (height_px, width_px) or None) of the only stream of a kind in the XML of the header."""
     with reading(f"{path}: the header's XML", "the file is damaged"):
-        plain = text.decode("utf-8")  # decoded here, so that another encoding cannot hide a declaration
+        # decoded here, so that another encoding cannot hide a declaration
+        plain = text.decode("utf-8")
         if "<!" in plain.replace("<!--", ""):
             raise FileFormatError(
                 f"{path}: the header's XML declares a document type or entities; none is allowed."

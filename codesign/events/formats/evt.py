@@ -12,7 +12,8 @@ import numpy as np
 
 from codesign.errors import FileFormatError
 
-OTHER_TYPES = (0x7, 0xA, 0xE, 0xF)  # triggers, counters and what continues them: no events of pixels
+# triggers, counters and what continues them: no events of pixels
+OTHER_TYPES = (0x7, 0xA, 0xE, 0xF)
 EVT2_WORD = np.dtype("<u4")
 EVT2_LOOP_US = 2**34
 EVT2_HIGH = 0x8  # a word with the high bits of the time

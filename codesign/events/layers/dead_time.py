@@ -38,7 +38,8 @@ from codesign.exclusive import exclusive
 PHASES = 6
 WIDTH = 2 / PHASES  # of a count: every phase belongs to two groups
 BLOCK = 32  # parts between two stored states, at least
-GOLDEN = (5**0.5 - 1) / 2  # its multiples spread evenly: neighbouring pixels stand at different phases
+# its multiples spread evenly: neighbouring pixels stand at different phases
+GOLDEN = (5**0.5 - 1) / 2
 STEPS = 5  # of the recursion in a dead time, at least
 MOST_ROWS = 2000  # of the recursion in a dead time: they lie in the memory of a thread
 MOST_LOAD = 5.0  # rate x dead time up to which gradients were measured to point right

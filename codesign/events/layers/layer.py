@@ -26,7 +26,8 @@ from codesign.types import EventVolume
 
 STEP = 0.1  # a unit step of a variable changes its value by a tenth: exp(0.1) - 1 = 10.5 %
 THRESHOLDS = ("theta_on", "theta_off")
-PARTS_PER_BIN = 4  # intervals, from one node of a volume to the next, from which on finer ones change nothing
+# intervals, from one node of a volume to the next, from which on finer ones change nothing
+PARTS_PER_BIN = 4
 MOST_LEAD_S = 1e9
 NEAR = 1e-6  # of the lead, by which a frame may miss its end
 

@@ -13,7 +13,8 @@ from codesign.events.intensity import FrontEnd, kernel_levels, log_levels
 from codesign.events.layers import memory_kernel as kernel
 
 GRADIENTS = ("exact", "play")
-PLAY_RATIO = 1.25  # of the two thresholds: up to it the play met all that was asked of the exact gradient
+# of the two thresholds: up to it the play met all that was asked of the exact gradient
+PLAY_RATIO = 1.25
 MOST_RATIO = 4  # of the two thresholds, up to which gradients were set beside differences
 
 

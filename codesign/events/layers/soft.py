@@ -13,7 +13,8 @@ from codesign.checks import check_number, check_positive
 from codesign.events.entry import check_level, check_per_pixel
 from codesign.events.intensity import log_levels
 
-GHOST_LOGIT = -5.0  # a pixel without change fires sigmoid(-5) = 0.67 % of an event per polarity and frame
+# a pixel without change fires sigmoid(-5) = 0.67 % of an event per polarity and frame
+GHOST_LOGIT = -5.0
 # beyond a spread of so many events the sum over events equals its integral less a half, to exp(-2 pi^2 1.2^2)
 # = 5e-13
 SERIES_END = 1.2

@@ -305,7 +305,8 @@ class _Step:
         base = now["reference"]
         rest = now["reference_rest"]
         start = (before - base) - rest
-        if self.leak_hz is not None:  # per frame it may be less than the last digit of the memorised level
+        # per frame it may be less than the last digit of the memorised level
+        if self.leak_hz is not None:
             rise = self.leak_hz * dt_s
             leak = (rise * (1 - self.jitter * gauss[1]) if sensor.leak_jitters else rise) * self.thetas[0]
             base, now["reference_rest"] = exact_sum(base, rest - leak)

@@ -150,7 +150,8 @@ def _set(state, sensor):
     """Thresholds and leaks of a sensor, by the numbers drawn for the pixels."""
     level = state.reference
     kinds = (level.dtype, level.dtype)
-    if sensor.timing == "v2e":  # it keeps what is drawn in single, nominal thresholds in double precision
+    # it keeps what is drawn in single, nominal thresholds in double precision
+    if sensor.timing == "v2e":
         kinds = torch.float32, torch.float32 if sensor.theta_sigma > 0 else torch.float64
     rates, thetas = ({"dtype": kind, "device": level.device} for kind in kinds)
     deviates = state.deviate_on, state.deviate_off

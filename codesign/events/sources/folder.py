@@ -78,7 +78,8 @@ def read_picture(path):
     """
     content = read_bytes(path, MOST_BYTES)
     with reading(path, "is it a picture, and whole?"):
-        file = io.BytesIO(content)  # in memory, where a part that claims more than the file has takes no room
+        # in memory, where a part that claims more than the file has takes no room
+        file = io.BytesIO(content)
         if path.suffix.lower().startswith(".tif"):
             picture = _tiff(path, file)
         else:

@@ -51,7 +51,8 @@ def count_loss(found: Tensor, target: Tensor, *, side_px: int = 8, steps: int = 
 
 
 def _pooled(counts, side_px, steps):
-    by_polarity = counts.reshape(len(counts), -1, *counts.shape[-2:]).transpose(0, 1)  # [2 ..., T, H, W]
+    # [2 ..., T, H, W]
+    by_polarity = counts.reshape(len(counts), -1, *counts.shape[-2:]).transpose(0, 1)
     return F.avg_pool3d(by_polarity, (steps, side_px, side_px)) * (steps * side_px**2)
 
 

@@ -13,12 +13,14 @@ DATA_WEIGHT = 20.0  # lambda, for pictures of natural-log units
 COUPLING = 0.3  # theta: how far the solution of the data term may leave the smooth one
 DUAL_STEP = 0.25  # largest stable step of the dual variable, Chambolle 2004
 LEAST_GRADIENT = 1e-6  # squared; keeps the step finite on even surfaces
-MEDIAN_OF_NINE = (  # sorting network that leaves the median in place 4 (Paeth, Graphics Gems I, 1990)
+# sorting network that leaves the median in place 4 (Paeth, Graphics Gems I, 1990)
+MEDIAN_OF_NINE = (
     (1, 2), (4, 5), (7, 8), (0, 1), (3, 4), (6, 7), (1, 2), (4, 5), (7, 8), (0, 3), (5, 8), (4, 7), (3, 6), (1, 4), (2, 5), (4, 7), (4, 2), (6, 4), (4, 2),
 )  # fmt: skip
 RADIUS_PX = 9  # displacements looked at, at the scale of matching
 WINDOW_PX = 1  # neighbours on each side
-MOST = 0.5  # log units; larger differences count as this, so that an occluded corner does not decide
+# log units; larger differences count as this, so that an occluded corner does not decide
+MOST = 0.5
 STILLNESS = 5e-4  # log units per pixel: of equals the smaller displacement is taken
 # a match replaces the flow where its difference is below this share of the flow's, by at least this
 BETTER = 0.7

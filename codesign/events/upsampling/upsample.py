@@ -26,11 +26,11 @@ WORKED_ON = 1 << 14  # pixels at a time
 # forward and backward flow agree to about this much, plus this share of the motion
 TOLERANCE_PX = 0.5
 TOLERANCE_SHARE = 0.05
-HIDDEN = 0.05  # weight of what has no counterpart in the other frame: it shows where nothing else does
+# weight of what has no counterpart in the other frame: it shows where nothing else does
+HIDDEN = 0.05
 LEAST = 1e-4  # weight below which a pixel counts as empty
-HOLE_PX = (
-    1.5  # standard deviation of the blur that fills pixels on which nothing lands; grows until none is left
-)
+# standard deviation of the blur that fills pixels on which nothing lands; grows until none is left
+HOLE_PX = 1.5
 # of the pixels keep a bound; the rest is what the flow got wrong, which would otherwise decide
 LARGEST_SHARE = 0.999
 MAX_STEPS = 256

@@ -144,7 +144,8 @@ def sample(count, most, generator):
     if count < 4 * most:
         return torch.randperm(count, generator=generator)[:most].sort().values
     drawn = np.empty(0, np.int64)
-    while len(drawn) < most:  # numbers that came before are passed over, as in drawing without putting back
+    # numbers that came before are passed over, as in drawing without putting back
+    while len(drawn) < most:
         drawn = np.concatenate((drawn, torch.randint(count, (most,), generator=generator).numpy()))
         drawn = drawn[np.sort(np.unique(drawn, return_index=True)[1])]
     return torch.from_numpy(np.sort(drawn[:most]))

@@ -20,9 +20,8 @@ from codesign.types import EventStream
 
 iio = optional("imageio.v3", "video", "writing .gif")
 imageio_ffmpeg = optional("imageio_ffmpeg", "video", "writing .mp4")
-LEAST_SIDE_PX = (
-    256  # small frames are enlarged until their shorter side reaches this, so that single pixels can be seen,
-)
+# small frames are enlarged until their shorter side reaches this, so that single pixels can be seen,
+LEAST_SIDE_PX = 256
 LARGEST_SIDE_PX = 1280  # unless the longer one would exceed this
 
 

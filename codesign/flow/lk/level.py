@@ -29,7 +29,8 @@ from codesign.types import EventVolume
 # the factor 3 and the power 4 = 2^2 above
 DOUBT = 3.0
 DOUBLINGS = 2
-FEW_EVENTS = 10.0  # worth of Poisson noise the measured noise starts from: some events alone fit any field
+# worth of Poisson noise the measured noise starts from: some events alone fit any field
+FEW_EVENTS = 10.0
 OVERLAP = 4 * math.pi  # blurred white noise is alike over 4 pi sigma^2 pixels
 # for what makes errors larger than that: bins share events, thresholds quantise, fields warp imperfectly
 # (docs/flow_closed_form.md)

@@ -21,7 +21,8 @@ UNEVEN = 0.02  # mean square of speed over its mean, less 1, from which on it co
 NEAR = 3  # bins that far apart are compared
 SHORT = 1e-3  # share of the energy of all bins below which a bin says little
 TINY = 2.0**-100
-MIRRORED = 0.35  # correlation of the bins before and after a turn, sign turned, from which on it is one
+# correlation of the bins before and after a turn, sign turned, from which on it is one
+MIRRORED = 0.35
 SHARP = 6.0  # of the choice between ways, per unit of correlation
 POOL = 4  # pixels a side over which counts are compared
 
@@ -132,7 +133,8 @@ def _directions(signed, speed, weight):
     score = speed.new_zeros(len(speed), len(ways))
     slowest = speed
     for apart in range(1, min(NEAR, bins - 1) + 1):
-        slowest = torch.minimum(slowest[:, :-1], speed[:, apart:])  # over all bins from one to the other
+        # over all bins from one to the other
+        slowest = torch.minimum(slowest[:, :-1], speed[:, apart:])
         pairs = alike.diagonal(apart, 1, 2) + slowest
         score = score + pairs @ (ways[:, apart:] * ways[:, :-apart]).T
     return (SHARP * score).softmax(1) @ ways

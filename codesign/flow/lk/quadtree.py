@@ -244,7 +244,8 @@ class _Cells(Lanes):
             if not below.scale:
                 y -= self.shift(0)
                 x -= self.shift(1)
-            inside = (y < below.high) & (x < below.wide)  # below 0 whole numbers begin again from the largest
+            # below 0 whole numbers begin again from the largest
+            inside = (y < below.high) & (x < below.wide)
             place = y * below.wide + x
             for part in range(parts):
                 at = (chosen * parts + part) * below.plane + place

@@ -99,7 +99,8 @@ class Calibration:
         height, width = valid.shape
         slopes = self.directions(height, width)[..., :2]
         place = slopes * self.focal_px + self.centre_px
-        at = np.where(np.isfinite(place), place, -1.0)[..., ::-1].transpose(2, 0, 1)  # -1: beside the picture
+        # -1: beside the picture
+        at = np.where(np.isfinite(place), place, -1.0)[..., ::-1].transpose(2, 0, 1)
         known = map_coordinates(valid.astype(float), at, order=1, cval=0.0) > 1 - 1e-9
         read = np.stack([map_coordinates(part, at, order=1) for part in np.where(valid, flow_px, 0.0)], -1)
         landed = (
@@ -238,7 +239,8 @@ def _table(path, columns, names):
         delimiter = "," if b"," in file.read(400) else None
         file.seek(0)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of a file without a number, which is refused below
+            # of a file without a number, which is refused below
+            warnings.simplefilter("ignore", UserWarning)
             table = np.loadtxt(file, ndmin=2, comments="#", delimiter=delimiter, encoding="utf-8")
     if table.shape[1] != columns or len(table) < 2 or not (np.abs(table) < LARGEST).all():
         raise FileFormatError(

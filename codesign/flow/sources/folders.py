@@ -61,7 +61,8 @@ def opened(path: str | Path) -> Iterator[Path]:
                         f"{path} would unpack to {size} bytes, more than {MOST_BYTES} or than its own size "
                         "allows; unpack it by hand."
                     )
-                archive.extractall(folder, members)  # keeps inside the folder whatever the names say
+                # keeps inside the folder whatever the names say
+                archive.extractall(folder, members)
         inside = Path(folder)
         while (
             len(entries := [entry for entry in inside.iterdir() if entry.name != "__MACOSX"]) == 1

@@ -158,7 +158,8 @@ class Sequence(Recording):
         direction = self.rays["direction"]
         origin = self.rays["origin_m"]
         height, width = self.size_px
-        scale = (depth - origin[..., 2]) / direction[..., 2]  # depth counts along the camera's z axis
+        # depth counts along the camera's z axis
+        scale = (depth - origin[..., 2]) / direction[..., 2]
         points = (origin + scale[..., None] * direction).reshape(-1, 3)
         T_last_first = np.linalg.inv(self.poses[last]) @ self.poses[first]
         landed = self.fit.project(points @ T_last_first[:3, :3].T + T_last_first[:3, 3]).reshape(

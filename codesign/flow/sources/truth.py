@@ -252,7 +252,8 @@ def _of_table(path, size_px):
         if not header:
             file.seek(0)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of a file without a number, which is refused below
+            # of a file without a number, which is refused below
+            warnings.simplefilter("ignore", UserWarning)
             table = np.loadtxt(file, ndmin=2, delimiter="," if "," in first else None)
     height, width = size_px
     if not header and table.shape == (2 * height, width):
@@ -286,7 +287,8 @@ def _of_table(path, size_px):
     use = np.isfinite(uv).all(0) & (columns.get("valid", np.ones(1)) > 0)
     cell = (y * width + x).astype(np.int64)[use]
     sums = np.stack([np.bincount(cell, part[use], height * width) for part in uv])
-    with np.errstate(invalid="ignore"):  # the mean of several flows of a pixel, NaN where there is none
+    # the mean of several flows of a pixel, NaN where there is none
+    with np.errstate(invalid="ignore"):
         flow = sums / np.bincount(cell, minlength=height * width)
     return _whole(path, flow.reshape(2, height, width))
 

@@ -80,7 +80,8 @@ def source_rays(
     fields = torch.as_tensor(fields_rad, dtype=torch.float64)
     sine, cosine = fields.sin().to(pupil), fields.cos().to(pupil)
     vergence = vergence_per_mm(lens, at_m, f.entrance_pupil_z_mm).reshape(-1, *[1] * fields.ndim)
-    near = (vergence * cosine)[..., None]  # 1 / distance of the object point from the pupil's centre
+    # 1 / distance of the object point from the pupil's centre
+    near = (vergence * cosine)[..., None]
     x, y = (pupil * (f.entrance_pupil_diameter_mm / 2)).unbind(1)
     # towards q from the point at distance 1 / near along (0, sine, cosine), whose square is 1
     lean = 2 * sine[..., None] * y + near * (x * x + y * y)

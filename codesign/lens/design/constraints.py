@@ -185,7 +185,8 @@ def is_glass(lens: GeoLens) -> list[bool]:
     return [n > 1.001 for n in lens.index()[1:].tolist()]
 
 
-LEAST, MOST = True, False  # of a figure: name, value, bound or None, side, scale, unit, whether it can bind
+# of a figure: name, value, bound or None, side, scale, unit, whether it can bind
+LEAST, MOST = True, False
 
 
 def _lengths(lens, limits, apertures) -> Iterator[tuple[Any, ...]]:
@@ -218,7 +219,8 @@ def _rays(lens, limits) -> Iterator[tuple[Any, ...]]:
         hits = surface_hits(lens, origin, direction)
         sine = (1 - hits.cosine.clamp_max(1).square()).clamp_min(1e-12).sqrt()
         angle = torch.rad2deg(torch.atan2(sine, hits.cosine))
-        worst = torch.where(hits.passed, angle, 0.0).amax(1)  # a ray that fails is the business of ``rays``
+        # a ray that fails is the business of ``rays``
+        worst = torch.where(hits.passed, angle, 0.0).amax(1)
         for i, value in enumerate(worst.unbind(0)):
             yield f"incidence on surface {i + 1}", value, limits.incidence_deg, MOST, limits.scale_deg, "deg"
     if limits.rays:

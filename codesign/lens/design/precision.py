@@ -26,9 +26,8 @@ from codesign.errors import DomainError, ShapeError
 from codesign.lens.design.tolerance import Error, Forecast
 
 NODES = 2048  # of the sum over the characteristic function
-FARTHEST = (
-    25.0  # standard deviations from the mean that no lens reaches; the sum repeats itself after twice as many
-)
+# standard deviations from the mean that no lens reaches; the sum repeats itself after twice as many
+FARTHEST = 25.0
 ROUNDS = 40  # of the fixed point and of a bisection
 
 

@@ -196,7 +196,8 @@ def _open(rows, optics, diameter, half_field):
             row.semi_aperture = min(max(needed, 1e-3 * diameter), reach)
     for front, back in itertools.pairwise(rows):
         heights, gap = _edge(front, back)
-        crossed = int((gap < 0).int().argmax())  # the first height where they cross, 0 where they do not
+        # the first height where they cross, 0 where they do not
+        crossed = int((gap < 0).int().argmax())
         most = float(heights[crossed - 1])
         for row in (front, back) if front.medium is not None and crossed > 1 else ():
             if row in free:

@@ -64,9 +64,8 @@ class FileLens:
     image_tilt_deg: float = 0.0
 
 
-ROUNDING = (
-    1e-9  # of a length in the file's unit; a gap negative by less is a rounding error and counts as none
-)
+# of a length in the file's unit; a gap negative by less is a rounding error and counts as none
+ROUNDING = 1e-9
 
 
 def unfold(lens: FileLens) -> list[FileSurface]:

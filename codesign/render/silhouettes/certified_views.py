@@ -11,7 +11,8 @@ from codesign.pose import inverse
 from codesign.render.silhouettes.curve_points import FieldOfView
 
 WITHIN_PX = 2.0
-APART_PX = 0.1  # parts of a moving scene against one another: what touched nothing does not touch then
+# parts of a moving scene against one another: what touched nothing does not touch then
+APART_PX = 0.1
 MOST = 256  # views that are kept of a scene
 
 

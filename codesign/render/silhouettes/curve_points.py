@@ -21,15 +21,18 @@ from codesign.render.rows import Rows
 PIECE_PX = 8.0
 PIECE_RAD = 0.1
 MARGIN_PX = 1.0  # beyond the film, on top of the blur
-WIDER = 1.02  # of the film's field, for what chief rays of the border do not say: colour, pupil aberration
+# of the film's field, for what chief rays of the border do not say: colour, pupil aberration
+WIDER = 1.02
 # of a camera nearer to a curve than this the piece would be long on the film without end: at 1e-6 m a robot's
 # own body took 15 GB of points
 IN_FRONT_M = 1e-3
 STEP = 1e-4  # of a piece, for the direction of its curve
 PUPILS = 4096
 NEARBY = 0.07  # share of the distance from which what is not hidden is read again
-NEAR_RAD = 2e-6  # by how much, at least: an edge of a face five times as wide as it is away moved by 1.2e-6
-FLOAT32_RAD = 5e-7  # by how much a float32 ray may miss, per length of its coordinates over the distance
+# by how much, at least: an edge of a face five times as wide as it is away moved by 1.2e-6
+NEAR_RAD = 2e-6
+# by how much a float32 ray may miss, per length of its coordinates over the distance
+FLOAT32_RAD = 5e-7
 
 
 @dataclass(frozen=True)

@@ -31,9 +31,8 @@ DEEPEST = 0.5  # share of the radius seen at which the reading inside a curved s
 LONG = 2.0  # units in the last place by which a straight edge moves per share of its furthest end
 ROUND = 96  # pieces of a full circle
 PARTS = 16  # parts of a cylinder's length that tell their own distance
-GRAZING = (
-    0.05  # cosine of the view below which a piece is left out: it runs along the outline, which is listed
-)
+# cosine of the view below which a piece is left out: it runs along the outline, which is listed
+GRAZING = 0.05
 
 
 class Curve:

@@ -11,9 +11,11 @@ from scipy.spatial import cKDTree
 from codesign.render.rows import Rows
 from codesign.render.triangles import across, edge_pairs
 
-SAME_POINT = 1e-6  # vertices of a mesh nearer than this share of its size, or than rounding, are one
+# vertices of a mesh nearer than this share of its size, or than rounding, are one
+SAME_POINT = 1e-6
 ROUNDING = 2.0**-21  # of float32 coordinates, four units in the last place
-SAME_VALUE = 1e-6  # share of the largest by which what radiance is looked up by may differ across an edge
+# share of the largest by which what radiance is looked up by may differ across an edge
+SAME_VALUE = 1e-6
 # cosine of the angle of two faces: above the first an edge is none, below the second it may part two
 # radiances
 FLAT = 1 - 1e-6

@@ -212,7 +212,8 @@ def sliver_radiance(
     width = (away * across[:, None]).sum(2) / (away * ahead[:, None]).sum(2)
     normal = torch.linalg.cross(edge[:, None].expand_as(apex), apex - y[:, None])
     facing = (normal * ahead[:, None]).sum(2)
-    nearer = -(normal * across[:, None]).sum(2) / torch.where(facing.abs() > 0, facing, THIN)  # per angle
+    # per angle
+    nearer = -(normal * across[:, None]).sum(2) / torch.where(facing.abs() > 0, facing, THIN)
     sign = torch.tensor([-1.0, 1.0], dtype=y.dtype)[:, None, None]
     there = width * sign > 0
     face = torch.where(there, nearer * sign, torch.inf).argmin(2)

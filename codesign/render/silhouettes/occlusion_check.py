@@ -35,7 +35,8 @@ RAYS_PER_PX = 3
 HALVINGS = 14
 CONTRAST = 0.02  # of a frame's range: what is less is no jump worth the name
 FOUND_PX = 1e-3  # between a jump and the curve it lies on, beside what the curve is known to
-DEPTH = 0.01  # share of the distance by which a curve may lie before or behind what is seen beside it
+# share of the distance by which a curve may lie before or behind what is seen beside it
+DEPTH = 0.01
 NEAR = 0.1  # of the length of a piece, between its chord and a ray that may meet it
 NEAR_PX = 0.1  # the same, where pieces are short
 BEYOND = 0.3  # of a piece, by which it is searched beyond its ends

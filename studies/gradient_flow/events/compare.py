@@ -89,7 +89,8 @@ class Judge:
         generator = Generator().manual_seed(self.seed)
         level = events.lin_log(first[:1])[0]
         state = events.SensorState()
-        begin(state, self.sensor, first[0], level, start_s, generator)  # one draw of the sensor for all
+        # one draw of the sensor for all
+        begin(state, self.sensor, first[0], level, start_s, generator)
         for name, value in state.tensors().items():
             setattr(state, name, value.expand(len(places), *value.shape).contiguous())
         state.generator = generator
