@@ -12,7 +12,7 @@ BUDGETS = {
     "codesign/flow": 42_500,
     "codesign/grad": 3_300,
     "codesign/lens": 46_900,
-    "codesign/mount": 14_100,
+    "codesign/mount": 14_200,
     "codesign/optimise": 3_900,
     "codesign/render": 42_400,
     "codesign/report": 5_700,

@@ -8,6 +8,7 @@ flow(x0), by fixed-point steps from x0 = x, bilinear between pixels. Each step l
 higher in the slope of the flow.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -182,7 +183,8 @@ def smooth_image(tracks: EventTracks, at: float | Tensor, weight: Tensor | None 
     share_x = _spline(x - column)
     share_y = _spline(y - row)
     count = tracks.count if weight is None else tracks.count * weight[:, None]
-    parts = ((i - 1, k - 1, count * (share_x[i] * share_y[k])[:, None]) for i in range(3) for k in range(3))
+    cells = itertools.product(range(3), range(3))
+    parts = ((i - 1, k - 1, count * (share_x[i] * share_y[k])[:, None]) for i, k in cells)
     return _gathered(tracks, column.long(), row.long(), parts)
 
 
@@ -238,7 +240,8 @@ def sharpness(image: Tensor) -> Tensor:
     Gradient: image.
     Source: Gallego et al., Focus is all you need, CVPR 2019.
     """
-    return image.diff(dim=2).square().mean((2, 3)).sum(1) + image.diff(dim=3).square().mean((2, 3)).sum(1)
+    down, across = (image.diff(dim=axis).square().mean((2, 3)).sum(1) for axis in (2, 3))
+    return down + across
 
 
 def _spline(offset):

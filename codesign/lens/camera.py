@@ -56,13 +56,15 @@ def film_points(
     """Where light from points of space meets the film; see ``GeoLens.film_points``."""
     f = lens.first_order(wavelength_um)
     dtype = points_mm.dtype
-    at = torch.cat([pupil * (f.entrance_pupil_diameter_mm.to(dtype) / 2), torch.zeros_like(pupil[:, :1])], 1)
+    radius = f.entrance_pupil_diameter_mm.to(dtype) / 2
+    at = torch.cat([pupil * radius, torch.zeros_like(pupil[:, :1])], 1)
     flip = points_mm.new_tensor([1.0, 1.0, -1.0])
     start = points_mm * flip
     direction = torch.nn.functional.normalize((at - points_mm) * flip, dim=1)
     start = torch.cat([start[:, :2], start[:, 2:] + _origin_z_mm(lens, f, wavelength_um).to(dtype)], 1)
     out = trace(lens.prescription(wavelength_um).to(dtype).opened(lens.stop_index), start, direction)
-    back = (f.exit_pupil_z_mm - lens.thickness_mm[-1]).to(dtype) * out.direction[:, :2] / out.direction[:, 2:]
+    to_pupil = (f.exit_pupil_z_mm - lens.thickness_mm[-1]).to(dtype)
+    back = to_pupil * out.direction[:, :2] / out.direction[:, 2:]
     return (
         -out.position_mm[:, :2],
         (out.position_mm[:, :2] + back) / (f.exit_pupil_diameter_mm.to(dtype) / 2),

@@ -324,7 +324,8 @@ class GeoLens(Replaceable):
     def index(self, wavelength_um: float = D_UM) -> torch.Tensor:
         """Indices [S + 1] at a wavelength, the first before the lens (air). Behind a mirror it is the index
         before it."""
-        values = [1.0, *[1.0 if s.medium is None else s.medium.index(wavelength_um) for s in self.surfaces]]
+        media = (s.medium for s in self.surfaces)
+        values = [1.0 if medium is None else medium.index(wavelength_um) for medium in (None, *media)]
         base = torch.tensor(values, dtype=self.dtype, device=self.semi_aperture_mm.device)
         offset = torch.where(self.glass, self.index_offset, 0)
         found = base + torch.cat([torch.zeros_like(offset[:1]), offset])

@@ -204,7 +204,8 @@ class Glass:
         Args: nd in (1, 5); Vd from 10 to 150.
         Raises: DomainError.
         """
-        if not (_is_number(nd) and _is_number(Vd) and LEAST_INDEX < nd < INDEX_LIMIT and 10 <= Vd <= 150):
+        numbers = _is_number(nd) and _is_number(Vd)
+        if not (numbers and LEAST_INDEX < nd < INDEX_LIMIT and 10 <= Vd <= 150):
             raise DomainError(
                 f"glass {'' if name is None else _cut(name) + ': '}nd={_cut(nd)}, Vd={_cut(Vd)}: nd must "
                 "lie in (1, 5) and Vd in 10 to 150; for a medium without dispersion use Glass.from_indices."

@@ -239,7 +239,8 @@ def paraxial_rays(
     index = lens.index(wavelength_um)
     vergence = torch.as_tensor(vergence_per_mm, dtype=power.dtype, device=power.device)
     # colours have pupils of their own, and one object plane
-    shift = f.entrance_pupil_z_mm - (f if wavelength_um == D_UM else lens.first_order()).entrance_pupil_z_mm
+    d_line = f if wavelength_um == D_UM else lens.first_order()
+    shift = f.entrance_pupil_z_mm - d_line.entrance_pupil_z_mm
     slope = field.tan().to(power) / (1 + vergence * shift)
     spread = vergence / (1 + vergence * shift) * (f.entrance_pupil_diameter_mm / 2)
     starts = (

@@ -197,7 +197,8 @@ def _curve(curve, name):
             f"{name} must be a pair (wavelength_um [N], value [N]) with 2 <= N <= 10000, got "
             f"{wavelength_um.shape} and {value.shape}."
         )
-    if not (np.diff(wavelength_um) > 0).all() or not (wavelength_um[0] >= 0.1 and wavelength_um[-1] <= 100):
+    increase = (np.diff(wavelength_um) > 0).all()
+    if not (increase and wavelength_um[0] >= 0.1 and wavelength_um[-1] <= 100):
         raise DomainError(f"{name}: wavelengths must increase and lie in 0.1 to 100; give micrometres.")
     if not (value >= 0).all() or not 0 < value.max() < math.inf:
         raise DomainError(f"{name}: values must be finite, at least 0 and not all 0.")

@@ -112,7 +112,8 @@ class Surface:
                 f"{label}: medium {self.medium!r} is no glass; give Glass.named({str(self.medium)!r}), or "
                 "None for air."
             )
-        if math.isnan(self.radius_mm) or self.radius_mm == 0 or not all(math.isfinite(v) for v in numbers):
+        no_radius = math.isnan(self.radius_mm) or self.radius_mm == 0
+        if no_radius or not all(map(math.isfinite, numbers)):
             raise DomainError(
                 f"{label}: radius {self.radius_mm} mm, thickness {self.thickness_mm} mm, conic {self.conic} "
                 f"and asphere {self.asphere} must be finite numbers, the radius not 0 (inf is a plane)."
@@ -225,7 +226,8 @@ def sag_mm(
       the gradient stays finite.
     """
     r2 = height_mm.square()
-    sag = curvature_per_mm * r2 / (1 + (1 - (1 + conic) * curvature_per_mm**2 * r2).clamp_min(1e-6).sqrt())
+    root = (1 - (1 + conic) * curvature_per_mm**2 * r2).clamp_min(1e-6).sqrt()
+    sag = curvature_per_mm * r2 / (1 + root)
     for i, coefficient in enumerate(asphere):
         sag = sag + coefficient * r2 ** (i + 1)
     return sag

@@ -396,7 +396,8 @@ def _plate_turns(rays, placed, index, surface):
     axial = torch.where(passes, radicand, 1).sqrt()
     good = alive & reaches & passes
     why = torch.where(reaches, int(Status.TOTAL_REFLECTION), int(Status.MISS))
-    packed = torch.where(alive & ~good, 8 * surface + why + (rays.packed_status & 4), rays.packed_status)
+    failed = 8 * surface + why + (rays.packed_status & 4)
+    packed = torch.where(alive & ~good, failed, rays.packed_status)
     return replace(
         rays,
         direction=torch.where(good[:, None], torch.cat([across, axial[:, None]], 1), rays.direction),

@@ -30,8 +30,9 @@ def ground_depth(camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, sc
     slope = (rays.direction / rays.direction[:, 2:]).double()
     base = rays.origin_m.double() - slope * rays.origin_m[:, 2:].double()  # where a ray has depth 0
     up = T_world_cam[:, 2, :3].double()[:, None, :, None]
-    falling = -(slope.reshape(*pixels.shape[:2], 1, 3) @ up)[..., 0, 0]
-    height = T_world_cam[:, 2, 3].double()[:, None] + (base.reshape(*pixels.shape[:2], 1, 3) @ up)[..., 0, 0]
+    rising, above = ((v.reshape(*pixels.shape[:2], 1, 3) @ up)[..., 0, 0] for v in (slope, base))
+    falling = -rising
+    height = T_world_cam[:, 2, 3].double()[:, None] + above
     meets = falling.detach() > LEVEL
     meets = meets & ~hidden_by_objects(camera, pixels, T_world_cam, scene)
     return torch.where(meets, height / torch.where(meets, falling, 1.0), torch.inf)

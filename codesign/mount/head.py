@@ -145,7 +145,8 @@ def _lens(camera, windows, nearness, mounts):
     ahead = ahead / _length(ahead)[:, None]
     focal = -torch.linalg.det(slope_step).abs().log() / 2 - torch.tensor(FOCAL_PX).log()
     lines = (base, slope, base_step, slope_step)
-    blur = [_blur_px(camera, pixels, *lines, near).log1p() for near in (nearness, torch.zeros_like(nearness))]
+    depths = (nearness, torch.zeros_like(nearness))
+    blur = [_blur_px(camera, pixels, *lines, near).log1p() for near in depths]
     direction = (mounts[:, None, :3, :3] @ ahead[:, :, None])[..., 0]
     return torch.cat([direction, torch.stack([focal.expand_as(nearness), *blur], -1)], -1)
 
@@ -374,8 +375,9 @@ def _deviation(covariance):
 def _squared(seen, velocity):
     """[N, W]: squared flow that the velocity leaves unexplained, in units of its deviation."""
     along = velocity[:, None, :, None]
-    explained = (along.mT @ seen.information @ along)[..., 0, 0] - 2 * (seen.pull * velocity[:, None]).sum(-1)
-    return (seen.energy + explained).clamp_min(0)
+    bent = (along.mT @ seen.information @ along)[..., 0, 0]
+    pulled = (seen.pull * velocity[:, None]).sum(-1)
+    return (seen.energy + (bent - 2 * pulled)).clamp_min(0)
 
 
 def _solved(seen, weight, pulled, prior):

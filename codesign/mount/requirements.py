@@ -146,7 +146,8 @@ class LookAhead:
         of pixels decides and not its last one. Gradient: mount, and the lens behind the chief rays."""
         angles = self.angles(T_body_cam, camera)
         rank = torch.arange(angles.shape[-1]).to(angles)
-        weight = (1 - (rank - self._rank(angles)).abs() / max(1.0, self.smooth * len(rank))).clamp_min(0)
+        reach = max(1.0, self.smooth * len(rank))
+        weight = (1 - (rank - self._rank(angles)).abs() / reach).clamp_min(0)
         return (angles.sort(-1, descending=True).values * weight).sum(-1, keepdim=True) / weight.sum()
 
     def exact(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
@@ -176,7 +177,8 @@ class LookAhead:
         origin = pose[..., None, :3, 3] + rays.origin_m.double() @ pose[..., :3, :3].mT
         before = self.distance_m - origin[..., 0]
         height = origin[..., 2] - self.ground_z_m
-        over = (height * forward + before * direction[..., 2]) / torch.hypot(height, before).clamp_min(1e-9)
+        line_m = torch.hypot(height, before).clamp_min(1e-9)
+        over = (height * forward + before * direction[..., 2]) / line_m
         return torch.minimum(over, forward)
 
 

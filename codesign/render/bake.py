@@ -115,9 +115,8 @@ def shown(
         description[surface.name] = shape
         if back is not None:
             backs[surface.name] = back
-    plain = (
-        not backs and place.gain == 1 and (sky is None or bool((place.R_world_scene == torch.eye(3)).all()))
-    )
+    upright = sky is None or bool((place.R_world_scene == torch.eye(3)).all())
+    plain = not backs and place.gain == 1 and upright
     return MitsubaScene(description, device) if plain else SidedScene(description, backs, place, device)
 
 

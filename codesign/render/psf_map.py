@@ -76,7 +76,8 @@ class PsfMap:
         per_m = torch.as_tensor(per_m, dtype=torch.float64)
         if per_m.ndim != 1:
             raise ShapeError(f"psf map: distances must be a list [D], got shape {tuple(per_m.shape)}.")
-        if not bool(((per_m.detach() >= 0) & (per_m.detach() <= (1 + ROUNDING) / self.nearest_m)).all()):
+        known = (per_m.detach() >= 0) & (per_m.detach() <= (1 + ROUNDING) / self.nearest_m)
+        if not bool(known.all()):
             raise DomainError(
                 f"psf map: 1 / distance {per_m.tolist()} must lie between 0 and {1 / self.nearest_m:g} per "
                 f"metre, as the map is made for {self.nearest_m:g} m and beyond; give psf_map a smaller "
@@ -269,7 +270,8 @@ def _solved(matrix, vectors):
     """matrix^-1 [..., N, 2, 2] times vectors [..., N, M, 2], written out; nodes without chief rays give 0."""
     (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
     determinant = a * d - b * c
-    inverse = torch.where(determinant != 0, 1 / torch.where(determinant != 0, determinant, 1), 0)[..., None]
+    regular = determinant != 0
+    inverse = torch.where(regular, 1 / torch.where(regular, determinant, 1), 0)[..., None]
     x, y = vectors.unbind(-1)
     a, b, c, d = (v[..., None] for v in (a, b, c, d))
     return torch.stack([(d * x - b * y) * inverse, (a * y - c * x) * inverse], -1)

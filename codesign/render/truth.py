@@ -361,7 +361,8 @@ def camera_velocity(T_world_cam: Poses, t_s: Tensor | Sequence[float]) -> tuple[
         )
     poses = T_world_cam.double()
     start = poses[..., :-1, :, :]
-    twist = se3_log((inverse(start) @ poses[..., 1:, :, :]).reshape(-1, 4, 4)).reshape(*start.shape[:-2], 6)
+    moves = inverse(start) @ poses[..., 1:, :, :]
+    twist = se3_log(moves.reshape(-1, 4, 4)).reshape(*start.shape[:-2], 6)
     half_turn = se3_exp(torch.cat([torch.zeros_like(twist[..., :3]), twist[..., 3:] / 2], -1))[..., :3, :3]
     body = twist / t_s.diff()[:, None]
     turn = (start[..., :3, :3] @ half_turn)[..., None, :, :]

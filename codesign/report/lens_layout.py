@@ -87,7 +87,8 @@ def draw_layout(
     tallest = max(s.semi_aperture_mm for s in surfaces)
     before = None
     for i, (s, (z, y)) in enumerate(zip(surfaces, outlines, strict=True)):
-        if s.medium is not None and not s.mirror and i + 1 < len(surfaces) and not surfaces[i + 1].mirror:
+        is_glass = s.medium is not None and not s.mirror
+        if is_glass and i + 1 < len(surfaces) and not surfaces[i + 1].mirror:
             _draw_glass(axis, outlines[i : i + 2])
         # a stop or dummy in one medium: its mark below says enough
         if s.mirror or s.phase is not None or before != s.medium:

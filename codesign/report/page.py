@@ -86,10 +86,8 @@ def table(title: str, columns: Iterable[str], rows: Iterable[Iterable[Any]], cap
                 f"table '{title}': row {index} has {len(row)} cells for {len(columns)} columns; give one "
                 "cell per column."
             )
-    numeric = tuple(
-        any(_is_number(row[k]) for row in rows) and all(_is_number(row[k]) or row[k] is None for row in rows)
-        for k in range(len(columns))
-    )
+    given = [[row[k] for row in rows if row[k] is not None] for k in range(len(columns))]
+    numeric = tuple(bool(column) and all(map(_is_number, column)) for column in given)
     return Table(title, columns, tuple(tuple(map(cell, row)) for row in rows), numeric, caption)
 
 

@@ -114,9 +114,8 @@ def _ways(run, direct, stage, output, wanted) -> tuple[list[_Way], list[_Way]]:
     ways = []
     if "camera" in asked:
         lens = run["camera"].lens
-        names = (
-            {id(p): name for name, p in lens.named_parameters()} if isinstance(lens, torch.nn.Module) else {}
-        )
+        named = lens.named_parameters() if isinstance(lens, torch.nn.Module) else ()
+        names = {id(p): name for name, p in named}
         anew = ("camera", "rays") if output == "rays" or "rays" not in asked else ("camera",)
         ways = [_Way(f"the lens ({names.get(id(t), 'computed')})", t, t, anew) for t in run.junctions["lens"]]
     for name in (name for name in asked if name in _READ and name in run.made):
@@ -197,7 +196,8 @@ def _follows(
         return torch.cat([t.detach().double().flatten() for t in _main(output or "", found)])
 
     try:
-        start, *others = (moved(step) for step in ((0.0, STEP, 2 * STEP) if far is None else (0.0, far)))
+        steps = (0.0, STEP, 2 * STEP) if far is None else (0.0, far)
+        start, *others = map(moved, steps)
     except CodesignError:  # moved out of what the stage takes: nothing is proven
         return False
     if any(other.shape != start.shape for other in others) or not bool((others[0] - start).any()):

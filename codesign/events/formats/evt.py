@@ -146,7 +146,8 @@ def evt3_decoded(path, words):
     on = on[first:]
     count = BIT_COUNT[mask].astype(np.intp)
     last = np.cumsum(count)
-    bit = np.arange(int(last[-1]) if last.size else 0) + np.repeat(BIT_START[mask] - (last - count), count)
+    total = int(last[-1]) if last.size else 0
+    bit = np.arange(total) + np.repeat(BIT_START[mask] - (last - count), count)
     x = np.repeat(column, count) + BIT_LIST[bit]
     if x.size and int(x.max()) > 0x7FF:
         raise FileFormatError(
@@ -160,7 +161,8 @@ def _times(kind, load):
     """Positions of time words from the first time-high word on, and the time from each on."""
     at = np.flatnonzero((kind == TIME_LOW) | (kind == TIME_HIGH))
     is_high = kind[at] == TIME_HIGH
-    at, is_high = (values[np.argmax(is_high) if is_high.any() else len(at) :] for values in (at, is_high))
+    first = np.argmax(is_high) if is_high.any() else len(at)
+    at, is_high = at[first:], is_high[first:]
     if not at.size:
         return at, at
     ordinal = np.cumsum(is_high) - 1

@@ -40,9 +40,9 @@ def check_index(path, t, first, index):
     limit_us = 1000 * np.arange(len(index), dtype=np.int64)
     at = index[1:] - first
     inside, behind = (at >= 0) & (at < len(t)), (at > 0) & (at <= len(t))
-    if bool(
-        (t[at[inside]] < limit_us[1:][inside]).any() or (t[at[behind] - 1] >= limit_us[1:][behind]).any()
-    ):
+    early = t[at[inside]] < limit_us[1:][inside]
+    late = t[at[behind] - 1] >= limit_us[1:][behind]
+    if bool(early.any() or late.any()):
         raise FileFormatError(
             f"{path}: ms_to_idx does not give the first event of each millisecond; the file is damaged."
         )
@@ -153,7 +153,8 @@ class Hdf5Events:
         high = len(self)
         while high - low > FINE:
             middle = (low + high) // 2
-            low, high = (middle, high) if self.packet(middle, middle + 1)[0][0] < t_us else (low, middle)
+            before = self.packet(middle, middle + 1)[0][0] < t_us
+            low, high = (middle, high) if before else (low, middle)
         return low + int(np.searchsorted(self.packet(low, high)[0], t_us))
 
 

@@ -125,7 +125,8 @@ def check_blosc(path, dataset, name, place, options):
     data = stored_bytes(path, name, place)
     header = struct.unpack_from("<4B3I", data) if len(data) >= 16 else (0,) * 7
     version, _, _, typesize, unpacked, block, packed = header
-    fits = (version, typesize, unpacked, packed) == (2, width, size, len(data)) and 0 < block <= max(size, 1)
+    fits = (version, typesize, unpacked, packed) == (2, width, size, len(data))
+    fits = fits and 0 < block <= max(size, 1)
     if not (stored == size if mask & 1 else fits):
         raise damaged(path, name, at)
 
@@ -248,7 +249,8 @@ class Rows:
                 f"{self.path}: rows {first} to {last} of {self.name} were asked for, which has {len(self)}."
             )
         with self._dataset() as dataset:
-            if dataset.shape != self.shape or (dataset.chunks and tuple(dataset.chunks)) != self.block_shape:
+            block_shape = dataset.chunks and tuple(dataset.chunks)
+            if (dataset.shape, block_shape) != (self.shape, self.block_shape):
                 raise FileFormatError(f"{self.path} changed while it was in use.")
             if self.block_shape is None:
                 return np.asarray(dataset[first:last])

@@ -117,7 +117,8 @@ def soft_counts(
     theta_on = check_per_pixel(theta_on, "theta_on", level)
     theta_off = check_per_pixel(theta_off, "theta_off", level)
     step = level.diff(dim=0)
-    return torch.stack(((step.abs() + step) / (2 * theta_on), (step.abs() - step) / (2 * theta_off)), dim=1)
+    rise, fall = step.abs() + step, step.abs() - step
+    return torch.stack((rise / (2 * theta_on), fall / (2 * theta_off)), dim=1)
 
 
 def _gradient(name, theta_on, theta_off, steers):

@@ -100,7 +100,8 @@ def splatted(values, displacement_px):
     upper = values.reshape(-1, channels) * (1 - down)
     lower = values.reshape(-1, channels) * down
     for part, step in ((upper, 0), (lower, width + 2)):
-        total.index_add_(0, index + step, part * (1 - right)).index_add_(0, index + step + 1, part * right)
+        total.index_add_(0, index + step, part * (1 - right))
+        total.index_add_(0, index + step + 1, part * right)
     return total.reshape(height + 2, width + 2, channels)[1:-1, 1:-1]
 
 

@@ -63,7 +63,8 @@ def repaired(levels, flows, seen):
             within = (row >= 0) & (row < height) & (column >= 0) & (column < width)
             at = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
             unlike = (level.flatten()[at] - level[y, x][:, None]).abs()
-            vote = within * near * torch.exp(-unlike / ALIKE) * (weight * (weight >= DOUBTED)).flatten()[at]
+            trusted = (weight * (weight >= DOUBTED)).flatten()[at]
+            vote = within * near * torch.exp(-unlike / ALIKE) * trusted
             found = vote.sum(1) > 0
             for component in range(2):
                 flow[component, y, x] = torch.where(
@@ -135,7 +136,8 @@ def _motion_at(flows, seen, share):
     while bool(empty.any()):
         known = (~empty).to(motion.dtype)
         spread = blurred(torch.cat((motion * known, known[None]))[:, None], width)[:, 0]
-        motion = torch.where(empty & (spread[2] > LEAST), spread[:2] / spread[2].clamp(min=LEAST), motion)
+        reached = spread[2] > LEAST
+        motion = torch.where(empty & reached, spread[:2] / spread[2].clamp(min=LEAST), motion)
         empty = empty & (spread[2] <= LEAST)
         width = 2 * width
     weight = torch.stack([each[..., 2] for each in carried]).clamp(max=1)

@@ -185,7 +185,8 @@ def without(
 def gaps(t_us: np.ndarray) -> np.ndarray:
     """Times without any event [N, 2], microseconds: at least 10 ms, and 100 times the mean time
     between events."""
-    least_us = max(GAP_US, GAP_EVENTS * float(t_us[-1] - t_us[0]) / max(len(t_us) - 1, 1)) if len(t_us) else 0
+    mean_us = float(t_us[-1] - t_us[0]) / max(len(t_us) - 1, 1) if len(t_us) else 0
+    least_us = max(GAP_US, GAP_EVENTS * mean_us)
     at = np.flatnonzero(np.diff(t_us) > least_us)
     return np.stack([t_us[at], t_us[at + 1]], -1)
 

@@ -233,7 +233,8 @@ def read_spans(path: Path, count: int) -> list[tuple[float, float]]:
 
 def _checked_spans(path, ends, count):
     """Spans in seconds; whole numbers are microseconds."""
-    if ends.shape != (count, 2) or not np.isfinite(ends).all() or bool((ends[:, 1] <= ends[:, 0]).any()):
+    fits = ends.shape == (count, 2) and np.isfinite(ends).all()
+    if not fits or bool((ends[:, 1] <= ends[:, 0]).any()):
         raise FileFormatError(
             f"{path}: times of shape {list(ends.shape)} for {count} flow(s); each flow needs a time from "
             "and a later time to."

@@ -109,7 +109,8 @@ def traced_depth_of_field(
     nearest = _nearest(lens)
     top = 0.999 / nearest if nearest else CLOSEST_PER_MM
     centre = min(max(float(-at_parallel / per_vergence), 0.0), top)
-    width = 3 * float(blur_mm) / float(lens.first_order().entrance_pupil_diameter_mm * per_vergence.abs())
+    cone = float(lens.first_order().entrance_pupil_diameter_mm * per_vergence.abs())
+    width = 3 * float(blur_mm) / cone
 
     @functools.cache
     def rms(vergence):

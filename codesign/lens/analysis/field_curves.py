@@ -267,10 +267,8 @@ def relative_illumination(lens: GeoLens, fields_rad: Sequence[float], grid: int 
     lens = in_float64(lens)
     pupil = pupil_grid(grid)
     fields = [0.0, *map(float, fields_rad)]
-    heights = [_image_height(lens, field) for field in fields]
-    film = torch.stack([torch.zeros_like(torch.stack(heights)), torch.stack(heights)], 1).repeat_interleave(
-        pupil.shape[0], 0
-    )
+    heights = torch.stack([_image_height(lens, field) for field in fields])
+    film = torch.stack([torch.zeros_like(heights), heights], 1).repeat_interleave(pupil.shape[0], 0)
     # camera rays take points as seen upright
     rays = lens.camera_rays(-film, pupil.repeat(len(fields), 1), aim=True)
     assert rays.irradiance is not None  # GeoLens gives it

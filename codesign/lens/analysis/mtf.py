@@ -92,9 +92,8 @@ def _transfer(pupil, axis, frequency):
     spread = torch.fft.ifft(field, n=n * PADDING, dim=0)
     line_spread = torch.fft.fftshift((spread.real.square() + spread.imag.square()).sum(1))
     radius = pupil.cosine_radius[axis]
-    place = (torch.arange(n * PADDING, dtype=frequency.dtype, device=frequency.device) - n * PADDING // 2) * (
-        pupil.wavelength_mm / (2 * radius * PADDING)
-    )
+    number = torch.arange(n * PADDING, dtype=frequency.dtype, device=frequency.device)
+    place = (number - n * PADDING // 2) * (pupil.wavelength_mm / (2 * radius * PADDING))
     phase = 2 * math.pi * frequency[:, None] * place
     found = torch.complex(phase.cos() @ line_spread, -(phase.sin() @ line_spread)) / line_spread.sum()
     return torch.where(frequency < 2 * radius / pupil.wavelength_mm, found, 0)

@@ -79,11 +79,10 @@ def rim_rays(
 ) -> tuple[Tensor, Tensor]:
     """The chief ray and ``count`` rays on the rim of the entrance pupil, for each field and distance.
     Returns: origins and directions [distances * fields * (count + 1), 3]."""
-    turn = (
-        torch.arange(count, dtype=lens.dtype, device=lens.curvature_per_mm.device) * (2 * torch.pi / count)
-        + torch.pi / 2
-    )
-    pupil = torch.cat([torch.zeros_like(turn[:1]).expand(1, 2), torch.stack([turn.cos(), turn.sin()], 1)])
+    number = torch.arange(count, dtype=lens.dtype, device=lens.curvature_per_mm.device)
+    turn = number * (2 * torch.pi / count) + torch.pi / 2
+    rim = torch.stack([turn.cos(), turn.sin()], 1)
+    pupil = torch.cat([torch.zeros_like(rim[:1]), rim])
     rays = source_rays(lens, fields_rad, pupil, at_m)
     return rays.origin_mm.reshape(-1, 3), rays.direction.reshape(-1, 3)
 

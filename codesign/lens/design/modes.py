@@ -119,7 +119,8 @@ def _motion(design, variable, fields_rad, step=1e-4):
     """Ray motion about the mean of each spot per unit of one variable, RMS-normalised: [rays * 2] mm."""
     shift = torch.zeros_like(design.basis[0])
     shift[variable] = step
-    moved, weight = ray_motion(spots(design.lens(shift), fields_rad), spots(design.lens(-shift), fields_rad))
+    ahead, behind = (spots(design.lens(change), fields_rad) for change in (shift, -shift))
+    moved, weight = ray_motion(ahead, behind)
     moved = moved / (2 * step)
     weight = weight[..., None]
     # a shift of the whole spot does not blur

@@ -197,7 +197,8 @@ def _without(surfaces, at):
         found.insert(at, Surface(math.inf, gone.thickness_mm, medium, gone.semi_aperture_mm, is_stop=True))
         return found
     if at:
-        found[at - 1] = replace(found[at - 1], thickness_mm=found[at - 1].thickness_mm + gone.thickness_mm)
+        before = found[at - 1]
+        found[at - 1] = replace(before, thickness_mm=before.thickness_mm + gone.thickness_mm)
     return found
 
 

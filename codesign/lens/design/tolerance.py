@@ -340,7 +340,8 @@ def worst_offenders(
     row = slopes[figure]
     total = float(row.square().sum())
     order = row.abs().argsort(descending=True)[:most].tolist()
-    return [(errors[k].name, float(row[k]), float(row[k]) ** 2 / total if total else 0.0) for k in order]
+    changes = [(errors[k].name, float(row[k])) for k in order]
+    return [(name, change, change**2 / total if total else 0.0) for name, change in changes]
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,8 @@ def with_plate(lens: GeoLens, plate: Plate | None, surface: int | None = None, z
         return twin
     check_number(z_mm, f"{lens.name}: distance of a plate, mm,")
     last = len(lens.surfaces) - 1
-    at = lens.stop_index if surface is None else surface % (last + 1) if -1 <= surface <= last else surface
+    at = lens.stop_index if surface is None else surface
+    at = last if at == -1 else at
     if at not in (lens.stop_index, last) or (z_mm < 0 and at != lens.stop_index):
         raise DomainError(
             f"{lens.name}: a plate {z_mm:g} mm from surface {at + 1} is not modelled; put it next to the "

@@ -163,11 +163,9 @@ def _largest_step(front, seen):
     """Largest difference in waves of neighbouring points of the grid where both are lit."""
     opd = torch.zeros_like(seen, dtype=front.opd_mm.dtype).masked_scatter(seen, front.waves.detach())
     lit = torch.zeros_like(seen).masked_scatter(seen, front.weight > 0)
-    steps = [
-        (opd.diff(dim=d).abs() * (lit.narrow(d, 1, len(lit) - 1) & lit.narrow(d, 0, len(lit) - 1))).max()
-        for d in (0, 1)
-    ]
-    return float(torch.stack(steps).max())
+    count = len(lit) - 1
+    both = [lit.narrow(d, 1, count) & lit.narrow(d, 0, count) for d in (0, 1)]
+    return max(float((opd.diff(dim=d).abs() * both[d]).max()) for d in (0, 1))
 
 
 def _enough_cells(lens, field_rad, wavelength_um, vignetting, reference_mm, at_m) -> int:

@@ -92,7 +92,8 @@ def unfold(lens: FileLens) -> list[FileSurface]:
             )
         )
     if found:
-        found[-1].thickness = 0.0 if lens.focus else found[-1].thickness + lens.defocus * lens.unit_mm * sign
+        defocused = found[-1].thickness + lens.defocus * lens.unit_mm * sign
+        found[-1].thickness = 0.0 if lens.focus else defocused
     return _without_steps_back(found)
 
 

@@ -241,7 +241,9 @@ def _listed(camera, scene, curves, cameras, found):
     place_cam_m = seen.origin_m + seen.direction * found.distance.clamp_max(1e6)[:, None]
     total = torch.zeros_like(found.change)
     near = _near_curves(camera, curves, cameras, found, seen)
-    read = jumps(camera, scene, cameras, CurvePoints.joined([points for _, points in near])) if near else None
+    read = None
+    if near:
+        read = jumps(camera, scene, cameras, CurvePoints.joined([points for _, points in near]))
     if read is None:
         return found.frame, found.change, total, place_cam_m
     read = read[torch.nonzero(read.seen)[:, 0]]
