@@ -219,7 +219,9 @@ def frames_per_kernel(pixels: int) -> int:
 
 
 def run_kernel(
-    kernel: Callable[..., tuple[Any, ...]], inputs: Iterable[Tensor], out_shapes: Iterable[Sequence[int]]
+    kernel: Callable[..., tuple[Any, ...]],
+    inputs: Iterable[Tensor],
+    out_shapes: Iterable[Sequence[int]],
 ) -> tuple[Tensor, ...]:
     """Run a drjit kernel on torch tensors, with first derivatives.
 
@@ -336,7 +338,10 @@ def _adjoint(ctx, inputs, grads):
 _FIRST_ONLY = "drjit kernels give first derivatives only; a second derivative was asked for. Use differences of gradients instead."
 
 
-def first_only(found: Sequence[Tensor | None], sources: Iterable[Tensor | None]) -> Sequence[Tensor | None]:
+def first_only(
+    found: Sequence[Tensor | None],
+    sources: Iterable[Tensor | None],
+) -> Sequence[Tensor | None]:
     """Gradients that a kernel found, as they are; differentiating them to their sources raises GradientError."""
     if not torch.is_grad_enabled():
         return found

@@ -46,7 +46,10 @@ def reading(
 
 
 @contextmanager
-def building(what: str | Path, remedy: str = "it is damaged, or of another version") -> Iterator[None]:
+def building(
+    what: str | Path,
+    remedy: str = "it is damaged, or of another version",
+) -> Iterator[None]:
     """As ``reading``, around classes that are made of a file's values: their refusals name the file too."""
     try:
         with reading(what, remedy):

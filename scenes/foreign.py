@@ -149,7 +149,12 @@ class FileView:
     width_px: int
     height_px: int
 
-    def camera(self, samples_per_pixel: int = 16, width_px: int | None = None, seed: int = 0) -> Camera:
+    def camera(
+        self,
+        samples_per_pixel: int = 16,
+        width_px: int | None = None,
+        seed: int = 0,
+    ) -> Camera:
         """A pinhole of this field of view before a film of this size, or of ``width_px`` columns and as many rows
         as keep its proportions."""
         columns = self.width_px if width_px is None else width_px

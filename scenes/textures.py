@@ -265,7 +265,11 @@ def picture(
     return softened(photo(source), blur_texels)
 
 
-def sky(seed: int = 0, height_px: int = 256, sun_azimuth_deg: float = SUN_AZIMUTH_DEG) -> np.ndarray:
+def sky(
+    seed: int = 0,
+    height_px: int = 256,
+    sun_azimuth_deg: float = SUN_AZIMUTH_DEG,
+) -> np.ndarray:
     """A procedural sky as an equirectangular picture [height, 2 height], first row at the zenith: a gradient,
     soft clouds, a broad soft sun; 255 at most."""
     width = 2 * height_px

@@ -33,7 +33,12 @@ except Exception:
 print("ended well")"""
 
 
-def check(mi: Any, state: Any, file: Path | None = None, parameters: Iterable[tuple[str, Any]] = ()) -> None:
+def check(
+    mi: Any,
+    state: Any,
+    file: Path | None = None,
+    parameters: Iterable[tuple[str, Any]] = (),
+) -> None:
     """Refuse a parsed scene (mi.parser.ParserState) that Mitsuba would not survive.
 
     Args:

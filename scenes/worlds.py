@@ -135,7 +135,10 @@ def room(
 
 
 def blank_room(
-    level: float = PAINT, size_m: Sequence[float] = ROOM_M, device: str = "cpu", light: Light = emissive
+    level: float = PAINT,
+    size_m: Sequence[float] = ROOM_M,
+    device: str = "cpu",
+    light: Light = emissive,
 ) -> Any:
     """A closed room whose every surface has one radiance: the negative control, in which no motion makes an
     event.
@@ -269,7 +272,11 @@ def dark_room(seed: int = 0, device: str = "cpu", light: Light = emissive) -> An
     return light(World(shapes), device)
 
 
-def smooth_plane(seed: int = 0, T_world_plane: Tensor | None = None, **options: Any) -> TexturedPlane:
+def smooth_plane(
+    seed: int = 0,
+    T_world_plane: Tensor | None = None,
+    **options: Any,
+) -> TexturedPlane:
     """A band-limited analytic wall in the plane z = 0 of its frame; options go to textures.waves."""
     return TexturedPlane(*textures.waves(seed, **options), T_world_plane=T_world_plane)
 

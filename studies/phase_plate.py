@@ -101,7 +101,11 @@ def spread(config: Config, geo: GeoLens, at_m: float | Tensor, share: float, lig
 
 
 def contrast(
-    config: Config, geo: GeoLens, at_m: float | Tensor, share: float, light: Light = WAVELENGTH_UM["d"]
+    config: Config,
+    geo: GeoLens,
+    at_m: float | Tensor,
+    share: float,
+    light: Light = WAVELENGTH_UM["d"],
 ) -> Tensor:
     """Contrast [periods] of a point spread: the root mean square of its transfer over all directions."""
     energy = spread(config, geo, at_m, share, light).energy

@@ -104,7 +104,13 @@ def read_columns(path: Path, asked: Asked) -> EventColumns:
     return columns
 
 
-def write(path: str | Path, stream: EventStream, *, evt: int | None = None, t0_us: int | None = None) -> None:
+def write(
+    path: str | Path,
+    stream: EventStream,
+    *,
+    evt: int | None = None,
+    t0_us: int | None = None,
+) -> None:
     """Write an event stream; the file appears whole or not at all, and an earlier one stays when writing
     fails.
 

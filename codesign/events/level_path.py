@@ -19,7 +19,13 @@ from codesign.events.intensity import FrontEnd, log_levels
 ROUNDING = 1e-3
 
 
-def finer(frames: Tensor, t_s: Times, longest_s: float, *, log_input: bool = False) -> tuple[Tensor, Tensor]:
+def finer(
+    frames: Tensor,
+    t_s: Times,
+    longest_s: float,
+    *,
+    log_input: bool = False,
+) -> tuple[Tensor, Tensor]:
     """Frames between frames, so that no interval is longer than asked for.
 
     Args:

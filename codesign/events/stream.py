@@ -11,7 +11,14 @@ from codesign.events.entry import Times, check_dtype, check_room, check_times
 from codesign.types import EventStream
 
 
-def ordered(t_us: Tensor, x: Tensor, y: Tensor, p: Tensor, height_px: int, width_px: int) -> EventStream:
+def ordered(
+    t_us: Tensor,
+    x: Tensor,
+    y: Tensor,
+    p: Tensor,
+    height_px: int,
+    width_px: int,
+) -> EventStream:
     """EventStream of the given events, sorted by (t, y, x, p).
 
     Args:

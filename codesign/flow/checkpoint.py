@@ -170,7 +170,11 @@ def read(path: str | Path) -> NetworkFile:
     return NetworkFile(content["network"], content["config"], weights, content.get("metadata", {}))
 
 
-def build(stored: NetworkFile, path: str | Path, kind: Callable[..., Any] | None = None) -> "Network":
+def build(
+    stored: NetworkFile,
+    path: str | Path,
+    kind: Callable[..., Any] | None = None,
+) -> "Network":
     """The network of a NetworkFile; ``path`` is named in errors, ``kind`` as in ``load``.
 
     Raises: FileFormatError when class, configuration and weights do not fit each other.
@@ -206,7 +210,11 @@ def fill(network: nn.Module, weights: Mapping[str, Tensor], path: str | Path) ->
     network.load_state_dict(weights)
 
 
-def write_tensors(path: str | Path, tensors: Mapping[str, Tensor], content: Mapping[str, Any]) -> None:
+def write_tensors(
+    path: str | Path,
+    tensors: Mapping[str, Tensor],
+    content: Mapping[str, Any],
+) -> None:
     """Write tensors and a JSON dictionary with a checksum over both, whole or not at all.
 
     Raises: FileFormatError when the file cannot be written.

@@ -65,7 +65,11 @@ def check_volume(volume: EventVolume, bins: int | None = None, least_bins: int =
     return counts
 
 
-def check_flow(flow_px: Any, shape: tuple[int, ...] | None = None, name: str = "the flow") -> Tensor:
+def check_flow(
+    flow_px: Any,
+    shape: tuple[int, ...] | None = None,
+    name: str = "the flow",
+) -> Tensor:
     """``flow_px`` unchanged when it is a real tensor [B, 2, H, W] with pixels, of this shape where given, and
     finite; DomainError, ShapeError otherwise."""
     axes = "B 2 H W" if shape is None else shape

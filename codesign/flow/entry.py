@@ -65,7 +65,12 @@ def takes_volume(
     """
 
     @wraps(method)
-    def checked(network: Any, volume: EventVolume, *more: Given.args, **named: Given.kwargs) -> Found:
+    def checked(
+        network: Any,
+        volume: EventVolume,
+        *more: Given.args,
+        **named: Given.kwargs,
+    ) -> Found:
         counts = check_volume(volume, network.config["bins"])
         weight = next(network.parameters())
         if weight.device != counts.device:

@@ -29,7 +29,13 @@ def evenly_timed(counts: Tensor) -> EventVolume:
     return EventVolume(counts, *bin_times(counts.shape[2], 1.0))
 
 
-def export(network: nn.Module, path: str | Path, height_px: int, width_px: int, batch: int = 1) -> None:
+def export(
+    network: nn.Module,
+    path: str | Path,
+    height_px: int,
+    width_px: int,
+    batch: int = 1,
+) -> None:
     """Write a network as a program for one size of input.
 
     Args:
@@ -68,7 +74,12 @@ def export(network: nn.Module, path: str | Path, height_px: int, width_px: int, 
             temporary.write_bytes(_onnx(program, type(network).__name__))
 
 
-def trace(network: nn.Module, height_px: int, width_px: int, batch: int = 1) -> torch.export.ExportedProgram:
+def trace(
+    network: nn.Module,
+    height_px: int,
+    width_px: int,
+    batch: int = 1,
+) -> torch.export.ExportedProgram:
     """torch.export's ExportedProgram of a network, in evaluation mode.
 
     What depends on the bins' times alone becomes a constant. The program looks at no value and so refuses

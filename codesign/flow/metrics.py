@@ -68,7 +68,11 @@ def zero_flow_error(truth: Tensor, mask: Tensor | None = None) -> Tensor:
 
 
 def outlier_percent(
-    flow: Tensor, truth: Tensor, mask: Tensor | None = None, pixels: float = 3.0, share: float = 0.05
+    flow: Tensor,
+    truth: Tensor,
+    mask: Tensor | None = None,
+    pixels: float = 3.0,
+    share: float = 0.05,
 ) -> Tensor:
     """Share of pixels, in percent, whose endpoint error is above ``pixels`` AND above ``share`` of the true
     length (KITTI 2015: 3 px and 5 %).
@@ -131,7 +135,12 @@ def masks(volume: EventVolume, truth: FlowField) -> dict[str, Tensor]:
 
 
 def fwl(
-    stream: EventStream, flow_px: Tensor, t0_us: int, t1_us: int, at: float = 1.0, carry_steps: int = 0
+    stream: EventStream,
+    flow_px: Tensor,
+    t0_us: int,
+    t1_us: int,
+    at: float = 1.0,
+    carry_steps: int = 0,
 ) -> float:
     """Flow warp loss: variance of the image of warped events over its variance at zero flow. Above 1 the flow
     makes the events sharper.
@@ -159,7 +168,13 @@ def fwl(
     return float(moved / still)
 
 
-def rsat(stream: EventStream, flow_px: Tensor, t0_us: int, t1_us: int, carry_steps: int = 0) -> float:
+def rsat(
+    stream: EventStream,
+    flow_px: Tensor,
+    t0_us: int,
+    t1_us: int,
+    carry_steps: int = 0,
+) -> float:
     """Ratio of the squared average time stamps, warped to t1 over unwarped. Below 1 the flow aligns the
     events.
 

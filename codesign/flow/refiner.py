@@ -83,7 +83,12 @@ class Refiner(nn.Module):
             for parameter in last.parameters():
                 nn.init.zeros_(parameter)
 
-    def forward(self, volume: EventVolume, start_px: Tensor | None = None, clock: str = "time") -> FlowField:
+    def forward(
+        self,
+        volume: EventVolume,
+        start_px: Tensor | None = None,
+        clock: str = "time",
+    ) -> FlowField:
         """Flow of an EventVolume [B, 2, bins, H, W] of any H, W.
 
         Args:
@@ -107,7 +112,12 @@ class Refiner(nn.Module):
             share = _bends(start.flow_px)
         return [_mixed(volume, start, field, share) for field in self.refined(volume, start, clock=clock)]
 
-    def start(self, volume: EventVolume, start_px: Tensor | None = None, clock: str = "time") -> FlowField:
+    def start(
+        self,
+        volume: EventVolume,
+        start_px: Tensor | None = None,
+        clock: str = "time",
+    ) -> FlowField:
         """The closed form that is corrected."""
         # its solves need full precision
         with torch.autocast(volume.counts.device.type, enabled=False):

@@ -12,7 +12,10 @@ Loss = Callable[[dict[str, torch.Tensor]], torch.Tensor]
 SAME_NUMBERS = 1e-4  # two calls at one point may differ by rounding, not by random numbers
 
 
-def check_groups(params: Mapping[str, torch.Tensor], scales: Mapping[str, float | torch.Tensor]) -> None:
+def check_groups(
+    params: Mapping[str, torch.Tensor],
+    scales: Mapping[str, float | torch.Tensor],
+) -> None:
     """Raise DomainError or ShapeError for parameters that are not floating or are empty, and for scales that are of none,
     do not fit, or are not positive and finite."""
     if not params:
@@ -57,7 +60,11 @@ def components(value: torch.Tensor) -> Iterator[torch.Tensor]:
         yield line
 
 
-def random_lines(value: torch.Tensor, count: int, generator: torch.Generator) -> Iterator[torch.Tensor]:
+def random_lines(
+    value: torch.Tensor,
+    count: int,
+    generator: torch.Generator,
+) -> Iterator[torch.Tensor]:
     """Unit vectors in random directions, in the tensor's shape."""
     for _ in range(count):
         drawn = torch.randn(value.shape, generator=generator, dtype=torch.float64)

@@ -47,7 +47,12 @@ class Row:
     left_out: tuple[float, ...] = ()
 
 
-def make_row(name: str, autograd: Sequence[float], found: Sequence[Difference], tolerance: float) -> Row:
+def make_row(
+    name: str,
+    autograd: Sequence[float],
+    found: Sequence[Difference],
+    tolerance: float,
+) -> Row:
     """Row of derivatives by autograd and by differences along the same lines."""
     a = torch.tensor(autograd, dtype=torch.float64)
     d = torch.tensor([f.value for f in found], dtype=torch.float64)

@@ -13,7 +13,13 @@ from codesign.lens.traced import TracedLens, in_float64
 from codesign.types import Rays
 
 
-def camera_rays(lens: TracedLens, film_mm: Tensor, pupil: Tensor, wavelength_um: float, aim: bool) -> Rays:
+def camera_rays(
+    lens: TracedLens,
+    film_mm: Tensor,
+    pupil: Tensor,
+    wavelength_um: float,
+    aim: bool,
+) -> Rays:
     """Rays from image points through a lens towards the scene; see ``GeoLens.camera_rays``."""
     if aim and lens.dtype != torch.float64:
         return camera_rays(in_float64(lens), film_mm, pupil, wavelength_um, aim)

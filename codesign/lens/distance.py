@@ -15,7 +15,11 @@ Distances = float | Sequence[float] | Tensor  # metres; one, or several as [D]
 PARALLEL = math.inf
 
 
-def vergence_per_mm(lens: ParaxialLens, at_m: Distances, origin_z_mm: Tensor | None = None) -> Tensor:
+def vergence_per_mm(
+    lens: ParaxialLens,
+    at_m: Distances,
+    origin_z_mm: Tensor | None = None,
+) -> Tensor:
     """1 / distance of an object plane, per mm.
 
     Args:

@@ -60,7 +60,13 @@ class Kernel:
         """Whether any surface diffracts, is moved, or carries an obstruction."""
         return any(w.path or w.moved or w.obstructed for w in self.works)
 
-    def __call__(self, arr: Any, origin: Any, direction: Any, *prescription: Any) -> tuple[Any, ...]:
+    def __call__(
+        self,
+        arr: Any,
+        origin: Any,
+        direction: Any,
+        *prescription: Any,
+    ) -> tuple[Any, ...]:
         import drjit as dr
 
         count = dr.width(origin) // 3

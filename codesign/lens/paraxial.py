@@ -83,7 +83,11 @@ def yu_trace(
 
 
 def first_order(
-    power: Tensor, thickness_mm: Tensor, index: Tensor, stop: int, entrance_pupil_diameter_mm: float | Tensor
+    power: Tensor,
+    thickness_mm: Tensor,
+    index: Tensor,
+    stop: int,
+    entrance_pupil_diameter_mm: float | Tensor,
 ) -> FirstOrder:
     """First-order figures. Gradient: to every tensor. Raises: DomainError for an afocal lens, numbers
     that are not finite, or a stop that no ray images.

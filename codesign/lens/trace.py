@@ -357,7 +357,11 @@ def trace(prescription: Prescription, origin_mm: Tensor, direction: Tensor) -> T
     return joined(here, rest, gap + 1)
 
 
-def at_surfaces(prescription: Prescription, origin_mm: Tensor, direction: Tensor) -> list[TraceResult]:
+def at_surfaces(
+    prescription: Prescription,
+    origin_mm: Tensor,
+    direction: Tensor,
+) -> list[TraceResult]:
     """The rays on each surface [S], before it bends them; positions relative to its vertex."""
     count = len(prescription.mirrors)
     return [trace(prescription.until(i), origin_mm, direction) for i in range(count)]

@@ -30,7 +30,12 @@ class TracedLens(ParaxialLens, Protocol):
 
     def prescription(self, wavelength_um: float = D_UM) -> Prescription: ...
 
-    def trace(self, origin_mm: Tensor, direction: Tensor, wavelength_um: float = D_UM) -> TraceResult: ...
+    def trace(
+        self,
+        origin_mm: Tensor,
+        direction: Tensor,
+        wavelength_um: float = D_UM,
+    ) -> TraceResult: ...
 
     def replace(self, **tensors: Tensor) -> Self: ...
 

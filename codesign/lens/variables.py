@@ -59,7 +59,10 @@ class Variables(nn.Module):
     """
 
     def __init__(
-        self, tensors: Mapping[str, Tensor], chosen: Mapping[str, Chosen], held: Mapping[str, Tensor]
+        self,
+        tensors: Mapping[str, Tensor],
+        chosen: Mapping[str, Chosen],
+        held: Mapping[str, Tensor],
     ) -> None:
         super().__init__()
         self.tensor_of = {name: kind.tensor for name, kind in chosen.items()}
@@ -103,7 +106,10 @@ class Variables(nn.Module):
         }
 
 
-def ray_motion(ahead: tuple[Tensor, Tensor], behind: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+def ray_motion(
+    ahead: tuple[Tensor, Tensor],
+    behind: tuple[Tensor, Tensor],
+) -> tuple[Tensor, Tensor]:
     """How rays move on the film between two states of a lens: [fields, M, 2] mm, and [fields, M] 1 for rays
     that arrive in both, else 0.
 

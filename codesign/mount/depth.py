@@ -14,7 +14,12 @@ from codesign.types import ChiefRayCamera
 LEVEL = 1e-6  # metres that a ray must fall per metre of depth to meet the ground
 
 
-def ground_depth(camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, scene: Any = None) -> Tensor:
+def ground_depth(
+    camera: ChiefRayCamera,
+    pixels: Tensor,
+    T_world_cam: Tensor,
+    scene: Any = None,
+) -> Tensor:
     """Depth of the plane z = 0 of the world.
 
     Args:
@@ -49,7 +54,12 @@ def scene_depth(camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, sce
     return torch.where(hits.part == 0, ahead(hits.distance_m), torch.inf)
 
 
-def hidden_by_objects(camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, scene: Any) -> Tensor:
+def hidden_by_objects(
+    camera: ChiefRayCamera,
+    pixels: Tensor,
+    T_world_cam: Tensor,
+    scene: Any,
+) -> Tensor:
     """[N, P] bool: where an object of a MovingScene is seen. Arguments as for ``ground_depth``. No
     gradient."""
     if not any(isinstance(world, MovingScene) for world in _scenes(scene)):

@@ -188,7 +188,11 @@ class Mount(nn.Module):
         return motion.square().sum(1).mean(0).sqrt()
 
 
-def attitude(yaw_rad: float | Tensor, pitch_rad: float | Tensor, roll_rad: float | Tensor) -> Tensor:
+def attitude(
+    yaw_rad: float | Tensor,
+    pitch_rad: float | Tensor,
+    roll_rad: float | Tensor,
+) -> Tensor:
     """Rotations [..., 3, 3] float64 from camera to body axes: Rz(yaw) Ry(pitch) Rx(roll) after the axes of a
     level camera.
 

@@ -182,7 +182,11 @@ class LookAhead:
         return torch.minimum(over, forward)
 
 
-def penalty(requirements: Sequence[Requirement], T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
+def penalty(
+    requirements: Sequence[Requirement],
+    T_body_cam: Tensor,
+    camera: ChiefRayCamera,
+) -> Tensor:
     """What to add to an objective so that a search keeps to its requirements: sum of max(0, 1 - slack /
     step)^2.
 
@@ -212,7 +216,11 @@ class Verdict:
 
 
 @torch.no_grad()
-def judge(requirements: Sequence[Requirement], T_body_cam: Tensor, camera: ChiefRayCamera) -> list[Verdict]:
+def judge(
+    requirements: Sequence[Requirement],
+    T_body_cam: Tensor,
+    camera: ChiefRayCamera,
+) -> list[Verdict]:
     """The hard answer for one mount [4, 4], one Verdict for each requirement."""
     if T_body_cam.shape != (4, 4):
         raise ShapeError(f"judge: one mount [4, 4] is judged at a time, got {tuple(T_body_cam.shape)}.")
@@ -224,7 +232,11 @@ def judge(requirements: Sequence[Requirement], T_body_cam: Tensor, camera: Chief
 
 
 @torch.no_grad()
-def first_missed(requirements: Sequence[Requirement], T_body_cam: Tensor, camera: Any) -> Requirement | None:
+def first_missed(
+    requirements: Sequence[Requirement],
+    T_body_cam: Tensor,
+    camera: Any,
+) -> Requirement | None:
     """The first requirement that one mount [4, 4] does not keep, by the hard answer; None where all are kept."""
     for each in requirements:
         if float(each.exact(T_body_cam, camera).min()) < 0:

@@ -71,7 +71,11 @@ def starts(
 
 @torch.no_grad()
 def check_mount(
-    mount: Mount, requirements: Sequence[Requirement], camera: ChiefRayCamera, *, reach_m: float = 0.3
+    mount: Mount,
+    requirements: Sequence[Requirement],
+    camera: ChiefRayCamera,
+    *,
+    reach_m: float = 0.3,
 ) -> None:
     """Look at box, requirements and camera before anything is rendered.
 

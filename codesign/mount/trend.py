@@ -35,7 +35,12 @@ class PrecisionTrend:
         self._right: Tensor | None = None
 
     @torch.no_grad()
-    def add(self, read: Readings, flow_px: Tensor, covered: Tensor | None = None) -> "PrecisionTrend":
+    def add(
+        self,
+        read: Readings,
+        flow_px: Tensor,
+        covered: Tensor | None = None,
+    ) -> "PrecisionTrend":
         """Take in readings whose true flow is [N, P, 2] px; points without a surface are left out.
 
         covered: share of each window that the robot's own body covers, [windows] (``OwnBody.covered``) or [N,
@@ -66,7 +71,13 @@ class PrecisionTrend:
         errors as ``followed``."""
         return _terms(read, flow_px, covered) @ self._coefficients()
 
-    def carried(self, here: Readings, told_here: Tensor, there: Readings, told_there: Tensor) -> Readings:
+    def carried(
+        self,
+        here: Readings,
+        told_here: Tensor,
+        there: Readings,
+        told_there: Tensor,
+    ) -> Readings:
         """Readings of the same points and textures as if they had been made from another place, no picture of
         which there is.
 

@@ -70,7 +70,12 @@ class Descent(torch.optim.Optimizer):
                 parameter.copy_((moved * grain).round() / grain if grain else moved)
         return value
 
-    def _velocity(self, parameter: torch.Tensor, slope: torch.Tensor, group: dict[str, Any]) -> torch.Tensor:
+    def _velocity(
+        self,
+        parameter: torch.Tensor,
+        slope: torch.Tensor,
+        group: dict[str, Any],
+    ) -> torch.Tensor:
         state = self.state[parameter]
         if "velocity" not in state:
             state["velocity"] = torch.zeros_like(parameter)

@@ -9,7 +9,10 @@ from torch import Tensor
 from codesign.errors import DomainError, GradientError, ShapeError
 
 
-def sample_gradients(losses: Iterable[Tensor], parameters: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+def sample_gradients(
+    losses: Iterable[Tensor],
+    parameters: Sequence[Tensor],
+) -> tuple[Tensor, Tensor]:
     """Values and gradients of sample losses, each taken as soon as it is made, so that one graph lives at a
     time.
 

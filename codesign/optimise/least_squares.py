@@ -174,7 +174,11 @@ class DampedLeastSquares:
         self.stopped = self._why(steepest, moved, size, before, after, accepted)
         return entry
 
-    def run(self, steps: int | None = None, progress: Callable[[Entry], object] | None = None) -> Tensor:
+    def run(
+        self,
+        steps: int | None = None,
+        progress: Callable[[Entry], object] | None = None,
+    ) -> Tensor:
         """Step until a rule ends it, or for ``steps`` more. ``progress`` is called after each step. Returns
         the variables."""
         self.stopped = ""

@@ -235,7 +235,12 @@ class Camera:
             _, slope = lines(self.chief_rays(self.film.middle_px + beside))
         return float(slope[1, 0] - slope[0, 0])
 
-    def rays_through(self, pixels: Tensor, pupil: Tensor, wavelength_um: float | None = None) -> Rays:
+    def rays_through(
+        self,
+        pixels: Tensor,
+        pupil: Tensor,
+        wavelength_um: float | None = None,
+    ) -> Rays:
         """Rays of pixel coordinates [N, 2] through points [N, 2] of the pupil, of one colour (the d line when
         none is given): Rays, float64. The axial ray goes along: only a lens that passes nothing at all is an
         error."""

@@ -77,7 +77,12 @@ def _areas(corners):
     return np.linalg.norm(across(corners), axis=1) / 2
 
 
-def placed(mi: Any, chart: Chart | Nodes, to_world: np.ndarray, light: list[np.ndarray]) -> tuple[Any, Any]:
+def placed(
+    mi: Any,
+    chart: Chart | Nodes,
+    to_world: np.ndarray,
+    light: list[np.ndarray],
+) -> tuple[Any, Any]:
     """The shape moved by a similarity [4, 4], with its light as emission: textures [H, W] of a Chart, values
     [N] of Nodes, of its front and, where there are two, of its back. Returns the shape and the emitter of its
     back or None."""

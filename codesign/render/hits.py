@@ -21,7 +21,13 @@ class Hits(Rows):
     distance_m: Tensor
 
 
-def first_hits(origin_cam_m: Tensor, direction_cam: Tensor, lit: Tensor, scene: Any, cameras: Tensor) -> Hits:
+def first_hits(
+    origin_cam_m: Tensor,
+    direction_cam: Tensor,
+    lit: Tensor,
+    scene: Any,
+    cameras: Tensor,
+) -> Hits:
     """The nearest surface of all parts of a scene along rays given in camera space.
 
     Args:

@@ -199,7 +199,11 @@ class Choice:
 
 
 def choose(
-    levels: Mapping[str, Any], camera: Camera, T_world_cam: Tensor, tolerance: float, after_gain: bool = False
+    levels: Mapping[str, Any],
+    camera: Camera,
+    T_world_cam: Tensor,
+    tolerance: float,
+    after_gain: bool = False,
 ) -> Choice:
     """The cheapest light level whose RMS radiance error against the last one stays within a tolerance in
     every frame.

@@ -144,7 +144,12 @@ class PsfMap:
         return found.permute(0, 1, 3, 5, 2, 4).flip((-2, -1))
 
 
-def psf_map(camera: Camera, nearest_m: float = 0.3, cell_px: int = 64, rays_per_px: int = 4) -> PsfMap:
+def psf_map(
+    camera: Camera,
+    nearest_m: float = 0.3,
+    cell_px: int = 64,
+    rays_per_px: int = 4,
+) -> PsfMap:
     """Trace what the point spread functions of a camera at all distances from ``nearest_m`` on follow from.
 
     Args:

@@ -225,7 +225,14 @@ class Track:
     chief: tuple[Tensor, Tensor] | None = None
 
 
-def track(camera: Camera, views: Views, now: Tensor, later: Tensor, pixels: Tensor, rays: Rays) -> Track:
+def track(
+    camera: Camera,
+    views: Views,
+    now: Tensor,
+    later: Tensor,
+    pixels: Tensor,
+    rays: Rays,
+) -> Track:
     """Track of the pixel coordinates [P, 2] and their chief rays from frames ``now`` to frames ``later``
     (numbers [F]) of a sequence."""
     hits = hits_of(rays, views.scene, views.cameras[:, now])

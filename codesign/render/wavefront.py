@@ -15,7 +15,12 @@ from codesign.render.pixel_means import Wavefront, lanes, nearest, pixel_means, 
 from codesign.types import Rays
 
 
-def shade(rays: Rays, scene: Scene | MovingScene, T_world_cam: Poses, samples_per_pixel: int) -> Tensor:
+def shade(
+    rays: Rays,
+    scene: Scene | MovingScene,
+    T_world_cam: Poses,
+    samples_per_pixel: int,
+) -> Tensor:
     """Pixel means [..., T, P] of the radiance along rays given in camera space, seen from every pose.
 
     Args:

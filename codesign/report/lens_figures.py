@@ -33,7 +33,10 @@ LINE_COLOURS = ("#2e8b57", "#1b6ca8", "#c0392b", "#8e44ad", "#d68910")
 
 @torch.no_grad()
 def spot_diagrams(
-    lenses: Mapping[str, GeoLens], fields_rad: Sequence[float], pixel_mm: float, at_m: float = PARALLEL
+    lenses: Mapping[str, GeoLens],
+    fields_rad: Sequence[float],
+    pixel_mm: float,
+    at_m: float = PARALLEL,
 ) -> Figure:
     """Figure of spot diagrams: a row per lens (dict title -> lens), a column per field, one scale, the pixel
     drawn in."""
@@ -163,7 +166,11 @@ def psf_pictures(psfs: Sequence[Psf], titles: Sequence[str]) -> Figure:
     return figure
 
 
-def mtf_curves(frequency_per_mm: Tensor, curves: Mapping[str, Tensor], ideal: Tensor | None = None) -> Figure:
+def mtf_curves(
+    frequency_per_mm: Tensor,
+    curves: Mapping[str, Tensor],
+    ideal: Tensor | None = None,
+) -> Figure:
     """Figure of MTFs.
 
     Args:
@@ -196,7 +203,13 @@ def finish(axis: Any, **options: Any) -> None:
         axis.legend(fontsize=8, frameon=False)
 
 
-def _grid(rows: int, columns: int, width: float, height: float, **shared: Any) -> tuple[Figure, Any]:
+def _grid(
+    rows: int,
+    columns: int,
+    width: float,
+    height: float,
+    **shared: Any,
+) -> tuple[Figure, Any]:
     """A figure and its axes [rows, columns], each that large in inches."""
     size = (width * columns + 0.4, height * rows)
     return plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained", **shared)

@@ -72,7 +72,12 @@ def picture(path: str | Path, caption: str) -> Picture:
         ) from error
 
 
-def table(title: str, columns: Iterable[str], rows: Iterable[Iterable[Any]], caption: str = "") -> Table:
+def table(
+    title: str,
+    columns: Iterable[str],
+    rows: Iterable[Iterable[Any]],
+    caption: str = "",
+) -> Table:
     """Table of numbers, text and None (shown as a dash). A column of numbers is right-aligned; floats show
     four digits.
 

@@ -25,7 +25,13 @@ PICTURE = 256  # values from which on the scale of frames can be judged
 LONGEST_S = 2.0  # a window of flow that lasts longer is in milliseconds
 
 
-def check_layout(by: str, value: Any, kind: type, shape: str | tuple[int, ...] = "", **sizes: int) -> None:
+def check_layout(
+    by: str,
+    value: Any,
+    kind: type,
+    shape: str | tuple[int, ...] = "",
+    **sizes: int,
+) -> None:
     """Raise unless a value is of a kind and its tensors have their layouts, with the sizes that letters stand for.
 
     Args:

@@ -157,7 +157,12 @@ class System(nn.Module):
             raise DomainError(f"there is no {asked}; there are {', '.join(self.named_objectives)}.")
         return chosen
 
-    def begin(self, batch: Batch, recorded: Mapping[str, Any] | None = None, probe: bool = False) -> "Pass":
+    def begin(
+        self,
+        batch: Batch,
+        recorded: Mapping[str, Any] | None = None,
+        probe: bool = False,
+    ) -> "Pass":
         """A pass to read from by name (``["frames"]``, ``["volume"]``, ...); each stage runs when it is asked for."""
         return Pass(self, batch, dict(recorded or {}), probe)
 

@@ -173,7 +173,12 @@ class Started:
         one and a fifth of the start's flow, and a covariance of 1 px^2 along both axes.
     """
 
-    def __init__(self, source: Source, start: Callable[[EventVolume], FlowField], foreign: float = 0.0):
+    def __init__(
+        self,
+        source: Source,
+        start: Callable[[EventVolume], FlowField],
+        foreign: float = 0.0,
+    ):
         self.source = source
         self.start = start
         self.foreign = foreign

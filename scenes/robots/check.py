@@ -20,7 +20,11 @@ LEAST_FOLLOWED = 0.05  # of the pixels that show a surface: the pairs have 0.7 a
 
 
 @torch.no_grad()
-def check_pair(pair: RobotPair, camera: render.Camera | None = None, numbers: Sequence[int] = (0,)) -> None:
+def check_pair(
+    pair: RobotPair,
+    camera: render.Camera | None = None,
+    numbers: Sequence[int] = (0,),
+) -> None:
     """Look at bounds, mount, drives and worlds of a pair.
 
     Args:

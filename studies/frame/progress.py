@@ -45,7 +45,15 @@ class StepProgress:
       pace: what earlier sessions measured; goes on to be filled.
     """
 
-    def __init__(self, console: Console, total: int, description: str, done: int, interruption, pace: Pace):
+    def __init__(
+        self,
+        console: Console,
+        total: int,
+        description: str,
+        done: int,
+        interruption,
+        pace: Pace,
+    ):
         self.total = total
         self.description = description
         self.done = done

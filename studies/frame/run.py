@@ -268,7 +268,11 @@ def open_run(
     return Run(study, config, folder, device, False, interruption)
 
 
-def main(study: Callable[[Run[Config]], None], kind: type[Config], arguments: list[str] | None = None) -> int:
+def main(
+    study: Callable[[Run[Config]], None],
+    kind: type[Config],
+    arguments: list[str] | None = None,
+) -> int:
     """Run a study from its command line.
 
     Returns: exit code: 0 done, 2 bad input (one clear line on stderr), 130 interrupted, 143 ended by SIGTERM

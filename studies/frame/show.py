@@ -126,7 +126,11 @@ def panels(*charts: Panel, width: float = 4.5) -> Figure:
     return figure
 
 
-def pictures(rows: Mapping[str, Mapping[str, Any]], signed: Iterable[str] = (), side: float = 2.3) -> Figure:
+def pictures(
+    rows: Mapping[str, Mapping[str, Any]],
+    signed: Iterable[str] = (),
+    side: float = 2.3,
+) -> Figure:
     """Figure of pictures: row label -> column title -> [H, W] or, in colours of 0 to 1, [H, W, 3].
 
     Grey pictures of a row share their scale, with a display's gamma; columns that are ``signed`` are red
@@ -155,7 +159,10 @@ def pictures(rows: Mapping[str, Mapping[str, Any]], signed: Iterable[str] = (), 
 
 
 def bars(
-    values: Mapping[str, float | Interval], xlabel: str, log: bool = False, level: float | None = None
+    values: Mapping[str, float | Interval],
+    xlabel: str,
+    log: bool = False,
+    level: float | None = None,
 ) -> Figure:
     """Figure of horizontal bars, with whiskers where a value is an Interval; ``level`` is drawn as a red
     line."""

@@ -132,7 +132,12 @@ def _optimiser(config, system, objective, train, part, case):
     )
 
 
-def development_error(task: LensTask, flow: Any, cases: int, samples: int) -> Callable[[lens.GeoLens], float]:
+def development_error(
+    task: LensTask,
+    flow: Any,
+    cases: int,
+    samples: int,
+) -> Callable[[lens.GeoLens], float]:
     """Function of a lens to its geometric mean hard flow error on the development cases, mrad."""
     pool = make_worlds(DEVELOPMENT)
     drawn = [draw_case(pool, DEVELOPED + i, frames=17) for i in range(cases)]

@@ -124,7 +124,11 @@ def shrink_spots(
     return found
 
 
-def residuals(task: LensTask, size: Tensor, weights: tuple[float, ...]) -> Callable[[Tensor], Tensor]:
+def residuals(
+    task: LensTask,
+    size: Tensor,
+    weights: tuple[float, ...],
+) -> Callable[[Tensor], Tensor]:
     """Function of relative changes [V] to ray errors in pixels, whose squares sum to the weighted mean square spot;
     and to failed rays and edges below their floors."""
     kept = [(angle, w) for angle, w in zip(angles_rad(task), weights, strict=True) if w > 0]

@@ -49,7 +49,12 @@ def part_path(folder: Path, index: int):
     return folder / PARTS / f"{index:06d}.h5"
 
 
-def write_part(path: Path, arrays: dict[str, torch.Tensor], events: EventStream, state: SensorState):
+def write_part(
+    path: Path,
+    arrays: dict[str, torch.Tensor],
+    events: EventStream,
+    state: SensorState,
+):
     """Store arrays per frame (named as in FRAME_TYPES), events, and the sensor's state after them."""
     content = io.BytesIO()
     generator = state.generator or torch.Generator()

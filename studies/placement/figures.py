@@ -24,7 +24,12 @@ DRAWN_M = 0.6  # length of the drawn view
 COLOURS = ("#d62728", "#7f7f7f", "#1f77b4", "#2ca02c", "#9467bd", "#8c564b")
 
 
-def ways(problem: Problem, trails: dict[str, list[Trail]], errors: dict[str, Tensor], samples: int) -> Figure:
+def ways(
+    problem: Problem,
+    trails: dict[str, list[Trail]],
+    errors: dict[str, Tensor],
+    samples: int,
+) -> Figure:
     """Errors on unseen samples, and the best that a search saw of its own, over drives rendered; and of all
     mounts looked at height, pitch and error, below the ways of the descents.
 

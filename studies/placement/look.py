@@ -90,7 +90,13 @@ def surroundings(pair: RobotPair, pose: Tensor) -> Surroundings:
     return Surroundings((x, y, z), T_world_body, axes=pair.axes)
 
 
-def what_it_tells(run: Run[Any], pair: RobotPair, camera: render.Camera, pose: Tensor, marked: str) -> bool:
+def what_it_tells(
+    run: Run[Any],
+    pair: RobotPair,
+    camera: render.Camera,
+    pose: Tensor,
+    marked: str,
+) -> bool:
     """Show what a mount [4, 4] is blind to over flat ground, and all other directions there; False where it
     is too low."""
     around = surroundings(pair, pose)

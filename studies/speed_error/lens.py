@@ -80,7 +80,14 @@ def stage(run: Run[Config]) -> list[Asked]:
     return [*figures, Asked(what, min(column(rows, "ratio")), least=ASKED_ANALYSIS)]
 
 
-def tracing(precision: str, kind: str, tracer: str, count: int, repeats: int, seed: int) -> dict[str, Any]:
+def tracing(
+    precision: str,
+    kind: str,
+    tracer: str,
+    count: int,
+    repeats: int,
+    seed: int,
+) -> dict[str, Any]:
     """Cost and largest error of one tracer."""
     warnings.simplefilter("ignore")
     make = trace_by_optiland if tracer == "optiland" else trace_by_us

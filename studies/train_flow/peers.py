@@ -37,7 +37,13 @@ class ECN(Baseline):
 
     INSIDE: ClassVar[float] = 2.0
 
-    def __init__(self, bins: int = 8, width: float = 16.0, hidden: int | None = None, seed: int = 0) -> None:
+    def __init__(
+        self,
+        bins: int = 8,
+        width: float = 16.0,
+        hidden: int | None = None,
+        seed: int = 0,
+    ) -> None:
         super().__init__(bins, width, hidden, seed=seed)
         sizes = [channels(width, factor) for factor in (1, 2, 3, 4)]
         kept = [channels(width, factor) for factor in (3, 2, 1, 0.5)]

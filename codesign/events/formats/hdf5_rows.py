@@ -179,7 +179,11 @@ class Rows:
     """
 
     def __init__(
-        self, path: str | Path, name: str, columns: Sequence[int] | None = None, count: int | None = None
+        self,
+        path: str | Path,
+        name: str,
+        columns: Sequence[int] | None = None,
+        count: int | None = None,
     ) -> None:
         self.path = check_regular(path)
         self.name = name

@@ -235,7 +235,10 @@ class ComparatorLayer(EventLayer):
     learnable = ("theta_on", "theta_off", "theta_sigma", "cutoff_hz")
 
     def __init__(
-        self, comparator: Callable[..., tuple[Tensor, Any]], sensor: SensorModel | None = None, **options: Any
+        self,
+        comparator: Callable[..., tuple[Tensor, Any]],
+        sensor: SensorModel | None = None,
+        **options: Any,
     ):
         super().__init__(sensor, **options)
         check_comparator(comparator, self.sensor, self.learnt)

@@ -300,7 +300,12 @@ class HardSensor(nn.Module):
         self.lead_s = check_lead(lead_s)
 
     @torch.no_grad()
-    def forward(self, frames: Tensor, t_s: Tensor, generator: Generator | None = None) -> EventVolume:
+    def forward(
+        self,
+        frames: Tensor,
+        t_s: Tensor,
+        generator: Generator | None = None,
+    ) -> EventVolume:
         """Events of frames [N, T, H, W] at t_s [T] in time bins, [N, 2, bins, H, W].
 
         generator: one for all samples, which stand above one another as one tall sensor; None: seed 0.

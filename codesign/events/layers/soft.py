@@ -23,7 +23,11 @@ MOST_SPREAD = 1.0
 
 
 def soft(
-    frames: Tensor, theta: Tensor | float, *, sharpness: float | None = None, log_input: bool = False
+    frames: Tensor,
+    theta: Tensor | float,
+    *,
+    sharpness: float | None = None,
+    log_input: bool = False,
 ) -> Tensor:
     """Soft events of consecutive frames, without memory and capped at one per pixel, polarity and frame.
 

@@ -264,7 +264,11 @@ def of_pixels(theta: Any, sigma: Any, deviate: Tensor | None, like: Tensor) -> T
 
 
 def draw_leaks(
-    sensor: SensorModel, pixels: Sequence[int], generator: Generator, *, dtype: torch.dtype = torch.float32
+    sensor: SensorModel,
+    pixels: Sequence[int],
+    generator: Generator,
+    *,
+    dtype: torch.dtype = torch.float32,
 ) -> tuple[Tensor | None, Tensor | None]:
     """What makes the leaks of pixels differ, drawn only where the sensor has it: standard normal numbers of
     the spread, then even ones in 0 to 1, by which pixels are hot. [*pixels] each, or None."""

@@ -236,7 +236,13 @@ def _check_range(layout, end_s):
 
 
 @torch.no_grad()
-def naive(frames: Tensor, t_s: Times, theta: Tensor | float, *, log_input: bool = False) -> EventStream:
+def naive(
+    frames: Tensor,
+    t_s: Times,
+    theta: Tensor | float,
+    *,
+    log_input: bool = False,
+) -> EventStream:
     """At most one event per pixel and frame: ON when dL >= theta, OFF when dL <= -theta between consecutive
     frames.
 

@@ -177,7 +177,12 @@ class SpikeEsim(nn.Module):
             )
         return counts, SpikeEsimState(*after, frames[-1], float(times_s[-1]), comparator)
 
-    def expected_noise(self, frames: Tensor, t_s: Times, state: SpikeEsimState | None = None) -> Tensor:
+    def expected_noise(
+        self,
+        frames: Tensor,
+        t_s: Times,
+        state: SpikeEsimState | None = None,
+    ) -> Tensor:
         """Mean number of noise events per interval, [T-1, 2, ...] ([T, 2, ...] with a state), ON first.
         Gradient: the noise rates, frames."""
         frames, times_s = _checked(frames, t_s, state)

@@ -69,7 +69,12 @@ def check_mean(kernel, coupled, others, state):
 
 
 def mean_spikes(
-    response: Tensor, theta: Tensor, h_reset: Tensor, kernel: str, reset_scale: float, before: Tensor | None
+    response: Tensor,
+    theta: Tensor,
+    h_reset: Tensor,
+    kernel: str,
+    reset_scale: float,
+    before: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """Mean spikes of the noisy neurons.
 
@@ -169,7 +174,12 @@ def with_play(spikes, level, theta_on, theta_off, state):
     return straight_through(spikes, counts), (before, centre)
 
 
-def held_back(level: Tensor, centre: Tensor, theta_on: Tensor, theta_off: Tensor) -> tuple[Tensor, Tensor]:
+def held_back(
+    level: Tensor,
+    centre: Tensor,
+    theta_on: Tensor,
+    theta_off: Tensor,
+) -> tuple[Tensor, Tensor]:
     """The level [T, ...], held back to one threshold beyond a play, and the centre [...] of the play after
     it."""
     pixels = level.shape[1:]

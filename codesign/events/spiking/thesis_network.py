@@ -72,7 +72,11 @@ class TwoBranchSpikes(nn.Module):
         }
 
     def forward(
-        self, frames: Tensor, state: BranchState | None = None, *, theta: Tensor | float | None = None
+        self,
+        frames: Tensor,
+        state: BranchState | None = None,
+        *,
+        theta: Tensor | float | None = None,
     ) -> tuple[Tensor, Tensor, BranchState]:
         """Spikes of the frames.
 

@@ -18,7 +18,11 @@ NEVER_US = torch.iinfo(torch.int64).min
 
 
 def surface_from_stream(
-    stream: EventStream, at_us: Tensor | Sequence[int], tau_s: float, *, dtype: torch.dtype = torch.float32
+    stream: EventStream,
+    at_us: Tensor | Sequence[int],
+    tau_s: float,
+    *,
+    dtype: torch.dtype = torch.float32,
 ) -> Tensor:
     """Time surface of a stream at given times.
 

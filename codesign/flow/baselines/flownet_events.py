@@ -29,7 +29,13 @@ class FlowNetEvents(Baseline):
     torch.Size([1, 2, 32, 48])
     """
 
-    def __init__(self, bins: int = 8, width: float = 32.0, hidden: int | None = None, seed: int = 0) -> None:
+    def __init__(
+        self,
+        bins: int = 8,
+        width: float = 32.0,
+        hidden: int | None = None,
+        seed: int = 0,
+    ) -> None:
         super().__init__(bins, width, hidden, seed=seed)
         down = [channels(width, factor) for factor in (1, 2, 4, 8)]
         up = [channels(width, factor) for factor in (4, 2, 1, 0.5)]

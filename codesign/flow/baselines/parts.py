@@ -28,7 +28,14 @@ class Baseline(nn.Module):
     STRIDE: ClassVar[int] = 16
     INSIDE: ClassVar[float] = 8.0  # channels inside the residual blocks, over the width
 
-    def __init__(self, bins: int, width: float, hidden: int | None, even: bool = False, **rest: Any) -> None:
+    def __init__(
+        self,
+        bins: int,
+        width: float,
+        hidden: int | None,
+        even: bool = False,
+        **rest: Any,
+    ) -> None:
         super().__init__()
         check_bins(bins, even)
         check_sizes(width, hidden)
@@ -120,7 +127,11 @@ def start(module: nn.Module, seed: int, variance: float, heads: Iterable[nn.Modu
                     part.bias.zero_()
 
 
-def fill_budget(build: Callable[..., nn.Module], weights: int, inside: float = 8.0) -> tuple[float, int]:
+def fill_budget(
+    build: Callable[..., nn.Module],
+    weights: int,
+    inside: float = 8.0,
+) -> tuple[float, int]:
     """Arguments (width, hidden) of the network with the fewest weights that is not below the budget.
 
     Args:

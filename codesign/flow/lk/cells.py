@@ -34,7 +34,14 @@ class Cells:
     component before anything is seen.
     """
 
-    def __init__(self, batch: int, height: int, width: int, prior_px: float, device: torch.device) -> None:
+    def __init__(
+        self,
+        batch: int,
+        height: int,
+        width: int,
+        prior_px: float,
+        device: torch.device,
+    ) -> None:
         rows, columns = -(-height // CELL), -(-width // CELL)
         self.prior_px = prior_px
         self.scales = 1 + max(1, int(math.log2(max(height, width, 2 * CELL) / (2 * CELL))))

@@ -139,7 +139,13 @@ def descended(
     return descents[0].at_start(way.start)
 
 
-def field(volume: EventVolume, way: Path, flow: Tensor, covariance: Tensor, confidence: Tensor) -> FlowField:
+def field(
+    volume: EventVolume,
+    way: Path,
+    flow: Tensor,
+    covariance: Tensor,
+    confidence: Tensor,
+) -> FlowField:
     """FlowField over the interval of what was found along the way."""
     net, share = _net(way, volume.counts)
     interval_s = float(volume.collected_s.sum())
@@ -220,7 +226,14 @@ class Descent:
         flow = level.moments.flow(self.parameters())
         return flow + self.cells.on(level).to(flow) if self.local else flow
 
-    def descend(self, level: Level, steps: int, bend: bool, last: bool, expected: bool = False) -> None:
+    def descend(
+        self,
+        level: Level,
+        steps: int,
+        bend: bool,
+        last: bool,
+        expected: bool = False,
+    ) -> None:
         """Moves to the best field, by steps no longer than the linearisation reaches.
 
         Args:

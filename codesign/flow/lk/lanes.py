@@ -121,7 +121,10 @@ def tensors(shape: tuple[int, ...], *values: Any) -> list[Tensor]:
 
 
 def in_graph(
-    forward: Callable[..., Any], adjoint: Callable[..., Any], settings: tuple[Any, ...], *given: Tensor
+    forward: Callable[..., Any],
+    adjoint: Callable[..., Any],
+    settings: tuple[Any, ...],
+    *given: Tensor,
 ) -> tuple[Tensor, ...]:
     """What a kernel gives, in a graph of torch.
 

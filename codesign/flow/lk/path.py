@@ -47,7 +47,13 @@ class Path:
     direction: Tensor
 
 
-def path(signed: Tensor, events: Tensor, weight: Tensor, time: Tensor, mirrored: bool = False) -> Path:
+def path(
+    signed: Tensor,
+    events: Tensor,
+    weight: Tensor,
+    time: Tensor,
+    mirrored: bool = False,
+) -> Path:
     """The way of each sample.
 
     Args:

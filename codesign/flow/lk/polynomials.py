@@ -29,7 +29,12 @@ class Polynomials:
     """Fields of one model over an image of height x width pixels."""
 
     def __init__(
-        self, model: str, height: int, width: int, prior_px: float = 1.0, device: torch.device | None = None
+        self,
+        model: str,
+        height: int,
+        width: int,
+        prior_px: float = 1.0,
+        device: torch.device | None = None,
     ) -> None:
         self.terms = TERMS[model]
         self.powers = torch.tensor(POWERS[: self.terms], device=device)

@@ -53,7 +53,12 @@ class Setting:
 
 
 def at_start(
-    shape: Polynomials, parameters: Tensor, spread: Tensor, cells: Cells, joined: bool, start: Tensor
+    shape: Polynomials,
+    parameters: Tensor,
+    spread: Tensor,
+    cells: Cells,
+    joined: bool,
+    start: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Flow, its covariance, and confidence.
 

@@ -185,7 +185,12 @@ class CameraFit:
     Raises: FileFormatError when rays point backwards or the fit is worse than 0.01 px.
     """
 
-    def __init__(self, direction: np.ndarray, origin_m: np.ndarray, name: str = "the camera") -> None:
+    def __init__(
+        self,
+        direction: np.ndarray,
+        origin_m: np.ndarray,
+        name: str = "the camera",
+    ) -> None:
         direction = np.asarray(direction, np.float64)
         origin = np.asarray(origin_m, np.float64)
         if (

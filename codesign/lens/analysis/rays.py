@@ -30,7 +30,11 @@ Values = Sequence[float] | Tensor | np.ndarray
 Light = float | Values | SpectralLines  # wavelengths in um, of equal weight where they come alone
 
 
-def pupil_grid(count: int, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
+def pupil_grid(
+    count: int,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str = "cpu",
+) -> Tensor:
     """Cell centres of a count x count grid over [-1, 1]^2 that lie in the unit disc, [M, 2]."""
     count = check_whole(count, "samples across a pupil grid")
     line = (torch.arange(count, dtype=dtype, device=device) + 0.5) / count * 2 - 1

@@ -129,7 +129,11 @@ def gap_mm(lens: GeoLens, heights: Tensor, semi_aperture_mm: Tensor | None = Non
     return lens.thickness_mm[:-1, None] + sag(slice(1, None)) - sag(slice(None, -1))
 
 
-def evaluate(lens: GeoLens, limits: Limits, semi_aperture_mm: Tensor | None = None) -> list[Constraint]:
+def evaluate(
+    lens: GeoLens,
+    limits: Limits,
+    semi_aperture_mm: Tensor | None = None,
+) -> list[Constraint]:
     """All constraints that ``limits`` asks for, a list of Constraint.
 
     Args:

@@ -30,7 +30,12 @@ class Hits:
     passed: Tensor
 
 
-def surface_hits(lens: GeoLens, origin_mm: Tensor, direction: Tensor, wavelength_um: float = D_UM) -> Hits:
+def surface_hits(
+    lens: GeoLens,
+    origin_mm: Tensor,
+    direction: Tensor,
+    wavelength_um: float = D_UM,
+) -> Hits:
     """Trace rays once per surface, up to it, and once to the image. Args: origin_mm, direction [N, 3], see
     GeoLens.trace. Returns: Hits.
 

@@ -332,7 +332,11 @@ def compare(slopes: Tensor, trials: Trials) -> Comparison:
 
 
 def worst_offenders(
-    lens: GeoLens, tolerances: Tolerances | Sequence[Error], slopes: Tensor, figure: int, most: int = 10
+    lens: GeoLens,
+    tolerances: Tolerances | Sequence[Error],
+    slopes: Tensor,
+    figure: int,
+    most: int = 10,
 ) -> list[tuple[str, float, float]]:
     """The errors that change one figure most: a list of (name, change per standard deviation, share of the
     forecast variance)."""

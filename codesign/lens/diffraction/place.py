@@ -19,7 +19,12 @@ ACROSS = 129  # points of the plate at which its steepest phase is looked for
 LARGEST_STEP_WAVES = 0.5  # of the plate alone, between neighbouring cells of a pupil
 
 
-def with_plate(lens: GeoLens, plate: Plate | None, surface: int | None = None, z_mm: float = 0.0) -> GeoLens:
+def with_plate(
+    lens: GeoLens,
+    plate: Plate | None,
+    surface: int | None = None,
+    z_mm: float = 0.0,
+) -> GeoLens:
     """A lens with a phase plate in its stop or behind its last surface.
 
     >>> from codesign import lens

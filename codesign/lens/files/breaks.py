@@ -53,7 +53,11 @@ def _turn(axis, angle_deg):
     return turn
 
 
-def place(surfaces: Sequence[FileSurface], frames: Sequence[np.ndarray], image: np.ndarray) -> float:
+def place(
+    surfaces: Sequence[FileSurface],
+    frames: Sequence[np.ndarray],
+    image: np.ndarray,
+) -> float:
     """Write decentres, tilts and depths into the surfaces, seen from the image plane, whose normal through
     its centre is the axis of the model.
 

@@ -64,7 +64,11 @@ class CurvePoints(Rows):
 
 
 def curve_points(
-    view: "FieldOfView", curves: Sequence[Sequence[Any]], cameras: Tensor, frames_each: int, per_px: float
+    view: "FieldOfView",
+    curves: Sequence[Sequence[Any]],
+    cameras: Tensor,
+    frames_each: int,
+    per_px: float,
 ) -> CurvePoints | None:
     """Points on all curves that may fall on the film, about ``per_px`` per pixel length; None for none.
 
@@ -269,7 +273,11 @@ class FieldOfView:
         return front[rows], (enter, leave, along[rows].norm(dim=1) * (leave - enter), depths[rows])
 
 
-def places(length_px: Tensor, per_px: float, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+def places(
+    length_px: Tensor,
+    per_px: float,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor, Tensor]:
     """Where points lie on pieces of the given lengths [m] px: piece [n], position within it [n] 0..1, and
     share of the piece each stands for [n].
 

@@ -367,7 +367,12 @@ class Meridians(Curve):
     u: Tensor
     v: Tensor
 
-    def pieces(self, viewpoint: Tensor, angle: float, within_m: float = 0.0) -> tuple[Tensor, Tensor]:
+    def pieces(
+        self,
+        viewpoint: Tensor,
+        angle: float,
+        within_m: float = 0.0,
+    ) -> tuple[Tensor, Tensor]:
         """As for Segments; those that face the viewpoint [3]."""
         index, s = cut(torch.arange(len(self.centre)), torch.full((len(self.centre),), ROUND // 2))
         seen = torch.ones(len(index), dtype=torch.bool)

@@ -220,7 +220,11 @@ def _cut_at_ends(edges, apart_m):
     )
 
 
-def within_reach(tree: cKDTree, points: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def within_reach(
+    tree: cKDTree,
+    points: np.ndarray,
+    reach: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """Pairs [n], [n] of the number of a point and of what in a tree is nearer to it than its reach."""
     near = tree.query_ball_point(points, reach)
     numbers = [np.zeros(0, dtype=np.int64), *(np.array(found, dtype=np.int64) for found in near)]
@@ -234,7 +238,12 @@ def _from_line(points, edges):
 
 
 def rims_once(
-    centre: np.ndarray, u: np.ndarray, v: np.ndarray, axis: np.ndarray, width_m: np.ndarray, apart_m: float
+    centre: np.ndarray,
+    u: np.ndarray,
+    v: np.ndarray,
+    axis: np.ndarray,
+    width_m: np.ndarray,
+    apart_m: float,
 ) -> tuple[np.ndarray, ...]:
     """Rims centre + cos u + sin v with the ``axis`` of their cylinders, [C, 3] each, that are not one curve
     with an earlier one, whose axis is then that of either; and ``width_m`` [C], grown by how far apart those

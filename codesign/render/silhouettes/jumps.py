@@ -189,7 +189,13 @@ def _pixels(film, x, window):
 
 
 def sliver_radiance(
-    scene: object, cameras: Tensor, points: CurvePoints, y: Tensor, on: Tensor, origin: Tensor, sides: Tensor
+    scene: object,
+    cameras: Tensor,
+    points: CurvePoints,
+    y: Tensor,
+    on: Tensor,
+    origin: Tensor,
+    sides: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """(side [k], row [k], radiance [k]) where the face that is seen beside a straight edge is a sliver: read
     along its normal, since radiance is the same in all directions.

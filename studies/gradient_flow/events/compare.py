@@ -112,7 +112,10 @@ def blocks(maps: Tensor) -> Tensor:
     return split.sum((2, 4)).flatten(1)
 
 
-def of_layer(layer: Callable[[Tensor, Tensor], Tensor], observe: Callable[[Tensor], Tensor] = parts) -> Maps:
+def of_layer(
+    layer: Callable[[Tensor, Tensor], Tensor],
+    observe: Callable[[Tensor], Tensor] = parts,
+) -> Maps:
     """Maps of a layer (frames, t_s) -> counts [T-1, 2, H, W]."""
     return lambda frames, t_s: observe(layer(frames, t_s))
 
