@@ -81,19 +81,16 @@ def column_scales(jacobian: Tensor, limit: float | Tensor = math.inf) -> Tensor:
     )
 
 
-def principal_modes(jacobian: Tensor, limit: float = math.inf) -> Tensor:
+def principal_modes(jacobian: Tensor, limit: float = math.inf, size: Tensor | float = 1.0) -> Tensor:
     """Basis [V, V] whose columns are directions with effects at right angles, each of which changes the
-    residuals by 1.
+    residuals by 1, the weakest first.
 
-    Args: jacobian [M, V] of variables in comparable units; limit: largest change of any variable by a column,
-      for directions the residuals hardly see.
-    Source: eigenvectors of J^T J, as the right singular vectors of J.
+    Args:
+      jacobian: [M, V], by variables in units of their ``size``.
+      limit: largest change of any variable by a column, in these units, for directions the residuals hardly see.
+      size: [V] or one of all, what makes variables comparable; the basis is in the variables' own units.
+    Source: eigenvectors of J^T J.
     """
-    _, sizes, modes = torch.linalg.svd(jacobian, full_matrices=True)
-    sizes = torch.cat([sizes, sizes.new_zeros(modes.shape[0] - sizes.numel())])
-    reach = (
-        torch.minimum(1 / sizes.clamp_min(1e-300), limit / modes.abs().amax(1))
-        if limit < math.inf
-        else 1 / sizes.clamp_min(1e-300)
-    )
-    return modes.T * reach
+    power, modes = torch.linalg.eigh(jacobian.T @ jacobian)
+    reach = torch.minimum(power.clamp_min(1e-30).rsqrt(), limit / modes.abs().amax(0))
+    return torch.as_tensor(size, dtype=modes.dtype).reshape(-1, 1) * modes * reach

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
+from codesign.grad.jacobian import principal_modes
 from codesign.lens.analysis import rms_spot_mm, spots
 from codesign.lens.design.constraints import gap_mm
 from codesign.lens.geolens import LEARNABLES, GeoLens
@@ -110,9 +111,8 @@ def make_design(
         plain = LensDesign(lens, float(lens.first_order().efl_mm), torch.diag(size), *least)
         # [rays, V], steps per relative change
         motion = torch.stack([_motion(plain, v, fields_rad) for v in range(size.numel())], 1) / step_mm
-        power, modes = torch.linalg.eigh(motion.T @ motion)
-        reach = torch.minimum(power.clamp_min(1e-30).rsqrt(), 0.1 / modes.abs().amax(0))
-    return LensDesign(lens, plain.efl_mm, size[:, None] * modes * reach, *least)
+        basis = principal_modes(motion, limit=0.1, size=size)
+    return LensDesign(lens, plain.efl_mm, basis, *least)
 
 
 def _motion(design, variable, fields_rad, step=1e-4):
