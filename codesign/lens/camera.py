@@ -90,8 +90,7 @@ def _where(lens, out):
     if failed.numel() == 0 and any(s.inner_semi_aperture_mm for s in lens.surfaces):
         return (
             " (all of them are stopped by the edges of the apertures or by the central obstruction, which "
-            "chief rays "
-            "meet; point spread maps need chief rays, so render traced frames)"
+            "chief rays meet; point spread maps need chief rays, so render traced frames)"
         )
     if failed.numel() == 0:
         return " (all of them are stopped by the edges of the apertures); open the apertures"

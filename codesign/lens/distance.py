@@ -42,16 +42,14 @@ def vergence_per_mm(
     if not math.isfinite(origin_mm):
         raise DomainError(
             f"{lens.name}: the entrance pupil lies at infinity, so object distances and fields have no "
-            "origin; "
-            "move the stop off the focal plane."
+            "origin; move the stop off the focal plane."
         )
     nearest = max(origin_mm, 0.0) * 1e-3
     bad = [d for d in at.detach().reshape(-1).tolist() if not d > nearest]
     if bad:
         raise DomainError(
             f"{lens.name}: an object {', '.join(f'{d:.6g}' for d in bad)} m before the entrance pupil does "
-            "not lie "
-            f"before the lens; give distances above {nearest:.6g} m, inf for parallel light."
+            f"not lie before the lens; give distances above {nearest:.6g} m, inf for parallel light."
         )
     return 1 / (1e3 * at)
 

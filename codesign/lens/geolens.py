@@ -294,8 +294,7 @@ class GeoLens(Replaceable):
         if self.plate is not None:
             raise DomainError(
                 f"{self.name}: its phase plate is no surface, so files, drawings and copies by surfaces "
-                "cannot hold "
-                "it; take it out with diffraction.with_plate(lens, None)."
+                "cannot hold it; take it out with diffraction.with_plate(lens, None)."
             )
         bent = torch.tensor([s.curvature_per_mm for s in self.surfaces], dtype=self.dtype).tolist()
         tilted = torch.tensor([_tilt_rad(s) for s in self.surfaces], dtype=self.dtype).tolist()

@@ -229,8 +229,7 @@ def paraxial_rays(
     if not abs(float(field.detach())) < math.pi / 2:
         raise DomainError(
             f"{lens.name}: a paraxial chief ray at {math.degrees(float(field)):.4g} degrees has no slope; "
-            "give "
-            "a field below 90 degrees."
+            "give a field below 90 degrees."
         )
     f = lens.first_order(wavelength_um)
     if not math.isfinite(float(f.entrance_pupil_z_mm.detach())):

@@ -115,10 +115,8 @@ class ThinLens(Replaceable):
         if not float(distance_mm.detach()) > float(efl.detach()):
             raise DomainError(
                 f"thin lens: a point {float(distance_mm.detach()) * 1e-3:.6g} m away lies inside the focal "
-                "length "
-                f"({float(efl.detach()):.6g} mm), so its light leaves the lens without meeting; give a "
-                "larger "
-                "distance, or a shorter focal length."
+                f"length ({float(efl.detach()):.6g} mm), so its light leaves the lens without meeting; "
+                "give a larger distance, or a shorter focal length."
             )
         return self.replace(efl_mm=efl, image_distance_mm=1 / (1 / efl - 1 / distance_mm))
 

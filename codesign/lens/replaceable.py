@@ -142,8 +142,7 @@ class Replaceable(nn.Module):
         if len(given) != len(own):
             raise DomainError(
                 f"the state is of another {type(self).__name__} ({len(given)} numbers describe it, "
-                f"{len(own)} this one); "
-                f"{remedy}."
+                f"{len(own)} this one); {remedy}."
             )
         eps = 4 * torch.finfo(state.dtype if state.is_floating_point() else torch.float64).eps
         for (name, here), there in zip(own.items(), given, strict=True):
@@ -167,8 +166,7 @@ class Replaceable(nn.Module):
         if key in missing:  # torch names it in its error, unless it is asked not to be strict
             missing[missing.index(key)] = (
                 f"{key} (pupil, glasses and kinds of surfaces; states of earlier versions lack them: "
-                "strict=False loads "
-                "one that you know to be of this very lens)"
+                "strict=False loads one that you know to be of this very lens)"
             )
 
     def _known(self, name):

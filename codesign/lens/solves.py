@@ -88,9 +88,8 @@ def focus_at(lens: L, distance_m: float | Tensor, wavelength_um: float, spot_gri
     height, angle = paraxial.focused_image(lens, vergence, wavelength_um)
     if not float(angle.detach()) < -1e-12:
         raise DomainError(
-            f"{lens.name}: the light of a point {float(1e-3 / vergence.detach()):.6g} m before the entrance "
-            "pupil "
-            f"does not converge behind the lens; {_remedy(lens)}."
+            f"{lens.name}: the light of a point {float(1e-3 / vergence.detach()):.6g} m before the "
+            f"entrance pupil does not converge behind the lens; {_remedy(lens)}."
         )
     focused = _last_thickness(lens, -height * lens.index(wavelength_um)[-1] / angle)
     if spot_grid is None:
@@ -138,8 +137,8 @@ def focus_paraxial(lens: L, defocus_mm: float | Tensor = 0.0, at_m: float | Tens
     if abs(float(angle.detach())) < 1e-12:
         raise DomainError(
             f"{lens.name}: the light of a point {float(torch.as_tensor(at_m).detach()):.6g} m away leaves "
-            "the lens parallel, "
-            "so it has no focus; the lens is afocal for it: change a curvature or the distance."
+            "the lens parallel, so it has no focus; the lens is afocal for it: change a curvature or the "
+            "distance."
         )
     return _last_thickness(lens, -height * lens.index()[-1] / angle + defocus_mm)
 

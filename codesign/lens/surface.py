@@ -262,8 +262,8 @@ def with_medium(
     if passes:
         raise DomainError(
             f"{label}: the light passes the glass behind it again behind surface {passes[0] + 1}, as a "
-            "mirror sends it "
-            "back, and only one pass would change; build the lens with the other glass in both."
+            "mirror sends it back, and only one pass would change; build the lens with the other glass in "
+            "both."
         )
     if isinstance(glass, str):
         try:

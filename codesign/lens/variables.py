@@ -266,8 +266,7 @@ def make_variables(
         if not bool(alive.any()):
             raise DomainError(
                 f"{lens}: no {name} moves a ray (none is there, or all are masked), so it cannot be a "
-                "variable; "
-                "leave it out."
+                "variable; leave it out."
             )
         rows = rows[alive]
         limits = checked_bounds(name, kind, value, bounds.get(name), rows)

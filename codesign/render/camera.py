@@ -163,8 +163,8 @@ class Camera:
             raise DomainError(
                 f"camera: about {float(dark.double().mean()):.0%} of the film's pixels get no light: it "
                 f"comes as far as {lit_mm:.3g} mm from the axis, the film reaches "
-                f"{float(radius_mm.max()):.3g} mm; make "
-                "the film or its pixels smaller, or give a lens with a larger image circle."
+                f"{float(radius_mm.max()):.3g} mm; make the film or its pixels smaller, or give a lens "
+                "with a larger image circle."
             )
         return self
 

@@ -111,8 +111,7 @@ def check_memory(film: Film, samples_per_pixel: int) -> None:
         raise DomainError(
             f"camera: {math.prod(film.shape):.3g} pixels of {samples_per_pixel} samples are {count:.3g} rays "
             f"per frame, at least {needed / 2**30:.3g} GiB; this machine has {memory_bytes() / 2**30:.3g} "
-            "GiB: make "
-            "the film smaller, look at windows of it (render.Film), or take fewer samples."
+            "GiB: make the film smaller, look at windows of it (render.Film), or take fewer samples."
         )
 
 

@@ -90,8 +90,7 @@ def check_scene(mi: Any, scene: Any, emissive: bool) -> None:
         raise DomainError(
             f"shape {', '.join(map(repr, black[:NAMED]))}{more} has no emitter, so it would be black: give "
             "it one of type 'area' (of radiance 0 where black is meant), or let light.bake or "
-            "light.PathScene work out "
-            "its light."
+            "light.PathScene work out its light."
         )
     for emitter in scene.emitters():
         shape = emitter.get_shape()

@@ -127,9 +127,8 @@ def study(run: Run[Config]) -> None:
             run.figure(
                 _pictures(shown, who),
                 name,
-                f"{name.replace('_', ' ')}: events (red ON, blue OFF), true flow, estimates, and "
-                "the deviation "
-                "that the network claims. Colour: direction, strength: length.",
+                f"{name.replace('_', ' ')}: events (red ON, blue OFF), true flow, estimates, and the "
+                "deviation that the network claims. Colour: direction, strength: length.",
             )
     _tables(run, found, about, who)
     if "worlds" in found:

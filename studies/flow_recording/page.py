@@ -56,9 +56,8 @@ def show(run, packets, rows, names, film):
         "Every packet",
         ("packet", "ms", "events", "estimator", *UNITS.values()),
         table,
-        "AEE, outliers (above 3 px and 5 % of the true length) and angles where events are and the "
-        "truth is valid, unless "
-        "said otherwise. FWL above 1: sharper than without flow; RSAT below 1 likewise.",
+        "AEE, outliers (above 3 px and 5 % of the true length) and angles where events are and the truth "
+        "is valid, unless said otherwise. FWL above 1: sharper than without flow; RSAT below 1 likewise.",
     )
     table = [(name, *(mine.get(figure) for figure in UNITS)) for name, mine in means.items()]
     run.table("Means over packets", ("estimator", *UNITS.values()), table)
@@ -133,36 +132,31 @@ def doubts(packets, rows, name):
         (left_out, f"**Left out**: {', '.join(left_out)}."),
         (
             gaps,
-            f"**{gaps} packet(s) lie across a gap** of the recording, where no pixel sent an "
-            "event: their flow is that of "
-            "the rest of the window.",
+            f"**{gaps} packet(s) lie across a gap** of the recording, where no pixel sent an event: their "
+            "flow is that of the rest of the window.",
         ),
         (
             moving,
             f"**The camera translates** in {_some(moving)}, and the only true flow is that of its "
-            "rotation: the difference "
-            "from it is no error and is not counted as one; FWL says how good the flow is.",
+            "rotation: the difference from it is no error and is not counted as one; FWL says how good "
+            "the flow is.",
         ),
         (
             distorted_px,
             "**The camera has distortion**, and the true flow comes from a file: if that is of "
-            "undistorted pixels, it is "
-            f"{distorted_px:.2f} px off in the mean of a packet, enough to turn rankings round. "
-            "`--truth-pixels "
-            "undistorted` carries it to the sensor's pixels.",
+            f"undistorted pixels, it is {distorted_px:.2f} px off in the mean of a packet, enough to turn "
+            "rankings round. `--truth-pixels undistorted` carries it to the sensor's pixels.",
         ),
         (
             sharper,
-            f"**{name} makes the events sharper than the true flow does** in {_some(sharper)}: the "
-            "truth may belong to "
-            "other pixels or times, or leave something out; errors against it are then not the "
-            "estimate's alone.",
+            f"**{name} makes the events sharper than the true flow does** in {_some(sharper)}: the truth "
+            "may belong to other pixels or times, or leave something out; errors against it are then not "
+            "the estimate's alone.",
         ),
         (
             blurred,
-            f"**The true flow makes the events less sharp than none** in {_some(blurred)}: check "
-            "its unit, times and axes, "
-            "or whether it holds there.",
+            f"**The true flow makes the events less sharp than none** in {_some(blurred)}: check its unit, "
+            "times and axes, or whether it holds there.",
         ),
     )
     return [sentence for holds, sentence in sentences if holds]
@@ -182,9 +176,8 @@ def _some(names):
 
 def caption(packet):
     return (
-        f"{packet.name}: {len(packet.stream)} events in {_ms(packet):.2f} ms. "
-        f"{'; '.join(packet.notes)}. Hue is the "
-        "direction of the flow, saturation its length; black where nothing is known."
+        f"{packet.name}: {len(packet.stream)} events in {_ms(packet):.2f} ms. {'; '.join(packet.notes)}. "
+        "Hue is the direction of the flow, saturation its length; black where nothing is known."
     )
 
 

@@ -71,17 +71,14 @@ def write(run, held, tracker, name, start_s):
         "video_windows_without_events": tracker.left_out["windows_without_events"],
     }
     sentence = (
-        f"{len(found)} windows one after the other through `flow.Tracker`: "
-        f"{tracker.processor_s:.2f} s of processor "
-        f"time (median {statistics.median(spent_ms):.0f} ms a window; the first compiles) for "
-        f"{tracker.event_s:.3f} s of events, a real-time factor of {tracker.real_time_factor:.2f} "
-        "(below 1 one "
-        "core keeps up)."
+        f"{len(found)} windows one after the other through `flow.Tracker`: {tracker.processor_s:.2f} s of "
+        f"processor time (median {statistics.median(spent_ms):.0f} ms a window; the first compiles) for "
+        f"{tracker.event_s:.3f} s of events, a real-time factor of {tracker.real_time_factor:.2f} (below 1 "
+        "one core keeps up)."
     )
     caption = (
-        f"Events of every window, red brighter, blue darker, and the flow of {name}: an arrow as "
-        "long as the distance "
-        f"between arrows is {full:.0f} px/s; fainter where the confidence is less, none below "
+        f"Events of every window, red brighter, blue darker, and the flow of {name}: an arrow as long as "
+        f"the distance between arrows is {full:.0f} px/s; fainter where the confidence is less, none below "
         f"{SURE:g} or without events."
     )
     return Film(path, metrics, sentence, caption)
@@ -142,9 +139,8 @@ def pictures(held, found, cell, full, factor, name):
         axis.set_xlim(-0.5, held.width_px - 0.5)
         axis.set_ylim(held.height_px - 0.5, -0.5)
         title = (
-            f"{(one.t0_us - int(held.t_us[0])) * 1e-3:.1f} ms, window "
-            f"{1e-3 * (one.t1_us - one.t0_us):.2f} ms, "
-            f"{one.events} events, {name}, real-time factor {factor:.2f}"
+            f"{(one.t0_us - int(held.t_us[0])) * 1e-3:.1f} ms, window {1e-3 * (one.t1_us - one.t0_us):.2f} "
+            f"ms, {one.events} events, {name}, real-time factor {factor:.2f}"
         )
         figure.text(0.01, (1 + top) / 2, title, va="center", fontsize=10)
         canvas.draw()

@@ -151,7 +151,6 @@ def _typed(path, name, value, hint) -> Any:
         if type(value) is kind or (kind is type(None) and value is None):
             return value
     raise FileFormatError(
-        f"'{path}': {name} is {json.dumps(value)[:80]}, which is no {getattr(hint, '__name__', hint)}; "
-        "it was changed or "
-        "is damaged: start a new run."
+        f"'{path}': {name} is {json.dumps(value)[:80]}, which is no {getattr(hint, '__name__', hint)}; it "
+        "was changed or is damaged: start a new run."
     )

@@ -390,16 +390,14 @@ def measure_joint(config):
 
 TEXT = (
     "Relative error is |autograd - difference| / |difference| over the group; the noise floor is the "
-    "disagreement of "
-    "neighbouring step sizes, in the same unit."
+    "disagreement of neighbouring step sizes, in the same unit."
 )
 CHAIN = Topic(
     "Along the chain",
     TEXT + " Lens rays in float64, frames (textured room, no silhouettes) with respect to lens and pose, "
-    "event counts, "
-    "flow, and the final loss with respect to three curvatures and all six pose components, once with "
-    "the smooth event "
-    "layer and once with the straight-through layer against differences of the hard loss.",
+    "event counts, flow, and the final loss with respect to three curvatures and all six pose components, "
+    "once with the smooth event layer and once with the straight-through layer against differences of the "
+    "hard loss.",
     ("junction", "parameters"),
     lambda quick: [(label,) for label in (*JUNCTIONS, HARD)],
     measure_junction,

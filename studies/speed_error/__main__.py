@@ -32,9 +32,8 @@ def study(run: Run[Config]) -> None:
     config = run.config
     if config.repeats < 3 or config.rounds < 1 or not config.stages:
         raise DomainError(
-            f"repeats {config.repeats}, rounds {config.rounds}, stages {config.stages}: give at least "
-            f"3, 1 and "
-            "one."
+            f"repeats {config.repeats}, rounds {config.rounds}, stages {config.stages}: give at least 3, 1 "
+            "and one."
         )
     figures = []
     for name in dict.fromkeys(config.stages):

@@ -46,10 +46,8 @@ TITLES = {
 }
 CAPTION = (
     "Loss: van Rossum distance, 10 ms, over that of silence. Rates of ON and OFF (the smaller "
-    "correlation) in "
-    "bins of 10 ms, of the whole picture and of cells of 8 x 8 px; flicker: power of the rate above "
-    "50 Hz over "
-    "the target's. Brackets: 95 %, blocks of 16 x 16 px drawn again."
+    "correlation) in bins of 10 ms, of the whole picture and of cells of 8 x 8 px; flicker: power of the "
+    "rate above 50 Hz over the target's. Brackets: 95 %, blocks of 16 x 16 px drawn again."
 )
 
 

@@ -79,11 +79,9 @@ def random_systems(run: Run[Config]) -> list[str]:
         "Worst relative error of a gradient",
         ("numbers", "error", "pass"),
         [(name, f"{error:.1e}", error <= ALLOWED) for name, error in errors.items()],
-        f"{count} random lenses with equal neighbours, flats, concentric surfaces, zero conics and "
-        f"asphere terms, "
-        "stops in air, mirrors and zero phases, against differences of a trace in extended precision. "
-        "In every "
-        "tenth, each kind of number asks for a gradient alone.",
+        f"{count} random lenses with equal neighbours, flats, concentric surfaces, zero conics and asphere "
+        "terms, stops in air, mirrors and zero phases, against differences of a trace in extended "
+        "precision. In every tenth, each kind of number asks for a gradient alone.",
     )
     return [f"gradient to {name}" for name, error in errors.items() if not error <= ALLOWED]
 

@@ -173,8 +173,8 @@ def warnings(view, state, sensor, slow):
     if state.largest < view.light.white / 4:
         yield (
             f"**Dark input.** The largest digital value is {state.largest:g}, full light is "
-            f"{view.light.white:g}: the "
-            "sensor works in its dark, linear part. For 12 bits stored in 16 give --white-level 4095."
+            f"{view.light.white:g}: the sensor works in its dark, linear part. For 12 bits stored in 16 "
+            "give --white-level 4095."
         )
     if state.largest > view.light.white:
         yield (

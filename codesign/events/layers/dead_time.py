@@ -447,10 +447,9 @@ def warn_beyond(
     if most > MOST_LOAD:
         warnings.warn(
             f"rate x dead time is {most:.2g} for the average event, of which about one in {most + 0.5:.2g} "
-            "is "
-            f"kept; gradients are measured up to {MOST_LOAD:g} (docs/events.md). Beyond, which event is kept "
-            "depends on each one before, and the gradient of a shift is lost first (cosine 0.45 against "
-            "differences at 8.8): shorten the dead time or raise the thresholds.",
+            f"is kept; gradients are measured up to {MOST_LOAD:g} (docs/events.md). Beyond, which event is "
+            "kept depends on each one before, and the gradient of a shift is lost first (cosine 0.45 "
+            "against differences at 8.8): shorten the dead time or raise the thresholds.",
             stacklevel=4,
         )
     elif most > THRESHOLD_LOAD and any(theta.requires_grad for theta in thetas):

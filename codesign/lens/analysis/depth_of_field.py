@@ -65,8 +65,7 @@ def depth_of_field(
     ):
         raise DomainError(
             f"{lens.name}: no point before the lens has a blur of {float(blur_mm):.4g} mm or less on its "
-            "film; move "
-            "the film (focus_at), or allow more blur."
+            "film; move the film (focus_at), or allow more blur."
         )
     near = (1e-3 / (sharpest + reach)).clamp_min(nearest * 1e-3)
     return DepthOfField(near, _metres(sharpest - reach), _metres(sharpest))

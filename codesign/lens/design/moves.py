@@ -171,8 +171,7 @@ def _element_faces(lens, pairs, element):
     if lens.mirrors[front] or lens.mirrors[back]:
         raise DomainError(
             f"{lens.name}: element {range(len(pairs))[element] + 1} touches a mirror, and without that the "
-            "light "
-            "turns no more; choose another."
+            "light turns no more; choose another."
         )
     passes = passes_of(lens.to_surfaces(), front)
     if passes:
@@ -220,9 +219,8 @@ def _held(lens, surfaces, label):
         if not image > 0:
             raise DomainError(
                 f"{lens.name} {label}: at its focal length of {float(f.efl_mm):.6g} mm the image lies "
-                f"{-image:.4g} mm "
-                "before the last surface; flatten the element in steps and re-optimise in between, or take "
-                "out another."
+                f"{-image:.4g} mm before the last surface; flatten the element in steps and re-optimise in "
+                "between, or take out another."
             )
         made.curvature_per_mm.copy_(held.curvature_per_mm)
         made.thickness_mm.copy_(held.thickness_mm)
@@ -263,8 +261,7 @@ def moved_element(
     if len(faces) != 2 or not all(isinstance(face, int) for face in faces):
         raise DomainError(
             f"{lens.name}: faces {faces} of an element must be two whole numbers; give a pair out of "
-            "elements(lens) or "
-            "groups(lens)."
+            "elements(lens) or groups(lens)."
         )
     first, last = faces
     if not 0 <= first < last < count or any(lens.mirrors[first : last + 1]):

@@ -96,8 +96,7 @@ def cheapest(
     if isinstance(budget, bool) or not (0 < budget < math.inf and 0.5 < share < 1 and most > 0):
         raise DomainError(
             f"budget {budget}, share {share} and largest factor {most}: the budget must be a positive "
-            "increase of the "
-            "figure, the share lie between 0.5 and 1, and the factor be positive."
+            "increase of the figure, the share lie between 0.5 and 1, and the factor be positive."
         )
     names = list(dict.fromkeys(e.drawn for e in errors))
     member = torch.tensor([names.index(e.drawn) for e in errors])
@@ -148,9 +147,8 @@ def _largest(shape, member, most, keeps):
     low, high = -30.0, 30.0
     if keeps((shape * math.exp(high)).clamp_max(most)[member]):
         raise DomainError(
-            f"even at {most:g} times the deviations given the budget is not spent; allow larger factors, or "
-            "start from "
-            "larger deviations."
+            f"even at {most:g} times the deviations given the budget is not spent; allow larger factors, "
+            "or start from larger deviations."
         )
     for _ in range(ROUNDS):
         middle = (low + high) / 2

@@ -146,8 +146,7 @@ def _check_body(lens, first, last):
     if any(lens.mirrors[first : last + 1]) or any(passes_of(surfaces, i) for i in range(first, last)):
         raise DomainError(
             f"{lens.name}: element {first + 1}-{last + 1} holds a mirror or is passed twice by the light, "
-            "and moving it "
-            "as a body is not modelled; give tolerances of surfaces instead of elements."
+            "and moving it as a body is not modelled; give tolerances of surfaces instead of elements."
         )
 
 

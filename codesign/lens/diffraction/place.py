@@ -55,8 +55,7 @@ def with_plate(
     if at not in (lens.stop_index, last) or (z_mm < 0 and at != lens.stop_index):
         raise DomainError(
             f"{lens.name}: a plate {z_mm:g} mm from surface {at + 1} is not modelled; put it next to the "
-            "stop (surface "
-            f"{lens.stop_index + 1}) or behind the last surface ({last + 1})."
+            f"stop (surface {lens.stop_index + 1}) or behind the last surface ({last + 1})."
         )
     gap = at if z_mm >= 0 else at - 1
     room = lens.thickness_mm.detach()
@@ -73,8 +72,7 @@ def with_plate(
         raise DomainError(
             f"{lens.name}: a plate {after:.4g} mm behind "
             f"{f'surface {gap + 1}' if gap >= 0 else 'the first vertex'} meets a surface or the film; "
-            "between "
-            f"{low:.4g} and {high:.4g} mm there is room."
+            f"between {low:.4g} and {high:.4g} mm there is room."
         )
     twin.plate_at = (gap, after)
     return twin

@@ -93,10 +93,8 @@ def pupil_function(
     if grid < finest:
         raise DomainError(
             f"{lens.name}: the phase plate is finer than {grid} cells across the pupil resolve (its phase "
-            "may step by "
-            f"half a wave from cell to cell, and has detail of {lens.plate.finest_mm:.3g} mm); give a grid "
-            "of at least "
-            f"{finest}, or a smoother plate."
+            f"may step by half a wave from cell to cell, and has detail of {lens.plate.finest_mm:.3g} mm); "
+            f"give a grid of at least {finest}, or a smoother plate."
         )
     like = lens.curvature_per_mm
     line = (torch.arange(grid, dtype=like.dtype, device=like.device) + 0.5) / grid * 2 - 1

@@ -121,8 +121,7 @@ def _pupil(lens, rows, optics):
     if lens.pupil is None:
         raise FileFormatError(
             "it does not say how wide its beam is; give the entrance pupil diameter (ENPD in .zmx, EPD in "
-            ".seq), or "
-            "FLOA in .zmx where the stop's semi-diameter says it."
+            ".seq), or FLOA in .zmx where the stop's semi-diameter says it."
         )
     kind, value = lens.pupil
     if kind == "stop":

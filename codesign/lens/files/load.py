@@ -78,10 +78,8 @@ def load(source: str | Path, dtype: torch.dtype = torch.float64) -> GeoLens:
     if suffix == ".zmx" and beside_mm > SEEN * float(geo.semi_aperture_mm[geo.stop_index]):
         warnings.warn(
             f"lens file {path}: the centre of the stop lies {beside_mm:.4g} mm beside the axis, the normal "
-            "of the image "
-            "plane through its centre; first-order figures and pupils are those of that axis, so trace rays "
-            "of your "
-            "own or aim them (camera_rays(aim=True)).",
+            "of the image plane through its centre; first-order figures and pupils are those of that "
+            "axis, so trace rays of your own or aim them (camera_rays(aim=True)).",
             stacklevel=3,
         )
     return geo

@@ -162,8 +162,8 @@ def _without_steps_back(surfaces):
         else:
             raise FileFormatError(
                 f"surface {surfaces[i].label}: the light would travel {-surfaces[i].thickness:.6g} mm "
-                "backwards behind it; "
-                "give every thickness along the light (its sign turns at each mirror)."
+                "backwards behind it; give every thickness along the light (its sign turns at each "
+                "mirror)."
             )
     if not surfaces or not all(math.isfinite(s.thickness) for s in surfaces):
         raise FileFormatError(

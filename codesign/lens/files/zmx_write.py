@@ -74,9 +74,8 @@ def _surface(surface, sign, label, is_stop):
         )
     if surface.phase is not None:
         raise FileFormatError(
-            f"{label}: programs that read .zmx refuse its diffractive phase or leave it out without a word; "
-            "save the "
-            "lens as .json."
+            f"{label}: programs that read .zmx refuse its diffractive phase or leave it out without a "
+            "word; save the lens as .json."
         )
     terms = [sign * a + 0.0 for a in surface.asphere]
     if any(terms[MOST_TERMS:]):

@@ -60,9 +60,8 @@ class Curve:
 class Segments(Curve):
     """Straight edges. start, end: [E, 3]. normals: [E, 2, 3] of the two faces, on the side that shines, 0
     where none is known; always: [E] bool, True where it counts from every side but that from which both faces
-    are black
-    (rims, seams, sharp creases). width_m: [E], how far apart edges lie that count as this one. apexes: [E, 2,
-    3], third corners of the two faces, NaN for none."""
+    are black (rims, seams, sharp creases). width_m: [E], how far apart edges lie that count as this one.
+    apexes: [E, 2, 3], third corners of the two faces, NaN for none."""
 
     start: Tensor
     end: Tensor

@@ -125,8 +125,7 @@ def _check_frames(camera, scene, curves, cameras, rows, start):
         raise DomainError(
             f"gradient 'boundary': {share:.0%} of the jumps of radiance in frame {start + row} {what}, the "
             f"largest near ({at}) m: parts of a moving scene that touch, textures with hard texels, or "
-            "shapes that are not "
-            "known; move them apart, smooth the texture, or use 'difference'."
+            "shapes that are not known; move them apart, smooth the texture, or use 'difference'."
         )
 
 

@@ -152,9 +152,8 @@ def asked_of_sensor(row):
 
 SENSORS = Topic(
     "Physical layer",
-    f"Bandwidth of the photoreceptor, leak, spread of the thresholds, dead time, {PHYSICAL_HZ} frames "
-    f"per second: "
-    f"directions of the case, and fields of the sensor, moved by {STEP:.0%} either way (one scene).",
+    f"Bandwidth of the photoreceptor, leak, spread of the thresholds, dead time, {PHYSICAL_HZ} frames per "
+    f"second: directions of the case, and fields of the sensor, moved by {STEP:.0%} either way (one scene).",
     ("sensor", "direction"),
     lambda quick: [(name,) for name in list(PHYSICAL)[-1 if quick else 0 :]],
     measure_sensor,

@@ -199,12 +199,10 @@ def asked(row):
 
 TOPIC = Topic(
     "From silhouettes to the flow loss",
-    "A room with two boxes, through events and flow, to the camera's pose and to its lens. Relative "
-    "L2 error against "
-    f"differences; one estimate has {SINGLE} samples. The loss of hard counts is a mean over places of "
-    f"every pixel inside "
-    "its threshold; that of one place alone is another, rough function, whose differences nothing can "
-    "be judged by.",
+    "A room with two boxes, through events and flow, to the camera's pose and to its lens. Relative L2 "
+    f"error against differences; one estimate has {SINGLE} samples. The loss of hard counts is a mean over "
+    "places of every pixel inside its threshold; that of one place alone is another, rough function, "
+    "whose differences nothing can be judged by.",
     ("loss", "to"),
     lambda quick: [()],
     measure,

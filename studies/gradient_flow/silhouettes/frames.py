@@ -106,12 +106,10 @@ def asked(row):
 
 TOPIC = Topic(
     "Where objects hide one another",
-    "Frames of occluders over a wall, to the camera's pose and to three curvatures and thicknesses of "
-    "its lens; the loss is a "
-    "fixed smooth weighting of one frame. Relative L2 errors of the interior gradient (plain "
-    "automatic differentiation), "
-    f"of the one with the boundary term, and of single estimates of {SAMPLES} samples (median); noise "
-    f"of the differences.",
+    "Frames of occluders over a wall, to the camera's pose and to three curvatures and thicknesses of its "
+    "lens; the loss is a fixed smooth weighting of one frame. Relative L2 errors of the interior gradient "
+    "(plain automatic differentiation), of the one with the boundary term, and of single estimates of "
+    f"{SAMPLES} samples (median); noise of the differences.",
     ("scene", "lens", "to"),
     jobs,
     measure,
