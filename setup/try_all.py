@@ -93,7 +93,8 @@ def outcome(command: str, limit_s: float) -> tuple[bool, str, str]:
     name, *words = shlex.split(command)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
     with tempfile.TemporaryDirectory(prefix="try-all-") as folder:
-        os.symlink(ROOT / "docs", f"{folder}/docs")  # pages name raw tables as from the project's folder
+        # pages name raw tables as from the project's folder
+        os.symlink(ROOT / "docs", f"{folder}/docs")
         study = name == "python" or words[0] in STUDIES
         more = ["--quick", "--out", f"{folder}/out"] if study else SHORT.get(words[0], [])
         if name == "make":

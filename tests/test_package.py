@@ -34,8 +34,7 @@ PRIVATE = {
 
 def test_the_import_alone_loads_nothing_heavy():
     script = (
-        "import sys, codesign; "
-        "heavy = ('torch', 'numpy', 'drjit', 'mitsuba', 'kornia', 'matplotlib'); "
+        "import sys, codesign; heavy = ('torch', 'numpy', 'drjit', 'mitsuba', 'kornia', 'matplotlib'); "
         "print([name for name in heavy if name in sys.modules])"
     )
     done = subprocess.run(
@@ -50,7 +49,8 @@ def test_every_room_is_reachable_from_the_package():
         for path in (ROOT / "codesign").iterdir()
         if path.suffix == ".py" or (path / "__init__.py").exists()
     }
-    rooms = {name for name in codesign.__all__ if name.islower()}  # classes are shown there beside them
+    # classes are shown there beside them
+    rooms = {name for name in codesign.__all__ if name.islower()}
     assert rooms == standing - PRIVATE
     assert set(codesign.__all__) <= set(dir(codesign))
     script = "import codesign; print(codesign.errors.DomainError.__name__, codesign.lens.load.__name__)"

@@ -45,7 +45,8 @@ def test_a_quarter_turn_about_z_with_translation_by_hand():
 @pytest.mark.parametrize("scale", [0.0, 1e-9, 1e-5, 0.5, 2.0])
 def test_gradcheck(scale, generator):
     twist = (scale * torch.randn(2, 6, dtype=D, generator=generator)).requires_grad_()
-    assert torch.autograd.gradcheck(se3_exp, twist, atol=1e-8)  # steps of 1e-6: differences are good to 1e-9
+    # steps of 1e-6: differences are good to 1e-9
+    assert torch.autograd.gradcheck(se3_exp, twist, atol=1e-8)
 
 
 def test_the_derivative_at_zero_is_the_generators():

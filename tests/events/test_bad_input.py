@@ -279,4 +279,5 @@ def test_a_state_that_a_simpler_sensor_began(more, words):
 def test_what_a_layer_leaves_out_of_its_sensor_is_named(name):
     with pytest.warns(UserWarning, match="knows no leak_rate_hz, refractory_s: the sensor is taken without"):
         layer(name, events.PRESETS["default"])
-    layer(name, SensorModel(theta_sigma=0.03, shot_rate_hz=1.0))  # warns of nothing: warnings are errors here
+    # warns of nothing: warnings are errors here
+    layer(name, SensorModel(theta_sigma=0.03, shot_rate_hz=1.0))

@@ -248,7 +248,8 @@ def test_without_gradients_the_counts_are_the_hard_sensor_s_and_no_mean_is_compu
 @pytest.mark.parametrize(("dead_s", "learnt"), [(4e-3, True), (8e-3, True), (8e-3, False)])
 def test_gradients_to_thresholds_behind_a_long_dead_time_are_warned_of(dead_s, learnt, recwarn):
     t_s = torch.arange(41, dtype=D) / 1000
-    level = (60 * t_s)[:, None].requires_grad_()  # 0.15 in 2.5 ms: 1.6 and 3.2 events in a dead time
+    # 0.15 in 2.5 ms: 1.6 and 3.2 events in a dead time
+    level = (60 * t_s)[:, None].requires_grad_()
     theta = torch.tensor(0.15, dtype=D, requires_grad=learnt)
     sensor = SensorModel(theta_off=0.15, refractory_s=dead_s)
     sensor_counts(level, t_s, sensor, log_input=True, theta_on=theta)

@@ -99,7 +99,8 @@ def test_smooth_curves_between_frames_are_met_to_the_third_order(log_input):
     """h^3 |L'''| / 62 between inner frames, the term that central slopes leave."""
 
     def curve(t_s):
-        return 3.5 + 1.5 * torch.sin(2 * math.pi * 10 * t_s)  # 7 to 150 of 255: dark part and logarithm
+        # 7 to 150 of 255: dark part and logarithm
+        return 3.5 + 1.5 * torch.sin(2 * math.pi * 10 * t_s)
 
     errors = []
     for intervals in (20, 40):

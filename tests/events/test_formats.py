@@ -50,7 +50,8 @@ DAVIS = {"height_px": 260, "width_px": 346}
     ],
 )
 def test_events_come_back_exactly_with_the_size_of_the_sensor(tmp_path, name, first_us, span_us, options):
-    told = {"height_px": 480, "width_px": 640} if name == "e.CSV" else {}  # which text has no place for
+    # which text has no place for
+    told = {"height_px": 480, "width_px": 640} if name == "e.CSV" else {}
     for count in (30_000, 1, 0):
         stream = random_stream(count, 480, 640, span_us - 1, first_us)
         write(tmp_path / name, stream, **options)

@@ -71,7 +71,8 @@ def test_evt3_singles_vectors_and_time_parts(tmp_path):
             (0x3, 0x800 | 100), (0x4, 0b100000000001), (0x4, 0b10), (0x5, 0xF81),
             (0x8, 2), (0x2, 31),  # a repeated high part leaves the low one
             (0x8, 3), (0x2, 32),  # a new high part starts the low one at zero
-            (0xA, 0x101), (0xE, 0x14), (0xF, 1), (0x7, 2),  # trigger, counter and continuations: no events
+            # trigger, counter and continuations: no events
+            (0xA, 0x101), (0xE, 0x14), (0xF, 1), (0x7, 2),
             (0x6, 9), (0x5, 1),  # the base has moved on to 132
         )
     )  # fmt: skip

@@ -229,7 +229,8 @@ def test_noise_events_and_crossings_come_in_order_of_time(sign):
     light = (0.5 * (math.exp(4) + math.exp(4 + sign)) + 20) / 275
     expected = 3600 * rate_hz * (1 - 0.75 * light)
     assert abs(noise - expected) < 4 * math.sqrt(expected)
-    against = int((events.p == -sign).sum())  # half of the noise: crossings have the ramp's own polarity
+    # half of the noise: crossings have the ramp's own polarity
+    against = int((events.p == -sign).sum())
     assert abs(against - noise / 2) < 4 * math.sqrt(noise / 4)
 
 

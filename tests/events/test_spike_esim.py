@@ -149,9 +149,11 @@ def test_drawn_noise_is_poisson_of_the_expected_rate():
         model.noise_rate.fade.fill_(2.0)
     frames = torch.full((201, 30, 30), 117.5, dtype=D)
     t_s = torch.arange(201, dtype=D) / 500
-    expected = torch.tensor([30.0, 10.0], dtype=D) * math.exp(-2.0 * 0.5) / 500  # (117.5 + 20)/275 = 1/2
+    # (117.5 + 20)/275 = 1/2
+    expected = torch.tensor([30.0, 10.0], dtype=D) * math.exp(-2.0 * 0.5) / 500
     torch.testing.assert_close(model.expected_noise(frames, t_s)[0, :, 0, 0], expected, rtol=1e-6, atol=0)
-    counts, _ = model.draw(frames, t_s, torch.Generator().manual_seed(0))  # a still scene: nothing but noise
+    # a still scene: nothing but noise
+    counts, _ = model.draw(frames, t_s, torch.Generator().manual_seed(0))
     for found, mean in zip(counts.unbind(1), expected.tolist(), strict=True):
         error = math.sqrt(mean / found.numel())
         assert abs(float(found.mean()) - mean) < 4 * error

@@ -325,4 +325,5 @@ def test_coupled_step_reset_is_the_memorised_reference_model(shared, response):
     settings = STEP | {"response": response, "theta": float(data["C"])}
     spikes, _, _ = srm(torch.stack([drive, -drive], 1), **settings)
     truth = torch.stack([steps_first(data["P"]), steps_first(data["N"])], 1)
-    assert torch.equal(spikes, truth)  # levels are multiples of 2^-9 and theta of 2^-3: no rounding anywhere
+    # levels are multiples of 2^-9 and theta of 2^-3: no rounding anywhere
+    assert torch.equal(spikes, truth)

@@ -81,7 +81,8 @@ def test_the_mean_is_that_of_the_ages_written_out_and_passes_gradcheck(kind):
 
     def both(*given):
         mean, after = mean_spikes(kind, *given)
-        return mean, after[0]  # states of an age that holds next to nobody are steep, and weigh nothing
+        # states of an age that holds next to nobody are steep, and weigh nothing
+        return mean, after[0]
 
     assert torch.autograd.gradcheck(both, [x.requires_grad_() for x in given])
 
@@ -258,7 +259,8 @@ def test_the_slope_to_the_threshold_is_that_of_the_mean():
 
 
 def test_enough_steps_per_frame_give_the_counts_and_gradients_of_the_memory_layer():
-    level = walk(10, frames=12, size=0.4).requires_grad_()  # up to six thresholds between two frames
+    # up to six thresholds between two frames
+    level = walk(10, frames=12, size=0.4).requires_grad_()
     assert float((level.detach().diff(dim=0).abs() / THETA).max()) > 3
     seeds = torch.rand(11, 2, 6, generator=seeded(11), dtype=D)
     found = []

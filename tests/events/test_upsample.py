@@ -205,7 +205,8 @@ def test_what_leaves_the_picture_is_blended_where_it_stands_and_holes_are_filled
     # their neighbours: a slope stays a slope
     y, x = torch.meshgrid(torch.arange(41.0), torch.arange(41.0), indexing="ij")
     grows = 4 * torch.stack((x - 20, y - 20))
-    flows = torch.stack((grows, -grows / 5))  # at share 1 the first frame's flow has carried all the way
+    # at share 1 the first frame's flow has carried all the way
+    flows = torch.stack((grows, -grows / 5))
     truth = 30 + (x - 20) / 5
     made = between(10 + x, truth, flows, visibility(flows), 0.999)
     # the slope of 0.2 per px there is met to a fifth of a pixel of the growing frame, and Keys' 0.05 px

@@ -15,7 +15,8 @@ from codesign.events.stream import ordered
 from codesign.events.views.figures import rate_figure, sample, space_time_figure
 from tests.event_streams import stream_of
 
-COUNTS = torch.tensor([[[4.0, 0, 2, 0]], [[0, 4, 2, 0]]])  # [2, 1, 4]: four ON, four OFF, two of each, none
+# [2, 1, 4]: four ON, four OFF, two of each, none
+COUNTS = torch.tensor([[[4.0, 0, 2, 0]], [[0, 4, 2, 0]]])
 
 
 def test_colours_say_polarity_and_strength():

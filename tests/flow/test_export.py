@@ -64,7 +64,8 @@ def test_the_program_gives_the_numbers_of_the_network(tmp_path, generator, name)
     order 1."""
     network = Small().train()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of the packages that write and read programs
+        # of the packages that write and read programs
+        warnings.simplefilter("ignore", DeprecationWarning)
         export(network, tmp_path / name, 9, 12, batch=2)
         assert network.training, "left as it was"
         network.eval()

@@ -43,7 +43,8 @@ def slope_of_white_noise(taps, step):
     pixels of the square of what one pixel does there."""
     count = len(taps) + 4
     middle = count // 2
-    answer = np.array([correlate1d(row, taps) for row in np.eye(count)]).T  # [sample, sample that is lit]
+    # [sample, sample that is lit]
+    answer = np.array([correlate1d(row, taps) for row in np.eye(count)]).T
     each = np.repeat(answer, step, 1) / step  # [sample, pixel that is lit]
     slope = (each[middle + 1] - each[middle - 1]) / (2 * step)
     return (slope**2).sum() * (each[middle] ** 2).sum()
@@ -86,7 +87,8 @@ def evidence(volume, terms, sigma_px):
         np.clip(((size - 1) / 2 - np.abs(place)) / (1 + sigma_px), 0, 1)
         for size, place in ((width, x), (height, y))
     ]
-    fade = np.prod([end**2 * (3 - 2 * end) for end in ends], 0) ** 2  # of the first and of the last bin
+    # of the first and of the last bin
+    fade = np.prod([end**2 * (3 - 2 * end) for end in ends], 0) ** 2
     b = basis(x / (max(width, height) / 2), y / (max(width, height) / 2), terms)
     g = np.concatenate([by_x * b, by_y * b])
     normal = np.einsum("yx,iyx,jyx->ij", fade, g, g)

@@ -65,7 +65,8 @@ def test_the_plain_objective_collapses_and_the_guarded_one_finds_the_zoom(zoom):
     wide = [-3.0, -2.0, -1.25, -1.0, -0.75, -0.5, 0.0, zoom, 0.5, 0.75, 1.0, 1.5, 3.0]
     plain = [float(plain_contrast(volume, s * grid[None])) for s in wide]
     guarded = [float(losses.contrast_loss(volume, s * grid[None])) for s in wide]
-    assert wide[plain.index(min(plain))] in (-1.25, -1.0)  # every event ends in the middle, or passes it
+    # every event ends in the middle, or passes it
+    assert wide[plain.index(min(plain))] in (-1.25, -1.0)
     assert min(plain) < 0.5 * plain[wide.index(zoom)]
     assert wide[guarded.index(min(guarded))] == zoom
     # one carry step leaves (tau zoom)^2 of the flow, 2 to 3 % on average over the window
@@ -100,6 +101,7 @@ def test_the_weight_of_an_area_is_itself_where_it_is_moderate():
     assert losses._stretch((area, none, none, one)).tolist() == pytest.approx([0, 0, 0.2, 0.5, 1, 1.5, 2.5])
     # turned over in both axes: the area is positive, the warp is not upright
     assert not losses._stretch((-one, none, none, -area.abs())).any()
-    check_gradients(lambda a: losses._stretch((a, none, none, one)), area)  # no corner at 0, 0.2 or 1.5
+    # no corner at 0, 0.2 or 1.5
+    check_gradients(lambda a: losses._stretch((a, none, none, one)), area)
     turn = torch.tensor(0.8, dtype=D)  # a rotation by 46 degrees changes no area
     assert losses._stretch((turn.cos(), -turn.sin(), turn.sin(), turn.cos())).item() == pytest.approx(1)

@@ -139,7 +139,8 @@ def test_events_that_leave_count_in_the_denominator_only():
     # the last, at time 1; before, 9 / 24
     assert metrics.rsat(stream, constant(40.0, 12), 0, end_us) == pytest.approx(1 / (9 / 24))
     with pytest.raises(DomainError, match="every event out of the image"):
-        metrics.rsat(stream, constant(40.0, 12), 0, end_us + 1000)  # at 4/5 of the window it leaves too
+        # at 4/5 of the window it leaves too
+        metrics.rsat(stream, constant(40.0, 12), 0, end_us + 1000)
 
 
 def test_polarities_share_an_image_in_fwl_but_not_in_rsat():

@@ -161,7 +161,8 @@ def test_affine_flows_are_followed_exactly():
     place = at = torch.stack([x - 24.5, y - 19.5], -1)
     inside = torch.ones(40, 50, dtype=torch.bool)
     for _ in range(4):
-        inside &= (place.abs() <= torch.tensor([24.5, 19.5])).all(-1)  # the last place may lie outside
+        # the last place may lie outside
+        inside &= (place.abs() <= torch.tensor([24.5, 19.5])).all(-1)
         place = place @ matrix.T + shift
     step = (at @ matrix.T + shift - at).permute(2, 0, 1)
     flow, valid = chained(step.expand(4, -1, -1, -1), torch.ones(4, 40, 50, dtype=torch.bool))
@@ -188,5 +189,6 @@ def test_what_is_hidden_invalid_or_between_surfaces_is_not_followed():
     hidden[0, 2, 2] = hidden[1, 3, 5] = hidden[2, 6, 3] = True
     assert lost(ok, hidden) == [[2, 2], [3, 4]]
     edge = torch.zeros(2, 2, 8, 9, dtype=torch.float64)
-    edge[0, 0], edge[1, 0, :, 5:] = 0.5, 3.0  # half a pixel on, the columns 4 and 5 are read together
+    # half a pixel on, the columns 4 and 5 are read together
+    edge[0, 0], edge[1, 0, :, 5:] = 0.5, 3.0
     assert chained(edge, ok[:2])[1].all(0).tolist() == [k not in (4, 8) for k in range(9)]

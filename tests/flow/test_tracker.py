@@ -128,7 +128,8 @@ def test_a_warm_start_has_the_speed_of_the_window_before():
     found = list(flow.Tracker(steady, events=10).track([stream]))
     assert [window.warm for window in found] == [False, True, True]
     assert starts[0] is None
-    for start, window in zip(starts[1:], found[1:], strict=True):  # the same px per second, another duration
+    # the same px per second, another duration
+    for start, window in zip(starts[1:], found[1:], strict=True):
         seconds = (window.t1_us - window.t0_us) * 1e-6
         torch.testing.assert_close(start, speed * seconds, rtol=1e-5, atol=0)
     for tracker in (flow.Tracker(steady, events=10, warm_start=False), flow.Tracker(summed, events=10)):

@@ -90,7 +90,8 @@ def test_a_failed_ray_says_what_where_and_by_how_much(name):
     geo, origin, direction, status, surface, deficit = CASES[name]
     out = geo.trace(f64([origin]), f64([direction]))
     assert (out.status.item(), out.failed_surface.item(), out.weight.item()) == (status, surface, 0.0)
-    assert abs(out.deficit.item() - deficit) <= 1e-7  # radicands are measured from the grazing limit of 1e-8
+    # radicands are measured from the grazing limit of 1e-8
+    assert abs(out.deficit.item() - deficit) <= 1e-7
 
 
 @pytest.mark.parametrize("name", ["miss", "total reflection", "ellipsoid"])
@@ -247,7 +248,8 @@ def test_deep_conics_are_met_at_their_sag(conic):
     assert out.status.tolist() == [Status.OK] * len(heights)
     for r, z in zip(heights, out.position_mm[:, 2].tolist(), strict=True):
         close(2 * radius * z - (1 + conic) * z * z, r * r, 1e-12)
-        assert z < (radius / (1 + conic) if conic > -1 else math.inf)  # the half that holds the vertex
+        # the half that holds the vertex
+        assert z < (radius / (1 + conic) if conic > -1 else math.inf)
 
 
 @pytest.mark.parametrize("distance", [1e-3, 1e-5, 1e-7])

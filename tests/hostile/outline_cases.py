@@ -199,4 +199,5 @@ CASES: dict[str, Callable[[], World]] = {
     "ball_ahead": ball_ahead,
     "robot_body": robot_body,
 }
-CROSSING = ("sphere_in_floor", "cylinder_in_floor", "crossing_mesh")  # where a refusal is an answer too
+# where a refusal is an answer too
+CROSSING = ("sphere_in_floor", "cylinder_in_floor", "crossing_mesh")

@@ -21,7 +21,8 @@ from codesign.render.charts import emissive_mesh
 WIDTH_PX = 28  # of the square film that sizes are meant for
 WIDEST = 4 / 11  # slope at the border of the film, at most
 FRAMES = 3
-ROUNDEST = 1000  # radii from which round shapes are seen at most: half of where float32 rays lose their edges
+# radii from which round shapes are seen at most: half of where float32 rays lose their edges
+ROUNDEST = 1000
 BACKGROUNDS = ("wall", "room", "sky", "nothing")
 EDGED = ("cube", "card", "hull", "ring", "sheet", "fine", "bowl")
 KINDS = ("ball", "tube", "can", "disc", *EDGED)

@@ -226,7 +226,8 @@ HIDDEN_AT = {
     for part, make in (("events", layer), ("flow", network), ("estimate", speed))
 }
 PRODUCTS = ((CUTS, CUT_AT), (CUTS | HARD, THROUGH), (SHAPES, SHAPED_AT), (IN_PLACE, TOUCHED_AT))
-RIGHT = ("an axis more at frames", "an axis more at mount", "turned at valid")  # axes before, a square film
+# axes before, a square film
+RIGHT = ("an axis more at frames", "an axis more at mount", "turned at valid")
 BAD = {
     f"{how} at {place}": spoil(change)
     for ways, places in (*PRODUCTS, (HIDINGS, HIDDEN_AT))

@@ -23,8 +23,7 @@ CASES = {
     "break 66 -.5 -.2 -4 -6 -30 0",
     "a tilted image plane": "glass 4 .02, air 55 -.01, break 1 .1 .2 3 -2 10 0",
     "a turned last group behind a mirror": "break 0 0 0 10 0 0 0, mirror 0 -.005, break -30 0 0 10 0 0 0, "
-    "glass -4 .01, "
-    "air -40 -.01",
+    "glass -4 .01, air -40 -.01",
 }
 
 

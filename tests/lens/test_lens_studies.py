@@ -54,7 +54,8 @@ def telescope():
     f1 = 500.0
     gap = 380.0
     image = m * (f1 - gap)
-    radius = 2 * image / (m - 1)  # of the secondary; convex, so it bends the other way than the primary
+    # of the secondary; convex, so it bends the other way than the primary
+    radius = 2 * image / (m - 1)
     primary = Surface(
         -2 * f1, gap, None, 100.0, conic=-1.0, is_stop=True, mirror=True, inner_semi_aperture_mm=25.0
     )

@@ -245,7 +245,8 @@ def test_light_behind_the_last_surface_is_that_between_plane_waves():
         plate = ZernikePlate({5: 0.4, 7: 0.5, 11: 0.3}, 0.04 * before_mm).requires_grad_(False)
         psf = analysis.psf_on_pixels(with_plate(geo, plate, -1, 50 - before_mm), 0.0, pixel, 48, grid=256)
         x, field = before_film(analysis.pupil_function(geo, 0.0, grid=320), before_mm, pixel, count)
-        beyond = 2 / (math.pi * 2 * math.pi / 0.5875618e-3 * 0.04 * pixel * count / 2)  # of an Airy pattern
+        # of an Airy pattern
+        beyond = 2 / (math.pi * 2 * math.pi / 0.5875618e-3 * 0.04 * pixel * count / 2)
         energy = float(field.abs().square().sum()) * pixel**2
         close(energy, 1 - beyond, atol=2e-3)
         points = torch.stack(torch.meshgrid(x, x, indexing="xy"), -1).reshape(-1, 2)

@@ -66,7 +66,8 @@ def test_the_geometric_spread_keeps_light_and_its_mean():
     lost = geometric_psf(geo, field, 0.001, 8, grid=64)
     on = ((positions[0] - lost.reference_mm) / 0.001 + 4).floor()
     inside = ((on >= 0) & (on < 7)).all(1).double().mean()
-    assert float(inside) <= float(lost.energy.sum().detach()) < 1  # the share on the grid is not made up to 1
+    # the share on the grid is not made up to 1
+    assert float(inside) <= float(lost.energy.sum().detach()) < 1
 
 
 def test_diffraction_keeps_the_mean_of_the_rays():

@@ -154,7 +154,8 @@ def test_conversion_keeps_values_flags_and_gradients():
     back = geo.double().curvature_per_mm
     close(back, lens.load("la1509").curvature_per_mm, 1e-7)
     parameter = geo.thickness_mm
-    assert geo.double().thickness_mm is parameter  # nothing to convert: optimisers keep what they hold
+    # nothing to convert: optimisers keep what they hold
+    assert geo.double().thickness_mm is parameter
 
 
 def test_thin_lenses_are_modules():

@@ -146,7 +146,8 @@ def test_precision_is_carried_to_another_place():
     that showed nothing from here takes the texture of its neighbour, not that of all."""
     whole, flow = lawful()
     trend = PrecisionTrend().add(whole, flow)
-    rich = (torch.arange(20) % 2 == 0).to(F)[:, None]  # bodies whose world has more texture than the law's
+    # bodies whose world has more texture than the law's
+    rich = (torch.arange(20) % 2 == 0).to(F)[:, None]
     told = whole.precision * (1 + 4 * rich)[..., None, None]
     pixels = torch.cat([torch.zeros(20, 100, 2), torch.full((20, 100, 2), 50.0)], 1).to(F)
     here = replace(whole, precision=told, pixels=pixels, windows=2, share=whole.share.clone())
@@ -159,7 +160,8 @@ def test_precision_is_carried_to_another_place():
     wrong = 0.5 * (torch.logdet(found.precision) - torch.logdet(truth))
     assert float(wrong[:, :100].abs().max()) < 0.25  # the trend's third order against the law
     assert float(wrong[:, :100].mean().abs()) < 0.02
-    assert wrong[:, 100:].mean(1).tolist() == pytest.approx([0.0] * 20, abs=0.25)  # of 100 points' textures
+    # of 100 points' textures
+    assert wrong[:, 100:].mean(1).tolist() == pytest.approx([0.0] * 20, abs=0.25)
     odds = [(each / (1 - each)).log()[:, :100] for each in (found.confidence, whole.confidence)]
     law = 0.5 * ((2 * flow[..., 0] + 0.5) / (flow[..., 0] + 0.5)).log()[:, :100]
     assert float((odds[0] - odds[1] - law).mean().abs()) < 0.05

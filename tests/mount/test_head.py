@@ -108,7 +108,8 @@ def test_blur_and_focal_length_are_those_of_the_thin_lens(mount):
     )
     for column, near in ((4, 1 / 0.8), (5, 0.0)):
         disc_px = 10.0 * abs(1 - 20.5 * (1 / 20.0 - 1e-3 * near)) / PITCH_MM
-        expected = torch.full((2, 3), disc_px / 8**0.5, dtype=D)  # root mean square radius of a uniform disc
+        # root mean square radius of a uniform disc
+        expected = torch.full((2, 3), disc_px / 8**0.5, dtype=D)
         torch.testing.assert_close(found[..., column].expm1(), expected, rtol=1e-6, atol=1e-6)
 
 

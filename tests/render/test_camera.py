@@ -110,8 +110,10 @@ def test_angular_miss_is_the_angle_between_ray_and_point(name, generator):
     rays = camera.chief_rays(pixels)
     points = (rays.origin_m + 3 * rays.direction).detach()
     across = torch.linalg.cross(rays.direction, torch.tensor([[0.3, 1.0, 0.2]], dtype=D).expand(10, 3))
-    side = torch.nn.functional.normalize(across, dim=1).detach()  # at right angles to the ray: tan = 0.01
-    assert float(angular_miss_rad(camera, pixels, points).detach().max()) <= 1.01e-6  # the smooth floor
+    # at right angles to the ray: tan = 0.01
+    side = torch.nn.functional.normalize(across, dim=1).detach()
+    # the smooth floor
+    assert float(angular_miss_rad(camera, pixels, points).detach().max()) <= 1.01e-6
     found = angular_miss_rad(camera, pixels, points + 0.03 * side).detach()
     chord = torch.full((10,), 2 * math.sin(math.atan(0.01) / 2), dtype=D)
     torch.testing.assert_close(found, chord, rtol=1e-7, atol=0)  # the floor adds 5e-9

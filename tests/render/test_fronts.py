@@ -14,7 +14,8 @@ from codesign.render.silhouettes.shapes import read
 from scenes import worlds
 
 CAMERA = Camera(lens.Pinhole(4.0), 24, 24, 0.1, 4)
-EQUAL = {"sphere": [0, 1, 2], "cylinder": [0, 1], "disk": [0, 1]}  # axes of one length, as Mitsuba asks for
+# axes of one length, as Mitsuba asks for
+EQUAL = {"sphere": [0, 1, 2], "cylinder": [0, 1], "disk": [0, 1]}
 KINDS = ("rectangle", "disk", "sphere", "cylinder", "cube", "ply", "obj")
 
 

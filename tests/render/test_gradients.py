@@ -10,7 +10,8 @@ from scenes import worlds
 from tests.render.differences import assert_gradients
 
 D = torch.float64
-MOVES = torch.tensor([[0, 0, 0, 0, 0, 0], [0.02, 0.01, 0.03, 0.004, -0.003, 0.01]], dtype=D)  # two frames
+# two frames
+MOVES = torch.tensor([[0, 0, 0, 0, 0, 0], [0.02, 0.01, 0.03, 0.004, -0.003, 0.01]], dtype=D)
 
 
 def triplet():

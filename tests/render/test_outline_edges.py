@@ -40,7 +40,8 @@ def test_flat_diagonals_are_no_edges_and_inner_edges_count_at_silhouettes_only()
     assert bool(edges.always.all())
     edges = mesh_edges(*tube())
     assert int(edges.always.sum()) == 128  # the open ends
-    assert silhouettes(edges, (5.0, 0.1, 0.5)) == 2  # of 64 inner edges, the two where the tube turns away
+    # of 64 inner edges, the two where the tube turns away
+    assert silhouettes(edges, (5.0, 0.1, 0.5)) == 2
 
 
 def test_faces_wound_against_their_neighbour_part_light_from_black():

@@ -33,7 +33,8 @@ def test_the_table_projects_as_traced_rays_do(name, level):
         assert table.series is not None
         draw = torch.rand(400, 3, generator=torch.Generator().manual_seed(0), dtype=D)
         depth = 0.3 * 100 ** draw[:, 2:]
-        points = torch.cat([(draw[:, :2] - 0.5) * 0.9 * depth, depth], 1)  # within and beyond the field
+        # within and beyond the field
+        points = torch.cat([(draw[:, :2] - 0.5) * 0.9 * depth, depth], 1)
         pixels, base, slope = table(points)
         truth = render.project(cam, points)
         assert torch.equal(pixels.isnan(), truth.isnan())

@@ -87,7 +87,8 @@ def test_lateral_colour_is_in_it():
     optics = triplet()
     lines = lens.Spectrum((0.4861327, 0.6562725), (0.5, 0.5))
     psf = render.psf_map(camera(optics, 240, 160, spectrum=lines, samples=16))
-    found = psf.offsets_px(torch.zeros(1, dtype=D))[0].unflatten(1, (2, -1)).mean(2)  # [N, colours, 2]
+    # [N, colours, 2]
+    found = psf.offsets_px(torch.zeros(1, dtype=D))[0].unflatten(1, (2, -1)).mean(2)
     node = psf.nodes_px[0]
     back = [
         optics.camera_rays(psf.camera.film_mm(node[None]), torch.zeros(1, 2, dtype=D), w).direction

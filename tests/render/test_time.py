@@ -235,7 +235,8 @@ def test_the_lens_is_traced_once_and_its_gradient_is_the_sum_over_chunks(monkeyp
         for chunk in render.frame_chunks(cam, scene, poses, 2)
     )
     assert len(traced) == 1
-    torch.testing.assert_close(total, truth, rtol=1e-12, atol=0)  # the same terms, summed in another order
+    # the same terms, summed in another order
+    torch.testing.assert_close(total, truth, rtol=1e-12, atol=0)
 
 
 def test_no_exposure_is_the_frame_and_the_lens_keeps_its_gradient(generator):

@@ -26,7 +26,8 @@ def test_a_constant_twist_comes_back_at_any_spacing():
     body, _ = camera_velocity(trajectories.body_twist(start(), TWIST, t_s), t_s)
     truth = TWIST.expand(5, 6)
     assert float((body - truth)[1:].abs().max()) <= 1e-13
-    assert float((body - truth)[0].abs().max()) <= 1e-12  # positions of 2 m round to 4e-16 m over 1 ms
+    # positions of 2 m round to 4e-16 m over 1 ms
+    assert float((body - truth)[0].abs().max()) <= 1e-12
 
 
 def test_velocity_in_world_axes_is_that_of_the_centre_and_the_spin_at_the_middle():

@@ -184,7 +184,8 @@ def test_a_card_that_moves_hides_what_it_comes_to_cover(optics):
     assert torch.equal(seen.object_id.reshape(-1)[clear], (inside[0] > 0).long()[clear])
     assert not bool((found.occluded & ~found.valid).any())
     still = (seen.object_id == 0) & seen.valid
-    assert float(found.flow_px[0][:, still].detach().abs().max()) <= 1e-9  # the ground does not move
+    # the ground does not move
+    assert float(found.flow_px[0][:, still].detach().abs().max()) <= 1e-9
 
 
 def test_points_of_a_ball_that_turns_are_hidden_when_they_face_away():

@@ -54,7 +54,8 @@ def write_obj(folder, vertices, faces, name="q.obj", kd="1 1 1", picture="p.png"
 
 UPRIGHT = [(-1, 0, -1), (1, 0, -1), (1, 0, 1), (-1, 0, 1)]  # z up, facing -y
 SQUARE = [(1, 2, 3, 4)]
-CORNERS = {(-0.5, 0, 0.5): 0, (0.5, 0, 0.5): 64, (-0.5, 0, -0.5): 128, (0.5, 0, -0.5): 255}  # texel centres
+# texel centres
+CORNERS = {(-0.5, 0, 0.5): 0, (0.5, 0, 0.5): 64, (-0.5, 0, -0.5): 128, (0.5, 0, -0.5): 255}
 
 
 def write_gltf(folder, kind, sampler=None, uv=((0, 1), (1, 1), (1, 0), (0, 0)), **changes):
@@ -142,7 +143,8 @@ def test_axes_and_units(tmp_path):
     path = write_obj(tmp_path, [(0, 0, 0), (1, 0, 0), (1, 2, 0), (0, 2, 3)], SQUARE)
     given = {up: mesh_files.read(path, 0.01, up)[0].vertices_m for up in "xyz"}
     np.testing.assert_allclose(given["z"][3], [0, 0.02, 0.03])
-    np.testing.assert_allclose(given["y"][3], [0, -0.03, 0.02])  # y up, z towards the viewer, who is at -y
+    # y up, z towards the viewer, who is at -y
+    np.testing.assert_allclose(given["y"][3], [0, -0.03, 0.02])
     np.testing.assert_allclose(given["x"][1], [0, 0, 0.01])
     for axes in mesh_files.AXES.values():
         assert np.linalg.det(axes) == 1  # turned, never mirrored

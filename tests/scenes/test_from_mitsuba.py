@@ -80,7 +80,8 @@ def test_a_file_a_dictionary_and_a_loaded_scene_are_one_world(path):
             (mi.load_dict(described(mi, 3.0)), {}),
         )
     ]
-    for other in images[1:]:  # the file's turn by 90 degrees is rounded otherwise than the dictionary's
+    # the file's turn by 90 degrees is rounded otherwise than the dictionary's
+    for other in images[1:]:
         torch.testing.assert_close(images[0], other, rtol=1e-4, atol=1e-5)
     assert not torch.equal(images[0], seen(worlds.from_mitsuba(path, "path", samples=2), view))
 
@@ -287,7 +288,8 @@ def test_a_baked_scene_in_centimetres_stands_where_its_paths_do(path):
     baked = worlds.from_mitsuba(scene, "baked", texel_m=0.03, **options)
     paths = worlds.from_mitsuba(scene, "path", samples=32, **options)
     error = light.level_error(baked, paths, view.camera(8), view.T_world_cam[None])
-    assert float(error.rms) < 0.04  # 64 paths per texel: 3 % of what the sky gives, and the edge of a shadow
+    # 64 paths per texel: 3 % of what the sky gives, and the edge of a shadow
+    assert float(error.rms) < 0.04
     origin = torch.tensor([[0.0, -0.2, 0.5]], dtype=torch.float64)
     down = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64)
     for one, other in zip(baked.hit(origin, down), paths.hit(origin, down), strict=True):

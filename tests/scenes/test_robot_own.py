@@ -187,7 +187,8 @@ def test_a_robot_stands_on_the_ground_wherever_its_origin_is(page):
     poses, twist = found.drive(2, 4)
     assert torch.equal(twist, PAIRS["outdoors"]().drive(2, 4)[1])
     seen, _ = render.camera_velocity(poses, robot_pair.times())
-    torch.testing.assert_close(seen, twist[:, None].expand_as(seen), rtol=0, atol=1e-9)  # 1e-15 m over 2.9 ms
+    # 1e-15 m over 2.9 ms
+    torch.testing.assert_close(seen, twist[:, None].expand_as(seen), rtol=0, atol=1e-9)
     middle = poses[:, 0] @ pose.se3_exp(robot_pair.MIDDLE_S * twist)
     torch.testing.assert_close(middle[:, 2, 3], torch.full((4,), 0.058, dtype=D), rtol=0, atol=1e-12)
     corners = torch.from_numpy(next(iter(found.bodies.values())).vertices_m)

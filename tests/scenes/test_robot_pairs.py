@@ -34,7 +34,8 @@ def drives(pair):
 
 def test_boxes_and_cylinders_have_their_volumes_and_stand_where_they_are_asked_to():
     around = bodies.AROUND
-    area = around / 2 * math.sin(2 * math.pi / around)  # of the regular polygon in a circle of radius 1
+    # of the regular polygon in a circle of radius 1
+    area = around / 2 * math.sin(2 * math.pi / around)
     assert volume_m3(bodies.box((2.0, 1.0, 0.5), (3.0, 2.0, 1.0), 30.0)) == pytest.approx(1.0, rel=1e-12)
     for axis, name in enumerate("xyz"):
         body = bodies.cylinder(0.1, 0.04, (1.0, 2.0, 3.0), name)
@@ -49,7 +50,8 @@ def test_bodies_are_closed_and_stand_above_the_ground(pair, drives):
         edges = np.concatenate([body.faces[:, [k, (k + 1) % 3]] for k in range(3)])
         counted = np.unique(edges, axis=0, return_counts=True)
         assert (counted[1] == 1).all()  # every directed edge once,
-        assert {tuple(edge) for edge in edges} == {tuple(edge[::-1]) for edge in edges}  # and once back
+        # and once back
+        assert {tuple(edge) for edge in edges} == {tuple(edge[::-1]) for edge in edges}
         assert volume_m3(body) > 0
         points = torch.from_numpy(body.vertices_m)
         lowest = pose.apply(drives.T_world_body.flatten(0, 1), points)[..., 2].min()
@@ -59,7 +61,8 @@ def test_bodies_are_closed_and_stand_above_the_ground(pair, drives):
 def test_poses_follow_the_true_velocity(drives):
     twist = torch.stack([drives.twist] * (robot_pair.FRAMES - 1), 1)
     found, _ = render.camera_velocity(drives.T_world_body[0], drives.t_s)
-    torch.testing.assert_close(found, twist, rtol=0, atol=1e-9)  # rounding of poses of 1e-15 m over 2.5 ms
+    # rounding of poses of 1e-15 m over 2.5 ms
+    torch.testing.assert_close(found, twist, rtol=0, atol=1e-9)
 
 
 def test_the_ground_is_where_the_estimator_takes_it(pair, drives):

@@ -51,7 +51,8 @@ def test_a_planar_arm_reaches_where_its_closed_form_says(tmp_path):
     reach = 0.4 + d
     expected = [0.7 * math.cos(a) + reach * math.cos(a + b), 0.7 * math.sin(a) + reach * math.sin(a + b), 0.5]
     np.testing.assert_allclose(tip[:3, 3], expected, atol=1e-15)
-    fixed = turn("z", 0.5) @ turn("y", -0.4) @ turn("x", 0.3)  # URDF: roll, pitch, yaw about fixed axes
+    # URDF: roll, pitch, yaw about fixed axes
+    fixed = turn("z", 0.5) @ turn("y", -0.4) @ turn("x", 0.3)
     np.testing.assert_allclose(tip[:3, :3], turn("z", a + b) @ fixed, atol=1e-15)
     assert robot.frame("tip").dtype == torch.float64
     # in the axes of another link
@@ -83,7 +84,8 @@ def test_a_joint_that_mimics_another_follows_it(tmp_path):
         ('<box size="0.1 0.2 0.3"/>', 0.006, 1e-12),
         # inscribed prism of 48 sides: n/2 sin(2 pi/n) / pi of the circle
         ('<cylinder radius="0.1" length="0.3"/>', 0.01 * 0.3 * 24 * math.sin(math.pi / 24), 1e-9),
-        ('<sphere radius="0.1"/>', 4 / 3 * math.pi * 0.001, 0.02),  # 1,280 chords lie below the sphere
+        # 1,280 chords lie below the sphere
+        ('<sphere radius="0.1"/>', 4 / 3 * math.pi * 0.001, 0.02),
     ],
 )
 def test_bodies_have_their_volume(tmp_path, geometry, expected, share):
@@ -123,7 +125,8 @@ def test_collision_shapes_stand_in_and_are_shown_on_request():
         0.5 * 0.32 * 0.12 + 0.2 * 0.2 * 0.08
     )
     assert sum(volume_m3(p) for p in solid.parts if p.name == "chassis") == pytest.approx(0.5 * 0.32 * 0.2)
-    assert {p.name for p in solid.parts} == {p.name for p in seen.parts}  # wheels have visual shapes alone
+    # wheels have visual shapes alone
+    assert {p.name for p in solid.parts} == {p.name for p in seen.parts}
 
 
 def test_a_camera_on_a_link_looks_along_its_x_axis_with_z_up():

@@ -85,7 +85,8 @@ def test_four_digit_quaternions_become_rotations(tmp_path):
         (f"{LINE}\n1.0 {'1' * 500} 2 3 0 0 0 1\n", "line 2"),
         ("0,5 1,0 2,0 3,0 0,0 0,0 0,0 1,0\n", "line 1: .* is not"),  # decimal commas
         ("0.5,1,2,3,0,0,0,\n", "line 1: .* is not"),
-        (f"t_s,x,y,z,qw,qx,qy,qz\n{LINE}\n", "line 1: .* is not"),  # another order of the quaternion
+        # another order of the quaternion
+        (f"t_s,x,y,z,qw,qx,qy,qz\n{LINE}\n", "line 1: .* is not"),
         (f"{LINE}\nt x y z qx qy qz qw\n", "line 2: .* is not"),
         ("t x y z qx qy qz qw\n", "holds no pose"),
     ],
@@ -152,7 +153,8 @@ def test_recorded_paths_refuse_times_outside_and_ambiguous_turns(tmp_path):
         Recorded([0.0, 1.0], poses)
     write_tum(tmp_path / "a.txt", [0.0, 1.0], poses[:1].expand(2, 4, 4))
     path = Recorded.read(tmp_path / "a.txt")
-    torch.testing.assert_close(path(torch.tensor([0.5])), poses[:1], rtol=0, atol=0)  # standing still
+    # standing still
+    torch.testing.assert_close(path(torch.tensor([0.5])), poses[:1], rtol=0, atol=0)
     with pytest.raises(DomainError, match="from 0 to 1 s"):
         path(torch.tensor([1.5]))
     with pytest.raises(ShapeError, match="at least 2"):

@@ -195,7 +195,8 @@ def test_windows_of_worlds_last_until_the_flow_is_as_long_as_asked_and_count_who
     for flow, seen in zip(windows.truth.flow_px, windows.truth.valid, strict=True):
         assert 1.5 < flow.square().sum(0)[seen].mean().sqrt() < 3.8
     whole = windows.volume.counts.sum((1, 2, 3, 4))
-    torch.testing.assert_close(whole, whole.round(), rtol=1e-5, atol=0)  # shares of an event add up to one
+    # shares of an event add up to one
+    torch.testing.assert_close(whole, whole.round(), rtol=1e-5, atol=0)
     assert abs(float(windows.volume.collected_s.sum()) - 1.0) < 1e-12
 
 

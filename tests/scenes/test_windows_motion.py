@@ -73,7 +73,8 @@ def test_the_origins_of_a_field_lead_back_to_the_pixels(seed):
         origins = field.origins(points).double()
         for share, origin in zip(field.share, origins, strict=True):
             reached = origin + share * field.displacement(origin)
-            assert float((reached - points).abs().max()) < 1e-4  # a hundredth of what flow is judged by
+            # a hundredth of what flow is judged by
+            assert float((reached - points).abs().max()) < 1e-4
         assert torch.equal(origins[2].float(), points)
         # the end is the same displacement the other way round
         torch.testing.assert_close(field.end(origins[-1].float()), points, rtol=0, atol=1e-4)

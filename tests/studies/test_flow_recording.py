@@ -102,7 +102,8 @@ def test_a_recording_without_truth_has_its_sharpness_only(tmp_path):
     )
     code, metrics = run(tmp_path / "run", tmp_path / "events.txt")
     assert code == 0
-    assert metrics["packets_without_truth"] == metrics["packets"] == 1  # shorter than 0.1 s: one packet
+    # shorter than 0.1 s: one packet
+    assert metrics["packets_without_truth"] == metrics["packets"] == 1
     assert "lk_aee_px" not in metrics
     assert metrics["lk_fwl"] > 0
 

@@ -221,7 +221,8 @@ def counted(run: Run[Config]):
     ("steps", "stop_at", "seconds_per_step", "seconds"),
     [
         (10, 4, 0.02, 10 * 0.02 + 2 * 0.06 + 1.0),  # stopped between steps (after the next one)
-        (10, None, 0.02, 10 * 0.02 + 0.06 + 1.5),  # stopped while judging: nothing is left but to judge again
+        # stopped while judging: nothing is left but to judge again
+        (10, None, 0.02, 10 * 0.02 + 0.06 + 1.5),
         (1, None, 0.08, 0.08 + 1.5),  # one step alone: it is all that was timed
     ],
 )

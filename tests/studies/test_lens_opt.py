@@ -52,7 +52,8 @@ def test_the_start_is_in_best_focus_at_the_asked_spot_and_the_shown_twin_is_not(
 
 def test_spots_of_the_wall_agree_with_those_of_the_lens_package():
     geo = lens.load("cooke-triplet").scaled(0.22).freeze()
-    fields = (0.0, 0.1)  # where the soft edges of the apertures take away less than 1e-7 of the light
+    # where the soft edges of the apertures take away less than 1e-7 of the light
+    fields = (0.0, 0.1)
     green = lens.Spectrum.line("d")
     ours = spot_rays(geo, fields, 2.0, green, grid=32).rms_mm()
     assert torch.allclose(ours, lens.rms_spot_mm(geo, fields, at_m=2.0), rtol=1e-9)

@@ -117,7 +117,8 @@ def test_segments_are_the_shapes_of_the_scene():
         distance = (points - torch.tensor([0.1, 0.5, 0.25], dtype=D)).norm(dim=2)
         on_ball = segment_id[0] == index["static/ball"]
         assert bool(on_ball.any())
-        assert float((distance[on_ball] - 0.25).abs().max()) < 5e-3  # it rests a gap of 1 mm above the ground
+        # it rests a gap of 1 mm above the ground
+        assert float((distance[on_ball] - 0.25).abs().max()) < 5e-3
         on_floor = segment_id[0] == index["static/floor"]
         assert torch.equal(on_floor, points[..., 2].abs() < 1e-5)
         assert torch.equal(segment_id[0] == index["static/north"], (points[..., 1] - 2).abs() < 1e-5)
@@ -323,7 +324,8 @@ def test_impossible_options_end_with_one_sentence(options, sentence, tmp_path, c
 
 
 def test_paths_that_cannot_keep_clear_are_refused():
-    stage = Stage(low_m=(0.0, 1.99, 1.0), high_m=(0.0, 1.995, 1.0), target_m=(0.0, 3.0, 1.0))  # at the wall
+    # at the wall
+    stage = Stage(low_m=(0.0, 1.99, 1.0), high_m=(0.0, 1.995, 1.0), target_m=(0.0, 3.0, 1.0))
     with pytest.raises(DomainError, match="none of 200 radial paths"):
         motions.motion("radial", stage, worlds.room(), camera(size=16), 1.0, torch.Generator().manual_seed(0))
 

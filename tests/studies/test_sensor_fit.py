@@ -190,9 +190,8 @@ def test_the_study_records_what_the_files_say(tmp_path, capsys):
     with np.load(path) as data:
         frames = data["frames"].astype(np.float64)
     level = np.where(frames <= 20, frames * math.log(20) / 20, np.log(np.maximum(frames, 20)))
-    on = (
-        0  # the memorised level of every pixel follows in whole thresholds; the second half: intervals 3 to 5
-    )
+    # the memorised level of every pixel follows in whole thresholds; the second half: intervals 3 to 5
+    on = 0
     memory = level[0]
     for k, now in enumerate(level[1:]):
         steps = np.trunc((now - memory) / 0.2)

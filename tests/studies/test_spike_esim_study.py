@@ -101,7 +101,8 @@ def test_flicker_is_the_power_above_fifty_hertz():
     power = [
         judge.flicker(wave(high)[:, None, None, None].expand(-1, 2, 16, 16), DT_S) for high in (2.0, 1.0)
     ]
-    assert power[0] / power[1] == pytest.approx(4.0, rel=1e-6)  # the taper leaks below 1e-6 at this distance
+    # the taper leaks below 1e-6 at this distance
+    assert power[0] / power[1] == pytest.approx(4.0, rel=1e-6)
 
 
 def test_the_median_takes_lone_events_out_and_leaves_edges():
@@ -113,7 +114,8 @@ def test_the_median_takes_lone_events_out_and_leaves_edges():
 
 
 def test_an_ideal_generator_follows_an_ideal_sensor_through_every_threshold(monkeypatch):
-    noisy = SensorModel(0.18, 0.22, shot_rate_hz=50.0, leak_rate_hz=5.0)  # both are left out of the sweep
+    # both are left out of the sweep
+    noisy = SensorModel(0.18, 0.22, shot_rate_hz=50.0, leak_rate_hz=5.0)
     monkeypatch.setattr(study, "SENSOR", noisy)
     rows = study.swept(SpikeEsim(0.18, 0.22), [made(walk(16), None)])
     # some 5000 events; a level within rounding of a threshold may tell one more or less

@@ -160,7 +160,8 @@ def test_an_interrupted_run_goes_on_with_the_same_events(tmp_path, monkeypatch, 
     with (tmp_path / "cut" / study.LOG).open("ab") as file:
         file.write(b"rubbish")
     assert main(study.study, study.Config, ["--resume", str(tmp_path / "cut")]) == 0
-    assert len(calls) == (9 if how == "killed" else 8)  # of eight chunks the killed run made one again
+    # of eight chunks the killed run made one again
+    assert len(calls) == (9 if how == "killed" else 8)
     assert (tmp_path / "whole" / "e.npz").read_bytes() == (tmp_path / "cut" / "e.npz").read_bytes()
     assert main(study.study, study.Config, ["--resume", str(tmp_path / "cut")]) == 0
     assert "complete" in capsys.readouterr().out

@@ -76,7 +76,8 @@ def test_the_gradient_of_choice_is_found_for_a_lens_with_variables(wall):
     variables = geo.variables("curvature", "focus")
     losses = []
     slopes = []
-    for way in ("auto", "interior"):  # a wall that fills the view has no silhouette: both are the same
+    # a wall that fills the view has no silhouette: both are the same
+    for way in ("auto", "interior"):
         result = system_of(geo, wall, gradient=way)(batch())
         slopes.append(torch.cat(torch.autograd.grad(result.loss, variables)))
         losses.append(result.loss.item())

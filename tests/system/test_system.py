@@ -103,7 +103,8 @@ def test_table_counts_zero_gradients():
     result.backward()
     row = next(r for r in result.table() if r["junction"] == "rays")
     assert row["gradient_norm"] == pytest.approx(36.0)
-    assert row["zero_share"] == pytest.approx(2 / 3)  # of three direction components only x reaches the loss
+    # of three direction components only x reaches the loss
+    assert row["zero_share"] == pytest.approx(2 / 3)
 
 
 def test_without_a_probe_nothing_is_kept_and_nothing_looked_at():
@@ -131,7 +132,8 @@ def test_several_objectives_share_one_pass_and_add_up_by_weight():
     assert len(rendered) == 1
     result.backward({"square": 0.5, "sum": 10.0})
     assert lens.efl_mm.grad is not None
-    assert lens.efl_mm.grad.item() == pytest.approx(0.5 * 36 + 10 * 2)  # d(36 a^2)/da = 36, d(2 a)/da = 2
+    # d(36 a^2)/da = 36, d(2 a)/da = 2
+    assert lens.efl_mm.grad.item() == pytest.approx(0.5 * 36 + 10 * 2)
     assert set(system(BATCH, objectives=("sum",)).objectives) == {"sum"}
     with pytest.raises(DomainError, match="no objective 'cube'; there are square, sum"):
         system(BATCH, objectives=("cube",))
@@ -241,7 +243,8 @@ def test_windows_of_a_film_become_samples():
     camera.film = SimpleNamespace(shape=(3, 1, 1))
     poses = torch.eye(4, dtype=torch.float64).expand(2, 2, 4, 4)
 
-    def render(T_world_cam):  # [trajectory 2, T 2, window 3, 1, 1]: 100 trajectory + 10 time + window
+    # [trajectory 2, T 2, window 3, 1, 1]: 100 trajectory + 10 time + window
+    def render(T_world_cam):
         shape = torch.arange(2.0)[:, None, None] * 100 + torch.arange(2.0)[:, None] * 10 + torch.arange(3.0)
         return shape[..., None, None]
 

@@ -41,12 +41,10 @@ class CurvePoints(Rows):
 
     world_m, ahead_m [n, 3]: the point, and the same curve a little further on. share [n]: how many such steps
     each point stands for. aside_rad, near_rad [n]: how far to the sides radiance is safely read from afar and
-    from NEARBY of the way, both as seen from the viewpoint. face_slope [n]: tangent of the
-    view's angle to the steeper of the faces on both sides, infinite where what is seen may lie far behind.
-    apex_m
-    [n, 2, 3]: third corners of the triangles on both sides, NaN where there are none. pupil [n, 2];
-    colour, window, frame, part [n]: numbers of the wavelength, the window of the film, the frame and the part
-    of the scene.
+    from NEARBY of the way, both as seen from the viewpoint. face_slope [n]: tangent of the view's angle to
+    the steeper of the faces on both sides, infinite where what is seen may lie far behind. apex_m [n, 2, 3]:
+    third corners of the triangles on both sides, NaN where there are none. pupil [n, 2]; colour, window,
+    frame, part [n]: numbers of the wavelength, the window of the film, the frame and the part of the scene.
     """
 
     world_m: Tensor
