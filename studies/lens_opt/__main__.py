@@ -6,6 +6,9 @@ gradients through rays, frames, events and flow, beside rivals with the same fre
 limits: refocused alone, damped least squares on spots, and the seed project's edge energy. All are judged on textures
 and motions never optimised on, with a hard event sensor, case by case.
 
+With --motion any, forward, turn, hover or a file of poses, the lens is designed for a motion of that kind: another
+study with options of its own (python -m studies.lens_motion --help).
+
 The event layer and the flow estimator can be any of the toolkit's; a network can be trained together with the lens.
 """
 
@@ -20,6 +23,7 @@ from codesign.lens.design import edge_thickness_mm
 from codesign.system import check
 from studies.frame.compare import log_ratio
 from studies.frame.run import Run, StudyConfig, main
+from studies.lens_motion import __main__ as lens_motion
 from studies.lens_opt import page as lens_opt_page
 from studies.lens_opt import rivals
 from studies.lens_opt.descend import JUDGED, Job, development_error, prepare
@@ -296,5 +300,13 @@ def judge_all(course, lenses):
     return found
 
 
+def start(arguments: list[str] | None = None) -> int:
+    """The command line; with --motion it is that of lens_motion. Returns: exit code."""
+    words = sys.argv[1:] if arguments is None else arguments
+    if any(word.split("=")[0] == "--motion" for word in words):
+        return main(lens_motion.study, lens_motion.Config, arguments)
+    return main(study, Config, arguments)
+
+
 if __name__ == "__main__":
-    sys.exit(main(study, Config))
+    sys.exit(start())
