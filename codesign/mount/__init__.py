@@ -11,7 +11,7 @@ from codesign.mount.body import Body, Housing
 from codesign.mount.depth import ground_depth, scene_depth
 from codesign.mount.ego_velocity import EgoVelocity, Motion, Readings
 from codesign.mount.errors import Expected, FlowErrors, VelocityErrors, expected_errors, velocity_errors
-from codesign.mount.head import Evidence, VelocityHead
+from codesign.mount.head import Evidence, VelocityHead, window_optics
 from codesign.mount.observability import FREE, PLANAR, body_flow, flow_precision
 from codesign.mount.pose import Mount, MountRanges, yaw_pitch_roll_rad
 from codesign.mount.requirements import (
@@ -81,6 +81,7 @@ __all__ = [
     "sight_units",
     "starts",
     "velocity_errors",
+    "window_optics",
     "yaw_pitch_roll_rad",
 ]
 

@@ -136,6 +136,16 @@ def _length(vectors):
     return (vectors.square().sum(-1) + 1e-12).sqrt()
 
 
+def window_optics(camera: ChiefRayCamera, read: Readings) -> Tensor:
+    """[N, W, 2] of the windows of readings: logarithm of the focal length there, in units of FOCAL_PX, and log1p of
+    the blur of what is seen in them, px. Gradient: lens and depth."""
+    seen = read.share.detach() > 0
+    near = torch.where(seen, 1 / read.depth_m, 0.0).unflatten(1, (read.windows, -1))
+    count = seen.unflatten(1, (read.windows, -1)).sum(2).clamp_min(1)
+    mounts = torch.eye(4, dtype=near.dtype).expand(len(near), 4, 4)
+    return _lens(camera, read.windows, near.sum(2) / count, mounts)[..., 3:5]
+
+
 def _lens(camera, windows, nearness, mounts):
     """[N, W, 6]: direction of the windows in body axes, logarithm of the focal length there, blur in pixels
     (root mean square radius) of what is as near as 1 / nearness [N, W] m, and of what is infinitely far."""

@@ -27,6 +27,9 @@ class PrecisionTrend:
     """Regression of the logarithm of precision, and of the log odds of confidence, on flow length (third
     order), nearness, and the share of the window that the body covers (second).
 
+    Where lenses differ too, every call is given ``optics`` [N, windows, 2] of its readings (``window_optics``):
+    nearness then counts in pixels per metre, and blur is a term (second order, and with the length).
+
     >>> trend = PrecisionTrend()
     """
 
@@ -40,6 +43,7 @@ class PrecisionTrend:
         read: Readings,
         flow_px: Tensor,
         covered: Tensor | None = None,
+        optics: Tensor | None = None,
     ) -> "PrecisionTrend":
         """Take in readings whose true flow is [N, P, 2] px; points without a surface are left out.
 
@@ -47,7 +51,7 @@ class PrecisionTrend:
           windows].
         """
         seen = read.share > 0
-        terms = _terms(read, flow_px, covered)[seen]
+        terms = _terms(read, flow_px, covered, optics)[seen]
         wanted = torch.stack([_log_precision(read), _log_odds(read.confidence)], -1)[seen]
         normal, right = terms.mT @ terms, terms.mT @ wanted
         self._normal = normal if self._normal is None else self._normal + normal
@@ -66,10 +70,16 @@ class PrecisionTrend:
         confidence = torch.sigmoid(_log_odds(read.confidence.detach()) + change[..., 1])
         return replace(read, precision=precision, confidence=confidence)
 
-    def told(self, read: Readings, flow_px: Tensor, covered: Tensor | None = None) -> Tensor:
+    def told(
+        self,
+        read: Readings,
+        flow_px: Tensor,
+        covered: Tensor | None = None,
+        optics: Tensor | None = None,
+    ) -> Tensor:
         """[N, P, 2]: logarithm of precision and log odds of confidence by the trend alone. Arguments and
         errors as ``followed``."""
-        return _terms(read, flow_px, covered) @ self._coefficients()
+        return _terms(read, flow_px, covered, optics) @ self._coefficients()
 
     def carried(
         self,
@@ -107,17 +117,22 @@ class PrecisionTrend:
         return torch.linalg.solve(self._normal + ridge, self._right)
 
 
-def _terms(read, flow_px, covered):
-    """[N, P, 10] of true flow, depth and cover."""
+def _terms(read, flow_px, covered, optics=None):
+    """[N, P, 10] of true flow, depth and cover; [N, P, 13] where the optics are told."""
     length = ((flow_px.square().sum(-1) + 1e-12).sqrt() + LEAST_PX).log()
     near = torch.where(read.depth_m.isfinite(), 1 / read.depth_m, 0.0)
     nearness = (near.clamp_min(0) + LEAST_PER_M).log()
+    soft = []
+    if optics is not None:
+        focal, blur = read.of_windows(optics).unbind(-1)
+        nearness = nearness + focal
+        soft = [blur, blur**2, blur * length]
     one = torch.ones_like(length)
     terms = [one, length, length**2, length**3, nearness, nearness**2]
     hidden = torch.zeros_like(length)
     if covered is not None:
         hidden = read.of_windows(covered.to(length).expand(len(length), read.windows))
-    return torch.stack([*terms, length * nearness, length**2 * nearness, hidden, hidden**2], -1)
+    return torch.stack([*terms, length * nearness, length**2 * nearness, hidden, hidden**2, *soft], -1)
 
 
 def _of_nearest_window(read, values, seen):

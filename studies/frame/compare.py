@@ -166,3 +166,41 @@ def _units(values) -> Tensor:
     if not tensor.ndim or not tensor.shape[-1]:
         raise ShapeError(f"values of shape {list(tensor.shape)}; give a row of at least one.")
     return tensor
+
+
+def crossed(logs: Any, level: float = LEVEL, draws: int = DRAWS, seed: int = 0) -> Interval:
+    """Median over seeds of the mean over worlds of paired log ratios [seeds, worlds], and its interval when seeds and
+    worlds are redrawn, each by itself."""
+    logs = torch.as_tensor(logs, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(seed)
+    seeds, worlds = logs.shape
+    rows = torch.randint(seeds, (draws, seeds), generator=generator)
+    columns = torch.randint(worlds, (draws, worlds), generator=generator)
+    drawn = logs[rows[:, :, None], columns[:, None, :]].mean(2).quantile(0.5, dim=1)
+    ends = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
+    low, high = torch.quantile(drawn, ends).tolist()
+    return Interval(float(logs.mean(1).quantile(0.5)), low, high, seeds)
+
+
+def sign_flip(differences: Any, draws: int = 20_000, seed: int = 0) -> float:
+    """Two-sided p of paired differences [N] under random signs of their mean; every sign there is up to N = 14."""
+    found = _units(differences)
+    count = len(found)
+    if count <= 14:
+        signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * count)
+        signs = signs.reshape(-1, count)
+    else:
+        generator = torch.Generator().manual_seed(seed)
+        signs = 1 - 2.0 * torch.randint(2, (draws, count), generator=generator, dtype=torch.float64)
+    flipped = (signs * found).mean(1).abs()
+    return float((flipped >= found.mean().abs() * (1 - 1e-12)).double().mean())
+
+
+def holm(p: Sequence[float]) -> list[float]:
+    """p of several tests, adjusted by Holm's steps (Scandinavian Journal of Statistics 6, 1979)."""
+    found = [0.0] * len(p)
+    largest = 0.0
+    for rank, k in enumerate(sorted(range(len(p)), key=p.__getitem__)):
+        largest = max(largest, min(1.0, (len(p) - rank) * p[k]))
+        found[k] = largest
+    return found

@@ -99,10 +99,10 @@ class Problem:
     def batch(self, samples: Samples) -> Drives:
         """Worlds and drives of samples, the robot in them, which count as rendered."""
         self.rendered += self.samples
-        return self._scenes(samples)
+        return self.scenes(samples)
 
-    def _scenes(self, samples):
-        """The same; worlds are built once."""
+    def scenes(self, samples: Samples) -> Drives:
+        """Worlds and drives of samples; worlds are built once."""
         scenes = []
         poses = []
         twists = []
@@ -188,12 +188,14 @@ class Problem:
         """Mean bounded errors [M] to be expected of mounts [M, 4, 4], what was told from one of them carried
         over."""
         worlds, each = len(samples.numbers), len(samples.which)
-        batch = self._scenes(replace(samples, which=samples.which * len(poses)))
+        batch = self.scenes(replace(samples, which=samples.which * len(poses)))
         which = torch.arange(worlds * each).reshape(worlds, 1, each).expand(-1, len(poses), -1).flatten()
-        there = self._seen(_of(field, which, worlds * each), batch, poses.repeat_interleave(each, 0))
+        there = self._seen(of_bodies(field, which, worlds * each), batch, poses.repeat_interleave(each, 0))
         told = self.trend.told(here.surfaces, here.flow_px, here.covered)
         told_there = self.trend.told(there.surfaces, there.flow_px, there.covered)
-        read = self.trend.carried(_of(here.read, which, worlds * each), told[which], there.read, told_there)
+        read = self.trend.carried(
+            of_bodies(here.read, which, worlds * each), told[which], there.read, told_there
+        )
         return self._bounded(read, there, batch.twist).reshape(worlds, len(poses), each).mean((0, 2))
 
     def _seen(self, field, batch, T_body_cam):
@@ -218,7 +220,7 @@ class Problem:
         return squared / (1 + squared)
 
 
-def _of(parts, which, count):
+def of_bodies(parts, which, count):
     """A dataclass of tensors over ``count`` bodies, or their windows, of the bodies ``which`` alone."""
     found = {}
     for each in fields(parts):

@@ -1,0 +1,109 @@
+"""Does it pay to design lens, mount, sensor and estimator of a robot's camera together?
+
+One whole design is a vector: focal length, f-number and focus of the lens; place and pitch of the mount; threshold and
+bandwidth of the pixels; the prior of the flow's estimator. It pays for what it takes: light as 1 / N^2, noise events as
+thresholds fall, a bus of limited width, a mast that sways (scenes/robots/costs.py). Arms start at the same designs and
+render as many drives: jointly, in every order of the blocks, alternating, nested, by the book, and by searches without
+gradients. Single events of the hard sensor in worlds that no arm saw judge them.
+"""
+
+import sys
+from dataclasses import dataclass
+from typing import ClassVar
+
+from codesign.errors import DomainError
+from scenes.robots import pair as robot_pair
+from scenes.robots.costs import Costs
+from scenes.robots.pairs import PAIRS
+from studies.codesign.arms import ARMS
+from studies.codesign.design import Space
+from studies.codesign.landscape import landscape
+from studies.codesign.page import report
+from studies.codesign.problem import Drawn
+from studies.codesign.race import Judge, run_arm, spread_over, start
+from studies.frame.run import Run, StudyConfig, main
+from studies.frame.sweep import sweep
+from studies.placement.searches import SEARCHES, available
+
+LEAST_STEPS = 16  # of which an eighth is left to each block of eight sweeps
+
+
+@dataclass(frozen=True)
+class Config(StudyConfig):
+    QUICK: ClassVar = {
+        "seeds": 2,
+        "worlds": 3,
+        "per_draw": 3,
+        "judged_worlds": 3,
+        "arms": ("joint", "lens > mount > read-out", "default"),
+        "designs": 4,
+    }
+    pair: str = "outdoors"
+    """Robot and worlds: outdoors, corridor or flight."""
+    light: float = 1.0
+    """Share of daylight."""
+    arms: tuple[str, ...] = tuple(ARMS)
+    """Ways to a design that race."""
+    seeds: int = 12
+    """Paired starting designs."""
+    steps: int = 16
+    """Steps of every descent, looks of every search: the budget."""
+    worlds: int = 12
+    """Training worlds."""
+    per_draw: int = 12
+    """Drives rendered in a step."""
+    judged_worlds: int = 24
+    """Unseen worlds."""
+    judged_drives: int = 2
+    """Drives in each."""
+    designs: int = 64
+    """Designs all over the bounds, and as many near the best, looked at before the race; 64 and more calibrate it."""
+
+
+def study(run: Run[Config]) -> None:
+    size = run.config
+    checked(size)
+    if run.device.type != "cpu":
+        run.say("This study computes on the CPU; the device asked for stays unused.")
+    space = Space(PAIRS[size.pair](), Costs(light=size.light))
+    for seed in range(size.seeds):
+        start(space, size.seed + seed)
+    judge = Judge(space, size.judged_worlds, size.judged_drives)
+    gates = landscape(run, space, size.designs)
+
+    spread = spread_over(size.worlds, size.per_draw)
+    drawn = Drawn(space, robot_pair.training(size.worlds), *spread, gates.calibration)
+
+    def cell(seed, arm):
+        found = run_arm(drawn, arm, size.seed + seed, size.steps)
+        return {**found, "errors": judge(found["share"])}
+
+    rows = sweep(run, cell, "race", seed=range(size.seeds), arm=size.arms)
+    report(run, space, gates, rows)
+
+
+def checked(size: Config) -> None:
+    """Raise DomainError for sizes that cannot be."""
+    if size.pair not in PAIRS:
+        raise DomainError(f"--pair {size.pair}: choose from {', '.join(PAIRS)}.")
+    if not 0 < size.light <= 1:
+        raise DomainError(f"--light is {size.light:g}; a share of daylight above 0 and at most 1 is needed.")
+    for name in ("seeds", "worlds", "per_draw", "judged_worlds", "judged_drives", "designs"):
+        if getattr(size, name) < 1:
+            raise DomainError(f"--{name.replace('_', '-')} is {getattr(size, name)}; at least 1 is needed.")
+    if size.per_draw % min(size.worlds, size.per_draw):
+        raise DomainError(
+            f"--per-draw {size.per_draw} drives cannot be spread evenly over --worlds {size.worlds}; give a multiple."
+        )
+    if size.steps < LEAST_STEPS or size.steps % LEAST_STEPS:
+        raise DomainError(f"--steps is {size.steps}; a multiple of {LEAST_STEPS} is needed.")
+    unknown = [name for name in size.arms if name not in ARMS]
+    if unknown:
+        raise DomainError(f"--arms {unknown[0]}: choose from {', '.join(ARMS)}.")
+    if "joint" not in size.arms or len(set(size.arms)) < len(size.arms):
+        raise DomainError("--arms needs joint, with which all others are compared, and each name once.")
+    available(name for name in ("CMA-ES", *size.arms) if name in SEARCHES)
+
+
+if __name__ == "__main__":
+    sys.exit(main(study, Config))

@@ -1,0 +1,251 @@
+"""Ways to a whole design at equal rendered drives: joint, one block after the other, alternating, by the book, nested."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import permutations
+
+import torch
+from torch import Tensor
+
+from codesign.mount.requirements import first_missed
+from scenes.robots import pair as robot_pair
+from scenes.robots.costs import FASTEST
+from studies.codesign.design import BLOCKS, Space
+from studies.codesign.objective import Objective
+from studies.codesign.problem import Looked
+from studies.placement.searches import SEARCHES, Search, evolved
+
+FIRST_LENGTH, LAST_LENGTH = 0.15, 0.03  # of steps in the cube
+MOMENTUM = 0.7
+END = 0.25  # of the way, whose mean is the answer
+RECORDED = 4  # rounds of drives on which sensor and estimator are settled
+SETTLING = 24  # designs of sensor and estimator tried on recorded frames
+BOOK_STEPS = 40  # of focal length, from the longest on
+GEOMETRY = ("lens", "mount")
+
+
+@dataclass
+class Way:
+    """shares: looked at, with the error to be expected at each; recorded: the last drives that were rendered."""
+
+    shares: list[Tensor] = field(default_factory=list)
+    errors: list[float] = field(default_factory=list)
+    recorded: list[Looked] = field(default_factory=list)
+
+    def add(self, share: Tensor, error: float, looked: Looked) -> None:
+        """One step."""
+        self.shares.append(share)
+        self.errors.append(error)
+        self.recorded = [*self.recorded, looked][-RECORDED:]
+
+    @property
+    def answer(self) -> Tensor:
+        """Mean of the last quarter."""
+        return torch.stack(self.shares[-max(1, round(END * len(self.shares))) :]).mean(0)
+
+
+def descend(
+    objective: Objective,
+    start: Tensor,
+    free: list[int],
+    steps: int,
+    first: int,
+    way: Way,
+    before: Callable[[Tensor, Way], Tensor] = lambda share, way: share,
+) -> Tensor:
+    """Steps of equal length down the slope with momentum, shorter and shorter; fresh drives in each.
+
+    Args:
+      start: [V] shares.
+      free: places of those that move.
+      first: number of the first draw.
+      way: what is looked at goes there.
+      before: called before every step, for what is solved within it.
+    Returns: mean of the last quarter.
+    """
+    here, pace = start.clone(), torch.zeros_like(start)
+    mine = []
+    for step in range(steps):
+        here = before(here, way)
+        value, slope, looked = objective(here, objective.drawn.draw(first + step), free)
+        way.add(here, value, looked)
+        mine.append(here)
+        blocked = ((here <= 0) & (slope > 0)) | ((here >= 1) & (slope < 0))
+        slope = torch.where(blocked, 0.0, slope)
+        pace = MOMENTUM * pace + (1 - MOMENTUM) * slope / slope.norm().clamp_min(1e-12)
+        length = FIRST_LENGTH * (LAST_LENGTH / FIRST_LENGTH) ** (step / max(1, steps - 1))
+        here = (here - length * pace / pace.norm().clamp_min(1e-12)).clamp(0, 1)
+    return torch.stack([*mine, here][-max(1, round(END * steps)) :]).mean(0)
+
+
+def read_out(objective: Objective, share: Tensor, way: Way, seed: int, tries: int = SETTLING) -> Tensor:
+    """Shares [V] with the sensor and the estimator that make least hard errors on the drives recorded last.
+
+    Nothing is rendered: CMA-ES about what they are now, on frames that are there.
+    """
+    space = objective.space
+    free = space.block("sensor") + space.block("network")
+    if not free or not way.recorded:
+        return share
+
+    def judge(numbers):
+        tried = share.clone()
+        tried[free] = numbers
+        whole = space.made(tried)
+        chosen = {name: whole.numbers[name] for name in BLOCKS["sensor"] + BLOCKS["network"]}
+        errors = []
+        for looked in way.recorded:
+            frames = {"frames": looked.run["frames"]}
+            other = looked.whole.with_numbers(**chosen)
+            errors.append(objective.drawn.looked(other, looked.samples, recorded=frames).hard())
+        return float(torch.cat(errors).mean())
+
+    trail = Search(evolved, "cma")(judge, share[free], tries, seed)
+    found = share.clone()
+    found[free] = trail.share[int(trail.error.argmin())]
+    return found
+
+
+@dataclass(frozen=True)
+class Task:
+    """What every arm gets: objective, start [V], steps in all, first number of draws, seed."""
+
+    objective: Objective
+    start: Tensor
+    steps: int
+    first: int
+    seed: int
+
+    @property
+    def space(self) -> Space:
+        return self.objective.space
+
+    def free(self, *blocks: str) -> list[int]:
+        """Places of the blocks' numbers."""
+        return [k for name in blocks for k in self.space.block(name)]
+
+    def look(self, share: Tensor, way: Way) -> None:
+        """Render a draw at shares, for what is solved on recorded frames."""
+        drawn = self.objective.drawn
+        looked = drawn.looked(self.space.made(share), drawn.draw(self.first + len(way.shares)))
+        way.add(share, float(looked.expected.mean()), looked)
+
+    def descend(self, start, blocks, steps, way, **how) -> Tensor:
+        """Steps in some blocks, draws numbered on from those on the way."""
+        first = self.first + len(way.shares)
+        return descend(self.objective, start, self.free(*blocks), steps, first, way, **how)
+
+
+def joint(task: Task) -> tuple[Tensor, Way]:
+    """All numbers in one descent."""
+    way = Way()
+    return task.descend(task.start, tuple(BLOCKS), task.steps, way), way
+
+
+def ordered(names: tuple[str, ...]) -> Callable[[Task], tuple[Tensor, Way]]:
+    """One block after the other, half of the steps for lens and mount each; sensor and estimator in their turn on
+    what is recorded."""
+
+    def arm(task):
+        way, here = Way(), task.start
+        for name in names:
+            if name == "read-out":
+                if not way.recorded:
+                    task.look(here, way)
+                here = read_out(task.objective, here, way, task.seed)
+            else:
+                here = task.descend(here, (name,), task.steps // 2, way)
+        return here, way
+
+    return arm
+
+
+def alternating(sweeps: int) -> Callable[[Task], tuple[Tensor, Way]]:
+    """Lens, mount, sensor and estimator in turns."""
+
+    def arm(task):
+        way, here = Way(), task.start
+        for _ in range(sweeps):
+            for name in GEOMETRY:
+                here = task.descend(here, (name,), task.steps // (2 * sweeps), way)
+            here = read_out(task.objective, here, way, task.seed, SETTLING // sweeps)
+        return here, way
+
+    return arm
+
+
+def nested(task: Task) -> tuple[Tensor, Way]:
+    """Lens and mount in one descent, sensor and estimator solved again on recorded frames at every step."""
+    way = Way()
+
+    def solved(share, so_far):
+        return read_out(task.objective, share, so_far, task.seed, 8)
+
+    return task.descend(task.start, GEOMETRY, task.steps, way, before=solved), way
+
+
+def by_the_book(task: Task) -> tuple[Tensor, Way]:
+    """What a careful engineer does without a model of the task: the longest lens that still sees ahead from the nominal
+    place, focused at the hyperfocal distance and stopped down as far as light allows, default pixels; then the mount by
+    the task's own error, then the read-out."""
+    way, space = Way(), task.space
+    share = space.share(**chosen_by_the_book(space, task.objective.drawn.requirements))
+    return task.descend(share, ("mount",), task.steps, way), way
+
+
+def chosen_by_the_book(space: Space, requirements) -> dict[str, float]:
+    """Focal length, f-number and focus in the order of the handbook.
+
+    f-number: full light for half of the darkest surfaces' contrast, so the smallest at which the picture is as bright as
+    the sensor's knee (20 of 255). Focus: hyperfocal for a blur of one pixel.
+    """
+    low, high = space.limits("fno")
+    bright = 20 / robot_pair.LIGHT[0] / space.costs.light
+    fno = min(max(FASTEST / math.sqrt(bright), low), high)
+    shortest, longest = space.limits("efl_mm")
+    focal = longest
+    for step in range(BOOK_STEPS):
+        focal = longest * (shortest / longest) ** (step / (BOOK_STEPS - 1))
+        made = space.made(space.share(efl_mm=focal, fno=fno))
+        if first_missed(requirements, made.T_body_cam, made.camera) is None:
+            break
+    near, far = space.limits("focus_per_m")
+    hyperfocal = 1e3 * fno * robot_pair.PITCH_MM / focal**2
+    return {"efl_mm": focal, "fno": fno, "focus_per_m": min(max(hyperfocal, near), far)}
+
+
+def searched(name: str) -> Callable[[Task], tuple[Tensor, Way]]:
+    """A search without gradients over the whole design, by hard errors of the same drives."""
+
+    def arm(task):
+        way, drawn = Way(), task.objective.drawn
+        samples = drawn.draw(task.first)
+
+        def judge(share):
+            looked = drawn.looked(task.space.made(share), samples)
+            error = float(looked.hard().mean()) + task.objective.penalty(share)
+            way.add(share, error, looked)
+            return error
+
+        trail = SEARCHES[name](judge, task.start, task.steps, task.seed)
+        return trail.share[int(trail.error.argmin())], way
+
+    return arm
+
+
+def default(task: Task) -> tuple[Tensor, Way]:
+    """The pair's own design."""
+    return task.space.start, Way()
+
+
+ARMS: dict[str, Callable[[Task], tuple[Tensor, Way]]] = {
+    "joint": joint,
+    **{" > ".join(names): ordered(names) for names in permutations((*GEOMETRY, "read-out"))},
+    "alternating 4": alternating(4),
+    "alternating 8": alternating(8),
+    "nested": nested,
+    "book": by_the_book,
+    **{name: searched(name) for name in ("CMA-ES", "TPE", "random")},
+    "default": default,
+}

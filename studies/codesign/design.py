@@ -1,0 +1,196 @@
+"""A whole design in one vector: lens, mount, sensor and estimator of a robot's camera, as shares 0..1 of their bounds."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from codesign import events, flow, lens, render
+from codesign.errors import DomainError
+from codesign.mount import Mount
+from scenes.robots import pair as robot_pair
+from scenes.robots.costs import Costs, Exposed
+from scenes.robots.pair import RobotPair
+
+BLOCKS: dict[str, tuple[str, ...]] = {
+    "lens": ("efl_mm", "fno", "focus_per_m"),
+    "mount": ("x_m", "z_m", "pitch_rad"),
+    "sensor": ("theta", "cutoff_hz"),
+    "network": ("prior_px",),
+}
+# of which equal steps are equal ratios
+LOGARITHMIC = ("efl_mm", "fno", "theta", "cutoff_hz", "prior_px")
+# where a pair says nothing, or holds what is free here
+BOUNDS = {
+    "fno": (1.2, 8.0),
+    "theta": (0.08, 0.6),
+    "cutoff_hz": (30.0, 1500.0),
+    "prior_px": (1.0, 16.0),
+}
+DEFAULTS = {
+    "theta": robot_pair.SENSOR.theta_on,
+    "cutoff_hz": robot_pair.SENSOR.cutoff_hz,
+    "prior_px": robot_pair.PRIOR_PX,
+}
+WINDOWS = len(robot_pair.LEFTS_PX) * len(robot_pair.TOPS_PX)
+OF_SENSOR = (
+    WINDOWS * robot_pair.WINDOW_PX**2 / math.prod(robot_pair.SENSOR_PX)
+)  # share of its pixels in the windows
+
+
+def thin(efl_mm: float, fno: float, focus_per_m: float) -> lens.ThinLens:
+    """A thin lens focused at a distance of 1 / focus_per_m in metres."""
+    return lens.ThinLens(efl_mm, efl_mm / fno, 1 / (1 / efl_mm - 1e-3 * focus_per_m))
+
+
+@dataclass(frozen=True)
+class Space:
+    """Whole designs of a robot's camera.
+
+    pair: robot, worlds and drives. costs: what a design pays. optics: (focal length in mm, f-number, 1 /
+      distance in focus in m) -> lens. free: names of the numbers that shares are of; the others are held as the
+      pair's own design has them. bounds: name -> (low, high), in place of those of the pair or of BOUNDS.
+    Raises: DomainError for a name that is unknown or bounds that leave out the held design.
+
+    >>> from scenes.robots.pairs import PAIRS
+    >>> space = Space(PAIRS["outdoors"]())
+    >>> round(space.numbers(space.start)["efl_mm"], 6)
+    6.5
+    """
+
+    pair: RobotPair
+    costs: Costs = field(default_factory=Costs)
+    optics: Callable[[float, float, float], Any] = thin
+    free: tuple[str, ...] = tuple(name for names in BLOCKS.values() for name in names)
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    falloff: bool = False
+    rays_per_px: int = robot_pair.RAYS_PER_PX
+
+    def __post_init__(self) -> None:
+        known = [name for names in BLOCKS.values() for name in names]
+        for name in (*self.free, *self.bounds):
+            if name not in known:
+                raise DomainError(f"a design has no number '{name}'; there are {', '.join(known)}.")
+        for name in self.free:
+            low, high = self.limits(name)
+            if not low < high:
+                raise DomainError(f"{name} is free between {low:g} and {high:g}; give it room, or hold it.")
+            if not low <= self.default[name] <= high:
+                raise DomainError(
+                    f"{name} starts at {self.default[name]:g}, outside its bounds, {low:g} to {high:g}."
+                )
+
+    @cached_property
+    def default(self) -> dict[str, float]:
+        """The pair's own design."""
+        return {**vars(self.pair.design), **DEFAULTS}
+
+    def limits(self, name: str) -> tuple[float, float]:
+        """Bounds of a number."""
+        if name in self.bounds:
+            return self.bounds[name]
+        if name in BOUNDS:
+            return BOUNDS[name]
+        return getattr(self.pair.low, name), getattr(self.pair.high, name)
+
+    def block(self, name: str) -> list[int]:
+        """Places of a block's numbers among those that are free."""
+        return [self.free.index(each) for each in BLOCKS[name] if each in self.free]
+
+    def numbers(self, share: Tensor) -> dict[str, float]:
+        """All numbers of a design by name, from the shares [V] of those that are free."""
+        found = dict(self.default)
+        for name, each in zip(self.free, share.tolist(), strict=True):
+            low, high = self.limits(name)
+            if name in LOGARITHMIC:
+                found[name] = math.exp(math.log(low) + each * math.log(high / low))
+            else:
+                found[name] = low + each * (high - low)
+        return found
+
+    def share(self, **numbers: float) -> Tensor:
+        """Shares [V] of a design; what is not given is as the pair has it. Raises: DomainError out of bounds."""
+        every = {**self.default, **numbers}
+        found = []
+        for name in self.free:
+            low, high = self.limits(name)
+            value = every[name]
+            if not low <= value <= high:
+                raise DomainError(f"{name} = {value:g} lies outside its bounds, {low:g} to {high:g}.")
+            if name in LOGARITHMIC:
+                found.append(math.log(value / low) / math.log(high / low))
+            else:
+                found.append((value - low) / (high - low))
+        return torch.tensor(found, dtype=torch.float64)
+
+    @property
+    def start(self) -> Tensor:
+        """Shares [V] of the pair's own design."""
+        return self.share()
+
+    def made(self, share: Tensor) -> "Whole":
+        """The design of shares [V], ready to be put into a system."""
+        return Whole(self, self.numbers(share.clamp(0, 1)))
+
+
+@dataclass(frozen=True)
+class Whole:
+    """One whole design: camera, pose on the body, event stage and estimator."""
+
+    space: Space
+    numbers: Mapping[str, float]
+
+    @cached_property
+    def camera(self) -> render.Camera:
+        """Nine windows behind its lens."""
+        of = self.numbers
+        optics = self.space.optics(of["efl_mm"], of["fno"], of["focus_per_m"])
+        size = robot_pair.WINDOW_PX
+        rays = self.space.rays_per_px
+        return render.Camera(
+            optics, size, size, robot_pair.PITCH_MM, rays, 0, robot_pair.FILM, falloff=self.space.falloff
+        )
+
+    @cached_property
+    def T_body_cam(self) -> Tensor:
+        """[4, 4]."""
+        of = self.numbers
+        at = (of["x_m"], of["y_m"], of["z_m"])
+        attitude = {name: of[name] for name in ("yaw_rad", "pitch_rad", "roll_rad")}
+        return Mount(at, (0.0, 0.0, 0.0), **attitude)().detach()
+
+    @property
+    def sensor(self) -> events.SensorModel:
+        """At its threshold and bandwidth, with the noise that they bring."""
+        return self.space.costs.sensor(robot_pair.SENSOR, self.numbers["theta"], self.numbers["cutoff_hz"])
+
+    def events(self, kind: str) -> nn.Module:
+        """Event stage: "memory" (hard counts) or "sensor" (single events)."""
+        costs = self.space.costs
+        if kind == "sensor":
+            stage: nn.Module = events.HardSensor(self.sensor, robot_pair.BINS, robot_pair.LEAD_S)
+        else:
+            stage = events.Settled(events.layer("memory", self.sensor, learn=()), robot_pair.LEAD_S)
+        most = costs.bus_hz * robot_pair.DURATION_S * OF_SENSOR
+        return Exposed(stage, costs.gain(self.numbers["fno"]), most, WINDOWS)
+
+    @property
+    def flow(self) -> Callable[..., Any]:
+        """Affine flow of each window by its prior."""
+        return partial(flow.estimate_lk, model="affine", prior_px=self.numbers["prior_px"])
+
+    def with_numbers(self, **numbers: float) -> "Whole":
+        """The same design with other numbers, bounds or not."""
+        return replace(self, numbers={**self.numbers, **numbers})
+
+    def __str__(self) -> str:
+        of = self.numbers
+        return (
+            f"{of['efl_mm']:.2f} mm f/{of['fno']:.2f} focused at {of['focus_per_m']:.2f} / m, x {of['x_m']:.3f} z "
+            f"{of['z_m']:.3f} m pitch {math.degrees(of['pitch_rad']):.1f} deg, theta {of['theta']:.3f}, "
+            f"{of['cutoff_hz']:.0f} Hz, prior {of['prior_px']:.1f} px"
+        )

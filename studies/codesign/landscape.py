@@ -1,0 +1,203 @@
+"""Is there anything to design, and does the objective rank it? Hard and expected errors of designs all over the bounds, of
+others near the best of them, and along every number through the best, before any race."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from scipy.stats import linregress, spearmanr
+from torch import Tensor
+from torch.quasirandom import SobolEngine
+
+from codesign.flow import checkpoint
+from codesign.mount import FlowErrors, Readings
+from studies.codesign.calibration import Calibration, Conditions, fitted
+from studies.codesign.design import Space
+from studies.codesign.problem import Drawn, Seen
+from studies.codesign.race import kept, spread_over
+from studies.frame.run import Run
+from studies.frame.sweep import Row, sweep
+
+GRID = 5  # designs along each number, from bound to bound
+MOST_REFUSED = 200  # designs drawn for each that keeps what is required
+LOOKED = 12_345  # number of the draw
+FIRST_WORLD = 500  # of those that no arm is trained in
+BEST = 8  # designs, near which others are drawn
+NEAR = 0.12  # of the cube, standard deviation
+ENOUGH = 64  # designs, from which a calibration is fitted
+
+
+@dataclass(frozen=True)
+class Landscape:
+    """designs: rows of hard and expected errors all over the bounds; near: near the best of them; grid: along every
+    number through the best. calibration: by which errors were expected."""
+
+    designs: list[Row]
+    near: list[Row]
+    grid: list[Row]
+    calibration: Calibration
+
+    @property
+    def spread(self) -> float:
+        """Ninetieth over tenth percentile of hard errors over the designs."""
+        errors = torch.tensor([row["hard"] for row in self.designs], dtype=torch.float64)
+        low, high = torch.quantile(errors, torch.tensor([0.1, 0.9], dtype=torch.float64)).tolist()
+        return high / low
+
+    @property
+    def judged(self) -> list[Row]:
+        """Designs near the best that no calibration was fitted to."""
+        return self.near[1::2] if len(self.near) > 2 else self.near
+
+    @property
+    def rank(self) -> float:
+        """Spearman's correlation of expected and hard errors over them."""
+        columns = ([row[name] for row in self.judged] for name in ("expected", "hard"))
+        return float(spearmanr(*columns)[0])
+
+    @property
+    def slope(self) -> float:
+        """Of hard errors over expected ones, over them."""
+        columns = ([row[name] for row in self.judged] for name in ("expected", "hard"))
+        return float(linregress(*columns).slope)
+
+    def inside(self, name: str) -> bool:
+        """Whether the best of a number's grid lies off its bounds."""
+        rows = [row for row in self.grid if row["number_of"] == name and row["hard"] is not None]
+        return 0 < min(rows, key=lambda row: row["hard"])["at"] < 1
+
+
+def all_over(space: Space, count: int) -> list[Tensor]:
+    """Shares [V] spread evenly over what is allowed."""
+    requirements = space.pair.requirements()
+    drawn = SobolEngine(len(space.free), scramble=True, seed=3).draw(
+        MOST_REFUSED * count, dtype=torch.float64
+    )
+    found: list[Tensor] = []
+    for share in drawn:
+        if len(found) < count and kept(space, share, requirements):
+            found.append(share)
+    return found
+
+
+def near_by(space: Space, best: list[Tensor], count: int) -> list[Tensor]:
+    """Shares [V] at random near some."""
+    requirements = space.pair.requirements()
+    generator = torch.Generator().manual_seed(5)
+    found: list[Tensor] = []
+    while len(found) < count:
+        middle = best[int(torch.randint(len(best), (1,), generator=generator))]
+        away = NEAR * torch.randn(len(space.free), generator=generator, dtype=torch.float64)
+        share = (middle + away).clamp(0, 1)
+        if kept(space, share, requirements):
+            found.append(share)
+    return found
+
+
+class Looks:
+    """Designs looked at: the rows of a sweep, and beside them what expected errors are made of, in files."""
+
+    def __init__(self, run: Run[Any], space: Space) -> None:
+        size = run.config
+        numbers = range(FIRST_WORLD, FIRST_WORLD + size.worlds)
+        self.run = run
+        self.drawn = Drawn(space, numbers, *spread_over(size.worlds, size.per_draw))
+        self.space = space
+
+    def row(self, name: str, share: Tensor) -> Row:
+        """Hard errors of single events and of the memory layer; the expected one without calibration."""
+        whole = self.space.made(share)
+        looked = self.drawn.looked(whole, self.drawn.draw(LOOKED))
+        single = self.drawn.looked(whole, looked.samples, "sensor", {"frames": looked.run["frames"]})
+        path = self.run.path(f"looks/{name}.safetensors")
+        path.parent.mkdir(exist_ok=True)
+        conditions = {key: float(value) for key, value in vars(looked.conditions).items()}
+        checkpoint.write_tensors(
+            path, _flat(looked.seen), {"windows": looked.seen.read.windows, **conditions}
+        )
+        hard = torch.cat([single.hard(), looked.hard()]).mean()
+        plain = self.drawn.expected(looked.seen, looked.seen.read, FlowErrors()).mean()
+        return {"share": share.tolist(), "hard": float(hard), "plain": float(plain)}
+
+    def stored(self, name: str) -> tuple[Seen, Conditions]:
+        """What was seen of a design."""
+        tensors, content = checkpoint.read_tensors(self.run.path(f"looks/{name}.safetensors"))
+        conditions = Conditions(*(content[each.name] for each in fields(Conditions)))
+        return _unflat(tensors, content["windows"]), conditions
+
+    def expected(self, name: str, calibration: Calibration) -> float:
+        """Mean error to be expected of a design by a calibration."""
+        seen, at = self.stored(name)
+        return float(self.drawn.expected(seen, seen.read, calibration.errors(at)).mean())
+
+
+def _flat(seen: Seen) -> Mapping[str, Tensor]:
+    found = {f"seen.{f.name}": getattr(seen, f.name) for f in fields(Seen)}
+    tensors = {name: value for name, value in found.items() if torch.is_tensor(value)}
+    for part in ("read", "surfaces"):
+        read = getattr(seen, part)
+        tensors |= {f"{part}.{f.name}": getattr(read, f.name) for f in fields(Readings)}
+    return {name: value.float().contiguous() for name, value in tensors.items() if torch.is_tensor(value)}
+
+
+def _unflat(tensors: Mapping[str, Tensor], windows: int) -> Seen:
+    def of(part):
+        mine = f"{part}."
+        return {k.removeprefix(mine): v.double() for k, v in tensors.items() if k.startswith(mine)}
+
+    parts = {part: Readings(**of(part), windows=windows) for part in ("read", "surfaces")}
+    return Seen(**of("seen"), **parts)
+
+
+def landscape(run: Run[Any], space: Space, count: int) -> Landscape:
+    """Look at ``count`` designs, at as many near the best, fit the calibration to the first and every second of the others
+    where there are enough, then look along every number through the best."""
+    looks = Looks(run, space)
+    shares = all_over(space, count)
+    designs = sweep(
+        run, lambda number: looks.row(f"all_{number}", shares[number]), "designs", number=range(count)
+    )
+    order = sorted(designs, key=lambda row: row["hard"])
+    best = [torch.tensor(row["share"], dtype=torch.float64) for row in order]
+    others = near_by(space, best[:BEST], count)
+    near = sweep(run, lambda number: looks.row(f"near_{number}", others[number]), "near", number=range(count))
+    every = [f"all_{k}" for k in range(count)] + [f"near_{k}" for k in range(0, count, 2)]
+    calibration = Calibration()
+    if count >= ENOUGH:
+        run.say("fitting what flow's covariance does not know to the hard errors of these designs")
+        calibration = _fit(looks, every, designs + near[::2])
+    for name, rows in (("all", designs), ("near", near)):
+        for number, row in enumerate(rows):
+            row["expected"] = looks.expected(f"{name}_{number}", calibration)
+    least = torch.tensor(min(designs + near, key=lambda row: row["hard"])["share"], dtype=torch.float64)
+    return Landscape(designs, near, _along(run, looks, least, calibration), calibration)
+
+
+def _fit(looks, names, rows):
+    stored = [looks.stored(name) for name in names]
+    hard = torch.tensor([row["hard"] for row in rows], dtype=torch.float64)
+
+    def expected(number, errors):
+        seen = stored[number][0]
+        return float(looks.drawn.expected(seen, seen.read, errors).mean())
+
+    return fitted(expected, [at for _, at in stored], hard)
+
+
+def _along(run, looks, best, calibration):
+    """Errors along every number, the others as in the best design; None where something required is missed."""
+    space = looks.space
+    requirements = space.pair.requirements()
+
+    def cell(number_of, step):
+        share = best.clone()
+        share[space.free.index(number_of)] = step / (GRID - 1)
+        row = {"at": step / (GRID - 1), "value": space.numbers(share)[number_of]}
+        if not kept(space, share, requirements):
+            return {**row, "hard": None, "expected": None}
+        name = f"grid_{number_of}_{step}"
+        found = looks.row(name, share)
+        return {**row, "hard": found["hard"], "expected": looks.expected(name, calibration)}
+
+    return sweep(run, cell, "grid", number_of=space.free, step=range(GRID))

@@ -1,0 +1,209 @@
+"""What a search for a whole design looks at: drives of a robot through worlds, rendered for one design; the errors of its
+velocities, hard ones and those to be expected."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from codesign.mount import (
+    Body,
+    FlowErrors,
+    OwnBody,
+    Readings,
+    Requirement,
+    expected_errors,
+    scene_depth,
+    velocity_errors,
+)
+from codesign.pose import se3_exp
+from codesign.system import System
+from scenes.robots import pair as robot_pair
+from scenes.robots.pair import Drives
+from studies.codesign.calibration import Calibration, Conditions
+from studies.codesign.design import Space, Whole
+from studies.placement.problem import Problem, Samples
+
+DRAWS = 64  # of an error that is to be expected
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Drives as one design sees them.
+
+    twist: [N, 6] of the bodies. seen_twist: [N, 6] of what the camera moves with, the sway of its mast in it.
+    read: by the depth that the estimator believes in. surfaces: the same with true depths. true_rows: [N, P, 2,
+      6]. flow_px: [N, P, 2], true. covered: [N, windows] by the robot.
+    """
+
+    twist: Tensor
+    seen_twist: Tensor
+    read: Readings
+    surfaces: Readings
+    true_rows: Tensor
+    flow_px: Tensor
+    covered: Tensor
+
+
+class Drawn:
+    """Worlds and drives by number, for any whole design of a space.
+
+    numbers: of the worlds. spread: worlds of a draw, per_world: drives in each.
+    """
+
+    def __init__(
+        self,
+        space: Space,
+        numbers: Sequence[int],
+        spread: int = 12,
+        per_world: int = 1,
+        calibration: Calibration | None = None,
+    ) -> None:
+        self.space = space
+        self.calibration = calibration or Calibration()
+        self.base = Problem(space.pair, numbers, spread, per_world)
+        self.rendered = 0
+
+    def draw(self, number: int) -> Samples:
+        """Samples of that number (``Problem.draw``)."""
+        return self.base.draw(number)
+
+    @cached_property
+    def _system(self):
+        return self.space.pair.system(self.space.pair.design)
+
+    @cached_property
+    def own_body(self) -> OwnBody:
+        """Of the robot, in its camera's view."""
+        meshes = self.space.pair.bodies.values()
+        return OwnBody(Body((mesh.vertices_m, mesh.faces) for mesh in meshes), 1.0)
+
+    @cached_property
+    def requirements(self) -> list[Requirement]:
+        """Of the mount."""
+        return self.base.requirements
+
+    def scenes(self, mounts: Tensor, samples: Samples) -> tuple[Drives, Tensor]:
+        """Drives behind mounts [M, 4, 4], those of a world one mount after the other, and the twists [N, 6] that
+        the camera moves with; a mast sways."""
+        count, each = len(mounts), len(samples.which)
+        plain = self.base.scenes(replace(samples, which=samples.which * count))
+        worlds = len(samples.numbers)
+        speed = plain.twist[:, :3].norm(dim=1)
+        generator = torch.Generator().manual_seed(1 + samples.seed)
+        deviates = torch.randn(worlds, 1, each, 2, generator=generator, dtype=torch.float64)
+        deviates = deviates.expand(-1, count, -1, -1).reshape(-1, 2)
+        of_drive = mounts.repeat_interleave(each, 0).repeat(worlds, 1, 1)
+        beside = self.space.costs.sway(of_drive, self.space.pair.low.z_m, speed, deviates)
+        since_s = robot_pair.MIDDLE_S - float(plain.t_s[0])
+        middle = plain.T_world_body[..., 0, :, :].flatten(0, -3) @ se3_exp(since_s * plain.twist)
+        poses = robot_pair.moved(middle, plain.twist + beside).reshape(plain.T_world_body.shape)
+        return replace(plain, T_world_body=poses), plain.twist + beside
+
+    def system(self, whole: Whole, kind: str, head: Any = None) -> System:
+        """The chain of a design; ``head`` in place of least squares."""
+        parts = {"estimate": head} if head is not None else {}
+        pose = whole.T_body_cam
+        return self._system.replaced(
+            camera=whole.camera, mount=lambda: pose, events=whole.events(kind), flow=whole.flow, **parts
+        )
+
+    @torch.no_grad()
+    def looked(
+        self,
+        whole: Whole,
+        samples: Samples,
+        kind: str = "memory",
+        recorded: Mapping[str, Any] | None = None,
+    ) -> "Looked":
+        """Drives rendered for a design, or of recorded frames."""
+        if recorded is None:
+            self.rendered += self.base.samples
+        batch, twist = self.scenes(whole.T_body_cam[None], samples)
+        run = self.system(whole, kind).begin(batch, recorded)
+        return Looked(self, whole, samples, batch, twist, run)
+
+    @torch.no_grad()
+    def seen(self, camera: Any, mounts: Tensor, batch: Drives, twist: Tensor, field: Any) -> Seen:
+        """What flow in the windows is of, behind mounts [M, 4, 4] (``scenes``)."""
+        estimator = self._system.estimate
+        each = batch.T_world_body.shape[1] // len(mounts)
+        of_drive = mounts.repeat_interleave(each, 0)
+        T_world_cam = batch.T_world_body @ of_drive[:, None]
+        given = (field, camera, batch.scene, of_drive, T_world_cam, batch.t_s)
+        read = estimator.read(*given)
+        true = read if self.space.pair.depth == "scene" else estimator.read(*given, depth=scene_depth)
+        flow_px = (true.rows @ twist[:, None, :, None])[..., 0]
+        covered = self.own_body.covered(mounts, camera).repeat_interleave(each, 0)
+        covered = covered.repeat(len(batch.T_world_body), 1)
+        surfaces = replace(read, depth_m=true.depth_m)
+        return Seen(batch.twist, twist, read, surfaces, true.rows, flow_px, covered)
+
+    def expected(self, seen: Seen, read: Readings, errors: FlowErrors) -> Tensor:
+        """Mean bounded error [N] to be expected of drives: over errors drawn from their normal distribution,
+        the same for all designs."""
+        estimator = self._system.estimate
+        axes = list(self.space.pair.axes)
+        found = expected_errors(estimator, read, seen.seen_twist, seen.true_rows, errors)
+        mean = (found.mean + seen.seen_twist - seen.twist)[:, axes]
+        covariance = found.covariance[:, axes][:, :, axes]
+        unit = velocity_errors(torch.zeros_like(mean), seen.twist, tuple(axes)).unit
+        root = torch.linalg.cholesky(covariance + 1e-12 * torch.eye(len(axes), dtype=mean.dtype))
+        draws = _normal(len(axes)) @ root.mT
+        squared = ((mean[:, None] + draws) / unit[:, None]).square().mean(2)
+        return (squared / (1 + squared)).mean(1)
+
+
+def _normal(axes):
+    """[DRAWS, axes] standard normal numbers, evenly spread."""
+    points = torch.quasirandom.SobolEngine(axes, scramble=True, seed=0).draw(DRAWS, dtype=torch.float64)
+    return torch.special.ndtri(points.clamp(1e-6, 1 - 1e-6))
+
+
+@dataclass(frozen=True)
+class Looked:
+    """A design's drives: what ran, and what is read off it when it is asked for."""
+
+    drawn: Drawn
+    whole: Whole
+    samples: Samples
+    batch: Drives
+    twist: Tensor
+    run: Any
+
+    @cached_property
+    def seen(self) -> Seen:
+        """What its flow is of."""
+        mounts = self.whole.T_body_cam[None]
+        return self.drawn.seen(self.whole.camera, mounts, self.batch, self.twist, self.run["field"])
+
+    @cached_property
+    def conditions(self) -> Conditions:
+        """Under which its flow was read."""
+        whole, costs = self.whole, self.whole.space.costs
+        counts = self.run["volume"].counts
+        per_px = float(counts.sum()) / (counts.shape[0] * counts.shape[-1] * counts.shape[-2])
+        level = costs.gain(whole.numbers["fno"]) * float(self.run["frames"].mean())
+        return Conditions.of(whole.sensor, per_px, level, robot_pair.DURATION_S, whole.numbers["prior_px"])
+
+    @cached_property
+    def errors(self) -> FlowErrors:
+        """Of its flow beyond what that claims."""
+        return self.drawn.calibration.errors(self.conditions)
+
+    @cached_property
+    def expected(self) -> Tensor:
+        """[N] bounded errors to be expected."""
+        return self.drawn.expected(self.seen, self.seen.read, self.errors)
+
+    @torch.no_grad()
+    def hard(self, head: Any = None) -> Tensor:
+        """[N] bounded errors of the estimates, by least squares or a head on the same flow."""
+        run = self.run
+        if head is not None:
+            kept = {"frames": run["frames"], "events": run["volume"], "flow": run["field"]}
+            run = self.drawn.system(self.whole, "memory", head).begin(self.batch, kept)
+        return self.drawn.space.pair.errors(run["estimate"], self.batch).bounded()

@@ -1,0 +1,96 @@
+"""The race of the arms: from the same starts at equal rendered drives, judged by single events in worlds that none saw."""
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from codesign.errors import DomainError
+from codesign.mount.requirements import first_missed
+from scenes.robots import pair as robot_pair
+from studies.codesign.arms import ARMS, Task, read_out
+from studies.codesign.design import Space
+from studies.codesign.objective import Objective
+from studies.codesign.problem import Drawn
+from studies.frame.compare import Interval, crossed, holm, sign_flip
+
+EDGE = 0.1  # of the cube, that starts keep from its walls
+TRIES = 10_000
+JUDGED = 7_700_000  # number of the judge's draw
+
+
+def start(space: Space, seed: int) -> Tensor:
+    """Shares [V] at random, sensor and estimator as they are by default, that keep what is required.
+
+    Raises: DomainError where none of TRIES does.
+    """
+    generator = torch.Generator().manual_seed(1000 + seed)
+    requirements = space.pair.requirements()
+    held = [k for name in ("sensor", "network") for k in space.block(name)]
+    for _ in range(TRIES):
+        share = EDGE + (1 - 2 * EDGE) * torch.rand(len(space.free), generator=generator, dtype=torch.float64)
+        share[held] = space.start[held]
+        if kept(space, share, requirements):
+            return share
+    raise DomainError(
+        f"none of {TRIES} designs of '{space.pair.name}' keeps what is required; widen the bounds."
+    )
+
+
+def kept(space: Space, share: Tensor, requirements: Sequence[Any]) -> bool:
+    """Whether a design keeps what is required, by the hard answer."""
+    whole = space.made(share)
+    return first_missed(requirements, whole.T_body_cam, whole.camera) is None
+
+
+def run_arm(drawn: Drawn, arm: str, seed: int, steps: int) -> dict[str, Any]:
+    """One arm from one start: its answer, sensor and estimator settled once more on the drives recorded last; or the last
+    design on its way that keeps what is required."""
+    begun, rendered = time.process_time(), drawn.rendered
+    space = drawn.space
+    task = Task(Objective(drawn), start(space, seed), steps, 10_000 * seed, seed)
+    answer, way = ARMS[arm](task)
+    answer = read_out(task.objective, answer, way, seed)
+    candidates = [answer, *reversed(way.shares), task.start]
+    chosen = next(share for share in candidates if kept(space, share, drawn.requirements))
+    return {
+        "share": chosen.tolist(),
+        "kept": bool(chosen is answer),
+        "expected": way.errors[-1] if way.errors else None,
+        "drives": drawn.rendered - rendered,
+        "cpu_s": time.process_time() - begun,
+        **{name: value for name, value in space.numbers(chosen).items() if name in space.free},
+    }
+
+
+def spread_over(worlds: int, drives: int) -> tuple[int, int]:
+    """Worlds of a draw, and drives in each."""
+    each = min(worlds, drives)
+    return each, drives // each
+
+
+class Judge:
+    """Single events in unseen worlds, the same drives for every design; nothing that searched has seen them."""
+
+    def __init__(self, space: Space, worlds: int, per_world: int) -> None:
+        self.drawn = Drawn(space, robot_pair.unseen(worlds), worlds, per_world)
+        self.worlds = worlds
+
+    def __call__(self, share: Sequence[float]) -> list[float]:
+        """Mean bounded error in each world."""
+        whole = self.drawn.space.made(torch.tensor(share, dtype=torch.float64))
+        looked = self.drawn.looked(whole, self.drawn.draw(JUDGED), "sensor")
+        return looked.hard().unflatten(0, (self.worlds, -1)).mean(1).tolist()
+
+
+def compared(rows: Sequence[Mapping[str, Any]], ours: str = "joint") -> dict[str, tuple[Interval, float]]:
+    """The log ratio of our error to each rival's over paired seeds and worlds, and its p after Holm."""
+    errors = {
+        arm: torch.tensor([row["errors"] for row in rows if row["arm"] == arm], dtype=torch.float64)
+        for arm in dict.fromkeys(row["arm"] for row in rows)
+    }
+    logs = {arm: (errors[ours] / theirs).log() for arm, theirs in errors.items() if arm != ours}
+    adjusted = holm([sign_flip(each.mean(1)) for each in logs.values()])
+    return {arm: (crossed(each), p) for (arm, each), p in zip(logs.items(), adjusted, strict=True)}

@@ -1,0 +1,189 @@
+"""The joint study: designs and their shares, slopes against rendered differences, arms on a known valley, and the whole of
+it, resumed."""
+
+import json
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from codesign.errors import DomainError
+from codesign.mount import window_optics
+from scenes.robots import pair as robot_pair
+from scenes.robots.costs import Costs
+from scenes.robots.pairs import PAIRS
+from studies.codesign import __main__ as codesign
+from studies.codesign.arms import ARMS, Task, Way, chosen_by_the_book
+from studies.codesign.design import Space
+from studies.codesign.objective import Objective
+from studies.codesign.problem import Drawn
+from studies.codesign.race import compared, kept, start
+from studies.frame.run import main
+
+F = torch.float64
+
+
+@pytest.fixture(scope="module")
+def space():
+    return Space(PAIRS["outdoors"](), rays_per_px=4)
+
+
+@pytest.fixture(scope="module")
+def drawn(space):
+    return Drawn(space, robot_pair.training(2), 2, 2)
+
+
+def test_shares_and_numbers_of_a_design_are_each_other(space):
+    share = torch.linspace(0.1, 0.9, len(space.free), dtype=F)
+    numbers = space.numbers(share)
+    assert torch.allclose(space.share(**{name: numbers[name] for name in space.free}), share)
+    middle = space.numbers(torch.full((len(space.free),), 0.5, dtype=F))
+    # half way between 1.2 and 8 is their geometric mean, between 0 and 8 their mean
+    assert middle["fno"] == pytest.approx(math.sqrt(1.2 * 8))
+    assert middle["focus_per_m"] == pytest.approx(4.0)
+    assert space.numbers(space.start)["efl_mm"] == pytest.approx(6.5)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"free": ("colour",)}, "no number 'colour'"),
+        ({"bounds": {"fno": (2.0, 2.0)}}, "give it room"),
+        ({"bounds": {"efl_mm": (7.0, 12.0)}}, "starts at 6.5, outside"),
+    ],
+)
+def test_spaces_that_cannot_be_are_refused(wrong, said):
+    with pytest.raises(DomainError, match=said):
+        Space(PAIRS["outdoors"](), **wrong)
+
+
+def test_what_is_carried_to_the_same_design_is_what_was_seen(drawn, space):
+    objective = Objective(drawn)
+    share = space.share(efl_mm=4.0, fno=2.0, z_m=0.4, pitch_rad=0.5)
+    _, _, looked = objective(share, drawn.draw(0), [])
+    optics = window_optics(looked.whole.camera, looked.seen.read)
+    poses = looked.whole.T_body_cam.expand(3, 4, 4)
+    again = objective.carried(looked, looked.whole.camera, poses, optics)
+    assert torch.allclose(again, looked.expected.mean().expand(3), rtol=1e-9)
+
+
+def test_a_swaying_mast_is_an_error_that_is_expected(drawn, space):
+    """A hard error grows with sway; so does the one to be expected, on the same drives."""
+    high = space.share(efl_mm=4.0, z_m=0.7, pitch_rad=0.6, theta=0.2, cutoff_hz=150.0)
+    still = Space(space.pair, Costs(sway_per_m_s=0.0), rays_per_px=4)
+    shaken = Space(space.pair, Costs(sway_per_m_s=8.0), rays_per_px=4)
+    errors = {}
+    for name, each in (("still", still), ("shaken", shaken)):
+        seen = Drawn(each, robot_pair.training(2), 2, 4).looked(each.made(high), drawn.draw(0))
+        errors[name] = float(seen.hard().mean()), float(seen.expected.mean())
+    assert errors["shaken"][0] > errors["still"][0] + 0.1
+    assert errors["shaken"][1] > errors["still"][1] + 0.1
+
+
+class Valley:
+    """An objective whose error is known, in place of a rendered one: lens and mount pull at each other."""
+
+    def __init__(self, space):
+        self.space = space
+        self.drawn = SimpleNamespace(
+            draw=lambda number: SimpleNamespace(seed=number, numbers=(0,), which=(0,)),
+            requirements=[],
+            rendered=0,
+        )
+
+    def error(self, share):
+        away = share - 0.5
+        return away.square().sum() + 1.6 * away[0] * away[4]
+
+    def __call__(self, share, samples, free):
+        at = share.clone().requires_grad_()
+        error = self.error(at)
+        (slope,) = torch.autograd.grad(error, at)
+        held = [k for k in range(len(share)) if k not in free]
+        slope[held] = 0.0
+        return float(error.detach()), slope, None
+
+
+def test_joint_descent_reaches_the_bottom_of_a_valley_that_one_pass_over_the_blocks_does_not(
+    space, monkeypatch
+):
+    monkeypatch.setattr("studies.codesign.arms.read_out", lambda objective, share, *rest: share)
+    begun = torch.full((len(space.free),), 0.5, dtype=F)
+    begun[0], begun[4] = 0.1, 0.9
+    valley = Valley(space)
+    ends = {
+        name: ARMS[name](Task(valley, begun, 48, 0, 0))[0] for name in ("joint", "lens > mount > read-out")
+    }
+    errors = {name: float(valley.error(share)) for name, share in ends.items()}
+    assert errors["joint"] < 2e-3
+    # minimising along the lens, then along the mount leaves (1 - 0.64) 0.64 of the squared start
+    assert errors["lens > mount > read-out"] > 5 * errors["joint"]
+
+
+def test_starts_keep_what_is_required(space):
+    requirements = space.pair.requirements()
+    first, again, other = start(space, 3), start(space, 3), start(space, 4)
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    assert kept(space, first, requirements)
+    assert kept(space, other, requirements)
+
+
+def test_the_book_takes_the_longest_lens_that_sees_ahead_and_focuses_it_hyperfocally(space):
+    found = chosen_by_the_book(space, space.pair.requirements())
+    # full light makes 70 at f/1.2, the knee is at 20: f/1.2 sqrt(70 / 20)
+    assert found["fno"] == pytest.approx(1.2 * math.sqrt(3.5))
+    requirements = space.pair.requirements()
+    assert kept(space, space.share(**found), requirements)
+    hyperfocal = 1e3 * found["fno"] * robot_pair.PITCH_MM / found["efl_mm"] ** 2
+    assert found["focus_per_m"] == pytest.approx(hyperfocal)
+
+
+def test_the_comparison_is_of_pairs():
+    rows = [
+        {"arm": arm, "seed": seed, "errors": [scale * (1 + 0.1 * seed + 0.02 * world) for world in range(4)]}
+        for seed in range(6)
+        for arm, scale in (("joint", 0.8), ("book", 1.0), ("random", 0.8))
+    ]
+    found = compared(rows)
+    over, p = found["book"]
+    assert (math.exp(over.value), math.exp(over.low), math.exp(over.high)) == pytest.approx((0.8, 0.8, 0.8))
+    # of 64 signs two are as extreme, and two tests were made
+    assert p == pytest.approx(2 * 2 / 64)
+    assert found["random"][0].outcome == "ties"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (["--pair", "moon"], "choose from outdoors"),
+        (["--light", "0"], "share of daylight"),
+        (["--steps", "10"], "multiple of 16"),
+        (["--arms", "book"], "needs joint"),
+        (["--arms", "joint", "luck"], "choose from joint"),
+        (["--per-draw", "7", "--worlds", "3"], "spread evenly"),
+    ],
+)
+def test_wrong_command_lines_end_with_a_sentence(wrong, said, tmp_path, capsys):
+    assert main(codesign.study, codesign.Config, [*wrong, "--out", str(tmp_path / "run")]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_way_answers_with_the_mean_of_its_end():
+    way = Way()
+    for k in range(8):
+        way.add(torch.tensor([float(k)]), 0.0, None)
+    assert way.answer.tolist() == [6.5]
+    assert len(way.recorded) == 4
+
+
+def test_a_small_race_says_that_it_decides_nothing(tmp_path):
+    folder = tmp_path / "run"
+    given = "--quick --seeds 1 --worlds 1 --per-draw 1 --judged-worlds 1 --judged-drives 1 --designs 3 --arms joint default"
+    assert main(codesign.study, codesign.Config, [*given.split(), "--out", str(folder)]) == 0
+    page = (folder / "report.html").read_text()
+    assert "decides nothing" in page
+    numbers = json.loads((folder / "metrics.json").read_text())
+    assert numbers["race_joint_drives"] == 16
+    assert 0 < numbers["race_joint_median"] <= 1
