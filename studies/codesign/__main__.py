@@ -8,9 +8,10 @@ gradients. Single events of the hard sensor in worlds that no arm saw judge them
 """
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
+from codesign import lens
 from codesign.errors import DomainError
 from scenes.robots import pair as robot_pair
 from scenes.robots.costs import Costs
@@ -25,6 +26,7 @@ from studies.frame.run import Run, StudyConfig, main
 from studies.frame.sweep import sweep
 from studies.placement.searches import SEARCHES, available
 
+THIN = "thin"
 LEAST_STEPS = 16  # of which an eighth is left to each block of eight sweeps
 
 
@@ -40,6 +42,8 @@ class Config(StudyConfig):
     }
     pair: str = "outdoors"
     """Robot and worlds: outdoors, corridor or flight."""
+    family: str = "retrofocus-4"
+    """Family of traced lenses, or thin."""
     light: float = 1.0
     """Share of daylight."""
     arms: tuple[str, ...] = tuple(ARMS)
@@ -65,7 +69,8 @@ def study(run: Run[Config]) -> None:
     checked(size)
     if run.device.type != "cpu":
         run.say("This study computes on the CPU; the device asked for stays unused.")
-    space = Space(PAIRS[size.pair](), Costs(light=size.light))
+    family = None if size.family == THIN else size.family
+    space = Space(replace(PAIRS[size.pair](), family=family), Costs(light=size.light))
     for seed in range(size.seeds):
         start(space, size.seed + seed)
     judge = Judge(space, size.judged_worlds, size.judged_drives)
@@ -86,6 +91,8 @@ def checked(size: Config) -> None:
     """Raise DomainError for sizes that cannot be."""
     if size.pair not in PAIRS:
         raise DomainError(f"--pair {size.pair}: choose from {', '.join(PAIRS)}.")
+    if size.family != THIN:
+        lens.family(size.family)
     if not 0 < size.light <= 1:
         raise DomainError(f"--light is {size.light:g}; a share of daylight above 0 and at most 1 is needed.")
     for name in ("seeds", "worlds", "per_draw", "judged_worlds", "judged_drives", "designs"):

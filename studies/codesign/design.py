@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -11,13 +11,12 @@ from torch import Tensor, nn
 
 from codesign import events, flow, lens, render
 from codesign.errors import DomainError
-from codesign.mount import Mount
 from scenes.robots import pair as robot_pair
 from scenes.robots.costs import Costs, Exposed
-from scenes.robots.pair import RobotPair
+from scenes.robots.pair import Design, RobotPair
 
 BLOCKS: dict[str, tuple[str, ...]] = {
-    "lens": ("efl_mm", "fno", "focus_per_m"),
+    "lens": ("efl_mm", "fno", "focus_per_m", "bending"),
     "mount": ("x_m", "z_m", "pitch_rad"),
     "sensor": ("theta", "cutoff_hz"),
     "network": ("prior_px",),
@@ -27,6 +26,7 @@ LOGARITHMIC = ("efl_mm", "fno", "theta", "cutoff_hz", "prior_px")
 # where a pair says nothing, or holds what is free here
 BOUNDS = {
     "fno": (1.2, 8.0),
+    "bending": (-1.0, 1.0),
     "theta": (0.08, 0.6),
     "cutoff_hz": (30.0, 1500.0),
     "prior_px": (1.0, 16.0),
@@ -42,18 +42,13 @@ OF_SENSOR = (
 )  # share of its pixels in the windows
 
 
-def thin(efl_mm: float, fno: float, focus_per_m: float) -> lens.ThinLens:
-    """A thin lens focused at a distance of 1 / focus_per_m in metres."""
-    return lens.ThinLens(efl_mm, efl_mm / fno, 1 / (1 / efl_mm - 1e-3 * focus_per_m))
-
-
 @dataclass(frozen=True)
 class Space:
     """Whole designs of a robot's camera.
 
-    pair: robot, worlds and drives. costs: what a design pays. optics: (focal length in mm, f-number, 1 /
-      distance in focus in m) -> lens. free: names of the numbers that shares are of; the others are held as the
-      pair's own design has them. bounds: name -> (low, high), in place of those of the pair or of BOUNDS.
+    pair: robot, worlds and drives, behind a thin lens or the traced ones of a family. costs: what a design pays.
+    free: names of the numbers that shares are of, all of BLOCKS that its lens has when left out; the others are
+      held as the pair's own design has them. bounds: name -> (low, high), in place of those of the pair or of BOUNDS.
     Raises: DomainError for a name that is unknown or bounds that leave out the held design.
 
     >>> from scenes.robots.pairs import PAIRS
@@ -64,14 +59,15 @@ class Space:
 
     pair: RobotPair
     costs: Costs = field(default_factory=Costs)
-    optics: Callable[[float, float, float], Any] = thin
-    free: tuple[str, ...] = tuple(name for names in BLOCKS.values() for name in names)
+    free: tuple[str, ...] = ()
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    falloff: bool = False
     rays_per_px: int = robot_pair.RAYS_PER_PX
 
     def __post_init__(self) -> None:
         known = [name for names in BLOCKS.values() for name in names]
+        if not self.free:
+            own = [name for name in known if name != "bending" or self.pair.family]
+            object.__setattr__(self, "free", tuple(own))
         for name in (*self.free, *self.bounds):
             if name not in known:
                 raise DomainError(f"a design has no number '{name}'; there are {', '.join(known)}.")
@@ -93,6 +89,8 @@ class Space:
         """Bounds of a number."""
         if name in self.bounds:
             return self.bounds[name]
+        if name == "fno" and self.pair.family:
+            return lens.family(self.pair.family).fno
         if name in BOUNDS:
             return BOUNDS[name]
         return getattr(self.pair.low, name), getattr(self.pair.high, name)
@@ -146,22 +144,23 @@ class Whole:
 
     @cached_property
     def camera(self) -> render.Camera:
-        """Nine windows behind its lens."""
-        of = self.numbers
-        optics = self.space.optics(of["efl_mm"], of["fno"], of["focus_per_m"])
-        size = robot_pair.WINDOW_PX
-        rays = self.space.rays_per_px
+        """Nine windows behind its lens; a traced one's image is darker towards the corners."""
+        made = self.space.pair.camera(self.design)
+        size, rays = robot_pair.WINDOW_PX, self.space.rays_per_px
+        dark = self.space.pair.family is not None
         return render.Camera(
-            optics, size, size, robot_pair.PITCH_MM, rays, 0, robot_pair.FILM, falloff=self.space.falloff
+            made.lens, size, size, robot_pair.PITCH_MM, rays, 0, robot_pair.FILM, falloff=dark
         )
+
+    @cached_property
+    def design(self) -> Design:
+        """Lens and mount, as the pair says them."""
+        return Design(**{each.name: self.numbers[each.name] for each in fields(Design)})
 
     @cached_property
     def T_body_cam(self) -> Tensor:
         """[4, 4]."""
-        of = self.numbers
-        at = (of["x_m"], of["y_m"], of["z_m"])
-        attitude = {name: of[name] for name in ("yaw_rad", "pitch_rad", "roll_rad")}
-        return Mount(at, (0.0, 0.0, 0.0), **attitude)().detach()
+        return self.design.mount()
 
     @property
     def sensor(self) -> events.SensorModel:
