@@ -16,6 +16,7 @@ from codesign.errors import DomainError
 from scenes.robots import pair as robot_pair
 from scenes.robots.costs import Costs
 from scenes.robots.pairs import PAIRS
+from studies.codesign import slopes
 from studies.codesign.arms import ARMS
 from studies.codesign.design import Space
 from studies.codesign.landscape import landscape
@@ -33,12 +34,15 @@ LEAST_STEPS = 16  # of which an eighth is left to each block of eight sweeps
 @dataclass(frozen=True)
 class Config(StudyConfig):
     QUICK: ClassVar = {
-        "seeds": 2,
-        "worlds": 3,
-        "per_draw": 3,
-        "judged_worlds": 3,
+        "seeds": 1,
+        "worlds": 2,
+        "per_draw": 2,
+        "judged_worlds": 2,
         "arms": ("joint", "lens > mount > read-out", "default"),
-        "designs": 4,
+        "designs": 2,
+        "grid": 2,
+        "settling": 6,
+        "slopes": 0,
     }
     pair: str = "outdoors"
     """Robot and worlds: outdoors, corridor or flight."""
@@ -46,6 +50,8 @@ class Config(StudyConfig):
     """Family of traced lenses, or thin."""
     light: float = 1.0
     """Share of daylight."""
+    free: tuple[str, ...] = ()
+    """Numbers that are designed, the others being held as the pair has them; all when left out."""
     arms: tuple[str, ...] = tuple(ARMS)
     """Ways to a design that race."""
     seeds: int = 12
@@ -62,6 +68,12 @@ class Config(StudyConfig):
     """Drives in each."""
     designs: int = 64
     """Designs all over the bounds, and as many near the best, looked at before the race; 64 and more calibrate it."""
+    grid: int = 5
+    """Designs along each number, through the best."""
+    slopes: int = 24
+    """Draws by which the objective's slope is compared with rendered differences; 0: it is not."""
+    settling: int = 24
+    """Designs of sensor and estimator tried on recorded frames, wherever they are settled."""
 
 
 def study(run: Run[Config]) -> None:
@@ -70,7 +82,7 @@ def study(run: Run[Config]) -> None:
     if run.device.type != "cpu":
         run.say("This study computes on the CPU; the device asked for stays unused.")
     family = None if size.family == THIN else size.family
-    space = Space(replace(PAIRS[size.pair](), family=family), Costs(light=size.light))
+    space = Space(replace(PAIRS[size.pair](), family=family), Costs(light=size.light), size.free)
     for seed in range(size.seeds):
         start(space, size.seed + seed)
     judge = Judge(space, size.judged_worlds, size.judged_drives)
@@ -79,12 +91,14 @@ def study(run: Run[Config]) -> None:
     spread = spread_over(size.worlds, size.per_draw)
     drawn = Drawn(space, robot_pair.training(size.worlds), *spread, gates.calibration)
 
+    rows_of_slopes = slopes.slopes(run, space, drawn, gates.best, size.slopes) if size.slopes else []
+
     def cell(seed, arm):
-        found = run_arm(drawn, arm, size.seed + seed, size.steps)
+        found = run_arm(drawn, arm, size.seed + seed, size.steps, size.settling)
         return {**found, "errors": judge(found["share"])}
 
     rows = sweep(run, cell, "race", seed=range(size.seeds), arm=size.arms)
-    report(run, space, gates, rows)
+    report(run, space, gates, rows_of_slopes, rows)
 
 
 def checked(size: Config) -> None:
@@ -95,9 +109,13 @@ def checked(size: Config) -> None:
         lens.family(size.family)
     if not 0 < size.light <= 1:
         raise DomainError(f"--light is {size.light:g}; a share of daylight above 0 and at most 1 is needed.")
-    for name in ("seeds", "worlds", "per_draw", "judged_worlds", "judged_drives", "designs"):
+    for name in ("seeds", "worlds", "per_draw", "judged_worlds", "judged_drives", "designs", "settling"):
         if getattr(size, name) < 1:
             raise DomainError(f"--{name.replace('_', '-')} is {getattr(size, name)}; at least 1 is needed.")
+    if size.grid < 2 or size.slopes == 1 or size.slopes < 0:
+        raise DomainError(
+            f"--grid needs 2 or more, --slopes 0, or 2 and more; they are {size.grid} and {size.slopes}."
+        )
     if size.per_draw % min(size.worlds, size.per_draw):
         raise DomainError(
             f"--per-draw {size.per_draw} drives cannot be spread evenly over --worlds {size.worlds}; give a multiple."

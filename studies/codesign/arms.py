@@ -20,7 +20,7 @@ FIRST_LENGTH, LAST_LENGTH = 0.15, 0.03  # of steps in the cube
 MOMENTUM = 0.7
 END = 0.25  # of the way, whose mean is the answer
 RECORDED = 4  # rounds of drives on which sensor and estimator are settled
-SETTLING = 24  # designs of sensor and estimator tried on recorded frames
+NESTED = 8  # designs of sensor and estimator tried at every step
 BOOK_STEPS = 40  # of focal length, from the longest on
 GEOMETRY = ("lens", "mount")
 
@@ -79,12 +79,12 @@ def descend(
     return torch.stack([*mine, here][-max(1, round(END * steps)) :]).mean(0)
 
 
-def read_out(objective: Objective, share: Tensor, way: Way, seed: int, tries: int = SETTLING) -> Tensor:
+def read_out(task: "Task", share: Tensor, way: Way, tries: int = 0) -> Tensor:
     """Shares [V] with the sensor and the estimator that make least hard errors on the drives recorded last.
 
-    Nothing is rendered: CMA-ES about what they are now, on frames that are there.
+    Nothing is rendered: CMA-ES about what they are now, on frames that are there; ``tries`` of it, those of the task for 0.
     """
-    space = objective.space
+    space, drawn = task.space, task.objective.drawn
     free = space.block("sensor") + space.block("network")
     if not free or not way.recorded:
         return share
@@ -98,10 +98,10 @@ def read_out(objective: Objective, share: Tensor, way: Way, seed: int, tries: in
         for looked in way.recorded:
             frames = {"frames": looked.run["frames"]}
             other = looked.whole.with_numbers(**chosen)
-            errors.append(objective.drawn.looked(other, looked.samples, recorded=frames).hard())
+            errors.append(drawn.looked(other, looked.samples, recorded=frames).hard())
         return float(torch.cat(errors).mean())
 
-    trail = Search(evolved, "cma")(judge, share[free], tries, seed)
+    trail = Search(evolved, "cma")(judge, share[free], tries or task.settling, task.seed)
     found = share.clone()
     found[free] = trail.share[int(trail.error.argmin())]
     return found
@@ -109,13 +109,15 @@ def read_out(objective: Objective, share: Tensor, way: Way, seed: int, tries: in
 
 @dataclass(frozen=True)
 class Task:
-    """What every arm gets: objective, start [V], steps in all, first number of draws, seed."""
+    """What every arm gets: objective, start [V], steps in all, first number of draws, seed, designs of sensor and
+    estimator tried wherever these are settled."""
 
     objective: Objective
     start: Tensor
     steps: int
     first: int
     seed: int
+    settling: int = 24
 
     @property
     def space(self) -> Space:
@@ -153,7 +155,7 @@ def ordered(names: tuple[str, ...]) -> Callable[[Task], tuple[Tensor, Way]]:
             if name == "read-out":
                 if not way.recorded:
                     task.look(here, way)
-                here = read_out(task.objective, here, way, task.seed)
+                here = read_out(task, here, way)
             else:
                 here = task.descend(here, (name,), task.steps // 2, way)
         return here, way
@@ -169,7 +171,7 @@ def alternating(sweeps: int) -> Callable[[Task], tuple[Tensor, Way]]:
         for _ in range(sweeps):
             for name in GEOMETRY:
                 here = task.descend(here, (name,), task.steps // (2 * sweeps), way)
-            here = read_out(task.objective, here, way, task.seed, SETTLING // sweeps)
+            here = read_out(task, here, way, max(1, task.settling // sweeps))
         return here, way
 
     return arm
@@ -180,7 +182,7 @@ def nested(task: Task) -> tuple[Tensor, Way]:
     way = Way()
 
     def solved(share, so_far):
-        return read_out(task.objective, share, so_far, task.seed, 8)
+        return read_out(task, share, so_far, NESTED)
 
     return task.descend(task.start, GEOMETRY, task.steps, way, before=solved), way
 

@@ -19,7 +19,6 @@ from studies.codesign.race import kept, spread_over
 from studies.frame.run import Run
 from studies.frame.sweep import Row, sweep
 
-GRID = 5  # designs along each number, from bound to bound
 MOST_REFUSED = 200  # designs drawn for each that keeps what is required
 LOOKED = 12_345  # number of the draw
 FIRST_WORLD = 500  # of those that no arm is trained in
@@ -37,6 +36,11 @@ class Landscape:
     near: list[Row]
     grid: list[Row]
     calibration: Calibration
+
+    @property
+    def best(self) -> Tensor:
+        """Shares [V] of the least hard error."""
+        return best_of(self.designs + self.near)
 
     @property
     def spread(self) -> float:
@@ -170,8 +174,12 @@ def landscape(run: Run[Any], space: Space, count: int) -> Landscape:
     for name, rows in (("all", designs), ("near", near)):
         for number, row in enumerate(rows):
             row["expected"] = looks.expected(f"{name}_{number}", calibration)
-    least = torch.tensor(min(designs + near, key=lambda row: row["hard"])["share"], dtype=torch.float64)
-    return Landscape(designs, near, _along(run, looks, least, calibration), calibration)
+    return Landscape(designs, near, _along(run, looks, best_of(designs + near), calibration), calibration)
+
+
+def best_of(rows: list[Row]) -> Tensor:
+    """Shares [V] of the row with the least hard error."""
+    return torch.tensor(min(rows, key=lambda row: row["hard"])["share"], dtype=torch.float64)
 
 
 def _fit(looks, names, rows):
@@ -190,14 +198,16 @@ def _along(run, looks, best, calibration):
     space = looks.space
     requirements = space.pair.requirements()
 
+    last = run.config.grid - 1
+
     def cell(number_of, step):
         share = best.clone()
-        share[space.free.index(number_of)] = step / (GRID - 1)
-        row = {"at": step / (GRID - 1), "value": space.numbers(share)[number_of]}
+        share[space.free.index(number_of)] = step / last
+        row = {"at": step / last, "value": space.numbers(share)[number_of]}
         if not kept(space, share, requirements):
             return {**row, "hard": None, "expected": None}
         name = f"grid_{number_of}_{step}"
         found = looks.row(name, share)
         return {**row, "hard": found["hard"], "expected": looks.expected(name, calibration)}
 
-    return sweep(run, cell, "grid", number_of=space.free, step=range(GRID))
+    return sweep(run, cell, "grid", number_of=space.free, step=range(last + 1))

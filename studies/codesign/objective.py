@@ -56,6 +56,10 @@ class Objective:
         value = float(looked.expected.mean())
         return value + self.penalty(share), slope + self.penalty_slope(share, free), looked
 
+    def forget(self) -> None:
+        """All numbers of sensor and estimator take their turn in the next call."""
+        self._known.clear()
+
     def _turn(self, places):
         """All of them until all are known; then the one that is known longest."""
         if not all(k in self._known for k in places):

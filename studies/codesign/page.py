@@ -9,6 +9,7 @@ import torch
 from studies.codesign.design import Space
 from studies.codesign.landscape import Landscape
 from studies.codesign.race import compared
+from studies.codesign.slopes import show
 from studies.frame.compare import Interval
 from studies.frame.run import Run
 from studies.frame.show import Panel, bars, panels, table, tabulate
@@ -18,11 +19,13 @@ ENOUGH = 6  # seeds, below which nothing is decided
 SPREAD = 1.5  # of the landscape, below which there is nothing to design
 
 
-def report(run: Run[Any], space: Space, gates: Landscape, rows: Sequence[Row]) -> None:
+def report(run: Run[Any], space: Space, gates: Landscape, slopes: Sequence[Row], rows: Sequence[Row]) -> None:
     """Metrics and page."""
     found = compared(rows)
     race(run, found, rows)
     looked(run, space, gates)
+    if slopes:
+        show(run, space, slopes)
     designs(run, space, rows)
     run.record(seconds=run.seconds)
     run.finish("Lens, mount, sensor and estimator together", answer(run, found))

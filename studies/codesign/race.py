@@ -45,14 +45,14 @@ def kept(space: Space, share: Tensor, requirements: Sequence[Any]) -> bool:
     return first_missed(requirements, whole.T_body_cam, whole.camera) is None
 
 
-def run_arm(drawn: Drawn, arm: str, seed: int, steps: int) -> dict[str, Any]:
+def run_arm(drawn: Drawn, arm: str, seed: int, steps: int, settling: int) -> dict[str, Any]:
     """One arm from one start: its answer, sensor and estimator settled once more on the drives recorded last; or the last
     design on its way that keeps what is required."""
     begun, rendered = time.process_time(), drawn.rendered
     space = drawn.space
-    task = Task(Objective(drawn), start(space, seed), steps, 10_000 * seed, seed)
+    task = Task(Objective(drawn), start(space, seed), steps, 10_000 * seed, seed, settling)
     answer, way = ARMS[arm](task)
-    answer = read_out(task.objective, answer, way, seed)
+    answer = read_out(task, answer, way)
     candidates = [answer, *reversed(way.shares), task.start]
     chosen = next(share for share in candidates if kept(space, share, drawn.requirements))
     return {

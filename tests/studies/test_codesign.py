@@ -108,7 +108,7 @@ class Valley:
 def test_joint_descent_reaches_the_bottom_of_a_valley_that_one_pass_over_the_blocks_does_not(
     space, monkeypatch
 ):
-    monkeypatch.setattr("studies.codesign.arms.read_out", lambda objective, share, *rest: share)
+    monkeypatch.setattr("studies.codesign.arms.read_out", lambda task, share, *rest: share)
     begun = torch.full((len(space.free),), 0.5, dtype=F)
     begun[0], begun[4] = 0.1, 0.9
     valley = Valley(space)
@@ -163,6 +163,8 @@ def test_the_comparison_is_of_pairs():
         (["--arms", "book"], "needs joint"),
         (["--arms", "joint", "luck"], "choose from joint"),
         (["--per-draw", "7", "--worlds", "3"], "spread evenly"),
+        (["--family", "fisheye-9"], "no lens family"),
+        (["--free", "colour"], "no number 'colour'"),
     ],
 )
 def test_wrong_command_lines_end_with_a_sentence(wrong, said, tmp_path, capsys):
@@ -178,12 +180,16 @@ def test_way_answers_with_the_mean_of_its_end():
     assert len(way.recorded) == 4
 
 
-def test_a_small_race_says_that_it_decides_nothing(tmp_path):
+def test_a_small_race_says_that_it_decides_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(codesign, "LEAST_STEPS", 2)
     folder = tmp_path / "run"
-    given = "--quick --seeds 1 --worlds 1 --per-draw 1 --judged-worlds 1 --judged-drives 1 --designs 3 --arms joint default"
-    assert main(codesign.study, codesign.Config, [*given.split(), "--out", str(folder)]) == 0
-    page = (folder / "report.html").read_text()
-    assert "decides nothing" in page
+    given = "--quick --steps 2 --worlds 1 --per-draw 1 --judged-worlds 1 --judged-drives 1 --arms joint default --slopes 2"
+    free = ["--family", "thin", "--free", "efl_mm", "z_m", "theta"]
+    assert main(codesign.study, codesign.Config, [*given.split(), *free, "--out", str(folder)]) == 0
+    assert "decides nothing" in (folder / "report.html").read_text()
     numbers = json.loads((folder / "metrics.json").read_text())
-    assert numbers["race_joint_drives"] == 16
+    assert numbers["race_joint_drives"] == 2
     assert 0 < numbers["race_joint_median"] <= 1
+    before = (folder / "race.jsonl").read_bytes()
+    assert main(codesign.study, codesign.Config, ["--resume", str(folder)]) == 0
+    assert (folder / "race.jsonl").read_bytes() == before

@@ -1,0 +1,110 @@
+"""Is the slope that steers a design the slope of its errors? The objective's own against rendered differences, of the
+errors it expects and of hard ones, over the same draws."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from studies.codesign.design import BLOCKS, Space
+from studies.codesign.objective import STEP, Objective
+from studies.codesign.problem import Drawn
+from studies.frame.run import Run
+from studies.frame.show import tabulate
+from studies.frame.sweep import Row, sweep
+
+FIRST = 50_000  # number of the first draw
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Of a mean slope with a mean of differences over the same draws.
+
+    cosine: between them, in the cube. length: of the slope over that of the differences. beyond: relative L2 distance
+    that the standard errors of both do not explain. signal_to_noise: of the slope in one draw.
+    """
+
+    cosine: float
+    length: float
+    beyond: float
+    signal_to_noise: float
+
+
+def agreement(slopes: Tensor, differences: Tensor) -> Agreement:
+    """Of slopes [draws, V] with differences [draws, V]."""
+    ours, theirs = slopes.mean(0), differences.mean(0)
+    noise = (slopes - differences).var(0).sum() / len(slopes)
+    away = ((ours - theirs).square().sum() - noise).clamp_min(0).sqrt() / theirs.norm()
+    scatter = slopes.var(0).sum().sqrt()
+    return Agreement(
+        float(ours @ theirs / (ours.norm() * theirs.norm())),
+        float(ours.norm() / theirs.norm()),
+        float(away),
+        float(ours.norm() / scatter.clamp_min(1e-12)),
+    )
+
+
+def slopes(run: Run[Any], space: Space, drawn: Drawn, at: Tensor, draws: int) -> list[Row]:
+    """Rows of every draw and number at shares [V]: the slope, and the differences over a step to either side.
+
+    The slope of the first draw, by which the trend has learnt nothing else, is not among them.
+    """
+    objective = Objective(drawn)
+    free = range(len(space.free))
+    objective(at, drawn.draw(FIRST - 1), free)
+
+    def of_slope(draw):
+        objective.forget()
+        return {"slope": objective(at, drawn.draw(FIRST + draw), free)[1].tolist()}
+
+    def of_differences(draw, number):
+        ends = at.repeat(2, 1)
+        k = space.free.index(number)
+        ends[:, k] = (at[k] + torch.tensor([-STEP, STEP], dtype=at.dtype)).clamp(0, 1)
+        looked = [drawn.looked(space.made(share), drawn.draw(FIRST + draw)) for share in ends]
+        width = float(ends[1, k] - ends[0, k])
+        expected, hard = (
+            [float(each.mean()) for each in of]
+            for of in zip(*((e.expected, e.hard()) for e in looked), strict=True)
+        )
+        return {"expected": (expected[1] - expected[0]) / width, "hard": (hard[1] - hard[0]) / width}
+
+    found = sweep(run, of_slope, "slopes", draw=range(draws))
+    rows = sweep(run, of_differences, "differences", draw=range(draws), number=space.free)
+    return [{**row, "slope": found[row["draw"]]["slope"][space.free.index(row["number"])]} for row in rows]
+
+
+def show(run: Run[Any], space: Space, rows: Sequence[Row]) -> None:
+    """How the slopes agree, block by block and number by number."""
+    draws = max(row["draw"] for row in rows) + 1
+    of = {
+        kind: torch.tensor([row[kind] for row in rows], dtype=torch.float64).reshape(draws, -1)
+        for kind in ("slope", "expected", "hard")
+    }
+    lines = []
+    for name in ("all", *BLOCKS):
+        places = list(range(len(space.free))) if name == "all" else space.block(name)
+        if not places:
+            continue
+        for kind in ("expected", "hard"):
+            found = agreement(of["slope"][:, places], of[kind][:, places])
+            lines.append({"block": name, "against": kind, **vars(found)})
+    run.section(
+        "Is the slope right?",
+        f"At the best design that was looked at, over {draws} draws of fresh drives: the slope by geometry, trend and recorded frames "
+        f"against differences of rendered errors over {STEP} of the bounds to either side, on the same drives.",
+    )
+    tabulate(run, "Agreement", lines, "block", "against", prefix="slope")
+    numbers = []
+    for k, name in enumerate(space.free):
+        line = {"number": name}
+        for kind, values in of.items():
+            line |= {
+                kind: float(values[:, k].mean()),
+                f"{kind}_error": float(values[:, k].std()) / math.sqrt(draws),
+            }
+        numbers.append(line)
+    tabulate(run, "Mean slopes, per share of the bounds", numbers, "number", prefix="mean_slope")
