@@ -9,7 +9,7 @@ RUN := .venv/bin/python
 INSTALL := $(RUN) -m pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable
 STUDIES := lens-opt lens-report lens-scratch lens-tolerance lens-bench dataset video-to-events \
 	srm-bench sensor-fit train-flow flow-quality flow-recording \
-	placement speed-error stability gradcheck
+	placement codesign speed-error stability gradcheck
 
 .PHONY: help setup test fuzz kill-test test-bits lint core-check try-all doctor clean $(STUDIES)
 
@@ -52,6 +52,7 @@ train-flow: .venv/with-event-files.stamp .venv/with-training-logs.stamp ## train
 flow-quality: ## error of the delivered refiner and of the closed form on unseen textures and worlds
 flow-recording: .venv/with-event-files.stamp ## flow of a recording: make flow-recording ARGS="--recording FOLDER"
 placement: .venv/with-search.stamp ## where to mount the camera on a robot
+codesign: .venv/with-search.stamp ## lens, mount, sensor and estimator designed together, raced against every other order
 speed-error: ## time, memory and error of every stage: make speed-error ARGS="--stages lens events flow"
 stability: ## hard cases: outcome expected and seen
 gradcheck: ## gradients against differences: make gradcheck ARGS="--cases chain joint layers sensors timing silhouettes"
