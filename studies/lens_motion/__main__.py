@@ -11,6 +11,7 @@ import csv
 import math
 import sys
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import ClassVar
 
@@ -25,7 +26,7 @@ from codesign.system.objectives import angular_error_mrad, edge_energy
 from studies.frame.compare import Interval, log_ratio
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.show import bars, table
-from studies.frame.sweep import column, select, sweep
+from studies.frame.sweep import column, plain, select, sweep
 from studies.lens_motion import page, rivals
 from studies.lens_motion.forms import Form, make_form
 from studies.lens_motion.motions import TALL_PX, WIDE_PX, Motion
@@ -227,6 +228,8 @@ def _finish(run, lenses, motion, rows):
                 **pair.metrics(f"{prefix}_{name}"), **{f"{prefix}_{name}_detectable": detectable(pair)}
             )
     said = verdict("the flow design", {page.LABELS[name]: pair for name, pair in flown.items()})
+    spots_and_mtf = {page.LABELS[name]: along[name] for name in ("spots", "mtf")}
+    said += " " + verdict("the design by MTF along the motion", spots_and_mtf)
     run.section("Who wins", page.EXPLAINED)
     titles = {
         "lens": "designer",
@@ -259,12 +262,14 @@ def _redraw(run):
         ]
     values = {}
     for setting in dict.fromkeys(row["setting"] for row in rows):
-        for turned in sorted({row["turned"] for row in select(rows, setting=setting)}):
-            for name, pair in ratios(select(rows, setting=setting), "flow", turned).items():
-                if name in ("spots", "mtf"):
-                    label = f"{setting}{', turned' if turned else ''}: over {page.LABELS[name]}"
-                    values[label] = page.as_ratio(pair)
-                    run.record(**pair.metrics(f"log_ratio_{setting.replace(' ', '_')}_{turned}_{name}"))
+        own = select(rows, setting=setting)
+        for turned, design, name in product((0, 1), ("mtf_along", "flow"), ("spots", "mtf")):
+            pair = ratios(own, design, turned)[name]
+            words = (setting, "turned" if turned else "as it is")
+            run.record(**pair.metrics(f"log_ratio_{plain(*words, design, name)}"))
+            values[f"{', '.join(words)}: {page.LABELS[design]} over {page.LABELS[name]}"] = page.as_ratio(
+                pair
+            )
     run.figure(
         bars(values, "flow error, ratio", log=True, level=1.0), "lens_motion", "Ratios with 95 % intervals."
     )
