@@ -267,11 +267,12 @@ def _redraw(run):
             pair = ratios(own, design, turned)[name]
             words = (setting, "turned" if turned else "as it is")
             run.record(**pair.metrics(f"log_ratio_{plain(*words, design, name)}"))
-            values[f"{', '.join(words)}: {page.LABELS[design]} over {page.LABELS[name]}"] = page.as_ratio(
-                pair
-            )
+            if design == "mtf_along":
+                values[f"{setting}{', turned' if turned else ''}: over {name}"] = page.as_ratio(pair)
     run.figure(
-        bars(values, "flow error, ratio", log=True, level=1.0), "lens_motion", "Ratios with 95 % intervals."
+        bars(values, "flow error of MTF along the motion, ratio", log=True, level=1.0),
+        "lens_motion",
+        "Ratios with 95 % intervals.",
     )
     run.finish("A lens for the motion: all settings", f"Drawn from {run.config.raw.name}.")
 
