@@ -55,7 +55,7 @@ class Config(StudyConfig):
     arms: tuple[str, ...] = tuple(ARMS)
     """Ways to a design that race."""
     seeds: int = 12
-    """Paired starting designs."""
+    """Paired starting designs; 0 looks at the landscape and races nothing."""
     steps: int = 16
     """Steps of every descent, looks of every search: the budget."""
     worlds: int = 12
@@ -85,9 +85,9 @@ def study(run: Run[Config]) -> None:
     space = Space(replace(PAIRS[size.pair](), family=family), Costs(light=size.light), size.free)
     for seed in range(size.seeds):
         start(space, size.seed + seed)
-    judge = Judge(space, size.judged_worlds, size.judged_drives)
     gates = landscape(run, space, size.designs)
 
+    judge = Judge(space, size.judged_worlds, size.judged_drives)
     spread = spread_over(size.worlds, size.per_draw)
     drawn = Drawn(space, robot_pair.training(size.worlds), *spread, gates.calibration)
 
@@ -109,7 +109,9 @@ def checked(size: Config) -> None:
         lens.family(size.family)
     if not 0 < size.light <= 1:
         raise DomainError(f"--light is {size.light:g}; a share of daylight above 0 and at most 1 is needed.")
-    for name in ("seeds", "worlds", "per_draw", "judged_worlds", "judged_drives", "designs", "settling"):
+    if size.seeds < 0:
+        raise DomainError(f"--seeds is {size.seeds}; 0 or more are needed.")
+    for name in ("worlds", "per_draw", "judged_worlds", "judged_drives", "designs", "settling"):
         if getattr(size, name) < 1:
             raise DomainError(f"--{name.replace('_', '-')} is {getattr(size, name)}; at least 1 is needed.")
     if size.grid < 2 or size.slopes == 1 or size.slopes < 0:

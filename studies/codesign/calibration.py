@@ -51,12 +51,12 @@ class Calibration:
     The numbers are those of docs/joint_design.md.
     """
 
-    claimed: float = 0.88
-    noise: float = 1.7
-    share: float = 0.027
-    lag: float = 0.48
-    reach_px: float = 33.0
-    priors: float = 7.8
+    claimed: float = 0.48
+    noise: float = 0.64
+    share: float = 0.028
+    lag: float = 0.52
+    reach_px: float = 22.0
+    priors: float = 12.4
 
     def errors(self, at: Conditions) -> FlowErrors:
         """Of flow under some conditions."""

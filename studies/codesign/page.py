@@ -21,14 +21,17 @@ SPREAD = 1.5  # of the landscape, below which there is nothing to design
 
 def report(run: Run[Any], space: Space, gates: Landscape, slopes: Sequence[Row], rows: Sequence[Row]) -> None:
     """Metrics and page."""
-    found = compared(rows)
-    race(run, found, rows)
+    found = compared(rows) if rows else {}
+    if rows:
+        race(run, found, rows)
     looked(run, space, gates)
     if slopes:
         show(run, space, slopes)
-    designs(run, space, rows)
+    if rows:
+        designs(run, space, rows)
     run.record(seconds=run.seconds)
-    run.finish("Lens, mount, sensor and estimator together", answer(run, found))
+    lead = answer(run, found) if rows else "This run looks at the landscape and races nothing."
+    run.finish("Lens, mount, sensor and estimator together", lead)
 
 
 def answer(run: Run[Any], found: dict[str, tuple[Interval, float]]) -> str:
