@@ -51,12 +51,12 @@ class Calibration:
     The numbers are those of docs/joint_design.md.
     """
 
-    claimed: float = 0.48
-    noise: float = 0.64
-    share: float = 0.028
-    lag: float = 0.52
-    reach_px: float = 22.0
-    priors: float = 12.4
+    claimed: float = 0.425
+    noise: float = 0.396
+    share: float = 0.026
+    lag: float = 0.536
+    reach_px: float = 19.4
+    priors: float = 13.8
 
     def errors(self, at: Conditions) -> FlowErrors:
         """Of flow under some conditions."""

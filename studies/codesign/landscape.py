@@ -10,6 +10,7 @@ from scipy.stats import linregress, spearmanr
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
+from codesign.atomic import write_atomic
 from codesign.flow import checkpoint
 from codesign.mount import FlowErrors, Readings
 from studies.codesign.calibration import Calibration, Conditions, fitted
@@ -65,6 +66,20 @@ class Landscape:
         """Of hard errors over expected ones, over them."""
         columns = ([row[name] for row in self.judged] for name in ("expected", "hard"))
         return float(linregress(*columns).slope)
+
+    def csv(self, space: Space) -> str:
+        """Every design: where it was drawn, its numbers, and its errors; "near" are those that judge the fit."""
+        lines = [",".join(("drawn", *space.free, "hard", "expected"))]
+        for kind, rows in (
+            ("all over", self.designs),
+            ("near, fitted", self.near[::2]),
+            ("near", self.near[1::2]),
+        ):
+            for row in rows:
+                numbers = space.numbers(torch.tensor(row["share"], dtype=torch.float64))
+                values = [numbers[name] for name in space.free] + [row["hard"], row["expected"]]
+                lines.append(f'"{kind}",' + ",".join(f"{value:.5g}" for value in values))
+        return "\n".join(lines) + "\n"
 
     def inside(self, name: str) -> bool:
         """Whether the best of a number's grid lies off its bounds."""
@@ -174,7 +189,10 @@ def landscape(run: Run[Any], space: Space, count: int) -> Landscape:
     for name, rows in (("all", designs), ("near", near)):
         for number, row in enumerate(rows):
             row["expected"] = looks.expected(f"{name}_{number}", calibration)
-    return Landscape(designs, near, _along(run, looks, best_of(designs + near), calibration), calibration)
+    grid = _along(run, looks, best_of(designs + near), calibration)
+    found = Landscape(designs, near, grid, calibration)
+    write_atomic(run.path("landscape.csv"), found.csv(space).encode())
+    return found
 
 
 def best_of(rows: list[Row]) -> Tensor:

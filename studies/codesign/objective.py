@@ -78,9 +78,20 @@ class Objective:
             return self.carried(looked, looked.whole.camera, poses, optics).tolist()
         if name in BLOCKS["lens"]:
             pose = looked.whole.T_body_cam[None]
-            return [float(self.carried(looked, whole.camera, pose, optics)) for whole in wholes]
+            sharp = [float(self.carried(looked, whole.camera, pose, optics)) for whole in wholes]
+            if name != "fno":
+                return sharp
+            # geometry knows the blur, recorded frames the light
+            here = float(looked.expected.mean())
+            return [
+                blur + light - here for blur, light in zip(sharp, self._again(looked, wholes), strict=True)
+            ]
+        return self._again(looked, wholes, name in BLOCKS["network"])
+
+    def _again(self, looked, wholes, same_events=False):
+        """Mean errors to be expected of other designs on the frames, or on the events, that were recorded."""
         recorded = {"frames": looked.run["frames"]}
-        if name in BLOCKS["network"]:
+        if same_events:
             recorded["events"] = looked.run["volume"]
         return [
             float(self.drawn.looked(whole, looked.samples, recorded=recorded).expected.mean())
