@@ -222,10 +222,13 @@ def _along(run, looks, best, calibration):
         share = best.clone()
         share[space.free.index(number_of)] = step / last
         row = {"at": step / last, "value": space.numbers(share)[number_of]}
-        if not kept(space, share, requirements):
-            return {**row, "hard": None, "expected": None}
-        name = f"grid_{number_of}_{step}"
-        found = looks.row(name, share)
-        return {**row, "hard": found["hard"], "expected": looks.expected(name, calibration)}
+        hard = (
+            looks.row(f"grid_{number_of}_{step}", share)["hard"] if kept(space, share, requirements) else None
+        )
+        return {**row, "hard": hard}
 
-    return sweep(run, cell, "grid", number_of=space.free, step=range(last + 1))
+    rows = sweep(run, cell, "grid", number_of=space.free, step=range(last + 1))
+    for row in rows:
+        name = f"grid_{row['number_of']}_{row['step']}"
+        row["expected"] = None if row["hard"] is None else looks.expected(name, calibration)
+    return rows

@@ -122,9 +122,12 @@ def looked(run: Run[Any], space: Space, gates: Landscape) -> None:
         values = [row["value"] for row in of]
         series = {kind: (values, [row[kind] for row in of]) for kind in ("hard", "expected")}
         charts.append(Panel(series, name, "error"))
-    run.figure(
-        panels(*charts, width=2.6), "grid", "Errors along every number through the best of the designs."
-    )
+    half = (len(charts) + 1) // 2
+    for name, part in (("grid_first", charts[:half]), ("grid_last", charts[half:])):
+        if part:
+            run.figure(
+                panels(*part, width=2.6), name, "Errors along numbers through the best of the designs.", 110
+            )
 
 
 def designs(run: Run[Any], space: Space, rows: Sequence[Row]) -> None:
