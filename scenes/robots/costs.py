@@ -13,11 +13,14 @@ from torch import Tensor, nn
 
 from codesign.checks import check_number, check_positive
 from codesign.events import SensorModel
+from codesign.events.sensor.model import threshold_to_noise
 from codesign.types import EventVolume
 
 FASTEST = 1.2  # f-number of full light
 DAVIS_BUS_HZ = 12e6  # events per second that a DAVIS346 reads out
 WALKING_M_S = 1.0  # above which a mast sways no more
+MOST_RATE = 10.0  # of noise events, per 2 x bandwidth
+LEAST_RATE = 1e-7
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ class Costs:
         changed = replace(nominal, theta_on=theta, theta_off=theta, cutoff_hz=cutoff_hz)
         if not self.noise:
             return changed
-        ratio = nominal.theta_on / noise_ratio_inverse(nominal)
+        ratio = nominal.theta_on / threshold_to_noise(nominal.shot_rate_hz, nominal.cutoff_hz)
         deviation = ratio * math.sqrt(cutoff_hz / nominal.cutoff_hz)
         return replace(changed, shot_rate_hz=noise_rate_hz(theta / deviation, cutoff_hz))
 
@@ -80,21 +83,6 @@ class Costs:
         turn = torch.cat([rate[:, None] * deviates, torch.zeros_like(deviates[:, :1])], 1)
         pivot = torch.cat([place[:, :2], (foot_m + length / 3)[:, None]], 1)
         return torch.cat([-torch.linalg.cross(turn, pivot), turn], 1)
-
-
-def threshold_to_noise(rate_hz: float, cutoff_hz: float) -> float:
-    """v2e's fit: threshold over noise deviation at which a pixel makes this many noise events per second."""
-    x = math.log10(rate_hz / (2 * cutoff_hz))
-    return 10 ** (-0.0026 * x**3 - 0.036 * x**2 - 0.1949 * x + 0.321)
-
-
-def noise_ratio_inverse(sensor: SensorModel) -> float:
-    """Threshold over noise deviation of a sensor, by its noise rate."""
-    return threshold_to_noise(sensor.shot_rate_hz, sensor.cutoff_hz)
-
-
-MOST_RATE = 10.0  # of noise events, per 2 x bandwidth
-LEAST_RATE = 1e-7
 
 
 def noise_rate_hz(ratio: float, cutoff_hz: float) -> float:

@@ -54,7 +54,10 @@ class Objective:
         for k in turns:
             slope[k] = self._known[k]
         value = float(looked.expected.mean())
-        return value + self.penalty(share), slope + self.penalty_slope(share, free), looked
+        penalty = self.penalty(share)
+        if penalty:
+            slope = slope + self.penalty_slope(share, free)
+        return value + penalty, slope, looked
 
     def forget(self) -> None:
         """All numbers of sensor and estimator take their turn in the next call."""
@@ -126,8 +129,6 @@ class Objective:
     def penalty_slope(self, share: Tensor, free: Sequence[int]) -> Tensor:
         """[V] along the free numbers, by small differences."""
         slope = torch.zeros_like(share)
-        if not self.penalty(share):
-            return slope
         for k in free:
             if self.space.free[k] in GEOMETRY:
                 ends = share.repeat(2, 1)

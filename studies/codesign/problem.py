@@ -10,9 +10,7 @@ import torch
 from torch import Tensor
 
 from codesign.mount import (
-    Body,
     FlowErrors,
-    OwnBody,
     Readings,
     Requirement,
     expected_errors,
@@ -76,12 +74,6 @@ class Drawn:
         return self.space.pair.system(self.space.pair.design)
 
     @cached_property
-    def own_body(self) -> OwnBody:
-        """Of the robot, in its camera's view."""
-        meshes = self.space.pair.bodies.values()
-        return OwnBody(Body((mesh.vertices_m, mesh.faces) for mesh in meshes), 1.0)
-
-    @cached_property
     def requirements(self) -> list[Requirement]:
         """Of the mount."""
         return self.base.requirements
@@ -137,7 +129,7 @@ class Drawn:
         read = estimator.read(*given)
         true = read if self.space.pair.depth == "scene" else estimator.read(*given, depth=scene_depth)
         flow_px = (true.rows @ twist[:, None, :, None])[..., 0]
-        covered = self.own_body.covered(mounts, camera).repeat_interleave(each, 0)
+        covered = self.base.own_body.covered(mounts, camera).repeat_interleave(each, 0)
         covered = covered.repeat(len(batch.T_world_body), 1)
         surfaces = replace(read, depth_m=true.depth_m)
         return Seen(batch.twist, twist, read, surfaces, true.rows, flow_px, covered)

@@ -58,10 +58,9 @@ class Form:
             curvature_per_mm=self.start.curvature_per_mm + STEPS[1] * bending,
             thickness_mm=torch.stack(thickness),
         )
-        focused = hold_efl(bent, self.efl_mm).focus_at(DISTANCE_M).thickness_mm
-        return hold_efl(bent, self.efl_mm).replace(
-            thickness_mm=torch.cat([focused[:-1], (focused[-1] + STEPS[0] * film)[None]])
-        )
+        held = hold_efl(bent, self.efl_mm)
+        focused = held.focus_at(DISTANCE_M).thickness_mm
+        return held.replace(thickness_mm=torch.cat([focused[:-1], (focused[-1] + STEPS[0] * film)[None]]))
 
     def penalty(self, optics: lens.GeoLens) -> Tensor:
         """Of glass edges that are too thin, scalar."""

@@ -117,7 +117,8 @@ class Problem:
         return Drives(torch.stack(poses), times(), tuple(scenes), samples.seed, twist=torch.cat(twists))
 
     @cached_property
-    def _own_body(self):
+    def own_body(self) -> OwnBody:
+        """Of the robot, in its camera's view."""
         body = Body((mesh.vertices_m, mesh.faces) for mesh in self.pair.bodies.values())
         return OwnBody(body, 1.0)
 
@@ -207,7 +208,7 @@ class Problem:
         read = look()
         true = read if self.pair.depth == "scene" else look(depth=scene_depth)
         flow_px = (true.rows @ batch.twist[:, None, :, None])[..., 0]
-        covered = self._own_body.covered(T_body_cam, self.camera)
+        covered = self.own_body.covered(T_body_cam, self.camera)
         covered = covered.expand(*T_world_cam.shape[:2], -1).flatten(0, 1)
         return Seen(read, replace(read, depth_m=true.depth_m), true.rows, flow_px, covered)
 

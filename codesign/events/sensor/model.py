@@ -129,7 +129,6 @@ class SensorModel:
         """
         if not self.photoreceptor_noise:
             return 0.0
-        x = math.log10(self.shot_rate_hz / (2 * self.cutoff_hz))
         smaller = min(self.theta_on, self.theta_off)
         spread = math.sqrt(2) * self.theta_sigma
         if spread > 0:  # mean of the smaller of two independent normal numbers (Clark 1961)
@@ -137,7 +136,16 @@ class SensorModel:
             above = 0.5 * math.erfc(-share / math.sqrt(2))
             density = math.exp(-(share**2) / 2) / math.sqrt(2 * math.pi)
             smaller = self.theta_on * above + self.theta_off * (1 - above) - spread * density
-        return smaller / 10 ** (-0.0026 * x**3 - 0.036 * x**2 - 0.1949 * x + 0.321)
+        return smaller / threshold_to_noise(self.shot_rate_hz, self.cutoff_hz)
+
+
+def threshold_to_noise(rate_hz: float, cutoff_hz: float) -> float:
+    """Threshold over noise deviation at which a pixel of that bandwidth makes so many noise events per second.
+
+    Source: v2e's fit (see ``SensorModel.noise_level``).
+    """
+    x = math.log10(rate_hz / (2 * cutoff_hz))
+    return 10 ** (-0.0026 * x**3 - 0.036 * x**2 - 0.1949 * x + 0.321)
 
 
 # v2e's presets and the defaults of its command line
