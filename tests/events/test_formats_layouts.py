@@ -4,6 +4,7 @@ bit."""
 import struct
 import subprocess
 import sys
+import zlib
 
 import h5py
 import hdf5plugin
@@ -17,7 +18,7 @@ from codesign.errors import FileFormatError
 from codesign.events import read, write
 from codesign.events.formats import hdf5
 from codesign.events.formats.aedat import read_frames
-from codesign.events.formats.hdf5_rows import new_hdf5
+from codesign.events.formats.hdf5_rows import GZIP, new_hdf5, places_of, undone
 from codesign.events.stream import ordered
 from tests.event_streams import (
     DAT,
@@ -341,6 +342,25 @@ def test_a_window_is_the_events_between_two_times(tmp_path, monkeypatch, indexed
         columns = (STREAM.x[inside], STREAM.y[inside], STREAM.p[inside])
         truth = ordered(torch.from_numpy(times[inside] + EPOCH_US), *columns, 480, 640)
         assert same(events.window(t0_us + EPOCH_US, t1_us + EPOCH_US, (480, 640)), truth)
+
+
+def test_a_block_lies_inside_the_file_to_its_last_byte(tmp_path):
+    (tmp_path / "e.h5").write_bytes(in_hdf5({"a": np.arange(40)}, chunks=True))
+    with h5py.File(tmp_path / "e.h5") as file:
+        (block,) = (file["a"].id.get_chunk_info(k) for k in range(file["a"].id.get_num_chunks()))
+        end = block.byte_offset + block.size
+        assert len(places_of("e.h5", file["a"], "a", end)) == 1
+        with pytest.raises(FileFormatError, match="needs 1 blocks and lacks some"):
+            places_of("e.h5", file["a"], "a", end - 1)
+
+
+@pytest.mark.parametrize("change", [lambda packed: packed + b"x", lambda packed: packed[:-1]])
+def test_a_gzip_block_ends_where_its_stream_ends(change):
+    data = bytes(range(200))
+    packed = zlib.compress(data)
+    assert undone("e.h5", "a", GZIP, (), packed, len(data)) == data
+    with pytest.raises(FileFormatError, match=r"e\.h5: a block of a \(gzip\) does not unpack"):
+        undone("e.h5", "a", GZIP, (), change(packed), len(data))
 
 
 PROGRAM = """

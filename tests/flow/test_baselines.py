@@ -80,6 +80,14 @@ def test_a_weight_budget_is_filled_and_hardly_exceeded(network, budget):
     assert count_weights(network(**net.config)) == count_weights(net)
 
 
+@pytest.mark.parametrize("network", NETWORKS)
+def test_a_network_by_its_budget_begins_as_one_by_its_width(network):
+    net = network.with_weights(300_000)
+    sizes = {name: net.config[name] for name in ("bins", "width", "hidden")}
+    for found, wanted in zip(net.parameters(), network(**sizes).parameters(), strict=True):
+        assert torch.equal(found, wanted)
+
+
 def test_weights_by_hand():
     """From the sizes of the layers of a plain network 16 channels wide; of the peers the numbers as
     delivered, published 0.15 and 1.4 million."""

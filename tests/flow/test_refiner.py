@@ -13,7 +13,7 @@ from codesign.events import from_stream
 from codesign.flow.checkpoint import load
 from codesign.flow.lk import estimate_lk
 from codesign.flow.metrics import aee
-from codesign.flow.refiner import Refiner, _on_pixels
+from codesign.flow.refiner import Refiner, _on_cells, _on_pixels
 from codesign.flow.refiner_evidence import (
     AROUND,
     CALIBRATION,
@@ -215,6 +215,14 @@ def test_cells_become_pixels_linearly_until_edges_are_learnt():
     torch.testing.assert_close(
         steps, image.repeat_interleave(CELL, 2).repeat_interleave(CELL, 3), rtol=0, atol=1e-9
     )
+
+
+def test_an_image_is_continued_on_cells_by_its_own_width_and_height():
+    rows, columns = 7, 9
+    y, x = np.meshgrid(np.arange(8).clip(max=rows - 1), np.arange(12).clip(max=columns - 1), indexing="ij")
+    whole = (10.0 * y + x).reshape(2, CELL, 3, CELL).mean((1, 3))
+    image = 10 * torch.arange(rows, dtype=D)[:, None] + torch.arange(columns, dtype=D)
+    np.testing.assert_allclose(_on_cells(image[None, None])[0, 0].numpy(), whole, rtol=1e-14)
 
 
 def test_gradient_to_a_start_passes_gradcheck(generator):

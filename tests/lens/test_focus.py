@@ -88,6 +88,12 @@ def test_paraxial_focus_of_a_ball_lens():
         close(found, 1.5 * 5 / (2 * 0.5) - 5 + defocus, 1e-13)
 
 
+def test_paraxial_focus_inside_glass():
+    # one surface of radius R into n focuses parallel light n R / (n - 1) behind it
+    found = focus_paraxial(GeoLens([Surface(20.0, 40.0, CROWN, 5.0)], 4.0)).thickness_mm[-1]
+    close(found, 1.5 * 20 / 0.5, 1e-13)
+
+
 def mean_square(geo, fields, wavelengths, back_mm):
     """Mean square spot over fields, computed directly from traced rays."""
     moved = geo.replace(thickness_mm=torch.cat([geo.thickness_mm[:-1], f64([back_mm])]))

@@ -148,6 +148,13 @@ def test_a_capsule_is_its_spheres(generator):
     assert bool(((found - sampled).abs() <= 0.12 / 16 / 2 + 1e-12)[~outside].all())
 
 
+def test_a_capsule_through_a_cube_reaches_its_middle():
+    body = Body([box_mesh((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1))])
+    pose = torch.eye(4, dtype=D)
+    pose[2, 3] = 0.2
+    assert float(body.clearances_m(pose, Housing(0.03, behind_m=0.4))) == pytest.approx(-0.13, abs=1e-12)
+
+
 def test_gradient_of_the_clearance_to_the_mount(generator):
     body = Body([box_mesh(*BOX), ball_mesh(0.2)])
     poses = some_poses(generator, 4, 3.0)
@@ -162,6 +169,15 @@ def test_rays_are_hidden_by_what_stands_before_them():
     direction = torch.tensor([[-2.0, 0.0, 0.0], [1.0, 0.0, 0.0], [-1.0, 0.5, 0.0]], dtype=D)
     found = first_crossings(origin, direction, body.triangles)
     assert found.tolist() == [pytest.approx(0.35), math.inf, math.inf]  # 0.7 m in lengths of 2 m
+
+
+@pytest.mark.parametrize("first", [0, 1, 2])
+def test_a_line_through_the_edge_between_two_triangles_crosses_them(first):
+    """A square at z = 2, cut from corner to corner; its middle lies on that edge."""
+    corners = torch.tensor([[0.0, 0, 2], [4, 0, 2], [4, 4, 2], [0, 4, 2]], dtype=D)
+    square = torch.stack([corners[[0, 1, 2]].roll(first, 0), corners[[2, 3, 0]].roll(first, 0)])
+    origin, direction = torch.tensor([[[2.0, 2, 0]], [[0, 0, 1]]], dtype=D)
+    assert first_crossings(origin, direction, square).tolist() == [2.0]
 
 
 def test_the_rover_is_a_body_without_its_camera():

@@ -182,3 +182,11 @@ def test_sight_of_two_that_look_alike():
     torch.testing.assert_close(found.alone, torch.full((2,), 101.0, dtype=D).rsqrt())
     assert found.weakest_named() in ("+0.71 forward -0.71 pitch", "-0.71 forward +0.71 pitch")
     assert found.weakest_deviation == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("scale", [1e-10, 1e10])
+def test_what_is_seen_does_not_hang_on_the_unit_of_information(scale):
+    """NOTHING is a share of the largest eigenvalue: of 4 and 1 times any scale both are seen."""
+    found = sight(scale * torch.diag(torch.tensor([4.0, 1.0, 0.0], dtype=D)), (1.0, 1.0, 1.0), PLANAR)
+    expected = torch.tensor([0.5, 1.0, math.inf], dtype=D) / math.sqrt(scale)
+    torch.testing.assert_close(found.deviation, expected, rtol=1e-12, atol=0)

@@ -40,6 +40,10 @@ def test_starts_fill_the_inner_bounds_and_keep_what_is_required(rover, camera):
     assert not torch.equal(starts(RANGES, 256, seed=4), free)
 
 
+def test_the_seed_left_out_is_0_as_everywhere():
+    assert torch.equal(starts(RANGES, 4), starts(RANGES, 4, seed=0))
+
+
 def test_global_random_numbers_stay_as_they_are():
     torch.manual_seed(5)
     expected = torch.rand(3)

@@ -1,6 +1,7 @@
 """Light levels: closed forms of radiative transfer, baked light against path tracing, and the choice between
 levels."""
 
+import itertools
 import math
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch
 from codesign import backend, lens, render
 from codesign.pose import look_at
 from codesign.render import Camera, MitsubaScene, light
+from codesign.render.atlas import cells_of
 from codesign.render.charts import chart_of, emissive_mesh
 from codesign.types import Rays
 from scenes import textures, worlds
@@ -180,6 +182,16 @@ def test_faces_of_two_triangles_stay_whole_where_they_are_baked():
     """A cube has twelve edges: no diagonal of a face parts two pieces of its texture."""
     (edges,) = light.bake({"cube": {"type": "cube", **grey(0.5, 1.0)}}, samples=1).outline()
     assert len(edges.start) == 12
+
+
+def test_of_faces_in_a_strip_those_with_the_longest_edge_are_one_cell():
+    """Three triangles in a row: the middle one makes a parallelogram with either neighbour."""
+    corners = np.array([[0.0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0], [4, 0, 0]])
+    for faces in itertools.permutations([[0, 1, 3], [1, 2, 3], [1, 4, 2]]):
+        cells = cells_of(corners, np.array(faces))
+        assert cells.area().tolist() == [2.0, 1.0]
+        # the rectangle, whose diagonal is longer than the edge between the other two
+        assert np.linalg.norm(cells.along_u + cells.along_v, axis=1)[0] == pytest.approx(math.sqrt(5))
 
 
 def test_the_sky_is_the_same_at_every_level():

@@ -1,5 +1,6 @@
 """What a stranger gives wrongly is one sentence: what was given, what is allowed, what to do."""
 
+import contextlib
 import dataclasses
 import functools
 import math
@@ -137,6 +138,24 @@ def test_a_mesh_of_ones_own_is_looked_at_before_mitsuba_uses_it():
     parameters.update()
     with pytest.raises(DomainError, match="mesh 'mine': 1 of 4 vertices are NaN"):
         MitsubaScene({"mine": bare}, emissive=False)
+
+
+def test_slivers_have_no_albedo_at_their_vertices():
+    """Triangles of length 1: 1/300 high they pass, 1/400 high they are refused."""
+    mi = backend.mitsuba()
+    for high, refused in ((1 / 300, False), (1 / 400, True)):
+        albedo = {"type": "mesh_attribute", "name": "vertex_albedo"}
+        options = mi.Properties()
+        options["mesh_bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": albedo})
+        own = mi.Mesh("own", 3, 1, props=options)
+        own.add_attribute("vertex_albedo", 3, [0.5] * 9)
+        parameters = mi.traverse(own)
+        parameters["vertex_positions"] = mi.Float([0, 0, 0, 1, 0, 0, 1, high, 0])
+        parameters["faces"] = mi.UInt32([0, 1, 2])
+        parameters.update()
+        sentence = "mesh 'mine': 1 of its faces are more than 316 times as long as wide"
+        with pytest.raises(DomainError, match=sentence) if refused else contextlib.nullcontext():
+            MitsubaScene({"mine": own}, emissive=False)
 
 
 def test_files_are_looked_at_before_they_end_the_process(tmp_path):

@@ -102,5 +102,6 @@ def test_a_moving_object_has_a_truth(wall):
     scene = render.MovingScene(worlds.blank_room(size_m=(8.0, 8.0, 8.0)), {"wall": (wall, shift)})
     still = START.expand(1, 5, 4, 4)
     truth = system_of(lens.Pinhole(8.0), scene).begin(Batch(still, T_S))["truth"]
+    assert truth.interval_s == pytest.approx(0.05, rel=1e-12)
     # 0.04 m to the right at 2 m, 8 mm behind the pinhole: 0.16 mm on pixels of 37 um
     assert float(truth.flow_px[0, 0, 16, 16]) == pytest.approx(0.8 * 0.05 / 2.0 * 8.0 / 0.037, rel=1e-3)
