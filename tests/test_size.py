@@ -51,7 +51,7 @@ BUDGETS = {
     "tests/lens": 37_700,
     "tests/mount": 15_050,
     "tests/optimise": 3_500,
-    "tests/render": 30_550,
+    "tests/render": 30_700,
     "tests/scenes": 21_500,
     "tests/studies": 28_700,
     "tests/system": 5_800,

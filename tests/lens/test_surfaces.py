@@ -9,7 +9,7 @@ import torch
 from codesign import lens
 from codesign.lens import GeoLens, Phase, Status, Surface
 from codesign.lens.surface import scaled
-from codesign.lens.trace import trace
+from codesign.lens.trace import _active, trace
 from tests.lens.systems import PLANE, check_lens_gradient, close, efl, f64, glass
 
 N = 1.6
@@ -188,6 +188,12 @@ def test_light_goes_back_the_way_it_came_by_the_same_path(geo):
     close(back.position_mm[:, :2], origin[:, :2], atol=1e-12)
     close(-back.direction * flip, direction, atol=1e-13)
     close(back.optical_path_mm, out.optical_path_mm, atol=1e-11)
+
+
+def test_terms_are_computed_up_to_the_last_that_is_not_zero_or_all_for_their_gradient():
+    table = f64([[0.0, 0.0, 0.0], [1e-3, 0.0, 0.0], [0.0, 1e-5, 0.0]])
+    assert _active(table) == [0, 1, 2]
+    assert _active(table.requires_grad_()) == [3, 3, 3]
 
 
 @pytest.mark.parametrize("factor", [0.1, 7.3])

@@ -3,6 +3,7 @@ face, an edge of a floor against two walls. Against closed forms and differences
 numbers."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from codesign.errors import DomainError
 from codesign.render import MitsubaScene
 from codesign.render.charts import emissive_mesh
 from codesign.render.silhouettes import occlusion_check
+from codesign.render.silhouettes.curve_points import CurvePoints
+from codesign.render.silhouettes.jumps import jumps
 from scenes.silhouettes import smooth
 from studies.gradient_flow.silhouettes.frames import PITCH_MM, SIZE_PX, STEPS, Task
 from tests.hostile import judge
@@ -190,3 +193,36 @@ def test_no_surface_is_nearer_than_it_is_said(kind, generator):
         assert scene.nearest_m(eye) <= nearest * (1 + 1e-5)
         if kind in ("sphere", "cube"):
             assert scene.nearest_m(eye) > nearest - 0.06
+
+
+def test_an_edge_that_is_seen_end_on_is_no_line_in_the_picture():
+    """Of an edge along the optical axis and one across it only the second jumps, upwards at its own place."""
+    world = torch.tensor([[0.0, 0, 5], [0.3, 0.1, 5]], dtype=F64)
+    ahead = world + torch.tensor([[0.0, 0, 0.01], [0, 0.01, 0]], dtype=F64)
+    one, none = torch.ones(2, dtype=F64), torch.zeros(2, dtype=torch.long)
+    faces = 1e-4 * one, 1e-4 * one, torch.inf * one, torch.full((2, 2, 3), torch.nan, dtype=F64)
+    points = CurvePoints(world, ahead, one, *faces, torch.zeros(2, 2, dtype=F64), none, none, none, none)
+    camera = render.Camera(lens.Pinhole(8.0), 33, 25, 0.05)
+    scene = render.TexturedPlane([[0.7, 0.3]], [0.4], [0.2])
+    found = jumps(camera, scene, torch.eye(4, dtype=F64)[None, None], points)
+    assert found is not None
+    assert found.row.tolist() == [1]
+    place = [16 + 0.3 / 5 * 8 / 0.05, 12 + 0.1 / 5 * 8 / 0.05]
+    torch.testing.assert_close(found.film_px, torch.tensor([place], dtype=F64))
+    torch.testing.assert_close(found.normal, torch.tensor([[-1.0, 0.0]], dtype=F64))
+
+
+@pytest.mark.parametrize("eye_m", [0.0, 9.0])
+def test_rays_that_meet_a_chord_are_near_its_piece_wherever_the_eye_is(eye_m, generator):
+    """Chords 0.2 m long 1 m before the eye, and rays from it to points all along them."""
+    eye = torch.tensor([0.0, 0.0, eye_m], dtype=F64)
+    start = torch.rand(40, 3, generator=generator, dtype=F64) * 0.4 + eye + torch.tensor([0.0, 0.0, 1.0])
+    along = 0.2 * torch.nn.functional.normalize(torch.randn(40, 3, generator=generator, dtype=F64), dim=1)
+    curve = SimpleNamespace(points=lambda index, s, eye: start[index] + s[:, None] * along[index])
+    piece = torch.arange(40).repeat(9)
+    to = curve.points(piece, torch.linspace(0.02, 0.98, 9, dtype=F64).repeat_interleave(40), eye) - eye
+    distance = to.norm(dim=1)
+    bounds = torch.tensor([[0.0, 1.0]], dtype=F64).expand(40, 2)
+    rays = eye.expand_as(to), to / distance[:, None], distance
+    near = occlusion_check._near(curve, torch.arange(40), bounds, eye, *rays, 1e-6)
+    assert set(enumerate(piece.tolist())) <= set(zip(*(v.tolist() for v in near), strict=True))
