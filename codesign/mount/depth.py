@@ -31,6 +31,20 @@ def ground_depth(
       meets an object that moves.
     Gradient: pose, and the lens behind the chief rays.
     """
+    return _over_ground(camera, pixels, T_world_cam, hidden_by_objects(camera, pixels, T_world_cam, scene))
+
+
+def ground_and_scene_depth(
+    camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, scene: Any
+) -> tuple[Tensor, Tensor]:
+    """``ground_depth`` and ``scene_depth`` by one cast of rays: what is believed, and what is."""
+    hits, ahead = _hits(camera, pixels, T_world_cam, scene)
+    believed = _over_ground(camera, pixels, T_world_cam, hits.part > 0)
+    return believed, torch.where(hits.part == 0, ahead(hits.distance_m), torch.inf)
+
+
+def _over_ground(camera, pixels, T_world_cam, hidden):
+    """Depth [N, P] of the ground, infinite where it is hidden [N, P]."""
     rays = camera.chief_rays(pixels.reshape(-1, 2))
     slope = (rays.direction / rays.direction[:, 2:]).double()
     base = rays.origin_m.double() - slope * rays.origin_m[:, 2:].double()  # where a ray has depth 0
@@ -38,8 +52,7 @@ def ground_depth(
     rising, above = ((v.reshape(*pixels.shape[:2], 1, 3) @ up)[..., 0, 0] for v in (slope, base))
     falling = -rising
     height = T_world_cam[:, 2, 3].double()[:, None] + above
-    meets = falling.detach() > LEVEL
-    meets = meets & ~hidden_by_objects(camera, pixels, T_world_cam, scene)
+    meets = (falling.detach() > LEVEL) & ~hidden
     return torch.where(meets, height / torch.where(meets, falling, 1.0), torch.inf)
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from codesign.checks import check_finite, check_positive, check_whole
 from codesign.errors import DomainError
 from codesign.mount import unknown_depth
-from codesign.mount.depth import ground_depth, scene_depth
+from codesign.mount.depth import ground_and_scene_depth, ground_depth, scene_depth
 from codesign.mount.observability import PLANAR, body_flow, flow_precision
 from codesign.mount.unknown_depth import UnknownDepth
 from codesign.types import ChiefRayCamera, FlowField
@@ -174,6 +174,24 @@ class EgoVelocity:
         windows = _windows(camera)
         share = INDEPENDENT * windows / flow.shape[1] * on_surface.to(flow)
         return Readings(middle, flow, precision, confidence[..., 0], depth_m, rows, share, windows, parallax)
+
+    def read_beside_truth(self, *given: Any) -> tuple[Readings, Readings]:
+        """``read`` by the depth that is believed, and the same points with the depths that they have in the scene.
+
+        given: arguments of ``read`` but the last. Over flat ground rays are cast once for both depths.
+        """
+        if self.depth is scene_depth:
+            read = self.read(*given)
+            return read, read
+        if self.depth is not ground_depth:
+            return self.read(*given), self.read(*given, depth=scene_depth)
+        depths: list[Tensor] = []
+
+        def believed(*places):
+            depths.extend(ground_and_scene_depth(*places))
+            return depths[0]
+
+        return self.read(*given, depth=believed), self.read(*given, depth=lambda *places: depths[1])
 
     def solve(self, read: Readings) -> Motion:
         """Least squares, reweighted for outliers. Gradient: all readings."""

@@ -19,6 +19,7 @@ from codesign.render.triangles import across
 # Mitsuba itself follows their faces to vertices that are not there
 FILES_UNCHECKED = ("ply", "serialized")
 RADIANCE = ("value", "data", "scale")  # last part of the names of what an emitter shines with
+REPEAT = "radiance.to_uv"  # of an emitter's picture
 # of a mesh, beside the attributes its user has given it
 OWN = ("positions", "normals", "texcoords")
 # from the origin of texture coordinates: beyond, float32 knows a texel to a quarter at best
@@ -239,6 +240,35 @@ def interpolated(mi: Any, shape: Any, name: str, si: Any) -> Any:
     return value[0] + mi.Float(share_u) * (value[1] - value[0]) + mi.Float(share_v) * (value[2] - value[0])
 
 
+def repeats(mi: Any, scene: Any) -> dict[Any, Any]:
+    """Emitter -> how often its picture is repeated (an opaque drjit transform), where it has one picture that is."""
+    import drjit as dr
+
+    found = {}
+    for emitter in scene.emitters():
+        parameters = mi.traverse(emitter)
+        if REPEAT in parameters:
+            found[emitter] = mi.AffineTransform3f(parameters[REPEAT].matrix)
+    dr.make_opaque(found)
+    return found
+
+
+def eval_repeated(mi: Any, emitter: Any, si: Any, repeat: Any) -> Any:
+    """What an emitter shows (drjit arrays), its repeat taken from memory. Mitsuba writes it into the kernel, so that
+    every other world would need a new one, of as many pieces as it has pictures."""
+    if repeat is None:
+        return emitter.eval(si)
+    parameters = mi.traverse(emitter)
+    own = parameters[REPEAT]
+    si.uv = repeat @ si.uv
+    try:
+        # not told to the emitter (``update``), whose other numbers stand
+        parameters[REPEAT] = mi.ScalarAffineTransform3f()
+        return emitter.eval(si)
+    finally:
+        parameters[REPEAT] = own
+
+
 def shape_numbers(mi: Any, scene: Any) -> Any:
     """Numbers of the shapes of a Mitsuba scene in its own list, behind what their pointers hold (drjit
     array)."""
@@ -260,6 +290,7 @@ def box_around(mi: Any, scene: Any) -> Any:
     if scene.environment() is not None or not box.valid():
         return None
     room = ROOM * float(dr.norm(box.extents()))
-    found = mi.BoundingBox3f(mi.Point3f(box.min - room), mi.Point3f(box.max + room))
-    dr.make_opaque(found)  # another scene needs no new kernel
-    return found
+    low, high = mi.Point3f(box.min - room), mi.Point3f(box.max + room)
+    # another scene needs no new kernel
+    dr.make_opaque(low, high)
+    return mi.BoundingBox3f(low, high)

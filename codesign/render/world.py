@@ -17,7 +17,9 @@ from codesign.render.mitsuba_shapes import (
     box_around,
     check_description,
     check_scene,
+    eval_repeated,
     interpolated,
+    repeats,
     shape_numbers,
     vertex_attribute,
 )
@@ -67,6 +69,7 @@ class MitsubaScene:
                 self.scene = self._built(description, False)  # joined meshes have lost their names
         check_scene(self.mi, self.scene, emissive)
         self._numbers = shape_numbers(self.mi, self.scene)
+        self._repeats = repeats(self.mi, self.scene)
         self._box = box_around(self.mi, self.scene)
 
     def _built(self, description, merge):
@@ -166,7 +169,7 @@ class MitsubaScene:
         si.wi = self.mi.Vector3f(0, 0, facing)
         name = vertex_attribute(emitter)
         if name is None:
-            return emitter.eval(si)[0]
+            return eval_repeated(self.mi, emitter, si, self._repeats.get(emitter))[0]
         scale = float(self.mi.traverse(emitter)["radiance.scale"])
         return dr.select(facing > 0, scale * interpolated(self.mi, shape, name, si), 0)
 

@@ -14,7 +14,6 @@ from codesign.mount import (
     Readings,
     Requirement,
     expected_errors,
-    scene_depth,
     velocity_errors,
 )
 from codesign.pose import se3_exp
@@ -126,8 +125,7 @@ class Drawn:
         of_drive = mounts.repeat_interleave(each, 0)
         T_world_cam = batch.T_world_body @ of_drive[:, None]
         given = (field, camera, batch.scene, of_drive, T_world_cam, batch.t_s)
-        read = estimator.read(*given)
-        true = read if self.space.pair.depth == "scene" else estimator.read(*given, depth=scene_depth)
+        read, true = estimator.read_beside_truth(*given)
         flow_px = (true.rows @ twist[:, None, :, None])[..., 0]
         covered = self.base.own_body.covered(mounts, camera).repeat_interleave(each, 0)
         covered = covered.repeat(len(batch.T_world_body), 1)

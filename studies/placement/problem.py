@@ -4,7 +4,7 @@ and the requirements of the mount. A mount is six shares of the pair's ranges.""
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -19,7 +19,6 @@ from codesign.mount import (
     Requirement,
     VelocityErrors,
     expected_errors,
-    scene_depth,
     velocity_errors,
 )
 from codesign.system import System
@@ -204,9 +203,8 @@ class Problem:
         world."""
         T_world_cam = batch.T_world_body @ T_body_cam[..., None, :, :]
         estimator = self._system.estimate
-        look = partial(estimator.read, field, self.camera, batch.scene, T_body_cam, T_world_cam, batch.t_s)
-        read = look()
-        true = read if self.pair.depth == "scene" else look(depth=scene_depth)
+        given = (field, self.camera, batch.scene, T_body_cam, T_world_cam, batch.t_s)
+        read, true = estimator.read_beside_truth(*given)
         flow_px = (true.rows @ batch.twist[:, None, :, None])[..., 0]
         covered = self.own_body.covered(T_body_cam, self.camera)
         covered = covered.expand(*T_world_cam.shape[:2], -1).flatten(0, 1)

@@ -8,7 +8,16 @@ import torch
 
 from codesign import lens, pose, render
 from codesign.errors import DomainError
-from codesign.mount import FREE, PLANAR, EgoVelocity, Mount, body_flow, ground_depth, velocity_errors
+from codesign.mount import (
+    FREE,
+    PLANAR,
+    EgoVelocity,
+    Mount,
+    body_flow,
+    ground_depth,
+    scene_depth,
+    velocity_errors,
+)
 from codesign.types import FlowField
 from scenes import worlds
 
@@ -52,6 +61,17 @@ def test_exact_flow_of_free_bodies_through_a_lens(camera, drive, depth):
     # whose curvature is of that size: 1e-5 of the flow, in a system that tells turning from shifting ten
     # times less well
     torch.testing.assert_close(found.velocity, twists, rtol=0, atol=2e-4)
+
+
+@pytest.mark.parametrize("depth", ["ground", "scene", lambda *given: 2 * ground_depth(*given)])
+def test_readings_beside_the_truth_are_two_readings(camera, drive, depth):
+    mount, poses, _, flow = drive
+    ours = EgoVelocity(FREE, (1e3,) * 6, depth)
+    given = (field_of(flow), camera, worlds.smooth_plane(), mount, poses)
+    read, true = ours.read_beside_truth(*given)
+    for found, asked in ((read, ours.read(*given)), (true, ours.read(*given, depth=scene_depth))):
+        torch.testing.assert_close(found.rows, asked.rows, rtol=0, atol=0)
+        torch.testing.assert_close(found.depth_m, asked.depth_m, rtol=0, atol=0)
 
 
 def test_least_squares_written_out_with_covariance_and_confidence(camera, drive):

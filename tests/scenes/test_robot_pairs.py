@@ -3,6 +3,7 @@
 import math
 from dataclasses import fields, replace
 
+import drjit as dr
 import numpy as np
 import pytest
 import torch
@@ -10,7 +11,7 @@ import torch
 from codesign import lens, pose, render
 from codesign.errors import DomainError
 from codesign.mount import FREE, Body, EgoVelocity, ground_depth, judge
-from codesign.mount.depth import scene_depth
+from codesign.mount.depth import ground_and_scene_depth, scene_depth
 from scenes import bodies, worlds
 from scenes.robots import pair as robot_pair
 from scenes.robots.pairs import PAIRS
@@ -19,6 +20,7 @@ from tests.scenes.solids import volume_m3
 
 D = torch.float64
 NAMES = tuple(PAIRS)
+LARGE = 200  # operations of a kernel that casts rays
 
 
 @pytest.fixture(scope="module", params=NAMES)
@@ -77,6 +79,32 @@ def test_the_ground_is_where_the_estimator_takes_it(pair, drives):
     near = ground < 1.5
     alike = (ground - seen).abs() < 1e-4
     assert float(alike[near].double().mean()) > 0.7
+
+
+def test_one_cast_gives_the_depth_that_is_believed_and_the_true_one(pair, drives):
+    camera = pair.design.camera()
+    pixels = camera.film.pixels()[::37].expand(3, -1, 2)
+    poses = drives.T_world_body[0, :, robot_pair.FRAMES // 2] @ pair.design.mount()
+    believed, true = ground_and_scene_depth(camera, pixels, poses, drives.scene)
+    torch.testing.assert_close(believed, ground_depth(camera, pixels, poses, drives.scene), rtol=0, atol=0)
+    torch.testing.assert_close(true, scene_depth(camera, pixels, poses, drives.scene), rtol=0, atol=0)
+
+
+def test_another_world_of_a_pair_needs_no_kernel_of_its_own(pair):
+    """Repeats of pictures, boxes and places are data; what is compiled depends on the kinds of shapes alone."""
+    camera = pair.design.camera()
+    mount = pair.design.mount()
+
+    def compiled(number):
+        world, (driven, _) = pair.world(number), pair.drive(number, 1)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            render.frames(camera, world, driven[0] @ mount)
+            return {
+                kernel["hash"] for kernel in dr.kernel_history() if kernel.get("operation_count", 0) > LARGE
+            }
+
+    assert compiled(21) == compiled(22) != set()
 
 
 def test_a_known_body_has_no_depth(pair, drives):
