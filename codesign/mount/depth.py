@@ -31,21 +31,21 @@ def ground_depth(
       meets an object that moves.
     Gradient: pose, and the lens behind the chief rays.
     """
-    return _over_ground(camera, pixels, T_world_cam, hidden_by_objects(camera, pixels, T_world_cam, scene))
+    rays = camera.chief_rays(pixels.reshape(-1, 2))
+    return _over_ground(rays, pixels, T_world_cam, _hidden(rays, pixels, T_world_cam, scene))
 
 
 def ground_and_scene_depth(
     camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, scene: Any
 ) -> tuple[Tensor, Tensor]:
     """``ground_depth`` and ``scene_depth`` by one cast of rays: what is believed, and what is."""
-    hits, ahead = _hits(camera, pixels, T_world_cam, scene)
-    believed = _over_ground(camera, pixels, T_world_cam, hits.part > 0)
-    return believed, torch.where(hits.part == 0, ahead(hits.distance_m), torch.inf)
-
-
-def _over_ground(camera, pixels, T_world_cam, hidden):
-    """Depth [N, P] of the ground, infinite where it is hidden [N, P]."""
     rays = camera.chief_rays(pixels.reshape(-1, 2))
+    hits, depth_m = _on_surfaces(rays, pixels, T_world_cam, scene)
+    return _over_ground(rays, pixels, T_world_cam, hits.part > 0), depth_m
+
+
+def _over_ground(rays, pixels, T_world_cam, hidden):
+    """Depth [N, P] of the ground, infinite where it is hidden [N, P]."""
     slope = (rays.direction / rays.direction[:, 2:]).double()
     base = rays.origin_m.double() - slope * rays.origin_m[:, 2:].double()  # where a ray has depth 0
     up = T_world_cam[:, 2, :3].double()[:, None, :, None]
@@ -63,8 +63,7 @@ def scene_depth(camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, sce
       poses. Of a MovingScene the objects stand where they are in the middle of its frames, and have no depth.
     Gradient: pose and lens, the surface taken as its tangent plane.
     """
-    hits, ahead = _hits(camera, pixels, T_world_cam, scene)
-    return torch.where(hits.part == 0, ahead(hits.distance_m), torch.inf)
+    return _on_surfaces(camera.chief_rays(pixels.reshape(-1, 2)), pixels, T_world_cam, scene)[1]
 
 
 def hidden_by_objects(
@@ -75,14 +74,17 @@ def hidden_by_objects(
 ) -> Tensor:
     """[N, P] bool: where an object of a MovingScene is seen. Arguments as for ``ground_depth``. No
     gradient."""
+    return _hidden(camera.chief_rays(pixels.reshape(-1, 2)), pixels, T_world_cam, scene)
+
+
+def _hidden(rays, pixels, T_world_cam, scene):
     if not any(isinstance(world, MovingScene) for world in _scenes(scene)):
         return torch.zeros(pixels.shape[:-1], dtype=torch.bool, device=pixels.device)
-    return _hits(camera, pixels, T_world_cam, scene)[0].part > 0
+    return _on_surfaces(rays, pixels, T_world_cam, scene)[0].part > 0
 
 
-def _hits(camera, pixels, T_world_cam, scene):
-    """First surfaces [N, P], and the function from distances along the rays to depths."""
-    rays = camera.chief_rays(pixels.reshape(-1, 2))
+def _on_surfaces(rays, pixels, T_world_cam, scene):
+    """First surfaces along rays through pixels [N, P, 2], and their depth [N, P], infinite for objects and for none."""
     shape = pixels.shape[:2]
     origin = rays.origin_m.double().reshape(*shape, 3)
     direction = rays.direction.double().reshape(*shape, 3)
@@ -99,11 +101,8 @@ def _hits(camera, pixels, T_world_cam, scene):
         views = views_of(world, poses)
         found.append(first_hits(origin[mine], direction[mine], lit[mine], views.scene, views.cameras))
     hits = Hits(*(torch.cat([getattr(each, name) for each in found]) for name in Hits.__dataclass_fields__))
-
-    def ahead(distance_m):
-        return origin[..., 2] + direction[..., 2] * distance_m
-
-    return hits, ahead
+    ahead = origin[..., 2] + direction[..., 2] * hits.distance_m
+    return hits, torch.where(hits.part == 0, ahead, torch.inf)
 
 
 def _scenes(scene):

@@ -259,14 +259,14 @@ def eval_repeated(mi: Any, emitter: Any, si: Any, repeat: Any) -> Any:
     if repeat is None:
         return emitter.eval(si)
     parameters = mi.traverse(emitter)
-    own = parameters[REPEAT]
-    si.uv = repeat @ si.uv
+    own, uv = parameters[REPEAT], mi.Point2f(si.uv)
     try:
         # not told to the emitter (``update``), whose other numbers stand
         parameters[REPEAT] = mi.ScalarAffineTransform3f()
+        si.uv = repeat @ uv
         return emitter.eval(si)
     finally:
-        parameters[REPEAT] = own
+        parameters[REPEAT], si.uv = own, uv
 
 
 def shape_numbers(mi: Any, scene: Any) -> Any:

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from codesign import backend, lens, render
 from codesign.pose import look_at
 from codesign.render import Camera, light
+from codesign.render.placed import Placement, SidedScene
 from codesign.render.silhouettes.shapes import read
 from scenes import worlds
 
@@ -88,3 +89,27 @@ def test_baked_light_shows_the_side_that_mitsuba_shows(tmp_path, kind, two_sided
     )
     assert float((ours - theirs).abs().mean()) < 0.03
     torch.testing.assert_close(ours.mean(), theirs.mean(), rtol=0.02, atol=0)
+
+
+def test_a_back_shows_its_own_picture_however_often_the_front_repeats_its():
+    """Seen from behind; the truth is a wall whose front has no picture."""
+    mi = backend.mitsuba()
+    random = np.random.default_rng(3)
+
+    def wall(radiance):
+        return {"type": "rectangle", "emitter": {"type": "area", "radiance": radiance}}
+
+    def picture(times):
+        bitmap = mi.Bitmap(random.uniform(10, 200, (16, 16, 1)).astype(np.float32))
+        to_uv = mi.ScalarTransform3f().scale([times, times])
+        return {"type": "bitmap", "bitmap": bitmap, "raw": True, "to_uv": to_uv}
+
+    back = mi.load_dict(wall(picture(3.0)))
+    as_it_is = Placement(torch.eye(3, dtype=torch.float64))
+    behind = look_at((0.2, 0.1, -2.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))[None]
+    plain, repeated = (
+        render.frames(CAMERA, SidedScene({"wall": wall(front)}, {"wall": back.emitter()}, as_it_is), behind)
+        for front in ({"type": "rgb", "value": 50.0}, picture(2.0))
+    )
+    assert float(plain.std()) > 10
+    torch.testing.assert_close(repeated, plain, rtol=1e-5, atol=0)
