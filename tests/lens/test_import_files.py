@@ -102,3 +102,11 @@ def test_the_pupil_follows_from_any_way_to_give_it(spec, distance, stop, tmp_pat
         # a ray from the object's centre that leaves with slope 1 / (2 N)
         true = 2 * abs(0.1 / (c * distance + d) * (distance + slope / height))
     close(geo.entrance_pupil_diameter_mm, true, 1e-12)
+
+
+def test_an_object_without_a_thickness_touches_the_first_surface(tmp_path):
+    behind = r" ;; STOP\n => ;; SURF 2 => SURF 2\nSTOP"
+    geo = load_file(tmp_path, "zmx", f"ENPD 10 => FNUM 5 1 ;; DISZ INFINITY => COMM none{behind}")
+    (_, _), (_, d) = MATRIX
+    height, slope = 1 - 4 / N * (N - 1) * 0.02, 4 / N
+    close(geo.entrance_pupil_diameter_mm, 2 * abs(0.1 / d * slope / height), 1e-12)
