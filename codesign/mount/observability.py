@@ -98,17 +98,18 @@ def chief_lines(camera: ChiefRayCamera, pixels: Tensor) -> tuple[Tensor, Tensor,
         torch.tensor([[0.0, 0.0], [1, 0], [-1, 0], [0, 1], [0, -1]], dtype=pixels.dtype, device=pixels.device)
         * _STEP_PX
     )
-    rays = camera.chief_rays((pixels + step[:, None]).reshape(-1, 2))
+    # those of one pixel stand side by side
+    rays = camera.chief_rays((pixels[:, None] + step).reshape(-1, 2))
     origin = rays.origin_m.double()
     direction = rays.direction.double()
     slope = direction[:, :2] / direction[:, 2:]
-    base = (origin[:, :2] - slope * origin[:, 2:]).reshape(5, -1, 2)
-    slope = slope.reshape(5, -1, 2)
+    base = (origin[:, :2] - slope * origin[:, 2:]).reshape(-1, 5, 2)
+    slope = slope.reshape(-1, 5, 2)
 
     def change(v):
-        return torch.stack([v[1] - v[2], v[3] - v[4]], -1) / (2 * _STEP_PX)
+        return torch.stack([v[:, 1] - v[:, 2], v[:, 3] - v[:, 4]], -1) / (2 * _STEP_PX)
 
-    return base[0], slope[0], change(base), change(slope)
+    return base[:, 0], slope[:, 0], change(base), change(slope)
 
 
 def flow_of_points(velocity: Tensor, slope: Tensor, step: Tensor) -> Tensor:

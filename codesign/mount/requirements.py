@@ -307,7 +307,15 @@ class OwnBody:
     @torch.no_grad()
     def exact(self, T_body_cam: Tensor, camera: Camera) -> Tensor:
         """[..., 1]: the same, of the pixels whose chief ray meets the body."""
-        rays = camera.chief_rays(camera.film.pixels())
+        return self.largest_share - self.met(T_body_cam, camera).mean(-1, keepdim=True)
+
+    @torch.no_grad()
+    def met(self, T_body_cam: Tensor, camera: Camera, every_px: int = 1) -> Tensor:
+        """[..., windows] share of the pixels of every window of the film, or of every so many in both directions, whose
+        chief ray meets the body. No gradient."""
+        size = camera.film.shape[-2:]
+        first = every_px // 2
+        pixels = camera.film.pixels().reshape(-1, *size, 2)[:, first::every_px, first::every_px]
+        rays = camera.chief_rays(pixels.reshape(-1, 2))
         hits = hits_of(rays, self.scene, views_of(self.scene, T_body_cam.reshape(-1, 4, 4)).cameras)
-        covered = (hits.part >= 0).double().mean(-1).reshape(*T_body_cam.shape[:-2], 1)
-        return self.largest_share - covered
+        return (hits.part >= 0).double().reshape(*T_body_cam.shape[:-2], len(pixels), -1).mean(-1)

@@ -7,14 +7,16 @@ render as many drives: jointly, in every order of the blocks, alternating, neste
 gradients. Single events of the hard sensor in worlds that no arm saw judge them.
 """
 
+import json
 import sys
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import astuple, dataclass
+from pathlib import Path
+from typing import Any, ClassVar
 
 from codesign import lens
+from codesign.atomic import write_atomic
 from codesign.errors import DomainError
 from scenes.robots import pair as robot_pair
-from scenes.robots.costs import Costs
 from scenes.robots.pairs import PAIRS
 from studies.codesign import slopes
 from studies.codesign.arms import ARMS
@@ -22,9 +24,9 @@ from studies.codesign.design import Space
 from studies.codesign.landscape import landscape
 from studies.codesign.page import report
 from studies.codesign.problem import Drawn
-from studies.codesign.race import Judge, run_arm, spread_over, start
+from studies.codesign.race import Judge, racing, spread_over, start
 from studies.frame.run import Run, StudyConfig, main
-from studies.frame.sweep import sweep
+from studies.frame.sweep import Row, sweep
 from studies.placement.searches import SEARCHES, available
 
 THIN = "thin"
@@ -74,6 +76,10 @@ class Config(StudyConfig):
     """Draws by which the objective's slope is compared with rendered differences; 0: it is not."""
     settling: int = 24
     """Designs of sensor and estimator tried on recorded frames, wherever they are settled."""
+    processes: int = 0
+    """Arms that race side by side, each in a process of its own; 0: one after the other in this one."""
+    raw: Path | None = None
+    """Answers of earlier runs (answers.jsonl of their folder): what is there is not raced again."""
 
 
 def study(run: Run[Config]) -> None:
@@ -82,23 +88,50 @@ def study(run: Run[Config]) -> None:
     if run.device.type != "cpu":
         run.say("This study computes on the CPU; the device asked for stays unused.")
     family = None if size.family == THIN else size.family
-    space = Space(replace(PAIRS[size.pair](), family=family), Costs(light=size.light), size.free)
-    for seed in range(size.seeds):
-        start(space, size.seed + seed)
+    space = Space.of(size.pair, family, size.light, size.free)
+    for seed in range(size.seed, size.seed + size.seeds):
+        start(space, seed)
     gates = landscape(run, space, size.designs)
-
-    judge = Judge(space, size.judged_worlds, size.judged_drives)
-    spread = spread_over(size.worlds, size.per_draw)
-    drawn = Drawn(space, robot_pair.training(size.worlds), *spread, gates.calibration)
-
+    drawn = Drawn(
+        space,
+        robot_pair.training(size.worlds),
+        *spread_over(size.worlds, size.per_draw),
+        gates.calibration,
+    )
     rows_of_slopes = slopes.slopes(run, space, drawn, gates.best, size.slopes) if size.slopes else []
+    setting = {
+        **{name: getattr(size, name) for name in ("pair", "light", "free", "worlds", "per_draw", "steps")},
+        "settling": size.settling,
+        "family": family,
+        "calibration": astuple(gates.calibration),
+    }
+    report(run, space, gates, rows_of_slopes, raced(run, space, setting) if size.seeds else [])
 
-    def cell(seed, arm):
-        found = run_arm(drawn, arm, size.seed + seed, size.steps, size.settling)
-        return {**found, "errors": judge(found["share"])}
 
-    rows = sweep(run, cell, "race", seed=range(size.seeds), arm=size.arms)
-    report(run, space, gates, rows_of_slopes, rows)
+def raced(run: Run[Config], space: Space, setting: dict[str, Any]) -> list[Row]:
+    """Every arm from every start, and its errors by the judge; those of ``raw`` are taken from there."""
+    size = run.config
+    axes = {"seed": range(size.seed, size.seed + size.seeds), "arm": size.arms}
+    if size.raw is not None and not run.resumed:
+        known = size.raw.read_bytes()
+        for name in ("race", "answers"):
+            write_atomic(run.path(f"{name}.jsonl"), known)
+    given = {"setting": setting, "threads": 1 if size.processes else 0}
+    rows = sweep(run, racing, "race", size.processes, given=given, **axes)
+    judge = Judge(space, size.judged_worlds, size.judged_drives)
+    found = {(row["seed"], row["arm"]): row for row in rows}
+
+    def judged(seed, arm):
+        row = {name: value for name, value in found[seed, arm].items() if name not in axes}
+        return {**row, "errors": judge(row["share"]), "setting": setting}
+
+    answers = sweep(run, judged, "answers", **axes)
+    other = [row for row in answers if json.dumps(row["setting"]) != json.dumps(setting)]
+    if other:
+        raise DomainError(
+            f"'{size.raw}' has answers of another setting, {other[0]['setting']}; this race is of {setting}."
+        )
+    return answers
 
 
 def checked(size: Config) -> None:
@@ -129,6 +162,10 @@ def checked(size: Config) -> None:
         raise DomainError(f"--arms {unknown[0]}: choose from {', '.join(ARMS)}.")
     if "joint" not in size.arms or len(set(size.arms)) < len(size.arms):
         raise DomainError("--arms needs joint, with which all others are compared, and each name once.")
+    if size.processes < 0:
+        raise DomainError(f"--processes is {size.processes}; 0 or more are needed.")
+    if size.raw is not None and not size.raw.is_file():
+        raise DomainError(f"--raw {size.raw}: there is no such file.")
     available(name for name in ("CMA-ES", *size.arms) if name in SEARCHES)
 
 

@@ -39,11 +39,6 @@ class Way:
         self.errors.append(error)
         self.recorded = [*self.recorded, looked][-RECORDED:]
 
-    @property
-    def answer(self) -> Tensor:
-        """Mean of the last quarter."""
-        return torch.stack(self.shares[-max(1, round(END * len(self.shares))) :]).mean(0)
-
 
 def descend(
     objective: Objective,

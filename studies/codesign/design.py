@@ -1,7 +1,7 @@
 """A whole design in one vector: lens, mount, sensor and estimator of a robot's camera, as shares 0..1 of their bounds."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from typing import Any
@@ -14,6 +14,7 @@ from codesign.errors import DomainError
 from scenes.robots import pair as robot_pair
 from scenes.robots.costs import Costs, Exposed
 from scenes.robots.pair import Design, RobotPair
+from scenes.robots.pairs import PAIRS
 
 BLOCKS: dict[str, tuple[str, ...]] = {
     "lens": ("efl_mm", "fno", "focus_per_m", "bending"),
@@ -51,8 +52,7 @@ class Space:
       held as the pair's own design has them. bounds: name -> (low, high), in place of those of the pair or of BOUNDS.
     Raises: DomainError for a name that is unknown or bounds that leave out the held design.
 
-    >>> from scenes.robots.pairs import PAIRS
-    >>> space = Space(PAIRS["outdoors"]())
+    >>> space = Space.of("outdoors", None, 1.0, ())
     >>> round(space.numbers(space.start)["efl_mm"], 6)
     6.5
     """
@@ -79,6 +79,11 @@ class Space:
                 raise DomainError(
                     f"{name} starts at {self.default[name]:g}, outside its bounds, {low:g} to {high:g}."
                 )
+
+    @staticmethod
+    def of(pair: str, family: str | None, light: float, free: Sequence[str]) -> "Space":
+        """By names: of one of the three pairs, behind a thin lens for None, in a share of daylight."""
+        return Space(replace(PAIRS[pair](), family=family), Costs(light=light), tuple(free))
 
     @cached_property
     def default(self) -> dict[str, float]:
@@ -184,7 +189,10 @@ class Whole:
 
     def with_numbers(self, **numbers: float) -> "Whole":
         """The same design with other numbers, bounds or not."""
-        return replace(self, numbers={**self.numbers, **numbers})
+        other = replace(self, numbers={**self.numbers, **numbers})
+        if not set(numbers) & set(BLOCKS["lens"]):
+            vars(other)["camera"] = self.camera  # as cached there
+        return other
 
     def __str__(self) -> str:
         of = self.numbers

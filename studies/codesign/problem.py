@@ -22,9 +22,11 @@ from scenes.robots import pair as robot_pair
 from scenes.robots.pair import Drives
 from studies.codesign.calibration import Calibration, Conditions
 from studies.codesign.design import Space, Whole
+from studies.codesign.rig import Rig
 from studies.placement.problem import Problem, Samples
 
 DRAWS = 64  # of an error that is to be expected
+EVERY_PX = 2  # of the pixels that tell what the robot covers
 
 
 @dataclass(frozen=True)
@@ -118,19 +120,30 @@ class Drawn:
         return Looked(self, whole, samples, batch, twist, run)
 
     @torch.no_grad()
-    def seen(self, camera: Any, mounts: Tensor, batch: Drives, twist: Tensor, field: Any) -> Seen:
-        """What flow in the windows is of, behind mounts [M, 4, 4] (``scenes``)."""
+    def seen(
+        self, cameras: Sequence[Any], mounts: Tensor, batch: Drives, twist: Tensor, field: Any
+    ) -> tuple[Seen, Tensor]:
+        """What flow in the windows is of, behind mounts [M, 4, 4] (``scenes``) and a camera each, and its optics [N,
+        windows, 2] (``window_optics``)."""
         estimator = self._system.estimate
         each = batch.T_world_body.shape[1] // len(mounts)
         of_drive = mounts.repeat_interleave(each, 0)
         T_world_cam = batch.T_world_body @ of_drive[:, None]
-        given = (field, camera, batch.scene, of_drive, T_world_cam, batch.t_s)
-        read, true = estimator.read_beside_truth(*given)
+        unlike = list(dict.fromkeys(cameras))
+        of_mount = torch.tensor([unlike.index(camera) for camera in cameras])
+        worlds = len(batch.T_world_body)
+        rig = Rig(unlike, of_mount.repeat_interleave(each).repeat(worlds))
+        read, true = estimator.read_beside_truth(field, rig, batch.scene, of_drive, T_world_cam, batch.t_s)
         flow_px = (true.rows @ twist[:, None, :, None])[..., 0]
-        covered = self.base.own_body.covered(mounts, camera).repeat_interleave(each, 0)
-        covered = covered.repeat(len(batch.T_world_body), 1)
+        covered = torch.cat(
+            [
+                self.base.own_body.met(mounts[of_mount == number], camera, EVERY_PX)
+                for number, camera in enumerate(unlike)
+            ]
+        )[of_mount.argsort(stable=True).argsort()]
+        covered = covered.repeat_interleave(each, 0).repeat(worlds, 1)
         surfaces = replace(read, depth_m=true.depth_m)
-        return Seen(batch.twist, twist, read, surfaces, true.rows, flow_px, covered)
+        return Seen(batch.twist, twist, read, surfaces, true.rows, flow_px, covered), rig.optics(read)
 
     def expected(self, seen: Seen, read: Readings, errors: FlowErrors) -> Tensor:
         """Mean bounded error [N] to be expected of drives: over errors drawn from their normal distribution,
@@ -167,8 +180,18 @@ class Looked:
     @cached_property
     def seen(self) -> Seen:
         """What its flow is of."""
-        mounts = self.whole.T_body_cam[None]
-        return self.drawn.seen(self.whole.camera, mounts, self.batch, self.twist, self.run["field"])
+        return self._seen[0]
+
+    @property
+    def optics(self) -> Tensor:
+        """[N, windows, 2] of its readings (``window_optics``)."""
+        return self._seen[1]
+
+    @cached_property
+    def _seen(self):
+        whole = self.whole
+        given = (self.batch, self.twist, self.run["field"])
+        return self.drawn.seen([whole.camera], whole.T_body_cam[None], *given)
 
     @cached_property
     def conditions(self) -> Conditions:

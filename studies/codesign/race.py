@@ -1,9 +1,12 @@
 """The race of the arms: from the same starts at equal rendered drives, judged by single events in worlds that none saw."""
 
+import json
 import time
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
+import drjit
 import torch
 from torch import Tensor
 
@@ -11,6 +14,7 @@ from codesign.errors import DomainError
 from codesign.mount.requirements import first_missed
 from scenes.robots import pair as robot_pair
 from studies.codesign.arms import ARMS, Task, read_out
+from studies.codesign.calibration import Calibration
 from studies.codesign.design import Space
 from studies.codesign.objective import Objective
 from studies.codesign.problem import Drawn
@@ -65,6 +69,27 @@ def run_arm(drawn: Drawn, arm: str, seed: int, steps: int, settling: int) -> dic
     }
 
 
+def racing(seed: int, arm: str, setting: Mapping[str, Any], threads: int = 0) -> dict[str, Any]:
+    """``run_arm`` in a process that may know nothing yet.
+
+    setting: of the race, plain values. threads: that the process may use, beside others; 0: as it is.
+    """
+    if threads:
+        torch.set_num_threads(threads)
+        drjit.set_thread_count(threads)
+    return run_arm(_drawn(json.dumps(setting)), arm, seed, setting["steps"], setting["settling"])
+
+
+@lru_cache(maxsize=1)
+def _drawn(told: str) -> Drawn:
+    """Training worlds of a setting, as JSON says it."""
+    setting = json.loads(told)
+    space = Space.of(*(setting[name] for name in ("pair", "family", "light", "free")))
+    spread = spread_over(setting["worlds"], setting["per_draw"])
+    calibration = Calibration(*setting["calibration"])
+    return Drawn(space, robot_pair.training(setting["worlds"]), *spread, calibration)
+
+
 def spread_over(worlds: int, drives: int) -> tuple[int, int]:
     """Worlds of a draw, and drives in each."""
     each = min(worlds, drives)
@@ -82,7 +107,8 @@ class Judge:
         """Mean bounded error in each world."""
         whole = self.drawn.space.made(torch.tensor(share, dtype=torch.float64))
         looked = self.drawn.looked(whole, self.drawn.draw(JUDGED), "sensor")
-        return looked.hard().unflatten(0, (self.worlds, -1)).mean(1).tolist()
+        of_worlds = looked.hard().unflatten(0, (self.worlds, -1)).mean(1)
+        return [round(error, 6) for error in of_worlds.tolist()]
 
 
 def compared(rows: Sequence[Mapping[str, Any]], ours: str = "joint") -> dict[str, tuple[Interval, float]]:

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from codesign.errors import DomainError
-from codesign.mount import window_optics
 from scenes.robots import pair as robot_pair
 from scenes.robots.costs import Costs
 from scenes.robots.pairs import PAIRS
@@ -62,9 +61,7 @@ def test_what_is_carried_to_the_same_design_is_what_was_seen(drawn, space):
     objective = Objective(drawn)
     share = space.share(efl_mm=4.0, fno=2.0, z_m=0.4, pitch_rad=0.5)
     _, _, looked = objective(share, drawn.draw(0), [])
-    optics = window_optics(looked.whole.camera, looked.seen.read)
-    poses = looked.whole.T_body_cam.expand(3, 4, 4)
-    again = objective.carried(looked, looked.whole.camera, poses, optics)
+    again = objective.carried(looked, [looked.whole] * 3)
     assert torch.allclose(again, looked.expected.mean().expand(3), rtol=1e-9)
 
 
@@ -172,12 +169,11 @@ def test_wrong_command_lines_end_with_a_sentence(wrong, said, tmp_path, capsys):
     assert said in capsys.readouterr().err
 
 
-def test_way_answers_with_the_mean_of_its_end():
+def test_a_way_keeps_the_last_rounds_that_were_recorded():
     way = Way()
     for k in range(8):
-        way.add(torch.tensor([float(k)]), 0.0, None)
-    assert way.answer.tolist() == [6.5]
-    assert len(way.recorded) == 4
+        way.add(torch.tensor([float(k)]), 0.0, k)
+    assert way.recorded == [4, 5, 6, 7]
 
 
 def test_a_small_race_says_that_it_decides_nothing(tmp_path, monkeypatch):
@@ -193,3 +189,55 @@ def test_a_small_race_says_that_it_decides_nothing(tmp_path, monkeypatch):
     before = (folder / "race.jsonl").read_bytes()
     assert main(codesign.study, codesign.Config, ["--resume", str(folder)]) == 0
     assert (folder / "race.jsonl").read_bytes() == before
+
+
+def test_designs_are_carried_together_as_each_alone(drawn, space):
+    objective = Objective(drawn)
+    share = space.share(efl_mm=4.0, fno=2.0, z_m=0.4, pitch_rad=0.5)
+    _, _, looked = objective(share, drawn.draw(0), [])
+    changes = ({"efl_mm": 5.0}, {"z_m": 0.5}, {"focus_per_m": 1.0, "pitch_rad": 0.6}, {"z_m": 0.3})
+    wholes = [looked.whole.with_numbers(**change) for change in changes]
+    together = objective.carried(looked, wholes)
+    alone = torch.cat([objective.carried(looked, [whole]) for whole in wholes])
+    assert torch.allclose(together, alone, rtol=1e-9)
+    assert len({round(value, 6) for value in alone.tolist()}) == 4
+
+
+def test_answers_of_an_earlier_run_are_not_raced_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(codesign, "LEAST_STEPS", 2)
+    given = [
+        "--quick",
+        "--steps",
+        "2",
+        "--worlds",
+        "1",
+        "--per-draw",
+        "1",
+        "--judged-worlds",
+        "1",
+        "--judged-drives",
+        "1",
+        "--family",
+        "thin",
+    ]
+    free = ["--free", "efl_mm", "z_m", "theta", "--arms", "joint", "default"]
+
+    def raced(folder, *more):
+        code = main(codesign.study, codesign.Config, [*given, *free, *more, "--out", str(tmp_path / folder)])
+        return code, (tmp_path / folder / "answers.jsonl").read_text().splitlines()
+
+    code, one = raced("here")
+    assert code == 0
+    # a process of its own finds the same
+    code, other = raced("apart", "--processes", "1")
+    for a, b in zip(one, other, strict=True):
+        assert json.loads(a)[1][0]["share"] == json.loads(b)[1][0]["share"]
+    known = tmp_path / "known.jsonl"
+    cell, rows = json.loads(one[0])
+    known.write_text(json.dumps([cell, [{**rows[0], "cpu_s": 1e6}]]) + "\n")
+    code, again = raced("again", "--raw", str(known))
+    assert code == 0
+    assert json.loads(again[0])[1][0]["cpu_s"] == 1e6
+    assert len(again) == 2
+    code, _ = raced("dark", "--raw", str(known), "--light", "0.5")
+    assert code == 2
