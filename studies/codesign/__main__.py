@@ -105,10 +105,12 @@ def study(run: Run[Config]) -> None:
         "family": family,
         "calibration": astuple(gates.calibration),
     }
-    report(run, space, gates, rows_of_slopes, raced(run, space, setting) if size.seeds else [])
+    judge = Judge(space, size.judged_worlds, size.judged_drives)
+    rows = raced(run, judge, setting) if size.seeds else []
+    report(run, space, gates, rows_of_slopes, rows, judge)
 
 
-def raced(run: Run[Config], space: Space, setting: dict[str, Any]) -> list[Row]:
+def raced(run: Run[Config], judge: Judge, setting: dict[str, Any]) -> list[Row]:
     """Every arm from every start, and its errors by the judge; those of ``raw`` are taken from there."""
     size = run.config
     axes = {"seed": range(size.seed, size.seed + size.seeds), "arm": size.arms}
@@ -118,7 +120,6 @@ def raced(run: Run[Config], space: Space, setting: dict[str, Any]) -> list[Row]:
             write_atomic(run.path(f"{name}.jsonl"), known)
     given = {"setting": setting, "threads": 1 if size.processes else 0}
     rows = sweep(run, racing, "race", size.processes, given=given, **axes)
-    judge = Judge(space, size.judged_worlds, size.judged_drives)
     found = {(row["seed"], row["arm"]): row for row in rows}
 
     def judged(seed, arm):

@@ -1,14 +1,15 @@
 """The page of the race: the answer in one sentence, the arms beside one another, what the landscape is like, every design."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 
 from studies.codesign.design import Space
+from studies.codesign.gallery import handed, side_by_side
 from studies.codesign.landscape import Landscape
-from studies.codesign.race import compared
+from studies.codesign.race import Judge, compared
 from studies.codesign.slopes import show
 from studies.frame.compare import Interval
 from studies.frame.run import Run
@@ -19,11 +20,19 @@ ENOUGH = 6  # seeds, below which nothing is decided
 SPREAD = 1.5  # of the landscape, below which there is nothing to design
 
 
-def report(run: Run[Any], space: Space, gates: Landscape, slopes: Sequence[Row], rows: Sequence[Row]) -> None:
+def report(
+    run: Run[Any],
+    space: Space,
+    gates: Landscape,
+    slopes: Sequence[Row],
+    rows: Sequence[Row],
+    judge: Judge,
+) -> None:
     """Metrics and page."""
     found = compared(rows) if rows else {}
     if rows:
         race(run, found, rows)
+        shown(run, space, found, rows, judge)
     looked(run, space, gates)
     if slopes:
         show(run, space, slopes)
@@ -34,13 +43,18 @@ def report(run: Run[Any], space: Space, gates: Landscape, slopes: Sequence[Row],
     run.finish("Lens, mount, sensor and estimator together", lead)
 
 
+def best_order(found: Mapping[str, tuple[Interval, float]]) -> str:
+    """The order of blocks that joint design beats least; of all arms where none is an order."""
+    orders = {arm: value for arm, value in found.items() if arm.count(">") == 2}
+    rivals = orders or found
+    return max(rivals, key=lambda arm: rivals[arm][0].value)
+
+
 def answer(run: Run[Any], found: dict[str, tuple[Interval, float]]) -> str:
     """In one sentence."""
     where = f"'{run.config.pair}', {run.config.light:g} of daylight"
-    orders = {arm: value for arm, value in found.items() if arm.count(">") == 2}
-    rivals = orders or found
-    # the best order is the one that joint design beats least
-    name, (over, p) = max(rivals.items(), key=lambda item: item[1][0].value)
+    name = best_order(found)
+    over, p = found[name]
     ratio = f"{math.exp(over.value):.2f} ({math.exp(over.low):.2f} to {math.exp(over.high):.2f})"
     if run.config.seeds < ENOUGH:
         return f"This run of {run.config.seeds} starts decides nothing; it shows that everything works ({where})."
@@ -82,6 +96,11 @@ def race(run: Run[Any], found: dict[str, tuple[Interval, float]], rows: Sequence
         lines.append(line)
     tabulate(run, "Errors in unseen worlds", lines, "arm", prefix="race")
     if found:
+        for arm, name in {**{arm: arm for arm in found}, best_order(found): "best_order"}.items():
+            over = found[arm][0]
+            ends = zip(("median", "low95", "high95"), (over.value, over.low, over.high), strict=True)
+            plain_name = plain("joint_over", name)
+            run.record(**{f"{plain_name}_{end}_{run.config.pair}": math.exp(log) for end, log in ends})
         ratios = {
             arm: Interval(*(math.exp(x) for x in (over.value, over.low, over.high)), over.count)
             for arm, (over, _) in found.items()
@@ -90,6 +109,35 @@ def race(run: Run[Any], found: dict[str, tuple[Interval, float]], rows: Sequence
         run.figure(bars(ratios, "joint / arm", log=True, level=1.0), "ratios", caption)
         best = max(ratios, key=lambda arm: ratios[arm].value)
         run.card(f"joint over {best}", f"{ratios[best].value:.2f}", f"{ratios[best]:.2f}")
+
+
+def shown(
+    run: Run[Any],
+    space: Space,
+    found: Mapping[str, tuple[Interval, float]],
+    rows: Sequence[Row],
+    judge: Judge,
+) -> None:
+    """Three designs of the start at which the joint one is neither the best nor the worst, and the hand-over of the joint
+    one."""
+    mean = {(row["seed"], row["arm"]): sum(row["errors"]) / len(row["errors"]) for row in rows}
+    ours = sorted((error, seed) for (seed, arm), error in mean.items() if arm == "joint")
+    seed = ours[(len(ours) - 1) // 2][1]
+    others = [best_order(found), "book", "default"] if found else []
+    arms = [arm for arm in dict.fromkeys(["joint", *others]) if (seed, arm) in mean][:3]
+    designs = {}
+    for row in rows:
+        if row["seed"] == seed and row["arm"] in arms:
+            whole = space.made(torch.tensor(row["share"], dtype=torch.float64))
+            title = f"{row['arm']}: {mean[seed, row['arm']]:.3f}\n{whole}"
+            designs[row["arm"]] = title, whole
+    run.section(
+        "Designs side by side",
+        f"Answers from start {seed}, that of the median joint design, with their errors in unseen worlds: lens, robot and view, "
+        "and an unseen drive as frame, single events and flow.",
+    )
+    run.figure(side_by_side(judge, dict(designs[arm] for arm in arms)), "designs", "Whole designs.", 110)
+    handed(run, judge, designs["joint"][1], mean[seed, "joint"])
 
 
 def looked(run: Run[Any], space: Space, gates: Landscape) -> None:

@@ -15,7 +15,7 @@ from codesign.mount.requirements import first_missed
 from scenes.robots import pair as robot_pair
 from studies.codesign.arms import ARMS, Task, read_out
 from studies.codesign.calibration import Calibration
-from studies.codesign.design import Space
+from studies.codesign.design import Space, Whole
 from studies.codesign.objective import Objective
 from studies.codesign.problem import Drawn
 from studies.frame.compare import Interval, crossed, holm, sign_flip
@@ -104,8 +104,11 @@ class Judge:
         self.worlds = worlds
 
     def __call__(self, share: Sequence[float]) -> list[float]:
-        """Mean bounded error in each world."""
-        whole = self.drawn.space.made(torch.tensor(share, dtype=torch.float64))
+        """Mean bounded error in each world of shares [V]."""
+        return self.of(self.drawn.space.made(torch.tensor(share, dtype=torch.float64)))
+
+    def of(self, whole: Whole) -> list[float]:
+        """The same, of a design."""
         looked = self.drawn.looked(whole, self.drawn.draw(JUDGED), "sensor")
         of_worlds = looked.hard().unflatten(0, (self.worlds, -1)).mean(1)
         return [round(error, 6) for error in of_worlds.tolist()]

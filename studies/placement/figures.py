@@ -74,14 +74,14 @@ def before_and_after(problem: Problem, mount: Tensor) -> Figure:
     figure = plt.figure(figsize=(13, 6.4), layout="constrained")
     drives = fastest(problem)
     for row, pose in enumerate((problem.ranges.pose(problem.start), mount)):
-        _draw_pair(figure.add_subplot(2, 4, 4 * row + 1, projection="3d"), problem.pair, problem.camera, pose)
+        draw_pair(figure.add_subplot(2, 4, 4 * row + 1, projection="3d"), problem.pair, problem.camera, pose)
         axes = [figure.add_subplot(2, 4, 4 * row + column) for column in (2, 3, 4)]
-        _draw_frame(axes[0], drives, problem.camera, pose)
+        draw_frame(axes[0], drives, problem.camera, pose)
         with torch.no_grad():
             run = problem.system(pose, "sensor").begin(drives)
         counts, flow = run["volume"].counts.sum(2), run["field"].flow_px
-        axes[1].imshow(_tiled(events.picture(counts).numpy()))
-        axes[2].imshow(flow_colours(_tiled(flow.movedim(1, -1).numpy()).transpose(2, 0, 1)))
+        axes[1].imshow(tiled(events.picture(counts).numpy()))
+        axes[2].imshow(flow_colours(tiled(flow.movedim(1, -1).numpy()).transpose(2, 0, 1)))
         for axis, title in zip(axes, ("frame", "events", "flow"), strict=True):
             axis.set(xticks=[], yticks=[], title=title if row == 0 else "")
     return figure
@@ -94,7 +94,7 @@ def fastest(problem: Problem) -> Drives:
     return problem.batch(Samples((problem.numbers[0],), (which,), 0))
 
 
-def _tiled(windows: np.ndarray) -> np.ndarray:
+def tiled(windows: np.ndarray) -> np.ndarray:
     """Windows [9, H, W, C] in rows of three."""
     side = math.isqrt(len(windows))
     rows = [np.concatenate(list(windows[side * k : side * (k + 1)]), 1) for k in range(side)]
@@ -104,14 +104,14 @@ def _tiled(windows: np.ndarray) -> np.ndarray:
 def robot_and_frame(pair: RobotPair, drives: Drives, camera: Camera, pose: Tensor) -> Figure:
     """The robot with its camera's view, and beside it the middle frame of the first drive."""
     figure = plt.figure(figsize=(10, 4.4), layout="constrained")
-    _draw_pair(figure.add_subplot(1, 2, 1, projection="3d"), pair, camera, pose)
+    draw_pair(figure.add_subplot(1, 2, 1, projection="3d"), pair, camera, pose)
     right = figure.add_subplot(1, 2, 2)
-    _draw_frame(right, drives, camera, pose)
+    draw_frame(right, drives, camera, pose)
     right.set(xticks=[], yticks=[])
     return figure
 
 
-def _draw_pair(axis: Any, pair: RobotPair, camera: Camera, T_body_cam: Tensor) -> None:
+def draw_pair(axis: Any, pair: RobotPair, camera: Camera, T_body_cam: Tensor) -> None:
     """Robot and view, into a 3-D axis."""
     triangles = [mesh.vertices_m[mesh.faces] for mesh in pair.bodies.values()]
     shade = [np.clip(0.8 * bodies.skylight(mesh), 0, 1) for mesh in pair.bodies.values()]
@@ -120,7 +120,7 @@ def _draw_pair(axis: Any, pair: RobotPair, camera: Camera, T_body_cam: Tensor) -
 
 
 @torch.no_grad()
-def _draw_frame(axis: Any, drives: Drives, camera: Camera, T_body_cam: Tensor) -> None:
+def draw_frame(axis: Any, drives: Drives, camera: Camera, T_body_cam: Tensor) -> None:
     """The middle frame [H, W] of the first drive on the whole sensor, with the camera's windows."""
     whole = Camera(camera.lens, *SENSOR_PX, camera.film.pixel_pitch_mm, 8)
     scene = drives.scene[0].during([FRAMES // 2])

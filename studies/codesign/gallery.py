@@ -1,0 +1,91 @@
+"""Whole designs side by side, from the lens to the flow, and the hand-over of one."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import torch
+from matplotlib.figure import Figure
+
+from codesign import events, lens
+from codesign.report.flow_colours import flow_colours
+from codesign.report.lens_figures import draw_layout
+from codesign.system import HandOver, load_hand_over, save_hand_over
+from scenes.robots import pair as robot_pair
+from studies.codesign.design import Whole
+from studies.codesign.race import JUDGED, Judge
+from studies.frame.run import Run
+from studies.placement.figures import draw_frame, draw_pair, tiled
+from studies.placement.problem import Samples
+
+COLUMNS = ("lens", "robot and view", "frame", "events", "flow")
+FIELDS_RAD = (0.0, 0.2, 0.4)  # of the rays that are drawn
+DRIVES = 6  # of which the fastest is shown
+
+
+def side_by_side(judge: Judge, designs: Mapping[str, Whole]) -> Figure:
+    """A row for each design: lens, robot with the camera's view, frame, single events and flow of one unseen drive."""
+    drawn = judge.drawn
+    number = drawn.base.numbers[0]
+    twist = drawn.base.scenes(Samples((number,), tuple(range(DRIVES)), JUDGED)).twist
+    samples = Samples((number,), (int(twist[:, :3].norm(dim=1).argmax()),), JUDGED)
+    figure = plt.figure(figsize=(15, 2.9 * len(designs)), layout="constrained")
+    for row, (title, whole) in enumerate(designs.items()):
+        axes = [
+            figure.add_subplot(
+                len(designs),
+                len(COLUMNS),
+                len(COLUMNS) * row + column + 1,
+                projection="3d" if name == "robot and view" else None,
+            )
+            for column, name in enumerate(COLUMNS)
+        ]
+        looked = drawn.looked(whole, samples, "sensor")
+        if isinstance(whole.camera.lens, lens.GeoLens):
+            draw_layout(axes[0], whole.camera.lens, FIELDS_RAD, rays=3)
+        axes[0].set_axis_off()
+        axes[0].set_title(title, fontsize=9, loc="left")
+        draw_pair(axes[1], whole.space.pair, whole.camera, whole.T_body_cam)
+        draw_frame(axes[2], looked.batch, whole.camera, whole.T_body_cam)
+        axes[3].imshow(tiled(events.picture(looked.run["volume"].counts.sum(2)).numpy()))
+        flow = looked.run["field"].flow_px
+        axes[4].imshow(flow_colours(tiled(flow.movedim(1, -1).numpy()).transpose(2, 0, 1)))
+        for axis, name in zip(axes[2:], COLUMNS[2:], strict=True):
+            axis.set(xticks=[], yticks=[], title=name if row == 0 else "")
+    return figure
+
+
+def handed(run: Run[Any], judge: Judge, whole: Whole, error: float) -> None:
+    """Write a design as design.yaml with its lens beside it, read it back, and see that it has the same score."""
+    path = run.path("design.yaml")
+    save(path, whole, error)
+    back = loaded(path, whole)
+    again = judge.of(back)
+    run.record(hand_over_score=error, hand_over_score_again=sum(again) / len(again))
+    run.section(
+        "Hand-over",
+        f"`design.yaml` has the transform, camera and sensor, and the estimator's prior among its notes; the lens stands beside "
+        f"it (`codesign.lens.load` reads it, `codesign.lens.save` makes a .zmx of it). Read back it scores "
+        f"{sum(again) / len(again):.4f} where the answer had {error:.4f}.",
+    )
+
+
+def save(path: Path, whole: Whole, error: float) -> None:
+    """A design with its error in unseen worlds, for those who build it."""
+    pair = whole.space.pair
+    mount = robot_pair.mount_at(pair.ranges, whole.T_body_cam)
+    notes = {"pair": pair.name, "error_unseen": error, **whole.numbers}
+    save_hand_over(
+        path, HandOver(mount, whole.camera, whole.sensor, pair.frame, "camera_optical_frame", notes)
+    )
+
+
+def loaded(path: Path, like: Whole) -> Whole:
+    """A design of the same space as the file has it: its lens, camera, mount and sensor, none of them made anew."""
+    back = load_hand_over(path)
+    numbers = {name: float(back.notes[name]) for name in like.numbers}
+    found = Whole(like.space, numbers)
+    with torch.no_grad():
+        vars(found).update(camera=back.camera, T_body_cam=back.mount().detach(), sensor=back.sensor)
+    return found
