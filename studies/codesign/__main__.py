@@ -7,19 +7,22 @@ render as many drives: jointly, in every order of the blocks, alternating, neste
 gradients. Single events of the hard sensor in worlds that no arm saw judge them.
 """
 
-import json
 import sys
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import torch
+
 from codesign import lens
 from codesign.atomic import write_atomic
 from codesign.errors import DomainError
 from scenes.robots import pair as robot_pair
+from scenes.robots.check import check_pair
 from scenes.robots.pairs import PAIRS
-from studies.codesign import slopes
+from studies.codesign import couplings, slopes
 from studies.codesign.arms import ARMS
+from studies.codesign.couplings import Pulls
 from studies.codesign.design import Space
 from studies.codesign.landscape import landscape
 from studies.codesign.page import report
@@ -27,6 +30,7 @@ from studies.codesign.problem import Drawn
 from studies.codesign.race import Judge, racing, spread_over, start
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.sweep import Row, sweep
+from studies.placement.look import size_in_words
 from studies.placement.searches import SEARCHES, available
 
 THIN = "thin"
@@ -45,9 +49,12 @@ class Config(StudyConfig):
         "grid": 2,
         "settling": 6,
         "slopes": 0,
+        "couplings": 0,
     }
     pair: str = "outdoors"
     """Robot and worlds: outdoors, corridor or flight."""
+    robot: Path | None = None
+    """A robot of your own instead, described in a .yaml file (docs/robots_and_worlds.md)."""
     family: str = "retrofocus-4"
     """Family of traced lenses, or thin."""
     light: float = 1.0
@@ -74,6 +81,8 @@ class Config(StudyConfig):
     """Designs along each number, through the best."""
     slopes: int = 24
     """Draws by which the objective's slope is compared with rendered differences; 0: it is not."""
+    couplings: int = 4
+    """Draws by which the couplings of the parts are measured around the best joint answer; 0: they are not."""
     settling: int = 24
     """Designs of sensor and estimator tried on recorded frames, wherever they are settled."""
     processes: int = 0
@@ -88,7 +97,11 @@ def study(run: Run[Config]) -> None:
     if run.device.type != "cpu":
         run.say("This study computes on the CPU; the device asked for stays unused.")
     family = None if size.family == THIN else size.family
-    space = Space.of(size.pair, family, size.light, size.free)
+    pair = str(size.robot) if size.robot else size.pair
+    space = Space.of(pair, family, size.light, size.free)
+    if size.robot:
+        run.say(size_in_words(space.pair))
+        check_pair(space.pair, space.made(space.start).camera, (0, robot_pair.UNSEEN_FROM))
     for seed in range(size.seed, size.seed + size.seeds):
         start(space, seed)
     gates = landscape(run, space, size.designs)
@@ -99,15 +112,23 @@ def study(run: Run[Config]) -> None:
         gates.calibration,
     )
     rows_of_slopes = slopes.slopes(run, space, drawn, gates.best, size.slopes) if size.slopes else []
+    told = ("light", "worlds", "per_draw", "steps", "settling")
     setting = {
-        **{name: getattr(size, name) for name in ("pair", "light", "free", "worlds", "per_draw", "steps")},
-        "settling": size.settling,
+        **{name: getattr(size, name) for name in told},
+        "pair": pair,
         "family": family,
-        "calibration": astuple(gates.calibration),
+        "free": list(size.free),
+        "calibration": list(astuple(gates.calibration)),
     }
     judge = Judge(space, size.judged_worlds, size.judged_drives)
     rows = raced(run, judge, setting) if size.seeds else []
-    report(run, space, gates, rows_of_slopes, rows, judge)
+    pulls = None
+    if rows and size.couplings:
+        ours = [row for row in rows if row["arm"] == "joint"]
+        at = torch.tensor(min(ours, key=lambda row: row["expected"])["share"], dtype=torch.float64)
+        starts = [start(space, seed) for seed in {row["seed"] for row in ours}]
+        pulls = Pulls(couplings.curvatures(run, drawn, at, size.couplings), at, starts)
+    report(run, space, gates, rows_of_slopes, rows, judge, pulls)
 
 
 def raced(run: Run[Config], judge: Judge, setting: dict[str, Any]) -> list[Row]:
@@ -127,7 +148,7 @@ def raced(run: Run[Config], judge: Judge, setting: dict[str, Any]) -> list[Row]:
         return {**row, "errors": judge(row["share"]), "setting": setting}
 
     answers = sweep(run, judged, "answers", **axes)
-    other = [row for row in answers if json.dumps(row["setting"]) != json.dumps(setting)]
+    other = [row for row in answers if row["setting"] != setting]
     if other:
         raise DomainError(
             f"'{size.raw}' has answers of another setting, {other[0]['setting']}; this race is of {setting}."
@@ -137,8 +158,10 @@ def raced(run: Run[Config], judge: Judge, setting: dict[str, Any]) -> list[Row]:
 
 def checked(size: Config) -> None:
     """Raise DomainError for sizes that cannot be."""
-    if size.pair not in PAIRS:
-        raise DomainError(f"--pair {size.pair}: choose from {', '.join(PAIRS)}.")
+    if size.robot is None and size.pair not in PAIRS:
+        raise DomainError(
+            f"--pair {size.pair}: choose from {', '.join(PAIRS)}, or give --robot and a .yaml file."
+        )
     if size.family != THIN:
         lens.family(size.family)
     if not 0 < size.light <= 1:
@@ -148,9 +171,10 @@ def checked(size: Config) -> None:
     for name in ("worlds", "per_draw", "judged_worlds", "judged_drives", "designs", "settling"):
         if getattr(size, name) < 1:
             raise DomainError(f"--{name.replace('_', '-')} is {getattr(size, name)}; at least 1 is needed.")
-    if size.grid < 2 or size.slopes == 1 or size.slopes < 0:
+    if size.grid < 2 or size.slopes == 1 or min(size.slopes, size.couplings) < 0:
         raise DomainError(
-            f"--grid needs 2 or more, --slopes 0, or 2 and more; they are {size.grid} and {size.slopes}."
+            f"--grid needs 2 or more, --slopes 0, or 2 and more, --couplings 0 or more; they are {size.grid}, {size.slopes} and "
+            f"{size.couplings}."
         )
     if size.per_draw % min(size.worlds, size.per_draw):
         raise DomainError(

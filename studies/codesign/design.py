@@ -13,6 +13,7 @@ from codesign import events, flow, lens, render
 from codesign.errors import DomainError
 from scenes.robots import pair as robot_pair
 from scenes.robots.costs import Costs, Exposed
+from scenes.robots.own import own_pair
 from scenes.robots.pair import Design, RobotPair
 from scenes.robots.pairs import PAIRS
 
@@ -26,6 +27,8 @@ BLOCKS: dict[str, tuple[str, ...]] = {
 LOGARITHMIC = ("efl_mm", "fno", "theta", "cutoff_hz", "prior_px")
 # where a pair says nothing, or holds what is free here
 BOUNDS = {
+    "efl_mm": (2.5, 12.0),
+    "focus_per_m": (0.0, 8.0),
     "fno": (1.2, 8.0),
     "bending": (-1.0, 1.0),
     "theta": (0.08, 0.6),
@@ -48,8 +51,8 @@ class Space:
     """Whole designs of a robot's camera.
 
     pair: robot, worlds and drives, behind a thin lens or the traced ones of a family. costs: what a design pays.
-    free: names of the numbers that shares are of, all of BLOCKS that its lens has when left out; the others are
-      held as the pair's own design has them. bounds: name -> (low, high), in place of those of the pair or of BOUNDS.
+    free: names of the numbers that shares are of, all of BLOCKS that its lens has and that have room when left out;
+      the others are held as the pair's own design has them. bounds: name -> (low, high), in place of those of the pair or of BOUNDS.
     Raises: DomainError for a name that is unknown or bounds that leave out the held design.
 
     >>> space = Space.of("outdoors", None, 1.0, ())
@@ -67,7 +70,8 @@ class Space:
         known = [name for names in BLOCKS.values() for name in names]
         if not self.free:
             own = [name for name in known if name != "bending" or self.pair.family]
-            object.__setattr__(self, "free", tuple(own))
+            roomy = [name for name in own if self.limits(name)[0] < self.limits(name)[1]]
+            object.__setattr__(self, "free", tuple(roomy))
         for name in (*self.free, *self.bounds):
             if name not in known:
                 raise DomainError(f"a design has no number '{name}'; there are {', '.join(known)}.")
@@ -82,8 +86,10 @@ class Space:
 
     @staticmethod
     def of(pair: str, family: str | None, light: float, free: Sequence[str]) -> "Space":
-        """By names: of one of the three pairs, behind a thin lens for None, in a share of daylight."""
-        return Space(replace(PAIRS[pair](), family=family), Costs(light=light), tuple(free))
+        """By names: of one of the three pairs or of an own robot's page (.yaml), behind a thin lens for None, in a share of
+        daylight."""
+        found = PAIRS[pair]() if pair in PAIRS else own_pair(pair)
+        return Space(replace(found, family=family), Costs(light=light), tuple(free))
 
     @cached_property
     def default(self) -> dict[str, float]:
@@ -96,9 +102,8 @@ class Space:
             return self.bounds[name]
         if name == "fno" and self.pair.family:
             return lens.family(self.pair.family).fno
-        if name in BOUNDS:
-            return BOUNDS[name]
-        return getattr(self.pair.low, name), getattr(self.pair.high, name)
+        low, high = (getattr(each, name, None) for each in (self.pair.low, self.pair.high))
+        return BOUNDS[name] if name in BOUNDS and low == high else (low, high)
 
     def block(self, name: str) -> list[int]:
         """Places of a block's numbers among those that are free."""

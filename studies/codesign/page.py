@@ -6,6 +6,8 @@ from typing import Any
 
 import torch
 
+from studies.codesign import couplings
+from studies.codesign.couplings import Pulls
 from studies.codesign.design import Space
 from studies.codesign.gallery import handed, side_by_side
 from studies.codesign.landscape import Landscape
@@ -27,19 +29,24 @@ def report(
     slopes: Sequence[Row],
     rows: Sequence[Row],
     judge: Judge,
+    pulls: Pulls | None,
 ) -> None:
     """Metrics and page."""
     found = compared(rows) if rows else {}
     if rows:
-        race(run, found, rows)
+        race(run, plain(space.pair.name), found, rows)
         shown(run, space, found, rows, judge)
+    if pulls:
+        couplings.show(run, space, pulls, {arm: math.exp(-over.value) for arm, (over, _) in found.items()})
     looked(run, space, gates)
     if slopes:
         show(run, space, slopes)
     if rows:
         designs(run, space, rows)
     run.record(seconds=run.seconds)
-    lead = answer(run, found) if rows else "This run looks at the landscape and races nothing."
+    lead = (
+        answer(run, space.pair.name, found) if rows else "This run looks at the landscape and races nothing."
+    )
     run.finish("Lens, mount, sensor and estimator together", lead)
 
 
@@ -50,9 +57,9 @@ def best_order(found: Mapping[str, tuple[Interval, float]]) -> str:
     return max(rivals, key=lambda arm: rivals[arm][0].value)
 
 
-def answer(run: Run[Any], found: dict[str, tuple[Interval, float]]) -> str:
+def answer(run: Run[Any], pair: str, found: Mapping[str, tuple[Interval, float]]) -> str:
     """In one sentence."""
-    where = f"'{run.config.pair}', {run.config.light:g} of daylight"
+    where = f"'{pair}', {run.config.light:g} of daylight"
     name = best_order(found)
     over, p = found[name]
     ratio = f"{math.exp(over.value):.2f} ({math.exp(over.low):.2f} to {math.exp(over.high):.2f})"
@@ -65,7 +72,7 @@ def answer(run: Run[Any], found: dict[str, tuple[Interval, float]]) -> str:
     )
 
 
-def race(run: Run[Any], found: dict[str, tuple[Interval, float]], rows: Sequence[Row]) -> None:
+def race(run: Run[Any], pair: str, found: Mapping[str, tuple[Interval, float]], rows: Sequence[Row]) -> None:
     """The arms beside one another."""
     run.section(
         "The race",
@@ -100,7 +107,7 @@ def race(run: Run[Any], found: dict[str, tuple[Interval, float]], rows: Sequence
             over = found[arm][0]
             ends = zip(("median", "low95", "high95"), (over.value, over.low, over.high), strict=True)
             plain_name = plain("joint_over", name)
-            run.record(**{f"{plain_name}_{end}_{run.config.pair}": math.exp(log) for end, log in ends})
+            run.record(**{f"{plain_name}_{end}_{pair}": math.exp(log) for end, log in ends})
         ratios = {
             arm: Interval(*(math.exp(x) for x in (over.value, over.low, over.high)), over.count)
             for arm, (over, _) in found.items()

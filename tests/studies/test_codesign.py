@@ -3,6 +3,7 @@ it, resumed."""
 
 import json
 import math
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
@@ -13,6 +14,7 @@ from scenes.robots import pair as robot_pair
 from scenes.robots.costs import Costs
 from scenes.robots.pairs import PAIRS
 from studies.codesign import __main__ as codesign
+from studies.codesign import couplings
 from studies.codesign.arms import ARMS, Task, Way, chosen_by_the_book, read_out
 from studies.codesign.design import Space
 from studies.codesign.objective import Objective
@@ -135,6 +137,45 @@ def test_a_read_out_is_settled_at_the_bottom_of_what_recorded_frames_tell(space)
     held = [k for k in range(len(begun)) if k not in free]
     assert torch.equal(found[held], begun[held])
     assert (found - bottom)[free].abs().max() < 0.02
+
+
+def test_couplings_of_a_known_valley_are_its_own(space, tmp_path):
+    """A quadratic valley in which lens and mount pull at each other: its curvature, its canonical coupling, and what one
+    pass leaves, all in closed form."""
+    size = len(space.free)
+    true = torch.eye(size, dtype=F)
+    lens_at, mount_at = space.block("lens")[0], space.block("mount")[0]
+    true[lens_at, mount_at] = true[mount_at, lens_at] = 0.8
+    bottom = torch.full((size,), 0.5, dtype=F)
+
+    def looked(share, samples):
+        away = share - bottom
+        return SimpleNamespace(expected=(0.1 + away @ true @ away / 2)[None])
+
+    known = SimpleNamespace(
+        space=SimpleNamespace(free=space.free, made=lambda share: share),
+        draw=lambda number: number,
+        looked=looked,
+    )
+    run = SimpleNamespace(
+        path=lambda name: tmp_path / name,
+        state_unread=False,
+        progress=lambda *_, **__: nullcontext(SimpleNamespace(advance=lambda: None)),
+    )
+    rows = couplings.curvatures(run, known, bottom, 2)
+    found, error = couplings.hessian(space, rows)
+    assert torch.allclose(found, true, atol=1e-9)
+    assert error == pytest.approx(0.1)
+    pulls = couplings.coupled(space, found)
+    assert pulls["lens and mount"] == pytest.approx(0.8)
+    assert pulls["lens and read-out"] == pytest.approx(0.0, abs=1e-9)
+    begun = bottom.clone()
+    begun[mount_at] += 0.3
+    # the lens goes to -0.8 x 0.3, then the mount to 0.64 x 0.3
+    lens_away, mount_away = -0.8 * 0.3, 0.64 * 0.3
+    left = (lens_away**2 + mount_away**2 + 1.6 * lens_away * mount_away) / 2
+    over = couplings.left_by(space, found, error, bottom, [begun], ("lens", "mount", "read-out"))
+    assert over == pytest.approx(1 + left / 0.1)
 
 
 def test_starts_keep_what_is_required(space):
