@@ -7,7 +7,9 @@ render as many drives: jointly, in every order of the blocks, alternating, neste
 gradients. Single events of the hard sensor in worlds that no arm saw judge them.
 """
 
+import math
 import sys
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -20,14 +22,12 @@ from codesign.errors import DomainError
 from scenes.robots import pair as robot_pair
 from scenes.robots.check import check_pair
 from scenes.robots.pairs import PAIRS
-from studies.codesign import couplings, slopes
+from studies.codesign import couplings, page, read_outs, slopes
 from studies.codesign.arms import ARMS
-from studies.codesign.couplings import Pulls
 from studies.codesign.design import Space
 from studies.codesign.landscape import landscape
-from studies.codesign.page import report
 from studies.codesign.problem import Drawn
-from studies.codesign.race import Judge, racing, spread_over, start
+from studies.codesign.race import Judge, compared, racing, spread_over, start
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.sweep import Row, sweep
 from studies.placement.look import size_in_words
@@ -50,6 +50,7 @@ class Config(StudyConfig):
         "settling": 6,
         "slopes": 0,
         "couplings": 0,
+        "read_outs": 0,
     }
     pair: str = "outdoors"
     """Robot and worlds: outdoors, corridor or flight."""
@@ -83,6 +84,8 @@ class Config(StudyConfig):
     """Draws by which the objective's slope is compared with rendered differences; 0: it is not."""
     couplings: int = 4
     """Draws by which the couplings of the parts are measured around the best joint answer; 0: they are not."""
+    read_outs: int = 24
+    """Read-outs of the best design by which it is asked what should settle them; 0: it is not."""
     settling: int = 24
     """Designs of sensor and estimator tried on recorded frames, wherever they are settled."""
     processes: int = 0
@@ -111,7 +114,6 @@ def study(run: Run[Config]) -> None:
         *spread_over(size.worlds, size.per_draw),
         gates.calibration,
     )
-    rows_of_slopes = slopes.slopes(run, space, drawn, gates.best, size.slopes) if size.slopes else []
     told = ("light", "worlds", "per_draw", "steps", "settling")
     setting = {
         **{name: getattr(size, name) for name in told},
@@ -122,13 +124,28 @@ def study(run: Run[Config]) -> None:
     }
     judge = Judge(space, size.judged_worlds, size.judged_drives)
     rows = raced(run, judge, setting) if size.seeds else []
-    pulls = None
+    said = page.lead(run, space, rows, judge)
     if rows and size.couplings:
-        ours = [row for row in rows if row["arm"] == "joint"]
-        at = torch.tensor(min(ours, key=lambda row: row["expected"])["share"], dtype=torch.float64)
-        starts = [start(space, seed) for seed in {row["seed"] for row in ours}]
-        pulls = Pulls(couplings.curvatures(run, drawn, at, size.couplings), at, starts)
-    report(run, space, gates, rows_of_slopes, rows, judge, pulls)
+        around_the_best(run, drawn, rows)
+    page.looked(run, space, gates)
+    if size.slopes:
+        slopes.show(run, space, slopes.slopes(run, space, drawn, gates.best, size.slopes))
+    if size.read_outs:
+        read_outs.show(run, read_outs.looked(run, space, drawn, gates.best, size.read_outs))
+    if rows:
+        page.designs(run, space, rows)
+    run.record(seconds=run.seconds)
+    run.finish("Lens, mount, sensor and estimator together", said)
+
+
+def around_the_best(run: Run[Config], drawn: Drawn, rows: Sequence[Row]) -> None:
+    """Couplings around the joint answer of which least error is expected, and what the orders would leave by them."""
+    ours = [row for row in rows if row["arm"] == "joint"]
+    at = torch.tensor(min(ours, key=lambda row: row["expected"])["share"], dtype=torch.float64)
+    starts = [start(drawn.space, seed) for seed in dict.fromkeys(row["seed"] for row in ours)]
+    measured = {arm: math.exp(-over.value) for arm, (over, _) in compared(rows).items()}
+    pulls = couplings.curvatures(run, drawn, at, run.config.couplings)
+    couplings.show(run, drawn.space, pulls, at, starts, measured)
 
 
 def raced(run: Run[Config], judge: Judge, setting: dict[str, Any]) -> list[Row]:
@@ -171,10 +188,10 @@ def checked(size: Config) -> None:
     for name in ("worlds", "per_draw", "judged_worlds", "judged_drives", "designs", "settling"):
         if getattr(size, name) < 1:
             raise DomainError(f"--{name.replace('_', '-')} is {getattr(size, name)}; at least 1 is needed.")
-    if size.grid < 2 or size.slopes == 1 or min(size.slopes, size.couplings) < 0:
+    if size.grid < 2 or size.slopes == 1 or min(size.slopes, size.couplings, size.read_outs) < 0:
         raise DomainError(
-            f"--grid needs 2 or more, --slopes 0, or 2 and more, --couplings 0 or more; they are {size.grid}, {size.slopes} and "
-            f"{size.couplings}."
+            f"--grid needs 2 or more, --slopes 0, or 2 and more, --couplings and --read-outs 0 or more; they are "
+            f"{size.grid}, {size.slopes}, {size.couplings} and {size.read_outs}."
         )
     if size.per_draw % min(size.worlds, size.per_draw):
         raise DomainError(

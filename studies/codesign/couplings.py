@@ -3,7 +3,6 @@ second differences of the errors to be expected around one design."""
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
@@ -21,15 +20,6 @@ FIRST = 60_000  # number of the first draw
 FLATTEST = 0.02  # of the largest curvature, below which none is taken
 READ_OUT = BLOCKS["sensor"] + BLOCKS["network"]
 PARTS = {"lens": BLOCKS["lens"], "mount": BLOCKS["mount"], "read-out": READ_OUT}
-
-
-@dataclass(frozen=True)
-class Pulls:
-    """rows: of ``curvatures`` around shares ``at`` [V]. starts: [V] each, of the race."""
-
-    rows: Sequence[Row]
-    at: Tensor
-    starts: Sequence[Tensor]
 
 
 def curvatures(run: Run[Any], drawn: Drawn, at: Tensor, draws: int) -> list[Row]:
@@ -103,9 +93,16 @@ def left_by(
     return float(torch.tensor(ratios).quantile(0.5))
 
 
-def show(run: Run[Any], space: Space, pulls: Pulls, measured: Mapping[str, float]) -> None:
+def show(
+    run: Run[Any],
+    space: Space,
+    rows: Sequence[Row],
+    at: Tensor,
+    starts: Sequence[Tensor],
+    measured: Mapping[str, float],
+) -> None:
     """Couplings, and the orders' errors over the joint one as predicted and as ``measured``."""
-    curvature, error = hessian(space, pulls.rows)
+    curvature, error = hessian(space, rows)
     run.section(
         "How the parts pull at each other",
         f"Second differences of expected errors over {STEP} of the bounds around the joint answer of which least error is "
@@ -113,12 +110,12 @@ def show(run: Run[Any], space: Space, pulls: Pulls, measured: Mapping[str, float
         "without the other.",
     )
     lines = [{"parts": name, "coupling": value} for name, value in coupled(space, curvature).items()]
-    tabulate(run, "Canonical couplings", lines, "parts", prefix="coupling")
+    tabulate(run, "Canonical couplings", lines, "parts", prefix="parts")
     lines = []
     for arm, ratio in measured.items():
         order = arm.split(" > ")
         if len(order) == len(PARTS):
-            predicted = left_by(space, curvature, error, pulls.at, pulls.starts, order)
+            predicted = left_by(space, curvature, error, at, starts, order)
             lines.append({"order": arm, "predicted": predicted, "measured": ratio})
     if lines:
         tabulate(run, "Error of an order over the joint one", lines, "order", prefix="order_over_joint")

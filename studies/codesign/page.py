@@ -6,13 +6,10 @@ from typing import Any
 
 import torch
 
-from studies.codesign import couplings
-from studies.codesign.couplings import Pulls
 from studies.codesign.design import Space
 from studies.codesign.gallery import handed, side_by_side
 from studies.codesign.landscape import Landscape
 from studies.codesign.race import Judge, compared
-from studies.codesign.slopes import show
 from studies.frame.compare import Interval
 from studies.frame.run import Run
 from studies.frame.show import Panel, bars, panels, table, tabulate
@@ -22,32 +19,14 @@ ENOUGH = 6  # seeds, below which nothing is decided
 SPREAD = 1.5  # of the landscape, below which there is nothing to design
 
 
-def report(
-    run: Run[Any],
-    space: Space,
-    gates: Landscape,
-    slopes: Sequence[Row],
-    rows: Sequence[Row],
-    judge: Judge,
-    pulls: Pulls | None,
-) -> None:
-    """Metrics and page."""
-    found = compared(rows) if rows else {}
-    if rows:
-        race(run, plain(space.pair.name), found, rows)
-        shown(run, space, found, rows, judge)
-    if pulls:
-        couplings.show(run, space, pulls, {arm: math.exp(-over.value) for arm, (over, _) in found.items()})
-    looked(run, space, gates)
-    if slopes:
-        show(run, space, slopes)
-    if rows:
-        designs(run, space, rows)
-    run.record(seconds=run.seconds)
-    lead = (
-        answer(run, space.pair.name, found) if rows else "This run looks at the landscape and races nothing."
-    )
-    run.finish("Lens, mount, sensor and estimator together", lead)
+def lead(run: Run[Any], space: Space, rows: Sequence[Row], judge: Judge) -> str:
+    """The race at the head of the page; returns the answer in one sentence."""
+    if not rows:
+        return "This run looks at the landscape and races nothing."
+    found = compared(rows)
+    race(run, plain(space.pair.name), found, rows)
+    shown(run, space, found, rows, judge)
+    return answer(run, space.pair.name, found)
 
 
 def best_order(found: Mapping[str, tuple[Interval, float]]) -> str:

@@ -238,14 +238,18 @@ def test_a_way_keeps_the_last_rounds_that_were_recorded():
 
 def test_a_small_race_says_that_it_decides_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(codesign, "LEAST_STEPS", 2)
+    monkeypatch.setattr("studies.codesign.read_outs.WORLDS", 1)
     folder = tmp_path / "run"
-    given = "--quick --steps 2 --worlds 1 --per-draw 1 --judged-worlds 1 --judged-drives 1 --arms joint default --slopes 2"
+    given = "--quick --steps 2 --worlds 1 --per-draw 1 --judged-worlds 1 --judged-drives 1 --arms joint default --slopes 2 --couplings 1 --read-outs 4"
     free = ["--family", "thin", "--free", "efl_mm", "z_m", "theta"]
     assert main(codesign.study, codesign.Config, [*given.split(), *free, "--out", str(folder)]) == 0
     assert "decides nothing" in (folder / "report.html").read_text()
     numbers = json.loads((folder / "metrics.json").read_text())
     assert numbers["race_joint_drives"] == 2
     assert 0 < numbers["race_joint_median"] <= 1
+    assert 0 <= numbers["parts_lens_and_mount_coupling"] < 1
+    assert -1 <= numbers["read_out_expected_rank_all"] <= 1
+    assert numbers["hand_over_score_again"] == pytest.approx(numbers["hand_over_score"], abs=1e-6)
     before = (folder / "race.jsonl").read_bytes()
     assert main(codesign.study, codesign.Config, ["--resume", str(folder)]) == 0
     assert (folder / "race.jsonl").read_bytes() == before
