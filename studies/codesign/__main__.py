@@ -90,6 +90,8 @@ class Config(StudyConfig):
     """Designs of sensor and estimator tried on recorded frames, wherever they are settled."""
     processes: int = 0
     """Arms that race side by side, each in a process of its own; 0: one after the other in this one."""
+    cluster: str = ""
+    """Address of a Ray cluster on whose cores arms race instead: "auto" for that of this machine, "here" for one of its own."""
     raw: Path | None = None
     """Answers of earlier runs (answers.jsonl of their folder): what is there is not raced again."""
 
@@ -156,8 +158,9 @@ def raced(run: Run[Config], judge: Judge, setting: dict[str, Any]) -> list[Row]:
         known = size.raw.read_bytes()
         for name in ("race", "answers"):
             write_atomic(run.path(f"{name}.jsonl"), known)
-    given = {"setting": setting, "threads": 1 if size.processes else 0}
-    rows = sweep(run, racing, "race", size.processes, given=given, **axes)
+    beside = {"processes": size.processes, "cluster": size.cluster}
+    given = {"setting": setting, "threads": 1 if any(beside.values()) else 0}
+    rows = sweep(run, racing, "race", given=given, **beside, **axes)
     found = {(row["seed"], row["arm"]): row for row in rows}
 
     def judged(seed, arm):

@@ -20,7 +20,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -29,6 +29,10 @@ from codesign.errors import CodesignError
 
 Key = TypeVar("Key")
 RUNNING: set[subprocess.Popen] = set()
+
+
+class KilledError(CodesignError):
+    """A process that a signal ended, such as that of a machine without memory."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +128,7 @@ def apart(
       function: of the top level of a module.
       arguments, keywords: plain values, as JSON keeps them; so is what it returns.
       environment: variables that the process has besides those of this one.
-    Raises: CodesignError with the last line of its stderr when the process fails.
+    Raises: CodesignError with the last line of its stderr when the process fails, KilledError when a signal ended it.
     """
     name = f"{function.__module__}:{function.__qualname__}"
     process = subprocess.Popen(
@@ -148,7 +152,8 @@ def apart(
     if process.returncode:
         last = (complaint.strip().splitlines() or ["no word"])[-1][:300]
         given = ", ".join(map(str, (*arguments, *keywords.values())))
-        raise CodesignError(f"{function.__name__}({given}) ended with code {process.returncode}: {last}")
+        kind = KilledError if process.returncode < 0 else CodesignError
+        raise kind(f"{function.__name__}({given}) ended with code {process.returncode}: {last}")
     return json.loads(said)
 
 
@@ -198,8 +203,8 @@ def _largest_mb():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
 
 
-def _called(name, arguments, keywords):
-    """JSON of what the function with this name returns."""
+def called(name: str, arguments: Sequence[Any], keywords: Mapping[str, Any]) -> str:
+    """JSON of what the function with this name ("module:function") returns; what it prints goes to stderr."""
     import codesign  # noqa: F401  (first: it sets OpenMP's wait policy before torch is imported)
 
     module, function = name.split(":")
@@ -209,4 +214,4 @@ def _called(name, arguments, keywords):
 
 
 if __name__ == "__main__":
-    print(_called(sys.argv[1], *json.loads(sys.argv[2])))
+    print(called(sys.argv[1], *json.loads(sys.argv[2])))

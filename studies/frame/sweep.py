@@ -15,14 +15,13 @@ import json
 import re
 import statistics
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed, wait
 from contextlib import closing
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from codesign.errors import DomainError, FileFormatError
-from studies.frame import bench
+from studies.frame import workers
 from studies.frame.run import Run
 
 Row = dict[str, Any]
@@ -35,6 +34,7 @@ def sweep(
     processes: int = 0,
     turns: int = 1,
     given: Mapping[str, Any] = MappingProxyType({}),
+    cluster: str = "",
     **axes: Iterable[Any] | Mapping[str, Any],
 ) -> list[Row]:
     """Rows of every combination of the axes; those that an earlier session wrote are read back.
@@ -44,10 +44,11 @@ def sweep(
         such rows.
       name: of the table, <name>.jsonl, and of the progress bar.
       processes: 0 calls ``cell`` here; otherwise each call gets a fresh process, so many at a time, and
-        ``cell`` stands at the top level of a module.
+        ``cell`` stands at the top level of a module. A process that is killed is asked again.
       turns: how often every cell is asked, all cells in turns, so that what else the machine does meets all;
         of figures that are numbers the rows have the medians.
       given: further arguments of every call, which are no axes.
+      cluster: address of a Ray cluster instead ("auto": that of this machine; "here": one of its own).
       axes: name -> values as JSON keeps them (numbers, text), or label -> value of any kind, where the row
         has the label. The last axis changes fastest.
     Returns: the long table, in the order of the axes: a row has the axes' values, then the figures.
@@ -64,7 +65,7 @@ def sweep(
     cells = [dict(zip(axes, point, strict=True)) for point in itertools.product(*map(list, axes.values()))]
     asked = cells if turns == 1 else [{**point, "turn": turn} for turn in range(turns) for point in cells]
     missing = [point for point in asked if _key(point) not in known]
-    measured = _measured(cell, missing, axes, given, processes)
+    measured = _measured(cell, missing, axes, given, processes, cluster)
     with (
         run.progress(len(asked), name, done=len(asked) - len(missing)) as progress,
         closing(measured),  # an interruption ends the processes
@@ -123,7 +124,7 @@ def plain(*words: object) -> str:
     return "_".join(re.findall(r"\w+", " ".join(map(str, words)))).lower()
 
 
-def _measured(cell, points, axes, given, processes) -> Generator[tuple[Row, Any]]:
+def _measured(cell, points, axes, given, processes, cluster) -> Generator[tuple[Row, Any]]:
     """Each point with what ``cell`` returns for it, in the order in which they are done."""
 
     def values(point):
@@ -132,20 +133,17 @@ def _measured(cell, points, axes, given, processes) -> Generator[tuple[Row, Any]
             for axis, values in axes.items()
         } | given
 
-    if not processes:
+    if not processes and not cluster:
         for point in points:
             yield point, cell(**values(point))
         return
-    with ThreadPoolExecutor(processes) as pool:
-        waiting = {pool.submit(bench.apart, cell, **values(point)): point for point in points}
-        try:
-            for done in as_completed(waiting):
-                yield waiting[done], done.result()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-            # one that is just being started is met by a later round
-            while wait(waiting, timeout=0.1).not_done:
-                bench.end_running()
+    calls = {number: values(point) for number, point in enumerate(points)}
+    answers = (
+        workers.on_cluster(cell, calls, cluster) if cluster else workers.in_processes(cell, calls, processes)
+    )
+    with closing(answers):
+        for number, found in answers:
+            yield points[number], found
 
 
 def _key(point):

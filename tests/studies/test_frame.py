@@ -3,8 +3,10 @@
 import json
 import math
 import os
+import signal
 import sys
 import time
+from pathlib import Path
 from statistics import stdev
 
 import numpy as np
@@ -12,7 +14,13 @@ import pytest
 import torch
 from matplotlib.patches import Rectangle
 
-from codesign.errors import CodesignError, DomainError, FileFormatError, ShapeError
+from codesign.errors import (
+    CodesignError,
+    DomainError,
+    FileFormatError,
+    MissingPackageError,
+    ShapeError,
+)
 from studies.frame import bench, compare, show
 from studies.frame.bench import Timing, apart, measure, turns
 from studies.frame.compare import Interval, bootstrap, student
@@ -85,6 +93,44 @@ def test_cells_in_processes_give_the_same_table(run):
     with pytest.raises(CodesignError, match=r"power\(-1, 2\) ended with code 1.*not below 0"):
         sweep(run, power, "refused", processes=2, given={"base": 2}, exponent=(-1,))
     assert not bench.RUNNING
+
+
+def killed_once(folder, exponent):
+    """Ends as by the system's memory killer, the first time."""
+    mark = Path(folder) / str(exponent)
+    if not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return {"power": 2**exponent}
+
+
+@pytest.mark.parametrize("way", [{"processes": 2}, {"cluster": "here"}])
+def test_cells_whose_worker_is_killed_are_asked_again(run, way, tmp_path):
+    if "cluster" in way:
+        pytest.importorskip("ray")
+    found = sweep(run, killed_once, given={"folder": str(tmp_path)}, exponent=(1, 5, 6), **way)
+    assert column(found, "power") == [2, 32, 64]
+    assert len((run.folder / "table.jsonl").read_text().splitlines()) == 3
+
+
+def killed(exponent):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_worker_that_is_killed_again_and_again_ends_the_sweep(run):
+    with pytest.raises(CodesignError, match=r"killed\(1\) ended with code -9"):
+        sweep(run, killed, processes=1, exponent=(1,))
+
+
+def test_a_cluster_refuses_in_a_sentence(run, monkeypatch):
+    pytest.importorskip("ray")
+    with pytest.raises(CodesignError, match=r"power failed on the cluster: .*not below 0"):
+        sweep(run, power, cluster="here", given={"base": 2}, exponent=(-1,))
+    with pytest.raises(CodesignError, match=r"no Ray cluster at '127\.0\.0\.1:1'"):
+        sweep(run, power, cluster="127.0.0.1:1", given={"base": 2}, exponent=(1,))
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(MissingPackageError, match=r"codesign\[cluster\]"):
+        sweep(run, power, cluster="here", given={"base": 2}, exponent=(1,))
 
 
 def slow(seconds):

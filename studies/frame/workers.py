@@ -1,0 +1,100 @@
+"""Calls in processes of their own, on this machine or on the nodes of a Ray cluster. A worker that is killed is asked
+again; one that fails by itself ends all of them."""
+
+import json
+import os
+import socket
+import sys
+from collections.abc import Callable, Generator, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed, wait
+from threading import Event
+from typing import Any, TypeVar
+
+from codesign.errors import CodesignError
+from codesign.optional import require
+from studies.frame import bench
+
+Key = TypeVar("Key")
+TRIES = 3
+PATIENCE_S = 5.0  # with the head of a cluster
+HERE = "here"  # a Ray of this machine's own, for the time of the calls
+
+
+def in_processes(
+    function: Callable[..., Any], calls: Mapping[Key, Mapping[str, Any]], processes: int
+) -> Generator[tuple[Key, Any]]:
+    """What a function of the top level of a module returns for the arguments of each call, in the order in which they are
+    done: so many fresh processes at a time.
+
+    Raises: CodesignError of a call that fails, or whose worker was killed TRIES times.
+    """
+    ending = Event()
+
+    def tried(given):
+        for left in reversed(range(TRIES)):
+            try:
+                return bench.apart(function, **given)
+            except bench.KilledError:
+                if ending.is_set() or not left:
+                    raise
+        raise AssertionError("unreachable")
+
+    with ThreadPoolExecutor(processes) as pool:
+        waiting = {pool.submit(tried, given): key for key, given in calls.items()}
+        try:
+            for done in as_completed(waiting):
+                yield waiting[done], done.result()
+        finally:
+            ending.set()
+            pool.shutdown(wait=False, cancel_futures=True)
+            # one that is just being started is met by a later round
+            while wait(waiting, timeout=0.1).not_done:
+                bench.end_running()
+
+
+def on_cluster(
+    function: Callable[..., Any], calls: Mapping[Key, Mapping[str, Any]], address: str
+) -> Generator[tuple[Key, Any]]:
+    """The same on a Ray cluster, a core a call. The package is installed on its nodes, at the same version.
+
+    Args:
+      address: of its head, "auto" for the one that this machine belongs to, HERE for one of its own.
+    Raises: MissingPackageError without Ray; CodesignError where there is no cluster, or as ``in_processes``.
+    """
+    ray = require("ray", "cluster", "a sweep over a cluster")
+    environment = {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
+    alone = address == HERE
+    try:
+        if ":" in address:  # ray would try for minutes
+            host, _, port = address.rpartition(":")
+            socket.create_connection((host, int(port)), timeout=PATIENCE_S).close()
+        ray.init(
+            address="local" if alone else address,
+            runtime_env={"env_vars": environment} if alone else None,
+            include_dashboard=False if alone else None,
+            log_to_driver=False,
+            logging_level="ERROR",
+        )
+    except (OSError, ValueError, RuntimeError) as error:
+        raise CodesignError(f"there is no Ray cluster at '{address}' ({error}).") from error
+    try:
+        name = f"{function.__module__}:{function.__qualname__}"
+        ask = ray.remote(num_cpus=1, max_retries=TRIES - 1, max_calls=1)(_asked)
+        waiting = {ask.remote(name, json.dumps(dict(given))): key for key, given in calls.items()}
+        while waiting:
+            done, _ = ray.wait(list(waiting))
+            for each in done:
+                try:
+                    yield waiting.pop(each), json.loads(ray.get(each))
+                except ray.exceptions.RayError as error:
+                    last = str(error).strip().splitlines()[-1][:300]
+                    raise CodesignError(f"a call of {name} failed on the cluster: {last}") from error
+    finally:
+        ray.shutdown()
+
+
+def _asked(name, given):
+    """On a node."""
+    from studies.frame.bench import called
+
+    return called(name, [], json.loads(given))
