@@ -24,7 +24,7 @@ BUDGETS = {
     "scenes/windows": 8_700,
     "setup": 1_400,
     "studies": 7_100,
-    "studies/codesign": 11_650,
+    "studies/codesign": 12_000,
     "studies/flow_quality": 5_300,
     "studies/flow_recording": 3_200,
     "studies/frame": 7_850,

@@ -296,6 +296,23 @@ def moved(T_world_body: Tensor, twist: Tensor) -> Tensor:
     return T_world_body[:, None] @ se3_exp((times() - MIDDLE_S)[:, None] * twist[:, None])
 
 
+def slowed(pair: RobotPair, share: float) -> RobotPair:
+    """The same drives through the same places at a share of their speed.
+
+    >>> from scenes.robots.pairs import PAIRS
+    >>> pair = PAIRS["outdoors"]()
+    >>> (poses, twist), (slow, third) = (each.drive(0, 2) for each in (pair, slowed(pair, 0.3)))
+    >>> bool(torch.allclose(third, 0.3 * twist)), float((slow - poses)[:, FRAMES // 2].abs().max()) < 2e-2
+    (True, True)
+    """
+
+    def drive(number: int, motions: int) -> tuple[Tensor, Tensor]:
+        poses, twist = pair.drive(number, motions)
+        return moved(poses[:, 0] @ se3_exp(MIDDLE_S * twist), share * twist), share * twist
+
+    return replace(pair, drive=drive)
+
+
 def speeds_and_deviates(number: int, motions: int, columns: int) -> tuple[Tensor, Tensor]:
     """Speeds [M] m/s, even in the logarithm over SPEED_M_S, and standard normal numbers [M, columns]; each of
     them spread evenly over its distribution, in an order of its own (a Latin hypercube)."""

@@ -27,7 +27,7 @@ from studies.codesign.arms import ARMS
 from studies.codesign.design import Space
 from studies.codesign.landscape import landscape
 from studies.codesign.problem import Drawn
-from studies.codesign.race import Judge, compared, racing, spread_over, start
+from studies.codesign.race import SPACE, Judge, compared, racing, spread_over, start
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.sweep import Row, sweep
 from studies.placement.look import size_in_words
@@ -60,6 +60,10 @@ class Config(StudyConfig):
     """Family of traced lenses, or thin."""
     light: float = 1.0
     """Share of daylight."""
+    speed: float = 1.0
+    """Share of the drives' speed."""
+    hold: tuple[str, ...] = ()
+    """Numbers that are held elsewhere than the pair has them, such as fno=4."""
     free: tuple[str, ...] = ()
     """Numbers that are designed, the others being held as the pair has them; all when left out."""
     arms: tuple[str, ...] = tuple(ARMS)
@@ -93,7 +97,7 @@ class Config(StudyConfig):
     cluster: str = ""
     """Address of a Ray cluster on whose cores arms race instead: "auto" for that of this machine, "here" for one of its own."""
     raw: Path | None = None
-    """Answers of earlier runs (answers.jsonl of their folder): what is there is not raced again."""
+    """Answers of earlier runs (answers.jsonl of their folder, or race.jsonl of one that was cut): not raced again."""
 
 
 def study(run: Run[Config]) -> None:
@@ -103,7 +107,15 @@ def study(run: Run[Config]) -> None:
         run.say("This study computes on the CPU; the device asked for stays unused.")
     family = None if size.family == THIN else size.family
     pair = str(size.robot) if size.robot else size.pair
-    space = Space.of(pair, family, size.light, size.free)
+    told = ("light", "speed", "worlds", "per_draw", "steps", "settling")
+    setting: dict[str, Any] = {
+        **{name: getattr(size, name) for name in told},
+        "pair": pair,
+        "family": family,
+        "free": list(size.free),
+        "held": held(size.hold),
+    }
+    space = Space.of(**{name: setting[name] for name in SPACE})
     if size.robot:
         run.say(size_in_words(space.pair))
         check_pair(space.pair, space.made(space.start).camera, (0, robot_pair.UNSEEN_FROM))
@@ -116,14 +128,7 @@ def study(run: Run[Config]) -> None:
         *spread_over(size.worlds, size.per_draw),
         gates.calibration,
     )
-    told = ("light", "worlds", "per_draw", "steps", "settling")
-    setting = {
-        **{name: getattr(size, name) for name in told},
-        "pair": pair,
-        "family": family,
-        "free": list(size.free),
-        "calibration": list(astuple(gates.calibration)),
-    }
+    setting["calibration"] = list(astuple(gates.calibration))
     judge = Judge(space, size.judged_worlds, size.judged_drives)
     rows = raced(run, judge, setting) if size.seeds else []
     said = page.lead(run, space, rows, judge)
@@ -156,8 +161,9 @@ def raced(run: Run[Config], judge: Judge, setting: dict[str, Any]) -> list[Row]:
     axes = {"seed": range(size.seed, size.seed + size.seeds), "arm": size.arms}
     if size.raw is not None and not run.resumed:
         known = size.raw.read_bytes()
-        for name in ("race", "answers"):
-            write_atomic(run.path(f"{name}.jsonl"), known)
+        write_atomic(run.path("race.jsonl"), known)
+        if b'"head_errors"' in known:  # as they were judged
+            write_atomic(run.path("answers.jsonl"), known)
     beside = {"processes": size.processes, "cluster": size.cluster}
     given = {"setting": setting, "threads": 1 if any(beside.values()) else 0}
     rows = sweep(run, racing, "race", given=given, **beside, **axes)
@@ -165,7 +171,7 @@ def raced(run: Run[Config], judge: Judge, setting: dict[str, Any]) -> list[Row]:
 
     def judged(seed, arm):
         row = {name: value for name, value in found[seed, arm].items() if name not in axes}
-        return {**row, "errors": judge(row["share"]), "setting": setting}
+        return {**row, **judge(row["share"]), "setting": setting}
 
     answers = sweep(run, judged, "answers", **axes)
     other = [row for row in answers if row["setting"] != setting]
@@ -174,6 +180,18 @@ def raced(run: Run[Config], judge: Judge, setting: dict[str, Any]) -> list[Row]:
             f"'{size.raw}' has answers of another setting, {other[0]['setting']}; this race is of {setting}."
         )
     return answers
+
+
+def held(told: Sequence[str]) -> dict[str, float]:
+    """Numbers by name, from "name=number" each."""
+    found = {}
+    for each in told:
+        name, _, value = each.partition("=")
+        try:
+            found[name] = float(value)
+        except ValueError as error:
+            raise DomainError(f"--hold {each}: give a number by name, such as fno=4.") from error
+    return found
 
 
 def checked(size: Config) -> None:
@@ -186,6 +204,10 @@ def checked(size: Config) -> None:
         lens.family(size.family)
     if not 0 < size.light <= 1:
         raise DomainError(f"--light is {size.light:g}; a share of daylight above 0 and at most 1 is needed.")
+    if not 0 < size.speed <= 1:
+        raise DomainError(
+            f"--speed is {size.speed:g}; a share of the drives' speed above 0 and at most 1 is needed."
+        )
     if size.seeds < 0:
         raise DomainError(f"--seeds is {size.seeds}; 0 or more are needed.")
     for name in ("worlds", "per_draw", "judged_worlds", "judged_drives", "designs", "settling"):
@@ -205,8 +227,10 @@ def checked(size: Config) -> None:
     unknown = [name for name in size.arms if name not in ARMS]
     if unknown:
         raise DomainError(f"--arms {unknown[0]}: choose from {', '.join(ARMS)}.")
-    if "joint" not in size.arms or len(set(size.arms)) < len(size.arms):
-        raise DomainError("--arms needs joint, with which all others are compared, and each name once.")
+    if "joint" not in size.arms or not 1 < len(size.arms) == len(set(size.arms)):
+        raise DomainError(
+            "--arms needs joint, with which all others are compared, another one, and each name once."
+        )
     if size.processes < 0:
         raise DomainError(f"--processes is {size.processes}; 0 or more are needed.")
     if size.raw is not None and not size.raw.is_file():

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -52,10 +53,10 @@ class Space:
 
     pair: robot, worlds and drives, behind a thin lens or the traced ones of a family. costs: what a design pays.
     free: names of the numbers that shares are of, all of BLOCKS that its lens has and that have room when left out;
-      the others are held as the pair's own design has them. bounds: name -> (low, high), in place of those of the pair or of BOUNDS.
+      the others are held as the pair's own design, or ``held``, has them. bounds: name -> (low, high), in place of those of the pair or of BOUNDS.
     Raises: DomainError for a name that is unknown or bounds that leave out the held design.
 
-    >>> space = Space.of("outdoors", None, 1.0, ())
+    >>> space = Space.of("outdoors", None)
     >>> round(space.numbers(space.start)["efl_mm"], 6)
     6.5
     """
@@ -63,18 +64,27 @@ class Space:
     pair: RobotPair
     costs: Costs = field(default_factory=Costs)
     free: tuple[str, ...] = ()
+    held: Mapping[str, float] = field(default_factory=dict)
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     rays_per_px: int = robot_pair.RAYS_PER_PX
 
     def __post_init__(self) -> None:
         known = [name for names in BLOCKS.values() for name in names]
         if not self.free:
-            own = [name for name in known if name != "bending" or self.pair.family]
-            roomy = [name for name in own if self.limits(name)[0] < self.limits(name)[1]]
+            own = [
+                name for name in known if name not in self.held and (name != "bending" or self.pair.family)
+            ]
+            roomy = [name for name in own if name in self.bounds or self._has_room(name)]
             object.__setattr__(self, "free", tuple(roomy))
-        for name in (*self.free, *self.bounds):
+        for name in (*self.free, *self.held, *self.bounds):
             if name not in known:
                 raise DomainError(f"a design has no number '{name}'; there are {', '.join(known)}.")
+        for name, value in self.held.items():
+            low, high = self.limits(name)
+            if name in self.free or not low <= value <= high:
+                raise DomainError(
+                    f"{name} is to be held at {value:g}; give a value within {low:g} to {high:g} of a number that is not free."
+                )
         for name in self.free:
             low, high = self.limits(name)
             if not low < high:
@@ -85,16 +95,25 @@ class Space:
                 )
 
     @staticmethod
-    def of(pair: str, family: str | None, light: float, free: Sequence[str]) -> "Space":
+    def of(
+        pair: str,
+        family: str | None,
+        light: float = 1.0,
+        speed: float = 1.0,
+        free: Sequence[str] = (),
+        held: Mapping[str, float] = MappingProxyType({}),
+    ) -> "Space":
         """By names: of one of the three pairs or of an own robot's page (.yaml), behind a thin lens for None, in a share of
-        daylight."""
+        daylight, at a share of the drives' speed."""
         found = PAIRS[pair]() if pair in PAIRS else own_pair(pair)
-        return Space(replace(found, family=family), Costs(light=light), tuple(free))
+        if speed != 1:
+            found = robot_pair.slowed(found, speed)
+        return Space(replace(found, family=family), Costs(light=light), tuple(free), held)
 
     @cached_property
     def default(self) -> dict[str, float]:
         """The pair's own design."""
-        return {**vars(self.pair.design), **DEFAULTS}
+        return {**vars(self.pair.design), **DEFAULTS, **self.held}
 
     def limits(self, name: str) -> tuple[float, float]:
         """Bounds of a number."""
@@ -104,6 +123,10 @@ class Space:
             return lens.family(self.pair.family).fno
         low, high = (getattr(each, name, None) for each in (self.pair.low, self.pair.high))
         return BOUNDS[name] if name in BOUNDS and low == high else (low, high)
+
+    def _has_room(self, name):
+        low, high = self.limits(name)
+        return low < high
 
     def block(self, name: str) -> list[int]:
         """Places of a block's numbers among those that are free."""

@@ -61,7 +61,7 @@ def handed(run: Run[Any], judge: Judge, whole: Whole, error: float) -> None:
     path = run.path("design.yaml")
     save(path, whole, error)
     back = loaded(path, whole)
-    again = judge.of(back)
+    again = judge.of(back)["errors"]
     run.record(hand_over_score=error, hand_over_score_again=sum(again) / len(again))
     run.section(
         "Hand-over",

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from codesign.mount import (
+    EgoVelocity,
     FlowErrors,
     Readings,
     Requirement,
@@ -74,6 +75,11 @@ class Drawn:
     def _system(self):
         return self.space.pair.system(self.space.pair.design)
 
+    @property
+    def estimate(self) -> EgoVelocity:
+        """Velocities by least squares, as the pair has them."""
+        return self._system.estimate
+
     @cached_property
     def requirements(self) -> list[Requirement]:
         """Of the mount."""
@@ -125,7 +131,7 @@ class Drawn:
     ) -> tuple[Seen, Tensor]:
         """What flow in the windows is of, behind mounts [M, 4, 4] (``scenes``) and a camera each, and its optics [N,
         windows, 2] (``window_optics``)."""
-        estimator = self._system.estimate
+        estimator = self.estimate
         each = batch.T_world_body.shape[1] // len(mounts)
         of_drive = mounts.repeat_interleave(each, 0)
         T_world_cam = batch.T_world_body @ of_drive[:, None]
@@ -148,7 +154,7 @@ class Drawn:
     def expected(self, seen: Seen, read: Readings, errors: FlowErrors) -> Tensor:
         """Mean bounded error [N] to be expected of drives: over errors drawn from their normal distribution,
         the same for all designs."""
-        estimator = self._system.estimate
+        estimator = self.estimate
         axes = list(self.space.pair.axes)
         found = expected_errors(estimator, read, seen.seen_twist, seen.true_rows, errors)
         mean = (found.mean + seen.seen_twist - seen.twist)[:, axes]

@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import drjit
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
+from codesign.mount import VelocityHead
 from codesign.mount.requirements import first_missed
 from scenes.robots import pair as robot_pair
 from studies.codesign.arms import ARMS, Task, read_out
@@ -22,6 +23,7 @@ from studies.frame.compare import Interval, crossed, holm, sign_flip
 
 EDGE = 0.1  # of the cube, that starts keep from its walls
 TRIES = 10_000
+SPACE = ("pair", "family", "light", "speed", "free", "held")  # of a setting (``Space.of``)
 JUDGED = 7_700_000  # number of the judge's draw
 
 
@@ -84,7 +86,7 @@ def racing(seed: int, arm: str, setting: Mapping[str, Any], threads: int = 0) ->
 def _drawn(told: str) -> Drawn:
     """Training worlds of a setting, as JSON says it."""
     setting = json.loads(told)
-    space = Space.of(*(setting[name] for name in ("pair", "family", "light", "free")))
+    space = Space.of(**{name: setting[name] for name in SPACE})
     spread = spread_over(setting["worlds"], setting["per_draw"])
     calibration = Calibration(*setting["calibration"])
     return Drawn(space, robot_pair.training(setting["worlds"]), *spread, calibration)
@@ -103,21 +105,30 @@ class Judge:
         self.drawn = Drawn(space, robot_pair.unseen(worlds), worlds, per_world)
         self.worlds = worlds
 
-    def __call__(self, share: Sequence[float]) -> list[float]:
-        """Mean bounded error in each world of shares [V]."""
+    def __call__(self, share: Sequence[float]) -> dict[str, list[float]]:
+        """Of shares [V] the mean bounded errors in each world: ``errors`` of least squares, and ``head_errors`` of the
+        delivered velocity head on the same flow."""
         return self.of(self.drawn.space.made(torch.tensor(share, dtype=torch.float64)))
 
-    def of(self, whole: Whole) -> list[float]:
+    def of(self, whole: Whole) -> dict[str, list[float]]:
         """The same, of a design."""
         looked = self.drawn.looked(whole, self.drawn.draw(JUDGED), "sensor")
-        of_worlds = looked.hard().unflatten(0, (self.worlds, -1)).mean(1)
-        return [round(error, 6) for error in of_worlds.tolist()]
+        return {name: self._by_world(looked.hard(head)) for name, head in self._heads.items()}
+
+    @cached_property
+    def _heads(self):
+        return {"errors": None, "head_errors": VelocityHead.pretrained(self.drawn.estimate)}
+
+    def _by_world(self, errors):
+        return [round(error, 6) for error in errors.unflatten(0, (self.worlds, -1)).mean(1).tolist()]
 
 
-def compared(rows: Sequence[Mapping[str, Any]], ours: str = "joint") -> dict[str, tuple[Interval, float]]:
+def compared(
+    rows: Sequence[Mapping[str, Any]], ours: str = "joint", of: str = "errors"
+) -> dict[str, tuple[Interval, float]]:
     """The log ratio of our error to each rival's over paired seeds and worlds, and its p after Holm."""
     errors = {
-        arm: torch.tensor([row["errors"] for row in rows if row["arm"] == arm], dtype=torch.float64)
+        arm: torch.tensor([row[of] for row in rows if row["arm"] == arm], dtype=torch.float64)
         for arm in dict.fromkeys(row["arm"] for row in rows)
     }
     logs = {arm: (errors[ours] / theirs).log() for arm, theirs in errors.items() if arm != ours}

@@ -46,6 +46,13 @@ def test_shares_and_numbers_of_a_design_are_each_other(space):
     assert space.numbers(space.start)["efl_mm"] == pytest.approx(6.5)
 
 
+def test_numbers_are_held_where_they_are_told_to_be():
+    space = Space.of("outdoors", None, held={"fno": 4.0})
+    assert "fno" not in space.free
+    assert space.made(space.start).numbers["fno"] == 4.0
+    assert space.costs.gain(4.0) == pytest.approx(0.09)
+
+
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
@@ -222,6 +229,12 @@ def test_the_comparison_is_of_pairs():
         (["--per-draw", "7", "--worlds", "3"], "spread evenly"),
         (["--family", "fisheye-9"], "no lens family"),
         (["--free", "colour"], "no number 'colour'"),
+        (["--speed", "2"], "share of the drives' speed"),
+        (["--hold", "fno"], "such as fno=4"),
+        (["--hold", "fno=40"], "give a value within 1.2 to 8"),
+        (["--arms", "joint"], "another one"),
+        (["--processes", "-1"], "0 or more"),
+        (["--raw", "nowhere.jsonl"], "no such file"),
     ],
 )
 def test_wrong_command_lines_end_with_a_sentence(wrong, said, tmp_path, capsys):
@@ -247,6 +260,7 @@ def test_a_small_race_says_that_it_decides_nothing(tmp_path, monkeypatch):
     numbers = json.loads((folder / "metrics.json").read_text())
     assert numbers["race_joint_drives"] == 2
     assert 0 < numbers["race_joint_median"] <= 1
+    assert 0 < numbers["race_joint_median_with_head"] <= 1
     assert 0 <= numbers["parts_lens_and_mount_coupling"] < 1
     assert -1 <= numbers["read_out_expected_rank_all"] <= 1
     assert numbers["hand_over_score_again"] == pytest.approx(numbers["hand_over_score"], abs=1e-6)
