@@ -104,8 +104,29 @@ def race(run: Run[Any], pair: str, found: Mapping[str, tuple[Interval, float]], 
         }
         caption = "Error of the joint design over that of each arm: median over starts, 95 % of resampled starts and worlds."
         run.figure(bars(ratios, "joint / arm", log=True, level=1.0), "ratios", caption)
+        trails(run, rows)
         best = max(ratios, key=lambda arm: ratios[arm].value)
         run.card(f"joint over {best}", f"{ratios[best].value:.2f}", f"{ratios[best]:.2f}")
+
+
+def trails(run: Run[Any], rows: Sequence[Row]) -> None:
+    """Expected errors on the way, of arms all of whose answers know theirs."""
+    series, bands = {}, {}
+    for arm in run.config.arms:
+        ways = [row.get("trail") for row in rows if row["arm"] == arm]
+        if not all(ways) or len({len(way) for way in ways}) > 1:
+            continue
+        middle = [0.25, 0.5, 0.75]
+        ends = torch.quantile(
+            torch.tensor(ways, dtype=torch.float64), torch.tensor(middle, dtype=torch.float64), 0
+        )
+        drives = [run.config.per_draw * (step + 1) for step in range(ends.shape[1])]
+        series[arm] = (drives, ends[1].tolist())
+        bands[arm] = (drives, ends[0].tolist(), ends[2].tolist())
+    if series:
+        chart = Panel(series, "drives rendered", "error expected", bands=bands)
+        caption = "Errors to be expected of what each arm looks at, on its own drives: median over starts, and the middle half."
+        run.figure(panels(chart, width=8.0), "trails", caption)
 
 
 def shown(

@@ -65,6 +65,7 @@ def run_arm(drawn: Drawn, arm: str, seed: int, steps: int, settling: int) -> dic
         "share": chosen.tolist(),
         "kept": bool(chosen is answer),
         "expected": way.errors[-1] if way.errors else None,
+        "trail": [round(error, 5) for error in way.errors],
         "drives": drawn.rendered - rendered,
         "cpu_s": time.process_time() - begun,
         **{name: value for name, value in space.numbers(chosen).items() if name in space.free},

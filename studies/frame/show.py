@@ -13,7 +13,7 @@ lens_layout.
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -93,13 +93,14 @@ def asked(run: Run, figures: Iterable[Asked], title: str = "Against what was ask
 @dataclass(frozen=True)
 class Panel:
     """One chart. series: label -> (x, y). log: axes that are logarithmic, of "xy". levels: heights of
-    dashed lines."""
+    dashed lines. bands: label -> (x, low, high), shaded in the colour of the series of that label."""
 
     series: Mapping[str, tuple[Any, Any]]
     xlabel: str
     ylabel: str
     log: str = ""
     levels: Sequence[float] = ()
+    bands: Mapping[str, tuple[Any, Any, Any]] = field(default_factory=dict)
 
 
 def panels(*charts: Panel, width: float = 4.5) -> Figure:
@@ -109,6 +110,9 @@ def panels(*charts: Panel, width: float = 4.5) -> Figure:
     )
     for axis, chart in zip(axes[0], charts, strict=True):
         draw_curves(axis, chart.series, chart.xlabel, chart.ylabel, chart.log, chart.levels)
+        colours = {line.get_label(): line.get_color() for line in axis.get_lines()}
+        for label, (x, low, high) in chart.bands.items():
+            axis.fill_between(x, low, high, color=colours[label], alpha=0.12, linewidth=0)
     if max(len(chart.series) for chart in charts) > 1:
         handles = {
             label: line
