@@ -27,13 +27,14 @@ from studies.codesign.arms import ARMS
 from studies.codesign.design import Space
 from studies.codesign.landscape import landscape
 from studies.codesign.problem import Drawn
-from studies.codesign.race import SPACE, Judge, compared, racing, spread_over, start
+from studies.codesign.race import SPACE, Judge, compared, racing, spread_over, start, taken_up
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.sweep import Row, sweep
 from studies.placement.look import size_in_words
 from studies.placement.searches import SEARCHES, available
 
 THIN = "thin"
+MOST_WORLDS = 200  # from 500 on are those of the landscape, from 700 on those of the read-outs
 LEAST_STEPS = 16  # of which an eighth is left to each block of eight sweeps
 
 
@@ -114,8 +115,10 @@ def study(run: Run[Config]) -> None:
         "family": family,
         "free": list(size.free),
         "held": held(size.hold),
+        "judge": [size.judged_worlds, size.judged_drives],
     }
     space = Space.of(**{name: setting[name] for name in SPACE})
+    setting["page"] = space.pair.page
     if size.robot:
         run.say(size_in_words(space.pair))
         check_pair(space.pair, space.made(space.start).camera, (0, robot_pair.UNSEEN_FROM))
@@ -129,6 +132,9 @@ def study(run: Run[Config]) -> None:
         gates.calibration,
     )
     setting["calibration"] = list(astuple(gates.calibration))
+    if size.raw is not None and not run.path("race.jsonl").exists():
+        for name, known in zip(("race", "answers"), taken_up(size.raw, setting), strict=True):
+            write_atomic(run.path(f"{name}.jsonl"), known)
     judge = Judge(space, size.judged_worlds, size.judged_drives)
     rows = raced(run, judge, setting) if size.seeds else []
     said = page.lead(run, space, rows, judge)
@@ -146,9 +152,20 @@ def study(run: Run[Config]) -> None:
 
 
 def around_the_best(run: Run[Config], drawn: Drawn, rows: Sequence[Row]) -> None:
-    """Couplings around the joint answer of which least error is expected, and what the orders would leave by them."""
+    """Couplings around the joint answer of which least error is expected on one fresh draw, and what the orders would leave
+    by them."""
     ours = [row for row in rows if row["arm"] == "joint"]
-    at = torch.tensor(min(ours, key=lambda row: row["expected"])["share"], dtype=torch.float64)
+    fresh = drawn.draw(couplings.FIRST - 1)
+
+    def expected(row):
+        return float(
+            drawn.looked(
+                drawn.space.made(torch.tensor(row["share"], dtype=torch.float64)), fresh
+            ).expected.mean()
+        )
+
+    at = torch.tensor(min(ours, key=expected)["share"], dtype=torch.float64)
+    at = at.clamp(couplings.STEP, 1 - couplings.STEP)
     starts = [start(drawn.space, seed) for seed in dict.fromkeys(row["seed"] for row in ours)]
     measured = {arm: math.exp(-over.value) for arm, (over, _) in compared(rows).items()}
     pulls = couplings.curvatures(run, drawn, at, run.config.couplings)
@@ -159,11 +176,6 @@ def raced(run: Run[Config], judge: Judge, setting: dict[str, Any]) -> list[Row]:
     """Every arm from every start, and its errors by the judge; those of ``raw`` are taken from there."""
     size = run.config
     axes = {"seed": range(size.seed, size.seed + size.seeds), "arm": size.arms}
-    if size.raw is not None and not run.resumed:
-        known = size.raw.read_bytes()
-        write_atomic(run.path("race.jsonl"), known)
-        if b'"head_errors"' in known:  # as they were judged
-            write_atomic(run.path("answers.jsonl"), known)
     beside = {"processes": size.processes, "cluster": size.cluster}
     given = {"setting": setting, "threads": 1 if any(beside.values()) else 0}
     rows = sweep(run, racing, "race", given=given, **beside, **axes)
@@ -173,13 +185,7 @@ def raced(run: Run[Config], judge: Judge, setting: dict[str, Any]) -> list[Row]:
         row = {name: value for name, value in found[seed, arm].items() if name not in axes}
         return {**row, **judge(row["share"]), "setting": setting}
 
-    answers = sweep(run, judged, "answers", **axes)
-    other = [row for row in answers if row["setting"] != setting]
-    if other:
-        raise DomainError(
-            f"'{size.raw}' has answers of another setting, {other[0]['setting']}; this race is of {setting}."
-        )
-    return answers
+    return sweep(run, judged, "answers", **axes)
 
 
 def held(told: Sequence[str]) -> dict[str, float]:
@@ -210,7 +216,12 @@ def checked(size: Config) -> None:
         )
     if size.seeds < 0:
         raise DomainError(f"--seeds is {size.seeds}; 0 or more are needed.")
-    for name in ("worlds", "per_draw", "judged_worlds", "judged_drives", "designs", "settling"):
+    if size.worlds > MOST_WORLDS or size.designs < 2:
+        raise DomainError(
+            f"--worlds is {size.worlds} and --designs {size.designs}; at most {MOST_WORLDS} worlds (others are for calibration) and "
+            "at least 2 designs are needed."
+        )
+    for name in ("worlds", "per_draw", "judged_worlds", "judged_drives", "settling"):
         if getattr(size, name) < 1:
             raise DomainError(f"--{name.replace('_', '-')} is {getattr(size, name)}; at least 1 is needed.")
     if size.grid < 2 or size.slopes == 1 or min(size.slopes, size.couplings, size.read_outs) < 0:

@@ -50,6 +50,8 @@ def descend(
     first: int,
     way: Way,
     before: Callable[[Tensor, Way], Tensor] = lambda share, way: share,
+    done: int = 0,
+    of: int = 0,
 ) -> Tensor:
     """Steps of equal length down the slope with momentum, shorter and shorter; fresh drives in each.
 
@@ -59,6 +61,7 @@ def descend(
       first: number of the first draw.
       way: what is looked at goes there.
       before: called before every step, for what is solved within it.
+      done, of: steps that went before, and all those over which their length falls; those of this call for 0.
     Returns: mean of the last quarter.
     """
     here, pace = start.clone(), torch.zeros_like(start)
@@ -71,7 +74,7 @@ def descend(
         blocked = ((here <= 0) & (slope > 0)) | ((here >= 1) & (slope < 0))
         slope = torch.where(blocked, 0.0, slope)
         pace = MOMENTUM * pace + (1 - MOMENTUM) * slope / slope.norm().clamp_min(1e-12)
-        length = FIRST_LENGTH * (LAST_LENGTH / FIRST_LENGTH) ** (step / max(1, steps - 1))
+        length = FIRST_LENGTH * (LAST_LENGTH / FIRST_LENGTH) ** ((done + step) / max(1, (of or steps) - 1))
         here = (here - length * pace / pace.norm().clamp_min(1e-12)).clamp(0, 1)
     return torch.stack([*mine, here][-max(1, round(END * steps)) :]).mean(0)
 
@@ -153,31 +156,37 @@ def joint(task: Task) -> tuple[Tensor, Way]:
 
 def ordered(names: tuple[str, ...]) -> Callable[[Task], tuple[Tensor, Way]]:
     """One block after the other, half of the steps for lens and mount each; sensor and estimator in their turn on
-    what is recorded."""
+    what is recorded, for which one step is spent where nothing is yet."""
 
     def arm(task):
         way, here = Way(), task.start
+        left = len(GEOMETRY)
         for name in names:
             if name == "read-out":
                 if not way.recorded:
                     task.look(here, way)
                 here = read_out(task, here, way)
             else:
-                here = task.descend(here, (name,), task.steps // 2, way)
+                here = task.descend(here, (name,), (task.steps - len(way.shares)) // left, way)
+                left -= 1
         return here, way
 
     return arm
 
 
 def alternating(sweeps: int) -> Callable[[Task], tuple[Tensor, Way]]:
-    """Lens, mount, sensor and estimator in turns."""
+    """Lens, mount, sensor and estimator in turns, steps shorter and shorter over all of them."""
 
     def arm(task):
         way, here = Way(), task.start
+        steps = task.steps // (len(GEOMETRY) * sweeps)
+        # a simplex has a corner more than numbers, and is to move once
+        tries = max(task.settling // sweeps, len(task.free("sensor", "network")) + 2)
         for _ in range(sweeps):
             for name in GEOMETRY:
-                here = task.descend(here, (name,), task.steps // (2 * sweeps), way)
-            here = read_out(task, here, way, max(1, task.settling // sweeps))
+                fallen = {"done": len(way.shares), "of": task.steps}
+                here = task.descend(here, (name,), steps, way, **fallen)
+            here = read_out(task, here, way, tries)
         return here, way
 
     return arm
@@ -219,7 +228,8 @@ def chosen_by_the_book(space: Space, requirements) -> dict[str, float]:
         if first_missed(requirements, made.T_body_cam, made.camera) is None:
             break
     near, far = space.limits("focus_per_m")
-    hyperfocal = 1e3 * fno * robot_pair.PITCH_MM / focal**2
+    has = space.made(space.share(efl_mm=focal, fno=fno)).numbers  # what is not free stays as it is held
+    hyperfocal = 1e3 * has["fno"] * robot_pair.PITCH_MM / has["efl_mm"] ** 2
     return {"efl_mm": focal, "fno": fno, "focus_per_m": min(max(hyperfocal, near), far)}
 
 
@@ -233,11 +243,14 @@ def searched(name: str) -> Callable[[Task], tuple[Tensor, Way]]:
         def judge(share):
             looked = drawn.looked(task.space.made(share), samples)
             error = float(looked.expected.mean()) + task.objective.penalty(share)
+            best = min(way.errors, default=math.inf)
+            recorded = [looked] if error < best else way.recorded
             way.add(share, error, looked)
+            way.recorded = recorded  # the read-out is settled on what the best design saw
             return error
 
         trail = SEARCHES[name](judge, task.start, task.steps, task.seed)
-        return trail.share[int(trail.error.argmin())], way
+        return trail.share[trail.best], way
 
     return arm
 

@@ -16,16 +16,16 @@ from studies.frame.show import tabulate
 from studies.frame.sweep import Row, sweep
 
 STEP = 0.12  # of the cube, to either side
-FIRST = 60_000  # number of the first draw
+FIRST = 5_500_000  # number of the first draw, beyond those of any race
+NULLS = 200  # draws of noise
 FLATTEST = 0.02  # of the largest curvature, below which none is taken
 READ_OUT = BLOCKS["sensor"] + BLOCKS["network"]
 PARTS = {"lens": BLOCKS["lens"], "mount": BLOCKS["mount"], "read-out": READ_OUT}
 
 
 def curvatures(run: Run[Any], drawn: Drawn, at: Tensor, draws: int) -> list[Row]:
-    """Rows of every draw and pair of numbers around shares [V]: the mixed second difference of the mean expected error, and
-    that error itself."""
-    at = at.clamp(STEP, 1 - STEP)
+    """Rows of every draw and pair of numbers around shares [V], a STEP off the bounds: the mixed second difference of the
+    mean expected error, and that error itself."""
     names = drawn.space.free
 
     def error(draw, *moves):
@@ -49,23 +49,40 @@ def curvatures(run: Run[Any], drawn: Drawn, at: Tensor, draws: int) -> list[Row]
     return sweep(run, cell, "couplings", draw=range(draws))
 
 
-def hessian(space: Space, rows: Sequence[Row]) -> tuple[Tensor, float]:
-    """Mean curvature [V, V] over the draws, made positive definite, and the mean error there."""
+def hessian(space: Space, rows: Sequence[Row]) -> tuple[Tensor, Tensor, float]:
+    """Mean curvature [V, V] over the draws, its standard error [V, V], and the mean error there."""
     size, draws = len(space.free), len({row["draw"] for row in rows})
-    found = torch.zeros(size, size, dtype=torch.float64)
+    found = torch.zeros(draws, size, size, dtype=torch.float64)
     for row in rows:
         a, b = space.free.index(row["one"]), space.free.index(row["other"])
-        found[a, b] += row["curvature"] / draws
-        if a != b:
-            found[b, a] += row["curvature"] / draws
-    values, vectors = torch.linalg.eigh(found)
-    values = values.clamp_min(FLATTEST * float(values.max()))
-    return vectors @ torch.diag(values) @ vectors.mT, sum(row["error"] for row in rows) / len(rows)
+        found[row["draw"], a, b] = found[row["draw"], b, a] = row["curvature"]
+    spread = found.std(0) if draws > 1 else torch.zeros_like(found[0])
+    return found.mean(0), spread / math.sqrt(draws), sum(row["error"] for row in rows) / len(rows)
+
+
+def bowl(curvature: Tensor) -> Tensor | None:
+    """The same [V, V] made positive definite; None where it bends upwards along nothing."""
+    values, vectors = torch.linalg.eigh(curvature)
+    if not float(values.max()) > 0:
+        return None
+    return vectors @ torch.diag(values.clamp_min(FLATTEST * float(values.max()))) @ vectors.mT
+
+
+def by_noise(space: Space, curvature: Tensor, error: Tensor) -> dict[str, float]:
+    """What couplings nineteen in twenty times are not above if there is none, by the standard errors [V, V] alone."""
+    generator = torch.Generator().manual_seed(0)
+    found: dict[str, list[float]] = {}
+    for _ in range(NULLS):
+        draw = torch.randn(curvature.shape, generator=generator, dtype=torch.float64).triu(1)
+        null = bowl(torch.diag(curvature.diagonal()) + error * (draw + draw.mT))
+        for name, value in (coupled(space, null) if null is not None else {}).items():
+            found.setdefault(name, []).append(value)
+    return {name: float(torch.tensor(values).quantile(0.95)) for name, values in found.items()}
 
 
 def coupled(space: Space, curvature: Tensor) -> dict[str, float]:
-    """Of every two parts the largest canonical coupling, 0 to 1: what one pass over both leaves of the way to the bottom is
-    its square at most."""
+    """Of every two parts the largest canonical coupling, 0 to 1: one pass over both leaves at most its square of the error
+    above the bottom."""
     found = {}
     for one, other in combinations(PARTS, 2):
         a, b = _places(space, one), _places(space, other)
@@ -80,12 +97,12 @@ def coupled(space: Space, curvature: Tensor) -> dict[str, float]:
 def left_by(
     space: Space, curvature: Tensor, error: float, at: Tensor, starts: Sequence[Tensor], order: Sequence[str]
 ) -> float:
-    """Error of one pass over the parts in an order, each brought to its bottom, over that of the joint bottom: median over
-    the starts, by the second-order model."""
+    """Error of one pass over the parts in an order and, as in the race, over the read-out once more, each brought to its
+    bottom, over that of the joint bottom: median over the starts, by the second-order model."""
     ratios = []
     for start in starts:
         away = start - at
-        for part in order:
+        for part in (*order, "read-out"):
             mine = _places(space, part)
             rest = [k for k in range(len(away)) if k not in mine]
             away[mine] = -torch.linalg.solve(curvature[mine][:, mine], curvature[mine][:, rest] @ away[rest])
@@ -102,14 +119,22 @@ def show(
     measured: Mapping[str, float],
 ) -> None:
     """Couplings, and the orders' errors over the joint one as predicted and as ``measured``."""
-    curvature, error = hessian(space, rows)
+    raw, spread, error = hessian(space, rows)
+    curvature = bowl(raw)
     run.section(
         "How the parts pull at each other",
         f"Second differences of expected errors over {STEP} of the bounds around the joint answer of which least error is "
         "expected. A coupling of 0 means that parts can be designed by themselves; of 1, that neither knows its place "
-        "without the other.",
+        "without the other. By noise: what nineteen in twenty times is not passed where there is none.",
     )
-    lines = [{"parts": name, "coupling": value} for name, value in coupled(space, curvature).items()]
+    if curvature is None:
+        run.text("Errors bend upwards along nothing there: no valley, and nothing to be said of couplings.")
+        return
+    noise = by_noise(space, curvature, spread)
+    lines = [
+        {"parts": name, "coupling": value, "by_noise": noise.get(name)}
+        for name, value in coupled(space, curvature).items()
+    ]
     tabulate(run, "Canonical couplings", lines, "parts", prefix="parts")
     lines = []
     for arm, ratio in measured.items():

@@ -79,6 +79,10 @@ class Space:
         for name in (*self.free, *self.held, *self.bounds):
             if name not in known:
                 raise DomainError(f"a design has no number '{name}'; there are {', '.join(known)}.")
+        if "bending" in self.free and not self.pair.family:
+            raise DomainError(
+                "a thin lens has no bending; give a family of traced lenses, or leave bending out."
+            )
         for name, value in self.held.items():
             low, high = self.limits(name)
             if name in self.free or not low <= value <= high:

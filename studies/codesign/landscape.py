@@ -1,7 +1,7 @@
 """Is there anything to design, and does the objective rank it? Hard and expected errors of designs all over the bounds, of
 others near the best of them, and along every number through the best, before any race."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from codesign.atomic import write_atomic
+from codesign.errors import DomainError
 from codesign.flow import checkpoint
 from codesign.mount import FlowErrors, Readings
 from studies.codesign.calibration import Calibration, Conditions, fitted
@@ -53,19 +54,18 @@ class Landscape:
     @property
     def judged(self) -> list[Row]:
         """Designs near the best that no calibration was fitted to."""
-        return self.near[1::2] if len(self.near) > 2 else self.near
+        return self.near[1::2] if len(self.near) > 3 else self.near
 
     @property
-    def rank(self) -> float:
+    def rank(self) -> float | None:
         """Spearman's correlation of expected and hard errors over them."""
-        columns = ([row[name] for row in self.judged] for name in ("expected", "hard"))
-        return float(spearmanr(*columns)[0])
+        return ranked(*([row[name] for row in self.judged] for name in ("expected", "hard")))
 
     @property
-    def slope(self) -> float:
-        """Of hard errors over expected ones, over them."""
-        columns = ([row[name] for row in self.judged] for name in ("expected", "hard"))
-        return float(linregress(*columns).slope)
+    def slope(self) -> float | None:
+        """Of hard errors over expected ones, over them; None where these are all alike."""
+        expected, hard = ([row[name] for row in self.judged] for name in ("expected", "hard"))
+        return float(linregress(expected, hard).slope) if len(set(expected)) > 1 else None
 
     def csv(self, space: Space) -> str:
         """Every design: where it was drawn, its numbers, and its errors; "near" are those that judge the fit."""
@@ -87,6 +87,13 @@ class Landscape:
         return 0 < min(rows, key=lambda row: row["hard"])["at"] < 1
 
 
+def ranked(one: Sequence[float], other: Sequence[float]) -> float | None:
+    """Spearman's correlation; None where fewer than three, or all alike, tell none."""
+    if len(one) < 3 or len(set(one)) == 1 or len(set(other)) == 1:
+        return None
+    return float(spearmanr(one, other)[0])
+
+
 def all_over(space: Space, count: int) -> list[Tensor]:
     """Shares [V] spread evenly over what is allowed."""
     requirements = space.pair.requirements()
@@ -97,6 +104,11 @@ def all_over(space: Space, count: int) -> list[Tensor]:
     for share in drawn:
         if len(found) < count and kept(space, share, requirements):
             found.append(share)
+    if len(found) < count:
+        raise DomainError(
+            f"of {len(drawn)} designs of '{space.pair.name}' {len(found)} keep what is required and {count} are needed; widen "
+            "the bounds, or give fewer --designs."
+        )
     return found
 
 

@@ -1,16 +1,18 @@
 """The race of the arms: from the same starts at equal rendered drives, judged by single events in worlds that none saw."""
 
 import json
+import math
 import time
 from collections.abc import Mapping, Sequence
 from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Any
 
 import drjit
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError
+from codesign.errors import DomainError, FileFormatError
 from codesign.mount import VelocityHead
 from codesign.mount.requirements import first_missed
 from scenes.robots import pair as robot_pair
@@ -80,7 +82,45 @@ def racing(seed: int, arm: str, setting: Mapping[str, Any], threads: int = 0) ->
     if threads:
         torch.set_num_threads(threads)
         drjit.set_thread_count(threads)
-    return run_arm(_drawn(json.dumps(setting)), arm, seed, setting["steps"], setting["settling"])
+    found = run_arm(_drawn(json.dumps(setting)), arm, seed, setting["steps"], setting["settling"])
+    return {**found, "setting": dict(setting)}
+
+
+def taken_up(path: Path, setting: Mapping[str, Any]) -> tuple[bytes, bytes]:
+    """Lines of a table of answers (race.jsonl, answers.jsonl), all of them and those that the same judge has judged.
+
+    Raises: FileFormatError for what is no such table; DomainError for answers of another setting.
+    """
+    lines = path.read_bytes().splitlines(keepends=True)
+    judged = []
+    for line in lines:
+        try:
+            _, rows = json.loads(line)
+            theirs = [dict(row["setting"]) for row in rows]
+        except (ValueError, TypeError, KeyError) as error:
+            raise FileFormatError(
+                f"'{path}' is no table of answers, or damaged; give answers.jsonl of a run."
+            ) from error
+        for each in theirs:
+            other = [
+                name for name in setting if name != "judge" and not _alike(each.get(name), setting[name])
+            ]
+            if other:
+                raise DomainError(
+                    f"'{path}' has answers of another setting: {other[0]} is {each.get(other[0])} there and {setting[other[0]]} here."
+                )
+        if all("head_errors" in row and row["setting"].get("judge") == setting["judge"] for row in rows):
+            judged.append(line)
+    return b"".join(lines), b"".join(judged)
+
+
+def _alike(one, other):
+    """The same, numbers but for rounding on another machine."""
+    if isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+        return all(_alike(*pair) for pair in zip(one, other, strict=True))
+    if isinstance(one, float) and isinstance(other, float):
+        return math.isclose(one, other, rel_tol=1e-6)
+    return one == other
 
 
 @lru_cache(maxsize=1)

@@ -2,21 +2,22 @@
 expected? Read-outs of one design, ranked by both, beside single events in many drives of other worlds."""
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import torch
-from scipy.stats import spearmanr
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from studies.codesign.arms import RECORDED
 from studies.codesign.design import Space
+from studies.codesign.landscape import ranked
 from studies.codesign.problem import Drawn
 from studies.frame.run import Run
 from studies.frame.show import tabulate
 from studies.frame.sweep import Row, column, sweep
 
-FIRST = 70_000  # number of the first draw
+FIRST = 6_000_000  # number of the first draw, beyond those of any race
 FIRST_WORLD = 700  # of those that no arm is trained in, nor a calibration fitted to
 WORLDS, DRIVES = 24, 4
 WIDE = 0.25  # of the cube, to either side
@@ -32,10 +33,14 @@ def looked(run: Run[Any], space: Space, drawn: Drawn, at: Tensor, count: int) ->
     spread = SobolEngine(len(free), scramble=True, seed=9).draw(count, dtype=torch.float64)
     judge = Drawn(space, range(FIRST_WORLD, FIRST_WORLD + WORLDS), WORLDS, DRIVES)
     whole = space.made(at)
-    begun = [drawn.looked(whole, drawn.draw(FIRST + number)) for number in range(RECORDED)]
-    truth = judge.looked(whole, judge.draw(FIRST))
+
+    @cache
+    def frames():
+        begun = [drawn.looked(whole, drawn.draw(FIRST + number)) for number in range(RECORDED)]
+        return begun, judge.looked(whole, judge.draw(FIRST))
 
     def cell(number):
+        begun, truth = frames()
         share = at.clone()
         share[free] = (at[free] + WIDE * (2 * spread[number] - 1)).clamp(0, 1)
         numbers = space.numbers(share)
@@ -64,14 +69,16 @@ def show(run: Run[Any], rows: Sequence[Row]) -> None:
         f"recorded ({RECORDED} rounds), beside single events in {WORLDS * DRIVES} drives of {WORLDS} other worlds. Good ones have "
         f"less than {LOST} there.",
     )
+    if not rows:
+        run.text("Nothing of sensor and estimator is free.")
+        return
     good = [row for row in rows if row["elsewhere"] < LOST]
     lines = []
     for name in ("hard", "expected"):
         pick = min(rows, key=lambda row: row[name])
         line = {"judge": name, "pick_elsewhere": pick["elsewhere"]}
         for kind, some in (("all", rows), ("good", good)):
-            ranks = spearmanr(column(some, name), column(some, "elsewhere"))[0] if len(some) > 2 else 0.0
-            line[f"rank_{kind}"] = float(ranks)
+            line[f"rank_{kind}"] = ranked(column(some, name), column(some, "elsewhere"))
         lines.append(line)
     run.record(read_outs=len(rows), read_outs_good=len(good))
     tabulate(

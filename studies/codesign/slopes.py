@@ -16,7 +16,7 @@ from studies.frame.run import Run
 from studies.frame.show import tabulate
 from studies.frame.sweep import Row, sweep
 
-FIRST = 50_000  # number of the first draw
+FIRST = 5_000_000  # number of the first draw, beyond those of any race
 
 
 @dataclass(frozen=True)

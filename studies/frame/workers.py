@@ -65,7 +65,7 @@ def on_cluster(
     environment = {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
     alone = address == HERE
     try:
-        if ":" in address:  # ray would try for minutes
+        if ":" in address and "//" not in address:  # ray would try for minutes
             host, _, port = address.rpartition(":")
             socket.create_connection((host, int(port)), timeout=PATIENCE_S).close()
         ray.init(
