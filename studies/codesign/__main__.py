@@ -142,7 +142,8 @@ def study(run: Run[Config]) -> None:
         around_the_best(run, drawn, rows)
     page.looked(run, space, gates)
     if size.slopes:
-        slopes.show(run, space, slopes.slopes(run, space, drawn, gates.best, size.slopes))
+        places = {"best": gates.best, "start": start(space, size.seed)}
+        slopes.show(run, space, slopes.slopes(run, space, drawn, places, size.slopes))
     if size.read_outs:
         read_outs.show(run, read_outs.looked(run, space, drawn, gates.best, size.read_outs))
     if rows:

@@ -2,8 +2,9 @@
 errors it expects and of hard ones, over the same draws."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import torch
@@ -47,23 +48,28 @@ def agreement(slopes: Tensor, differences: Tensor) -> Agreement:
     )
 
 
-def slopes(run: Run[Any], space: Space, drawn: Drawn, at: Tensor, draws: int) -> list[Row]:
-    """Rows of every draw and number at shares [V]: the slope, and the differences over a step to either side.
+def slopes(run: Run[Any], space: Space, drawn: Drawn, at: Mapping[str, Tensor], draws: int) -> list[Row]:
+    """Rows of every place, draw and number: the slope at shares [V], and the differences over a step to either side.
 
     The slope of the first draw, by which the trend has learnt nothing else, is not among them.
     """
-    objective = Objective(drawn)
     free = range(len(space.free))
-    objective(at, drawn.draw(FIRST - 1), free)
 
-    def of_slope(draw):
-        objective.forget()
-        return {"slope": objective(at, drawn.draw(FIRST + draw), free)[1].tolist()}
+    @cache
+    def objective(place):
+        found = Objective(drawn)
+        found(at[place], drawn.draw(FIRST - 1), free)
+        return found
 
-    def of_differences(draw, number):
-        ends = at.repeat(2, 1)
+    def of_slope(place, draw):
+        objective(place).forget()
+        return {"slope": objective(place)(at[place], drawn.draw(FIRST + draw), free)[1].tolist()}
+
+    def of_differences(place, draw, number):
+        here = at[place]
+        ends = here.repeat(2, 1)
         k = space.free.index(number)
-        ends[:, k] = (at[k] + torch.tensor([-STEP, STEP], dtype=at.dtype)).clamp(0, 1)
+        ends[:, k] = (here[k] + torch.tensor([-STEP, STEP], dtype=here.dtype)).clamp(0, 1)
         looked = [drawn.looked(space.made(share), drawn.draw(FIRST + draw)) for share in ends]
         width = float(ends[1, k] - ends[0, k])
         expected, hard = (
@@ -72,39 +78,43 @@ def slopes(run: Run[Any], space: Space, drawn: Drawn, at: Tensor, draws: int) ->
         )
         return {"expected": (expected[1] - expected[0]) / width, "hard": (hard[1] - hard[0]) / width}
 
-    found = sweep(run, of_slope, "slopes", draw=range(draws))
-    rows = sweep(run, of_differences, "differences", draw=range(draws), number=space.free)
-    return [{**row, "slope": found[row["draw"]]["slope"][space.free.index(row["number"])]} for row in rows]
+    found = sweep(run, of_slope, "slopes", place=list(at), draw=range(draws))
+    known = {(row["place"], row["draw"]): row["slope"] for row in found}
+    rows = sweep(run, of_differences, "differences", place=list(at), draw=range(draws), number=space.free)
+    return [
+        {**row, "slope": known[row["place"], row["draw"]][space.free.index(row["number"])]} for row in rows
+    ]
 
 
 def show(run: Run[Any], space: Space, rows: Sequence[Row]) -> None:
-    """How the slopes agree, block by block and number by number."""
+    """How the slopes agree, place by place, block by block and number by number."""
     draws = max(row["draw"] for row in rows) + 1
-    of = {
-        kind: torch.tensor([row[kind] for row in rows], dtype=torch.float64).reshape(draws, -1)
-        for kind in ("slope", "expected", "hard")
-    }
-    lines = []
-    for name in ("all", *BLOCKS):
-        places = list(range(len(space.free))) if name == "all" else space.block(name)
-        if not places:
-            continue
-        for kind in ("expected", "hard"):
-            found = agreement(of["slope"][:, places], of[kind][:, places])
-            lines.append({"block": name, "against": kind, **vars(found)})
+    lines, numbers = [], []
+    for place in dict.fromkeys(row["place"] for row in rows):
+        of = {
+            kind: torch.tensor(
+                [row[kind] for row in rows if row["place"] == place], dtype=torch.float64
+            ).reshape(draws, -1)
+            for kind in ("slope", "expected", "hard")
+        }
+        for name in ("all", *BLOCKS):
+            places = list(range(len(space.free))) if name == "all" else space.block(name)
+            for kind in ("expected", "hard") if places else ():
+                found = agreement(of["slope"][:, places], of[kind][:, places])
+                lines.append({"at": place, "block": name, "against": kind, **vars(found)})
+        for k, name in enumerate(space.free):
+            line: Row = {"at": place, "number": name}
+            for kind, values in of.items():
+                line |= {
+                    kind: float(values[:, k].mean()),
+                    f"{kind}_error": float(values[:, k].std()) / math.sqrt(draws),
+                }
+            numbers.append(line)
     run.section(
         "Is the slope right?",
-        f"At the best design that was looked at, over {draws} draws of fresh drives: the slope by geometry, trend and recorded frames "
-        f"against differences of rendered errors over {STEP} of the bounds to either side, on the same drives.",
+        f"At the best design that was looked at and at the first start, over {draws} draws of fresh drives: the slope by geometry, "
+        f"trend and recorded frames against differences of rendered errors over {STEP} of the bounds to either side, on the same "
+        "drives.",
     )
-    tabulate(run, "Agreement", lines, "block", "against", prefix="slope")
-    numbers = []
-    for k, name in enumerate(space.free):
-        line = {"number": name}
-        for kind, values in of.items():
-            line |= {
-                kind: float(values[:, k].mean()),
-                f"{kind}_error": float(values[:, k].std()) / math.sqrt(draws),
-            }
-        numbers.append(line)
-    tabulate(run, "Mean slopes, per share of the bounds", numbers, "number", prefix="mean_slope")
+    tabulate(run, "Agreement", lines, "at", "block", "against", prefix="slope")
+    tabulate(run, "Mean slopes, per share of the bounds", numbers, "at", "number", prefix="mean_slope")
