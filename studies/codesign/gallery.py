@@ -44,6 +44,7 @@ def side_by_side(judge: Judge, designs: Mapping[str, Whole]) -> Figure:
         looked = drawn.looked(whole, samples, "sensor")
         if isinstance(whole.camera.lens, lens.GeoLens):
             draw_layout(axes[0], whole.camera.lens, FIELDS_RAD, rays=3)
+            axes[0].get_legend().remove()  # it would lie over the robot
         axes[0].set_axis_off()
         axes[0].set_title(title, fontsize=9, loc="left")
         draw_pair(axes[1], whole.space.pair, whole.camera, whole.T_body_cam)

@@ -124,8 +124,11 @@ def trails(run: Run[Any], rows: Sequence[Row]) -> None:
         series[arm] = (drives, ends[1].tolist())
         bands[arm] = (drives, ends[0].tolist(), ends[2].tolist())
     if series:
-        chart = Panel(series, "drives rendered", "error expected", bands=bands)
-        caption = "Errors to be expected of what each arm looks at, on its own drives: median over starts, and the middle half."
+        chart = Panel(series, "drives rendered", "error expected, with penalty", log="y", bands=bands)
+        caption = (
+            "Errors to be expected of what each arm looks at, on its own drives, with the penalty of what is required: median over "
+            "starts, and the middle half."
+        )
         run.figure(panels(chart, width=8.0), "trails", caption)
 
 

@@ -179,6 +179,10 @@ def bars(
         axis.axvline(level, color="firebrick", linewidth=1)
     axis.set_yticks(range(len(values)), list(values))
     axis.set(xlabel=xlabel, xscale="log" if log else "linear")
+    if log:  # 0.5, not 5 x 10^-1
+        low, high = axis.get_xlim()
+        axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        axis.xaxis.set_minor_formatter(lambda value, _: f"{value:g}" if high < 10 * low else "")
     axis.invert_yaxis()
     return figure
 
