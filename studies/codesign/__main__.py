@@ -90,7 +90,7 @@ class Config(StudyConfig):
     couplings: int = 4
     """Draws by which the couplings of the parts are measured around the best joint answer; 0: they are not."""
     read_outs: int = 24
-    """Read-outs of the best design by which it is asked what should settle them; 0: it is not."""
+    """Read-outs of the best joint answer by which it is asked what should settle them; 0: it is not."""
     settling: int = 24
     """Designs of sensor and estimator tried on recorded frames, wherever they are settled."""
     processes: int = 0
@@ -138,36 +138,32 @@ def study(run: Run[Config]) -> None:
     judge = Judge(space, size.judged_worlds, size.judged_drives)
     rows = raced(run, judge, setting) if size.seeds else []
     said = page.lead(run, space, rows, judge)
+    best = best_joint(drawn, rows) if rows and (size.couplings or size.read_outs) else gates.best
     if rows and size.couplings:
-        around_the_best(run, drawn, rows)
+        around(run, drawn, best, rows)
     page.looked(run, space, gates)
     if size.slopes:
         places = {"best": gates.best, "start": start(space, size.seed)}
         slopes.show(run, space, slopes.slopes(run, space, drawn, places, size.slopes))
     if size.read_outs:
-        read_outs.show(run, read_outs.looked(run, space, drawn, gates.best, size.read_outs))
+        read_outs.show(run, read_outs.looked(run, space, drawn, best, size.read_outs))
     if rows:
         page.designs(run, space, rows)
     run.record(seconds=run.seconds)
     run.finish("Lens, mount, sensor and estimator together", said)
 
 
-def around_the_best(run: Run[Config], drawn: Drawn, rows: Sequence[Row]) -> None:
-    """Couplings around the joint answer of which least error is expected on one fresh draw, and what the orders would leave
-    by them."""
-    ours = [row for row in rows if row["arm"] == "joint"]
+def best_joint(drawn: Drawn, rows: Sequence[Row]) -> torch.Tensor:
+    """Shares [V] of the joint answer of which least error is expected on one fresh draw."""
     fresh = drawn.draw(couplings.FIRST - 1)
+    shares = [torch.tensor(row["share"], dtype=torch.float64) for row in rows if row["arm"] == "joint"]
+    return min(shares, key=lambda share: float(drawn.looked(drawn.space.made(share), fresh).expected.mean()))
 
-    def expected(row):
-        return float(
-            drawn.looked(
-                drawn.space.made(torch.tensor(row["share"], dtype=torch.float64)), fresh
-            ).expected.mean()
-        )
 
-    at = torch.tensor(min(ours, key=expected)["share"], dtype=torch.float64)
+def around(run: Run[Config], drawn: Drawn, at: torch.Tensor, rows: Sequence[Row]) -> None:
+    """Couplings around a joint answer, and what the orders would leave by them."""
     at = at.clamp(couplings.STEP, 1 - couplings.STEP)
-    starts = [start(drawn.space, seed) for seed in dict.fromkeys(row["seed"] for row in ours)]
+    starts = [start(drawn.space, seed) for seed in dict.fromkeys(row["seed"] for row in rows)]
     measured = {arm: math.exp(-over.value) for arm, (over, _) in compared(rows).items()}
     pulls = couplings.curvatures(run, drawn, at, run.config.couplings)
     couplings.show(run, drawn.space, pulls, at, starts, measured)

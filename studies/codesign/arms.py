@@ -83,8 +83,8 @@ def read_out(task: "Task", share: Tensor, way: Way, tries: int = 0) -> Tensor:
     """Shares [V] with the sensor and the estimator that let expect least error on the drives recorded last.
 
     Nothing is rendered: a simplex (Nelder and Mead) from what they are now, on frames that are there; ``tries`` of it,
-    those of the task for 0. By expected errors, since hard ones of so few drives tell good read-outs apart no better than
-    by a rank correlation of 0.64, expected ones by 0.94 (docs/joint_design.md).
+    those of the task for 0. By expected errors, which rank good read-outs better than hard ones of so few drives do (0.93
+    and 0.85, docs/joint_design.md).
     """
     space, drawn = task.space, task.objective.drawn
     free = space.block("sensor") + space.block("network")

@@ -65,7 +65,7 @@ def show(run: Run[Any], rows: Sequence[Row]) -> None:
     """Rank correlations, and where the pick of either ends."""
     run.section(
         "By what to settle a read-out",
-        f"{len(rows)} read-outs around that of the best design that was looked at: errors on the drives that an arm has "
+        f"{len(rows)} read-outs around that of the joint answer of which least error is expected: errors on the drives that an arm has "
         f"recorded ({RECORDED} rounds), beside single events in {WORLDS * DRIVES} drives of {WORLDS} other worlds. Good ones have "
         f"less than {LOST} there.",
     )
