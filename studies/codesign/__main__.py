@@ -27,7 +27,7 @@ from studies.codesign.arms import ARMS
 from studies.codesign.design import Space
 from studies.codesign.landscape import landscape
 from studies.codesign.problem import Drawn
-from studies.codesign.race import SPACE, Judge, compared, racing, spread_over, start, taken_up
+from studies.codesign.race import SPACE, Judge, compared, racing, start, taken_up, training
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.sweep import Row, sweep
 from studies.placement.look import size_in_words
@@ -125,13 +125,8 @@ def study(run: Run[Config]) -> None:
     for seed in range(size.seed, size.seed + size.seeds):
         start(space, seed)
     gates = landscape(run, space, size.designs)
-    drawn = Drawn(
-        space,
-        robot_pair.training(size.worlds),
-        *spread_over(size.worlds, size.per_draw),
-        gates.calibration,
-    )
     setting["calibration"] = list(astuple(gates.calibration))
+    drawn = training(setting)
     if size.raw is not None and not run.path("race.jsonl").exists():
         for name, known in zip(("race", "answers"), taken_up(size.raw, setting), strict=True):
             write_atomic(run.path(f"{name}.jsonl"), known)

@@ -12,7 +12,7 @@ from torch import Tensor
 from codesign.mount.requirements import first_missed
 from scenes.robots import pair as robot_pair
 from scenes.robots.costs import FASTEST
-from studies.codesign.design import BLOCKS, Space
+from studies.codesign.design import BLOCKS, PARTS, Space
 from studies.codesign.objective import Objective
 from studies.codesign.problem import Looked
 from studies.placement.searches import SEARCHES
@@ -87,7 +87,7 @@ def read_out(task: "Task", share: Tensor, way: Way, tries: int = 0) -> Tensor:
     and 0.85, docs/joint_design.md).
     """
     space, drawn = task.space, task.objective.drawn
-    free = space.block("sensor") + space.block("network")
+    free = space.part("read-out")
     if not free or not way.recorded:
         return share
     tried = []
@@ -96,7 +96,7 @@ def read_out(task: "Task", share: Tensor, way: Way, tries: int = 0) -> Tensor:
         moved = share.clone()
         moved[free] = torch.from_numpy(numbers).clamp(0, 1)
         whole = space.made(moved)
-        chosen = {name: whole.numbers[name] for name in BLOCKS["sensor"] + BLOCKS["network"]}
+        chosen = {name: whole.numbers[name] for name in PARTS["read-out"]}
         errors = []
         for looked in way.recorded:
             frames = {"frames": looked.run["frames"]}
@@ -181,7 +181,7 @@ def alternating(sweeps: int) -> Callable[[Task], tuple[Tensor, Way]]:
         way, here = Way(), task.start
         steps = task.steps // (len(GEOMETRY) * sweeps)
         # a simplex has a corner more than numbers, and is to move once
-        tries = max(task.settling // sweeps, len(task.free("sensor", "network")) + 2)
+        tries = max(task.settling // sweeps, len(task.space.part("read-out")) + 2)
         for _ in range(sweeps):
             for name in GEOMETRY:
                 fallen = {"done": len(way.shares), "of": task.steps}

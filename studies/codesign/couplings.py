@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from studies.codesign.design import BLOCKS, Space
+from studies.codesign.design import PARTS, Space
 from studies.codesign.problem import Drawn
 from studies.frame.run import Run
 from studies.frame.show import tabulate
@@ -19,8 +19,6 @@ STEP = 0.12  # of the cube, to either side
 FIRST = 5_500_000  # number of the first draw, beyond those of any race
 NULLS = 200  # draws of noise
 FLATTEST = 0.02  # of the largest curvature, below which none is taken
-READ_OUT = BLOCKS["sensor"] + BLOCKS["network"]
-PARTS = {"lens": BLOCKS["lens"], "mount": BLOCKS["mount"], "read-out": READ_OUT}
 
 
 def curvatures(run: Run[Any], drawn: Drawn, at: Tensor, draws: int) -> list[Row]:
@@ -85,7 +83,7 @@ def coupled(space: Space, curvature: Tensor) -> dict[str, float]:
     above the bottom."""
     found = {}
     for one, other in combinations(PARTS, 2):
-        a, b = _places(space, one), _places(space, other)
+        a, b = space.part(one), space.part(other)
         if a and b:
             roots = [torch.linalg.cholesky(curvature[p][:, p]) for p in (a, b)]
             half = torch.linalg.solve_triangular(roots[0], curvature[a][:, b], upper=False)
@@ -103,7 +101,7 @@ def left_by(
     for start in starts:
         away = start - at
         for part in (*order, "read-out"):
-            mine = _places(space, part)
+            mine = space.part(part)
             rest = [k for k in range(len(away)) if k not in mine]
             away[mine] = -torch.linalg.solve(curvature[mine][:, mine], curvature[mine][:, rest] @ away[rest])
         ratios.append(1 + float(away @ curvature @ away) / 2 / error)
@@ -149,7 +147,3 @@ def show(
         {"number": name, "per_share": float(value)} for name, value in zip(space.free, steepness, strict=True)
     ]
     tabulate(run, "How steep the valley is along each number", each, "number", prefix="steepness")
-
-
-def _places(space, part):
-    return [space.free.index(name) for name in PARTS[part] if name in space.free]

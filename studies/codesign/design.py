@@ -24,6 +24,12 @@ BLOCKS: dict[str, tuple[str, ...]] = {
     "sensor": ("theta", "cutoff_hz"),
     "network": ("prior_px",),
 }
+# what is designed in one go
+PARTS = {
+    "lens": BLOCKS["lens"],
+    "mount": BLOCKS["mount"],
+    "read-out": BLOCKS["sensor"] + BLOCKS["network"],
+}
 # of which equal steps are equal ratios
 LOGARITHMIC = ("efl_mm", "fno", "theta", "cutoff_hz", "prior_px")
 # where a pair says nothing, or holds what is free here
@@ -127,6 +133,10 @@ class Space:
             return lens.family(self.pair.family).fno
         low, high = (getattr(each, name, None) for each in (self.pair.low, self.pair.high))
         return BOUNDS[name] if name in BOUNDS and low == high else (low, high)
+
+    def part(self, name: str) -> list[int]:
+        """Places of a part's numbers (PARTS) among those that are free."""
+        return [self.free.index(each) for each in PARTS[name] if each in self.free]
 
     def _has_room(self, name):
         low, high = self.limits(name)

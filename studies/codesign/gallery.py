@@ -8,28 +8,23 @@ import matplotlib.pyplot as plt
 import torch
 from matplotlib.figure import Figure
 
-from codesign import events, lens
-from codesign.report.flow_colours import flow_colours
+from codesign import lens
 from codesign.report.lens_figures import draw_layout
 from codesign.system import HandOver, load_hand_over, save_hand_over
 from scenes.robots import pair as robot_pair
 from studies.codesign.design import Whole
 from studies.codesign.race import JUDGED, Judge
 from studies.frame.run import Run
-from studies.placement.figures import draw_frame, draw_pair, tiled
-from studies.placement.problem import Samples
+from studies.placement.figures import draw_pair, draw_seen, fastest
 
 COLUMNS = ("lens", "robot and view", "frame", "events", "flow")
 FIELDS_RAD = (0.0, 0.2, 0.4)  # of the rays that are drawn
-DRIVES = 6  # of which the fastest is shown
 
 
 def side_by_side(judge: Judge, designs: Mapping[str, Whole]) -> Figure:
     """A row for each design: lens, robot with the camera's view, frame, single events and flow of one unseen drive."""
     drawn = judge.drawn
-    number = drawn.base.numbers[0]
-    twist = drawn.base.scenes(Samples((number,), tuple(range(DRIVES)), JUDGED)).twist
-    samples = Samples((number,), (int(twist[:, :3].norm(dim=1).argmax()),), JUDGED)
+    samples = fastest(drawn.base, JUDGED)
     figure = plt.figure(figsize=(15, 2.9 * len(designs)), layout="constrained")
     for row, (title, whole) in enumerate(designs.items()):
         axes = [
@@ -48,12 +43,7 @@ def side_by_side(judge: Judge, designs: Mapping[str, Whole]) -> Figure:
         axes[0].set_axis_off()
         axes[0].set_title(title, fontsize=9, loc="left")
         draw_pair(axes[1], whole.space.pair, whole.camera, whole.T_body_cam)
-        draw_frame(axes[2], looked.batch, whole.camera, whole.T_body_cam)
-        axes[3].imshow(tiled(events.picture(looked.run["volume"].counts.sum(2)).numpy()))
-        flow = looked.run["field"].flow_px
-        axes[4].imshow(flow_colours(tiled(flow.movedim(1, -1).numpy()).transpose(2, 0, 1)))
-        for axis, name in zip(axes[2:], COLUMNS[2:], strict=True):
-            axis.set(xticks=[], yticks=[], title=name if row == 0 else "")
+        draw_seen(axes[2:], looked.batch, whole.camera, whole.T_body_cam, looked.run, titled=row == 0)
     return figure
 
 

@@ -116,13 +116,11 @@ def trails(run: Run[Any], rows: Sequence[Row]) -> None:
         ways = [row.get("trail") for row in rows if row["arm"] == arm]
         if not all(ways) or len({len(way) for way in ways}) > 1:
             continue
-        middle = [0.25, 0.5, 0.75]
-        ends = torch.quantile(
-            torch.tensor(ways, dtype=torch.float64), torch.tensor(middle, dtype=torch.float64), 0
-        )
-        drives = [run.config.per_draw * (step + 1) for step in range(ends.shape[1])]
-        series[arm] = (drives, ends[1].tolist())
-        bands[arm] = (drives, ends[0].tolist(), ends[2].tolist())
+        errors = torch.tensor(ways, dtype=torch.float64)
+        low, median, high = (errors.quantile(share, 0).tolist() for share in (0.25, 0.5, 0.75))
+        drives = [run.config.per_draw * (step + 1) for step in range(len(median))]
+        series[arm] = (drives, median)
+        bands[arm] = (drives, low, high)
     if series:
         chart = Panel(series, "drives rendered", "error expected, with penalty", log="y", bands=bands)
         caption = (

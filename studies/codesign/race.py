@@ -36,7 +36,7 @@ def start(space: Space, seed: int) -> Tensor:
     """
     generator = torch.Generator().manual_seed(1000 + seed)
     requirements = space.pair.requirements()
-    held = [k for name in ("sensor", "network") for k in space.block(name)]
+    held = space.part("read-out")
     for _ in range(TRIES):
         share = EDGE + (1 - 2 * EDGE) * torch.rand(len(space.free), generator=generator, dtype=torch.float64)
         share[held] = space.start[held]
@@ -82,7 +82,7 @@ def racing(seed: int, arm: str, setting: Mapping[str, Any], threads: int = 0) ->
     if threads:
         torch.set_num_threads(threads)
         drjit.set_thread_count(threads)
-    found = run_arm(_drawn(json.dumps(setting)), arm, seed, setting["steps"], setting["settling"])
+    found = run_arm(training(setting), arm, seed, setting["steps"], setting["settling"])
     return {**found, "setting": dict(setting)}
 
 
@@ -123,9 +123,13 @@ def _alike(one, other):
     return one == other
 
 
+def training(setting: Mapping[str, Any]) -> Drawn:
+    """Training worlds of a setting; built once in a process."""
+    return _training(json.dumps(setting))
+
+
 @lru_cache(maxsize=1)
-def _drawn(told: str) -> Drawn:
-    """Training worlds of a setting, as JSON says it."""
+def _training(told):
     setting = json.loads(told)
     space = Space.of(**{name: setting[name] for name in SPACE})
     spread = spread_over(setting["worlds"], setting["per_draw"])

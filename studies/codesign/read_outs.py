@@ -27,7 +27,7 @@ LOST = 0.5  # hard error, from which on a read-out is none of the good ones
 def looked(run: Run[Any], space: Space, drawn: Drawn, at: Tensor, count: int) -> list[Row]:
     """Rows of read-outs around that of shares [V]: errors on as many recorded drives as an arm has, hard and expected, and
     the hard ones of single events in other worlds."""
-    free = space.block("sensor") + space.block("network")
+    free = space.part("read-out")
     if not free:
         return []
     spread = SobolEngine(len(free), scramble=True, seed=9).draw(count, dtype=torch.float64)

@@ -1,6 +1,7 @@
 """Pictures of a placement: the ways of the searches, and the robot before and after."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -72,29 +73,36 @@ def _pitch_and_height(problem: Problem, share: Tensor) -> tuple[np.ndarray, np.n
 def before_and_after(problem: Problem, mount: Tensor) -> Figure:
     """Robot, frame, events and flow of an unseen drive, for the default mount and for one [4, 4]."""
     figure = plt.figure(figsize=(13, 6.4), layout="constrained")
-    drives = fastest(problem)
+    drives = problem.batch(fastest(problem))
     for row, pose in enumerate((problem.ranges.pose(problem.start), mount)):
         draw_pair(figure.add_subplot(2, 4, 4 * row + 1, projection="3d"), problem.pair, problem.camera, pose)
         axes = [figure.add_subplot(2, 4, 4 * row + column) for column in (2, 3, 4)]
-        draw_frame(axes[0], drives, problem.camera, pose)
         with torch.no_grad():
             run = problem.system(pose, "sensor").begin(drives)
-        counts, flow = run["volume"].counts.sum(2), run["field"].flow_px
-        axes[1].imshow(tiled(events.picture(counts).numpy()))
-        axes[2].imshow(flow_colours(tiled(flow.movedim(1, -1).numpy()).transpose(2, 0, 1)))
-        for axis, title in zip(axes, ("frame", "events", "flow"), strict=True):
-            axis.set(xticks=[], yticks=[], title=title if row == 0 else "")
+        draw_seen(axes, drives, problem.camera, pose, run, titled=row == 0)
     return figure
 
 
-def fastest(problem: Problem) -> Drives:
-    """Of six drives in the first world."""
-    drives = problem.batch(Samples((problem.numbers[0],), tuple(range(6)), 0))
-    which = int(drives.twist[:, :3].norm(dim=1).argmax())
-    return problem.batch(Samples((problem.numbers[0],), (which,), 0))
+def draw_seen(
+    axes: Sequence[Any], drives: Drives, camera: Camera, T_body_cam: Tensor, run: Any, titled: bool
+) -> None:
+    """Frame, single events and flow of a drive, into three axes. run: of the chain that saw it."""
+    _draw_frame(axes[0], drives, camera, T_body_cam)
+    counts, flow = run["volume"].counts.sum(2), run["field"].flow_px
+    axes[1].imshow(_tiled(events.picture(counts).numpy()))
+    axes[2].imshow(flow_colours(_tiled(flow.movedim(1, -1).numpy()).transpose(2, 0, 1)))
+    for axis, title in zip(axes, ("frame", "events", "flow"), strict=True):
+        axis.set(xticks=[], yticks=[], title=title if titled else "")
 
 
-def tiled(windows: np.ndarray) -> np.ndarray:
+def fastest(problem: Problem, seed: int = 0) -> Samples:
+    """Of six drives in the first world. seed: of film samples and noise."""
+    numbers = (problem.numbers[0],)
+    drives = problem.scenes(Samples(numbers, tuple(range(6)), seed))
+    return Samples(numbers, (int(drives.twist[:, :3].norm(dim=1).argmax()),), seed)
+
+
+def _tiled(windows: np.ndarray) -> np.ndarray:
     """Windows [9, H, W, C] in rows of three."""
     side = math.isqrt(len(windows))
     rows = [np.concatenate(list(windows[side * k : side * (k + 1)]), 1) for k in range(side)]
@@ -106,7 +114,7 @@ def robot_and_frame(pair: RobotPair, drives: Drives, camera: Camera, pose: Tenso
     figure = plt.figure(figsize=(10, 4.4), layout="constrained")
     draw_pair(figure.add_subplot(1, 2, 1, projection="3d"), pair, camera, pose)
     right = figure.add_subplot(1, 2, 2)
-    draw_frame(right, drives, camera, pose)
+    _draw_frame(right, drives, camera, pose)
     right.set(xticks=[], yticks=[])
     return figure
 
@@ -120,7 +128,7 @@ def draw_pair(axis: Any, pair: RobotPair, camera: Camera, T_body_cam: Tensor) ->
 
 
 @torch.no_grad()
-def draw_frame(axis: Any, drives: Drives, camera: Camera, T_body_cam: Tensor) -> None:
+def _draw_frame(axis: Any, drives: Drives, camera: Camera, T_body_cam: Tensor) -> None:
     """The middle frame [H, W] of the first drive on the whole sensor, with the camera's windows."""
     whole = Camera(camera.lens, *SENSOR_PX, camera.film.pixel_pitch_mm, 8)
     scene = drives.scene[0].during([FRAMES // 2])
