@@ -1,7 +1,7 @@
 """Differentiable co-design: lens, render, event camera, event flow.
 
-`import codesign` is all that is needed: its rooms (`codesign.lens`, `codesign.flow`, …) are imported when
-they are first asked for.
+`import codesign` is all that is needed: its rooms (`codesign.lens`, `codesign.flow`, …) are
+imported when they are first asked for.
 """
 
 import importlib
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     )
     from codesign.system import System
 
-# Torch's OpenMP threads would busy-wait after each operation on the core that drjit's thread pool needs (a
-# render step took 2x the CPU).
+# Torch's OpenMP threads would busy-wait after each operation on the core that drjit's thread pool
+# needs (a render step took 2x the CPU).
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 __all__ = [
@@ -65,7 +65,9 @@ def __getattr__(name: str) -> Any:
             return version("codesign")
         except PackageNotFoundError:
             return "unknown"  # run from a checkout that was never installed
-    raise AttributeError(f"module 'codesign' has no attribute '{name}'; it has {', '.join(__all__)}.")
+    raise AttributeError(
+        f"module 'codesign' has no attribute '{name}'; it has {', '.join(__all__)}."
+    )
 
 
 def __dir__() -> list[str]:

@@ -16,7 +16,8 @@ for example:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Parse the command line and run it. Returns the exit code; a study ends by itself (SystemExit)."""
+    """Parse the command line and run it. Returns the exit code; a study ends by itself
+    (SystemExit)."""
     with written_out():
         return _main(arguments)
 
@@ -33,12 +34,18 @@ def _main(arguments):
     commands.add_parser("list", help="every study with its question")
     run = commands.add_parser("run", help="run a study: codesign run NAME [OPTIONS]")
     run.add_argument("name", metavar="NAME", help="a study out of the list")
-    run.add_argument("options", nargs=argparse.REMAINDER, metavar="OPTIONS", help="what the study is told")
+    run.add_argument(
+        "options", nargs=argparse.REMAINDER, metavar="OPTIONS", help="what the study is told"
+    )
     doctor = commands.add_parser(
-        "doctor", help="what is installed, what is missing, what to do; exit 0 only when a render works"
+        "doctor",
+        help="what is installed, what is missing, what to do; exit 0 only when a render works",
     )
     doctor.add_argument(
-        "--device", choices=("cpu", "cuda"), default="cpu", help="where the trial render runs (default: cpu)"
+        "--device",
+        choices=("cpu", "cuda"),
+        default="cpu",
+        help="where the trial render runs (default: cpu)",
     )
     chosen = parser.parse_args(arguments)
     if chosen.command is None:

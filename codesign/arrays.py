@@ -1,5 +1,6 @@
-"""NumPy's files (.npy, .npz) from somebody nobody vouches for: what a header announces is compared with what the file
-holds before room is taken for it, objects are never built, and what is wrong is one sentence."""
+"""NumPy's files (.npy, .npz) from somebody nobody vouches for: what a header announces is compared
+with what the file holds before room is taken for it, objects are never built, and what is wrong is
+one sentence."""
 
 import math
 import re
@@ -27,7 +28,8 @@ KINDS = "biufcSU"  # data without pointers
 
 @dataclass(frozen=True)
 class Header:
-    """shape, dtype: of an array. by_columns: first index fastest. start: bytes before its first value."""
+    """shape, dtype: of an array. by_columns: first index fastest. start: bytes before its first
+    value."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
@@ -41,7 +43,8 @@ class Header:
 
 
 class Npz:
-    """The arrays of an open .npz, by their names without .npy. Every method raises FileFormatError alone."""
+    """The arrays of an open .npz, by their names without .npy. Every method raises FileFormatError
+    alone."""
 
     def __init__(self, path: Path, archive: zipfile.ZipFile, remedy: str) -> None:
         self.path = path
@@ -72,7 +75,8 @@ class Npz:
                 yield np.frombuffer(member.read(size), header.dtype).reshape(header.shape[1:])
 
     def mapped(self, name: str, most_bytes: int = MOST_BYTES) -> np.ndarray:
-        """The array, left on the disk (read-only) where the archive holds it as it is, else read."""
+        """The array, left on the disk (read-only) where the archive holds it as it is, else
+        read."""
         header = self.header(name)
         entry = self._entries[name]
         if entry.compress_type != zipfile.ZIP_STORED or not math.prod(header.shape):
@@ -104,12 +108,15 @@ class Npz:
 
 @contextmanager
 def open_npz(path: str | Path, remedy: str = "use a whole .npz file") -> Iterator[Npz]:
-    """Open an .npz of plain numbers and text, stored or deflated. Raises: FileFormatError that ends in ``remedy``."""
+    """Open an .npz of plain numbers and text, stored or deflated. Raises: FileFormatError that ends
+    in ``remedy``."""
     with open_regular(path) as file:
         with reading(path, remedy):
             archive = zipfile.ZipFile(file)
             if any(entry.compress_type not in PACKINGS for entry in archive.infolist()):
-                raise FileFormatError(f"{path} is packed in a way that NumPy does not use; save it anew.")
+                raise FileFormatError(
+                    f"{path} is packed in a way that NumPy does not use; save it anew."
+                )
             if not all(entry.filename.isprintable() for entry in archive.infolist()):
                 raise FileFormatError(f"{path} names arrays in no letters; it is damaged.")
         with archive:
@@ -123,7 +130,8 @@ def read_npz(path: str | Path, remedy: str = "use a whole .npz file") -> dict[st
 
 
 def read_npy(path: str | Path, mapped: bool = False) -> np.ndarray:
-    """The array of an .npy file; with ``mapped``, left on the disk (read-only). Raises: FileFormatError."""
+    """The array of an .npy file; with ``mapped``, left on the disk (read-only). Raises:
+    FileFormatError."""
     with open_regular(path) as file, reading(path, "use a whole .npy file"):
         header = _header(file, str(path))
         if header.end != Path(path).stat().st_size:

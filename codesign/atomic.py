@@ -15,16 +15,18 @@ UNFINISHED = re.compile(r"\..*-[a-z0-9_]{8}(\.[^.]*)?")  # a name of ``replacing
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path`` with the same extension; move it into place when the block ends
-    well, remove it otherwise.
+    """Yield a temporary path beside ``path`` with the same extension; move it into place when the
+    block ends well, remove it otherwise.
 
     The content reaches the disk before the name does, and the name before this returns.
-    Raises: FileFormatError when the folder is missing or not writable; an earlier file at ``path`` stays as
-      it was.
+    Raises: FileFormatError when the folder is missing or not writable; an earlier file at ``path``
+      stays as it was.
     """
     path = Path(path)
     try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
+        handle, name = tempfile.mkstemp(
+            dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix
+        )
         os.close(handle)
     except OSError as error:
         raise FileFormatError(
@@ -51,16 +53,16 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove what ``replacing`` left in a folder, and below, when its process was killed; for a folder that no other
-    process writes to."""
+    """Remove what ``replacing`` left in a folder, and below, when its process was killed; for a
+    folder that no other process writes to."""
     for path in folder.rglob(".*"):
         if UNFINISHED.fullmatch(path.name) and path.is_file():
             path.unlink(missing_ok=True)
 
 
 def write_atomic(path: str | Path, content: bytes) -> None:
-    """Write ``content`` so that ``path`` holds either the old bytes or all of the new ones, whatever happens
-    in between.
+    """Write ``content`` so that ``path`` holds either the old bytes or all of the new ones,
+    whatever happens in between.
 
     Raises: FileFormatError when it cannot be written.
     """

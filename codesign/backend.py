@@ -47,7 +47,8 @@ def install_hint() -> str:
 
 
 def llvm_version() -> tuple[int, int, int] | None:
-    """Version of the LLVM that drjit found, as (major, minor, patch), or None when it found none."""
+    """Version of the LLVM that drjit found, as (major, minor, patch), or None when it found
+    none."""
     import drjit as dr
 
     found = tuple(dr.detail.llvm_version())
@@ -55,10 +56,13 @@ def llvm_version() -> tuple[int, int, int] | None:
 
 
 def device_name(device: Any) -> str:
-    """ "cpu" or "cuda" for a device that kernels run on, also as torch.device; DomainError for any other."""
+    """ "cpu" or "cuda" for a device that kernels run on, also as torch.device; DomainError for any
+    other."""
     found = str(device)
     if found not in ("cpu", "cuda", "cuda:0"):
-        raise DomainError(f"device {found!r} is not known here; choose 'cpu' or 'cuda' (the first GPU).")
+        raise DomainError(
+            f"device {found!r} is not known here; choose 'cpu' or 'cuda' (the first GPU)."
+        )
     return found.removesuffix(":0")
 
 
@@ -87,16 +91,19 @@ def check_version(device: str = "cpu") -> None:
 
 
 def variant(device: str = "cpu") -> str:
-    """Name of the Mitsuba variant used on ``device``: one radiance channel, because event sensors are
-    monochrome."""
+    """Name of the Mitsuba variant used on ``device``: one radiance channel, because event sensors
+    are monochrome."""
     return "cuda_ad_mono" if device_name(device) == "cuda" else "llvm_ad_mono"
 
 
 def trial_render(device: str = "cpu", timeout_s: float = 180) -> tuple[bool, str]:
-    """Render a tiny scene in a subprocess, since a bad LLVM aborts the process. Returns (worked, message)."""
+    """Render a tiny scene in a subprocess, since a bad LLVM aborts the process. Returns
+    (worked, message)."""
     command = [sys.executable, "-c", _TRIAL.format(variant=variant(device))]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=timeout_s, check=False
+        )
     except subprocess.TimeoutExpired:
         return False, f"the trial render did not end within {timeout_s} s"
     if done.returncode == 0 and "render ok" in done.stdout:
@@ -106,7 +113,11 @@ def trial_render(device: str = "cpu", timeout_s: float = 180) -> tuple[bool, str
 
 
 def _memory_file():
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "codesign" / "trial_render.json"
+    return (
+        Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+        / "codesign"
+        / "trial_render.json"
+    )
 
 
 def _machine_key(device):
@@ -126,8 +137,8 @@ def _machine_key(device):
 def require_renderer(device: str = "cpu") -> None:
     """Check once that rendering works; raise BackendError with one sentence otherwise.
 
-    The version check runs in every process; the trial render runs once per machine and set of versions, and
-    is remembered.
+    The version check runs in every process; the trial render runs once per machine and set of
+    versions, and is remembered.
     """
     check_version(device)
     key = _machine_key(device)
@@ -139,7 +150,9 @@ def require_renderer(device: str = "cpu") -> None:
     if not (isinstance(known, dict) and known.get(key) == "ok"):
         worked, message = trial_render(device)
         if not worked:
-            raise BackendError(f"{message}; {install_hint()}, then run 'python -m codesign doctor'.")
+            raise BackendError(
+                f"{message}; {install_hint()}, then run 'python -m codesign doctor'."
+            )
         try:
             memory.parent.mkdir(parents=True, exist_ok=True)
             write_atomic(memory, json.dumps({key: "ok"}).encode())
@@ -182,7 +195,9 @@ def arrays(device: str = "cpu", dtype: torch.dtype = torch.float32) -> Arrays:
         return Arrays(ad.Float, ad.UInt32, ad.Int, ad.Bool, ad.Array3f, ad.Array4f)
     if dtype == torch.float64:
         return Arrays(ad.Float64, ad.UInt32, ad.Int, ad.Bool, ad.Array3f64, ad.Array4f64)
-    raise GradientError(f"kernels compute in float32 or float64, not {dtype}; convert the tensor first.")
+    raise GradientError(
+        f"kernels compute in float32 or float64, not {dtype}; convert the tensor first."
+    )
 
 
 @lru_cache(maxsize=1)
@@ -195,12 +210,12 @@ def memory_bytes() -> int:
 
 
 def widen(arr: Arrays, parameters: Any, count: int, width: int) -> list[Any]:
-    """The ``count`` scalars of a flat array, each gathered into a full-width array where its gradient is
-    wanted.
+    """The ``count`` scalars of a flat array, each gathered into a full-width array where its
+    gradient is wanted.
 
-    A scalar used by a million lanes would make one full recomputation per use in the backward pass; a gather
-    makes one reduction. Without a gradient a gather per lane only costs time, and the scalars stay scalars
-    (evaluated, so that other values need no new kernel).
+    A scalar used by a million lanes would make one full recomputation per use in the backward pass;
+    a gather makes one reduction. Without a gradient a gather per lane only costs time, and the
+    scalars stay scalars (evaluated, so that other values need no new kernel).
     """
     import drjit as dr
 
@@ -213,8 +228,8 @@ def widen(arr: Arrays, parameters: Any, count: int, width: int) -> list[Any]:
 
 
 def frames_per_kernel(pixels: int) -> int:
-    """How many frames of so many pixels one loop over time should take: few frames read memory in few
-    streams, which the processor fetches ahead; many save calls."""
+    """How many frames of so many pixels one loop over time should take: few frames read memory in
+    few streams, which the processor fetches ahead; many save calls."""
     return max(32, (1 << 22) // pixels)
 
 
@@ -226,13 +241,14 @@ def run_kernel(
     """Run a drjit kernel on torch tensors, with first derivatives.
 
     Args:
-      kernel: callable (arrays, *flat) -> tuple of flat drjit arrays; must be a pure function of its inputs.
-        Integer outputs carry no gradient.
-      inputs: float tensors of one dtype and device; each is handed to the kernel flattened (row-major).
+      kernel: callable (arrays, *flat) -> tuple of flat drjit arrays; must be a pure function of its
+        inputs. Integer outputs carry no gradient.
+      inputs: float tensors of one dtype and device; each is handed to the kernel flattened
+        (row-major).
       out_shapes: shape of each output.
     Returns: tuple of tensors that own their memory (no aliasing with the inputs).
-    Gradient: reverse mode, by running the kernel again in backward, so any number of backward passes give the
-      same numbers.
+    Gradient: reverse mode, by running the kernel again in backward, so any number of backward
+      passes give the same numbers.
     Raises: GradientError on mixed dtypes, and when a second derivative is asked for.
     """
     inputs = tuple(inputs)
@@ -247,8 +263,8 @@ def run_kernel(
 
 
 def load(array: Any, tensor: Tensor) -> Any:
-    """A flat drjit array of that type, of the numbers of a tensor, without a copy where they are dense. It must not
-    outlive the ``exclusive`` function that loads it."""
+    """A flat drjit array of that type, of the numbers of a tensor, without a copy where they are
+    dense. It must not outlive the ``exclusive`` function that loads it."""
     return array(exclusive.keep(tensor.detach().contiguous().reshape(-1)))
 
 
@@ -258,14 +274,16 @@ def pull_back(
     seeds: Sequence[Any],
     leaves: Sequence[Any] = (),
 ) -> list[Any]:
-    """Gradients of the drjit arrays that a function is given, one step of a loop for example, from those of
-    what it gives; then those of ``leaves``, which it may add its own to."""
+    """Gradients of the drjit arrays that a function is given, one step of a loop for example, from
+    those of what it gives; then those of ``leaves``, which it may add its own to."""
     import drjit as dr
 
     with dr.resume_grad():
         given = [dr.detach(value) + 0 for value in given]
         dr.enable_grad(given)
-        products = [value * dr.detach(seed) for value, seed in zip(function(*given), seeds, strict=True)]
+        products = [
+            value * dr.detach(seed) for value, seed in zip(function(*given), seeds, strict=True)
+        ]
         dr.backward_from(sum(products[1:], products[0]))
         return [dr.grad(value) for value in (*given, *leaves)]
 
@@ -289,7 +307,10 @@ class _Kernel(torch.autograd.Function):
         ctx.save_for_backward(*inputs)
         ctx.set_materialize_grads(False)
         with dr.suspend_grad():
-            outputs = [dr.detach(o) for o in kernel(ctx.arrays, *[load(ctx.arrays.Float, x) for x in inputs])]
+            outputs = [
+                dr.detach(o)
+                for o in kernel(ctx.arrays, *[load(ctx.arrays.Float, x) for x in inputs])
+            ]
             # memory that was there before may belong to something the kernel captured
             owned = [o.state != dr.VarState.Evaluated for o in outputs]
             dr.eval(outputs)
@@ -332,7 +353,10 @@ def _adjoint(ctx, inputs, grads):
     found = [dr.grad(value) if want else None for value, want in zip(flat, wanted, strict=True)]
     dr.eval(found)
     dr.sync_thread()
-    return [None if g is None else _to_torch(g, x.shape, inputs) for g, x in zip(found, inputs, strict=True)]
+    return [
+        None if g is None else _to_torch(g, x.shape, inputs)
+        for g, x in zip(found, inputs, strict=True)
+    ]
 
 
 _FIRST_ONLY = "drjit kernels give first derivatives only; a second derivative was asked for. Use differences of gradients instead."
@@ -342,7 +366,8 @@ def first_only(
     found: Sequence[Tensor | None],
     sources: Iterable[Tensor | None],
 ) -> Sequence[Tensor | None]:
-    """Gradients that a kernel found, as they are; differentiating them to their sources raises GradientError."""
+    """Gradients that a kernel found, as they are; differentiating them to their sources raises
+    GradientError."""
     if not torch.is_grad_enabled():
         return found
     live = [g for g in found if g is not None]
@@ -352,8 +377,8 @@ def first_only(
 
 
 class NoSecondDerivative(torch.autograd.Function):
-    """Passes the first ``count`` tensors, gradients, on unchanged; differentiating them again raises
-    GradientError with ``sentence``."""
+    """Passes the first ``count`` tensors, gradients, on unchanged; differentiating them again
+    raises GradientError with ``sentence``."""
 
     @staticmethod
     def forward(ctx: Any, sentence: str, count: int, *tensors: Tensor) -> tuple[Tensor, ...]:

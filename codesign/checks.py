@@ -1,4 +1,5 @@
-"""Arguments checked at the door, once: what was given, what is wanted, what to do. One fault is one sentence
+"""Arguments checked at the door, once: what was given, what is wanted, what to do. One fault is one
+sentence
 everywhere: ``<name> must be <what is wanted>, got <what was given>; <what to do>.``"""
 
 import math
@@ -38,19 +39,22 @@ def check(
     torch.Size([5, 2, 8, 9])
 
     Args:
-      axes: of the shape: numbers, and letters for at least one entry ("T>=2" for at least two), the same letter for
-        the same size; "..." stands for any axes, once ("...>=0" where they may be empty). A tuple is an exact shape.
+      axes: of the shape: numbers, and letters for at least one entry ("T>=2" for at least two), the
+        same letter for the same size; "..." stands for any axes, once ("...>=0" where they may be
+        empty). A tuple is an exact shape.
       dtypes: allowed; floating-point numbers of any precision by default.
       sizes: what letters stand for, from tensors checked before; letters that are new are added.
       least, finite: of the values, which are otherwise not looked at.
       remedy: what to do where values are wrong.
-    Raises: DomainError for another type, no values, or values out of range; ShapeError for another shape.
+    Raises: DomainError for another type, no values, or values out of range; ShapeError for another
+      shape.
     """
     if not isinstance(value, Tensor):
         raise DomainError(f"{name} must be a torch tensor, got {shown(value)}.")
     if value.dtype not in dtypes if dtypes else not value.is_floating_point():
         wanted = (
-            " or ".join(str(dtype).removeprefix("torch.") for dtype in dtypes) or "floating-point numbers"
+            " or ".join(str(dtype).removeprefix("torch.") for dtype in dtypes)
+            or "floating-point numbers"
         )
         raise DomainError(f"{name} must be {wanted}, got {value.dtype}; convert with .to().")
     if value.layout != torch.strided or value.is_meta:
@@ -97,7 +101,8 @@ def check_number(
     below: float = math.inf,
     remedy: str = "",
 ) -> float:
-    """A finite number as a float, also of a tensor of one element. Raises: DomainError for anything else.
+    """A finite number as a float, also of a tensor of one element. Raises: DomainError for anything
+    else.
 
     Args:
       least, most: smallest and largest that is allowed.
@@ -120,13 +125,16 @@ def check_positive(value: Any, name: str, least: float = LEAST, remedy: str = ""
 def check_whole(
     value: Any, name: str, least: int | None = 1, most: int = MOST_WHOLE, remedy: str = ""
 ) -> int:
-    """A whole number as an int, from ``least`` (None: any) to ``most``. Raises: DomainError for anything else."""
+    """A whole number as an int, from ``least`` (None: any) to ``most``. Raises: DomainError for
+    anything else."""
     number = _number(value)
     lowest = -most if least is None else least
     if not (math.isfinite(number) and number % 1 == 0 and lowest <= int(value) <= most):
         first = lowest if least is not None or number < lowest else -math.inf
         bounds = _bounds(first, most if most < MOST_WHOLE or number > most else math.inf)
-        raise DomainError(f"{name} must be a whole number{bounds}, got {shown(value)}{_told(remedy)}.")
+        raise DomainError(
+            f"{name} must be a whole number{bounds}, got {shown(value)}{_told(remedy)}."
+        )
     return int(value)
 
 
@@ -145,7 +153,9 @@ def check_flag(value: Any, name: str) -> bool:
 def check_choice(value: Any, name: str, allowed: Iterable[str]) -> str:
     """One of several names. Raises: DomainError for anything else."""
     if not isinstance(value, str) or value not in allowed:
-        raise DomainError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {shown(value)}.")
+        raise DomainError(
+            f"{name} must be one of {', '.join(map(repr, allowed))}, got {shown(value)}."
+        )
     return value
 
 
@@ -181,14 +191,17 @@ def _check_shape(value, axes, name, sizes):
         wanted = int(axis) if axis.isdigit() else sizes.setdefault(axis, size) if axis else size
         fits = fits and size == wanted and size >= least
     if not fits:
-        told = "".join(f", {axis} = {size}" for axis, size in known.items()).replace(",", " with", 1)
+        told = "".join(f", {axis} = {size}" for axis, size in known.items()).replace(
+            ",", " with", 1
+        )
         empty = " (no axis may be empty)" if 0 in shape else ""
         raise ShapeError(f"{name} must be [{', '.join(words)}]{told}, got {list(shape)}{empty}.")
 
 
 @cache
 def _read(axes):
-    """The words of a shape; (letter or number, least size) of each axis; the place of "..." among them, or None."""
+    """The words of a shape; (letter or number, least size) of each axis; the place of "..." among
+    them, or None."""
     words = axes.split()
     split = [word.partition(">=") for word in words]
     parts = [(axis, 0 if axis.isdigit() else int(least or 1)) for axis, _, least in split]

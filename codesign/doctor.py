@@ -1,5 +1,5 @@
-"""`python -m codesign doctor`: what is installed, what is missing, what to do. One line each; works when
-nothing else does."""
+"""`python -m codesign doctor`: what is installed, what is missing, what to do. One line each; works
+when nothing else does."""
 
 import os
 import platform
@@ -28,7 +28,8 @@ def diagnose(device="cpu"):
 
     Args:
       device: "cpu" or "cuda", where the trial render runs.
-    Returns: generator of Finding; never raises for something that is missing or broken on this machine.
+    Returns: generator of Finding; never raises for something that is missing or broken on this
+      machine.
     """
     yield _python()
     yield _package("torch", "")
@@ -42,8 +43,8 @@ def diagnose(device="cpu"):
 
 
 def main(device="cpu"):
-    """Print the findings as they come. Returns the exit code: 0 when a render works and nothing it needs is
-    unfit, else 2."""
+    """Print the findings as they come. Returns the exit code: 0 when a render works and nothing it
+    needs is unfit, else 2."""
     sys.stdout.reconfigure(errors="replace")  # pyright: ignore[reportAttributeAccessIssue]
     colour = sys.stdout.isatty() and "NO_COLOR" not in os.environ
     marks = (
@@ -137,7 +138,9 @@ def _cuda(device):
             return Finding("CUDA", True, f"{torch.version.cuda}, {torch.cuda.get_device_name(0)}")
     except Exception as error:  # noqa: BLE001 - see _package
         needed = device.startswith("cuda")
-        return Finding("CUDA", False if needed else None, _sentence(error), REINSTALL if needed else "")
+        return Finding(
+            "CUDA", False if needed else None, _sentence(error), REINSTALL if needed else ""
+        )
     if device.startswith("cuda"):
         return Finding(
             "CUDA",
@@ -164,7 +167,8 @@ def _threads():
 
 
 def _extras():
-    """What pyproject.toml offers beside the core, without what only collects (all, dev) or compares (bench)."""
+    """What pyproject.toml offers beside the core, without what only collects (all, dev) or compares
+    (bench)."""
     try:
         wanted = [line.split(";") for line in requires("codesign") or ()]
     except PackageNotFoundError:
@@ -181,7 +185,10 @@ def _extras():
         return Finding("extras", None, "every one is installed")
     names = ",".join(sorted(missing))
     return Finding(
-        "extras", None, f"not installed: {names}", f"pip install 'codesign[{names}]', if you need them"
+        "extras",
+        None,
+        f"not installed: {names}",
+        f"pip install 'codesign[{names}]', if you need them",
     )
 
 

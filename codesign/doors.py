@@ -1,8 +1,10 @@
-"""What a public function says when it fails for what it was given: which argument, what it was, what is needed.
+"""What a public function says when it fails for what it was given: which argument, what it was,
+what is needed.
 
-Values are checked where the formula needs it; that a number is not NaN, at every door. That text, None or a list stands
-where a tensor belongs is checked nowhere: when a call fails in Python, torch or NumPy, its arguments are held against
-the annotations, and the caller reads a sentence. A call that succeeds costs less than a microsecond more.
+Values are checked where the formula needs it; that a number is not NaN, at every door. That text,
+None or a list stands where a tensor belongs is checked nowhere: when a call fails in Python, torch
+or NumPy, its arguments are held against the annotations, and the caller reads a sentence. A call
+that succeeds costs less than a microsecond more.
 """
 
 import functools
@@ -27,7 +29,12 @@ HOME = str(Path(__file__).parent) + os.sep
 # packages that have doors, which are beside each other wherever they are installed
 PACKAGES = ("codesign.", "scenes.")
 OURS = tuple(str(Path(__file__).parents[1] / package[:-1]) + os.sep for package in PACKAGES)
-LIBRARIES = (sysconfig.get_path("stdlib"), sysconfig.get_path("purelib"), sysconfig.get_path("platlib"), "<")
+LIBRARIES = (
+    sysconfig.get_path("stdlib"),
+    sysconfig.get_path("purelib"),
+    sysconfig.get_path("platlib"),
+    "<",
+)
 FAILS = (ArithmeticError, AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError)
 # what torch and NumPy say of tensors that do not fit
 UNFIT = re.compile(
@@ -49,7 +56,8 @@ PLAIN: dict[Any, tuple[tuple[type, ...], str]] = {
 
 
 def explain(room: dict[str, Any]) -> None:
-    """Put doors into the public functions and classes of a room: ``explain(globals())`` is its last line."""
+    """Put doors into the public functions and classes of a room: ``explain(globals())`` is its last
+    line."""
     home = room["__name__"]
     for name in public_names(room):
         public = room[name]
@@ -63,9 +71,14 @@ def explain(room: dict[str, Any]) -> None:
 
 
 def public_names(room: Mapping[str, Any]) -> list[str]:
-    """What ``__all__`` of a module's names says, or what it defines itself without an underscore."""
+    """What ``__all__`` of a module's names says, or what it defines itself without an
+    underscore."""
     home = room["__name__"]
-    own = (name for name, made in room.items() if name[0] != "_" and getattr(made, "__module__", "") == home)
+    own = (
+        name
+        for name, made in room.items()
+        if name[0] != "_" and getattr(made, "__module__", "") == home
+    )
     return list(room.get("__all__", own))
 
 
@@ -87,8 +100,8 @@ def _class(kind):
 def door(function: Callable[P, T], name: str, nan_fits: bool = False) -> Callable[P, T]:
     """``function``, whose failures for what it was given are sentences.
 
-    Raises: ShapeError or DomainError from the error of torch, NumPy or Python; other errors as they are: those of
-      functions of the caller's own, and those that no argument explains.
+    Raises: ShapeError or DomainError from the error of torch, NumPy or Python; other errors as they
+      are: those of functions of the caller's own, and those that no argument explains.
     """
 
     def explained(error, args, kwargs) -> NoReturn:
@@ -112,7 +125,9 @@ def door(function: Callable[P, T], name: str, nan_fits: bool = False) -> Callabl
         for value in () if nan_fits else (*args, *kwargs.values()):
             if value.__class__ is float and value != value:
                 given = _listed(_given(function, args, kwargs) or {})
-                raise DomainError(f"{name}: an argument is NaN, which is no number; give one ({given}).")
+                raise DomainError(
+                    f"{name}: an argument is NaN, which is no number; give one ({given})."
+                )
         return later(result, args, kwargs) if isinstance(result, types.GeneratorType) else result
 
     told.__explained__ = True  # pyright: ignore
@@ -137,21 +152,28 @@ def _sentence(function, name, args, kwargs, error):
     for argument, value in given.items():
         parts = value if isinstance(value, (list, tuple)) else ()
         blamed = {f"{type(each).__name__}' object" for each in (value, *parts)}
-        if isinstance(error, (AttributeError, TypeError)) and any(words in said for words in blamed):
+        if isinstance(error, (AttributeError, TypeError)) and any(
+            words in said for words in blamed
+        ):
             return DomainError(f"{name}: {argument} = {shown(value)} does not fit ({said}).")
         name_of = f"has no attribute '{value}'" if isinstance(value, str) else None
-        unknown = name_of is not None and isinstance(error, AttributeError) and name_of in str(error)
+        unknown = (
+            name_of is not None and isinstance(error, AttributeError) and name_of in str(error)
+        )
         if unknown or (isinstance(error, KeyError) and error.args[0] is value):
             return DomainError(f"{name}: {argument} = {shown(value)} is not known.")
     if isinstance(error, (AttributeError, OSError, KeyError)) or not UNFIT.search(said):
         return None
     what = _listed(given)
     kind = ShapeError if re.search("shape|size|dimension|index|broadcast", said) else DomainError
-    return kind(f"{name} cannot work with {what}: {said[:200]} (its help says which shapes and values fit).")
+    return kind(
+        f"{name} cannot work with {what}: {said[:200]} (its help says which shapes and values fit)."
+    )
 
 
 def _given(function, args, kwargs):
-    """{argument: value}; None where Python's own sentence says what is wrong: too many, too few, unknown names."""
+    """{argument: value}; None where Python's own sentence says what is wrong: too many, too few,
+    unknown names."""
     try:
         given = inspect.signature(function).bind(*args, **kwargs).arguments
     except TypeError:
@@ -164,7 +186,8 @@ def _listed(given):
 
 
 def is_ours(trace: types.TracebackType | None) -> bool:
-    """Whether the last function that is no library's is one of ours, and no callback of the caller's."""
+    """Whether the last function that is no library's is one of ours, and no callback of the
+    caller's."""
     last = ""
     while trace is not None:
         file = trace.tb_frame.f_code.co_filename
@@ -181,14 +204,17 @@ def _hints(function):
     hints = {}
     for argument, hint in function.__annotations__.items():
         try:
-            hints[argument] = eval(hint, function.__globals__, KINDS) if isinstance(hint, str) else hint
+            hints[argument] = (
+                eval(hint, function.__globals__, KINDS) if isinstance(hint, str) else hint
+            )
         except (NameError, TypeError):
             hints[argument] = Any  # a name that stands under TYPE_CHECKING alone
     return hints
 
 
 def mismatch(value: Any, hint: Any) -> str:
-    """What ``hint`` asks for where ``value`` is nothing of the kind; empty where it is, or where that is not known."""
+    """What ``hint`` asks for where ``value`` is nothing of the kind; empty where it is, or where
+    that is not known."""
     if hint is Any:
         return ""
     origin, parts = typing.get_origin(hint), typing.get_args(hint)
@@ -218,14 +244,21 @@ def mismatch(value: Any, hint: Any) -> str:
         return f"a {kind.__name__}" if kind.__module__ != "torch" else f"a torch.{kind.__name__}"
     if parts and issubclass(kind, Mapping) and len(parts) == 2:
         return _within(value.values(), parts[1], kind)
-    if parts and issubclass(kind, Iterable) and isinstance(value, (list, tuple)) and kind is not tuple:
+    if (
+        parts
+        and issubclass(kind, Iterable)
+        and isinstance(value, (list, tuple))
+        and kind is not tuple
+    ):
         return _within(value, parts[0], kind)
     return ""
 
 
 def _asked(protocol):
     parts = [part for part in protocol.__mro__ if getattr(part, "_is_protocol", False)]
-    names = {name for part in parts for name in (*vars(part), *vars(part).get("__annotations__", {}))}
+    names = {
+        name for part in parts for name in (*vars(part), *vars(part).get("__annotations__", {}))
+    }
     return sorted(name for name in names if not name.startswith("_"))
 
 

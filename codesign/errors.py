@@ -1,4 +1,5 @@
-"""One small family of exceptions. Every message says what was given, what is allowed, and what to do."""
+"""One small family of exceptions. Every message says what was given, what is allowed, and what to
+do."""
 
 from pathlib import PurePath
 from typing import Any
@@ -21,11 +22,13 @@ class FileFormatError(CodesignError, ValueError):
 
 
 class MissingPackageError(CodesignError, ImportError):
-    """A package that the core does without is not installed; the message names the extra that brings it."""
+    """A package that the core does without is not installed; the message names the extra that
+    brings it."""
 
 
 class BackendError(CodesignError, RuntimeError):
-    """A system component that rendering needs (LLVM, a Mitsuba variant, CUDA) is missing or unfit."""
+    """A system component that rendering needs (LLVM, a Mitsuba variant, CUDA) is missing or
+    unfit."""
 
 
 class GradientError(CodesignError, RuntimeError):
@@ -33,14 +36,18 @@ class GradientError(CodesignError, RuntimeError):
 
 
 class NonFiniteError(CodesignError, ArithmeticError):
-    """A value or gradient became infinite or NaN; the message names the junction where it appeared."""
+    """A value or gradient became infinite or NaN; the message names the junction where it
+    appeared."""
 
 
 def shown(value: Any) -> str:
-    """A wrong value in one short line of a message: shape and type of what has them, the kind of what is long."""
+    """A wrong value in one short line of a message: shape and type of what has them, the kind of
+    what is long."""
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
     if shape is not None and dtype is not None:
         where = "" if str(getattr(value, "device", "cpu")) == "cpu" else f" on {value.device}"
         return f"{type(value).__name__} {list(shape)} {str(dtype).removeprefix('torch.')}{where}"
-    plain = value is None or isinstance(value, (str, bytes, int, float, complex, list, tuple, dict, PurePath))
+    plain = value is None or isinstance(
+        value, (str, bytes, int, float, complex, list, tuple, dict, PurePath)
+    )
     return " ".join(repr(value).split())[:80] if plain else f"a {type(value).__name__}"

@@ -1,10 +1,12 @@
 """drjit and Mitsuba for one thread at a time.
 
-Where two threads are in drjit at once, recordings read what is freed, and the threads wait for one another for ever:
-drjit's locks spin, so one that waits keeps Python's lock, while the other frees a tensor of torch that drjit held
-last, which gives Python's lock up for a moment. So whatever calls drjit is ``exclusive``; a tensor that drjit reads
-is kept until its arrays are gone; and no garbage is collected meanwhile, since that frees anything. Waiting for the
-lock here gives Python's lock up, and what holds it waits for no other thread.
+Where two threads are in drjit at once, recordings read what is freed, and the threads wait for one
+another for ever:
+drjit's locks spin, so one that waits keeps Python's lock, while the other frees a tensor of torch
+that drjit held last, which gives Python's lock up for a moment. So whatever calls drjit is
+``exclusive``; a tensor that drjit reads is kept until its arrays are gone; and no garbage is
+collected meanwhile, since that frees anything. Waiting for the lock here gives Python's lock up,
+and what holds it waits for no other thread.
 """
 
 import gc
@@ -25,8 +27,8 @@ FORKED = (
 
 
 class Exclusive(ContextDecorator):
-    """``with exclusive:`` and ``@exclusive``, as often inside one another as one likes. Arrays of drjit that read
-    tensors (``keep``) do not outlive the outermost."""
+    """``with exclusive:`` and ``@exclusive``, as often inside one another as one likes. Arrays of
+    drjit that read tensors (``keep``) do not outlive the outermost."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()

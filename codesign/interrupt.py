@@ -1,5 +1,5 @@
-"""Ctrl-C, and SIGTERM of a batch system, end a run between two steps, where its state is whole; a second one ends it
-at once."""
+"""Ctrl-C, and SIGTERM of a batch system, end a run between two steps, where its state is whole; a
+second one ends it at once."""
 
 import os
 import select
@@ -15,7 +15,8 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @contextmanager
 def written_out() -> Iterator[None]:
-    """A command whose reader went away (``| head``) ends without a traceback, with exit code 141."""
+    """A command whose reader went away (``| head``) ends without a traceback, with exit code
+    141."""
     try:
         yield
         sys.stdout.flush()
@@ -42,9 +43,9 @@ def _reader_gone(handle):
 class Interruption:
     """Turns SIGINT and SIGTERM into a request that a loop answers at its next safe point.
 
-    Outside a loop, and at the second signal, KeyboardInterrupt is raised at once and nothing is saved: what
-    was saved before still stands. ``exit_code`` is that of the signal (130, 143); ``raised``: whether that error was,
-    which a library that is being loaded may turn into another.
+    Outside a loop, and at the second signal, KeyboardInterrupt is raised at once and nothing is
+    saved: what was saved before still stands. ``exit_code`` is that of the signal (130, 143);
+    ``raised``: whether that error was, which a library that is being loaded may turn into another.
     """
 
     def __init__(self):
@@ -80,8 +81,8 @@ class Interruption:
         os.write(2, NOTICE)  # print is not safe in a signal handler
 
     def safe_point(self) -> None:
-        """Called by a loop after each whole step: saves and raises KeyboardInterrupt when a signal asked for
-        it."""
+        """Called by a loop after each whole step: saves and raises KeyboardInterrupt when a signal
+        asked for it."""
         if self.requested:
             if self.save is not None:
                 self.save()

@@ -1,5 +1,5 @@
-"""Packages that the core does without: imported when they are first used, and named in one sentence when they
-are missing."""
+"""Packages that the core does without: imported when they are first used, and named in one sentence
+when they are missing."""
 
 import importlib
 from types import ModuleType
@@ -39,7 +39,8 @@ def require(module: str, extra: str, purpose: str) -> ModuleType:
 
 
 def optional(module: str, extra: str, purpose: str, *before: str) -> Any:
-    """What stands in for ``import module``: the module, imported when an attribute of it is first asked for.
+    """What stands in for ``import module``: the module, imported when an attribute of it is first
+    asked for.
 
     Args:
       module, extra, purpose: as for ``require``.

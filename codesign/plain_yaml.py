@@ -1,7 +1,9 @@
-"""YAML as data: mappings, lists, text, finite numbers, booleans and null, read and written by PyYAML.
+"""YAML as data: mappings, lists, text, finite numbers, booleans and null, read and written by
+PyYAML.
 
-Numbers and booleans are those of JSON (YAML 1.2), so that ``yes`` is a word and ``1e-3`` a number. Tags, anchors and
-aliases are refused, so a file can make no object and unfold into no other; so are keys that stand twice.
+Numbers and booleans are those of JSON (YAML 1.2), so that ``yes`` is a word and ``1e-3`` a number.
+Tags, anchors and aliases are refused, so a file can make no object and unfold into no other; so are
+keys that stand twice.
 """
 
 import json
@@ -55,7 +57,9 @@ _Dumper.add_representer(
 )
 for _kind, _pattern in SCALARS.items():
     for _class in (_Loader, _Dumper):
-        _class.add_implicit_resolver(f"tag:yaml.org,2002:{_kind}", re.compile(f"^(?:{_pattern})$"), None)
+        _class.add_implicit_resolver(
+            f"tag:yaml.org,2002:{_kind}", re.compile(f"^(?:{_pattern})$"), None
+        )
 
 
 def dump(page: Mapping[str, Any], comment: str = "") -> str:
@@ -75,7 +79,9 @@ def dump(page: Mapping[str, Any], comment: str = "") -> str:
     try:
         plain = json.loads(json.dumps(page, allow_nan=False))
     except (TypeError, ValueError) as error:
-        raise DomainError(f"yaml: {error}; finite numbers, text, lists and mappings are written.") from error
+        raise DomainError(
+            f"yaml: {error}; finite numbers, text, lists and mappings are written."
+        ) from error
     head = "".join(f"# {line}".rstrip() + "\n" for line in comment.splitlines())
     style = {"sort_keys": False, "default_flow_style": False, "allow_unicode": True, "width": 10**6}
     return head + yaml.dump(plain, Dumper=_Dumper, **style)
@@ -96,7 +102,9 @@ def load(text: str) -> dict[str, Any]:
         json.dumps(page, allow_nan=False)
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
-        raise FileFormatError(f"yaml, line {line}: {error.problem}; give 'key: value' lines.") from error
+        raise FileFormatError(
+            f"yaml, line {line}: {error.problem}; give 'key: value' lines."
+        ) from error
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         raise FileFormatError(
             f"yaml: {' '.join(str(error).split())[:120]}; give 'key: value' lines."

@@ -1,5 +1,5 @@
-"""Rigid motions: SE(3) exponential, composition, inverse. T_world_cam maps camera points to the world and
-reads right to left."""
+"""Rigid motions: SE(3) exponential, composition, inverse. T_world_cam maps camera points to the
+world and reads right to left."""
 
 from collections.abc import Sequence
 from typing import Any, TypeAlias
@@ -13,7 +13,8 @@ from codesign.checks import check_finite
 from codesign.doors import explain
 from codesign.errors import DomainError, ShapeError
 
-# [..., T, 4, 4], or [4, 4] where one pose is asked for; numbers other than tensors are taken in float64
+# [..., T, 4, 4], or [4, 4] where one pose is asked for; numbers other than tensors are taken in
+# float64
 Poses: TypeAlias = Tensor | np.ndarray | Sequence[Any]
 
 
@@ -21,8 +22,8 @@ def se3_exp(twist: Tensor) -> Tensor:
     """Rigid transform of a twist.
 
     Args:
-      twist [..., 6]: translation part (m) then rotation vector (rad), in the frame on the right of the
-        product.
+      twist [..., 6]: translation part (m) then rotation vector (rad), in the frame on the right of
+        the product.
     Returns: [..., 4, 4]. Gradient: exact, also at zero. Source: kornia.geometry.liegroup.Se3.
 
     >>> se3_exp(torch.tensor([1.0, 2.0, 3.0, 0.0, 0.0, 0.0]))[:3, 3].tolist()
@@ -62,12 +63,13 @@ def look_at(
     target_m: Sequence[float] | Tensor,
     down: Sequence[float] | Tensor = (0.0, 0.0, -1.0),
 ) -> Tensor:
-    """T_world_cam of a camera (x right, y down, z forward) at ``origin_m`` facing ``target_m``; ``down`` is
-    the image's down direction in the world.
+    """T_world_cam of a camera (x right, y down, z forward) at ``origin_m`` facing ``target_m``;
+    ``down`` is the image's down direction in the world.
 
     Args: sequences of three numbers.
     Returns: [4, 4] float64, without gradient.
-    Raises: DomainError when the two points are one, the view is along ``down``, or a number is not finite.
+    Raises: DomainError when the two points are one, the view is along ``down``, or a number is not
+      finite.
 
     >>> look_at((0.0, 0.0, 1.0), (2.0, 0.0, 1.0))[:3, 2].tolist()  # the camera's z axis, in the world
     [1.0, 0.0, 0.0]
@@ -95,20 +97,26 @@ def look_at(
 
 
 def as_poses(poses: Poses) -> Tensor:
-    """Poses as a tensor: tensors as they are, numbers of numpy arrays and lists in float64, a list of tensors
-    stacked.
+    """Poses as a tensor: tensors as they are, numbers of numpy arrays and lists in float64, a list
+    of tensors stacked.
 
     >>> as_poses([look_at((0.0, 0.0, 1.0), (2.0, 0.0, 0.0))] * 3).shape
     torch.Size([3, 4, 4])
 
-    Gradient: to tensors, in a list too. Raises: DomainError for what are no numbers or complex ones;
-      ShapeError for a list of tensors that differ in shape.
+    Gradient: to tensors, in a list too. Raises: DomainError for what are no numbers or complex
+      ones; ShapeError for a list of tensors that differ in shape.
     """
     if isinstance(poses, Tensor):
         return poses
-    if isinstance(poses, list | tuple) and poses and all(isinstance(pose, Tensor) for pose in poses):
+    if (
+        isinstance(poses, list | tuple)
+        and poses
+        and all(isinstance(pose, Tensor) for pose in poses)
+    ):
         if len(shapes := {tuple(pose.shape) for pose in poses}) > 1:
-            raise ShapeError(f"poses are a list of tensors {sorted(shapes)}; give each the shape [4, 4].")
+            raise ShapeError(
+                f"poses are a list of tensors {sorted(shapes)}; give each the shape [4, 4]."
+            )
         return torch.stack(list(poses))
     try:
         values = np.asarray(poses)
@@ -123,8 +131,8 @@ def as_poses(poses: Poses) -> Tensor:
 
 
 def check_pose(transform: Poses) -> Tensor:
-    """Raise unless the tensor (or array, or nested list) is one rigid transform [4, 4]; returns it as a
-    tensor."""
+    """Raise unless the tensor (or array, or nested list) is one rigid transform [4, 4]; returns it
+    as a tensor."""
     transform = as_poses(transform)
     if transform.shape != (4, 4):
         raise ShapeError(f"a pose must be [4, 4], got {tuple(transform.shape)}.")
@@ -132,8 +140,8 @@ def check_pose(transform: Poses) -> Tensor:
 
 
 def check_poses(transform: Poses) -> Tensor:
-    """Raise unless the tensor (or array, or nested list) holds rigid transforms [..., T >= 1, 4, 4], a
-    trajectory or a batch of them; returns it as a tensor."""
+    """Raise unless the tensor (or array, or nested list) holds rigid transforms
+    [..., T >= 1, 4, 4], a trajectory or a batch of them; returns it as a tensor."""
     transform = as_poses(transform)
     if transform.ndim < 3 or transform.shape[-2:] != (4, 4) or transform.numel() == 0:
         raise ShapeError(
@@ -146,7 +154,9 @@ def check_poses(transform: Poses) -> Tensor:
     fixed = transform.detach().double()
     rotation = fixed[..., :3, :3]
     error = float(
-        (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs().max()
+        (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64, device=rotation.device))
+        .abs()
+        .max()
     )
     if error > 1e-4:
         raise DomainError(
@@ -157,7 +167,10 @@ def check_poses(transform: Poses) -> Tensor:
             "poses are not rigid: a rotation has determinant -1, so it mirrors; flip the sign of one axis."
         )
     last = (
-        (fixed[..., 3, :] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=fixed.device))
+        (
+            fixed[..., 3, :]
+            - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=fixed.device)
+        )
         .abs()
         .max()
     )

@@ -1,7 +1,8 @@
-"""The frame around every reader: which file is opened, how much of it is read, and what a failure inside means.
+"""The frame around every reader: which file is opened, how much of it is read, and what a failure
+inside means.
 
-A reader opens its file here, says from the header how much it is about to hold, and puts whatever it leaves to a
-library into ``reading``: no list of the errors of libraries stands anywhere else.
+A reader opens its file here, says from the header how much it is about to hold, and puts whatever
+it leaves to a library into ``reading``: no list of the errors of libraries stands anywhere else.
 """
 
 import json
@@ -50,7 +51,8 @@ def building(
     what: str | Path,
     remedy: str = "it is damaged, or of another version",
 ) -> Iterator[None]:
-    """As ``reading``, around classes that are made of a file's values: their refusals name the file too."""
+    """As ``reading``, around classes that are made of a file's values: their refusals name the file
+    too."""
     try:
         with reading(what, remedy):
             yield
@@ -65,8 +67,8 @@ def open_regular(path: str | Path, most_bytes: int | None = None) -> BinaryIO:
 
     Args:
       most_bytes: refuse a longer one.
-    Raises: FileFormatError where there is none, where it may not be read, where it is a folder, a pipe (which is not
-      waited for) or a device, or where it is too long.
+    Raises: FileFormatError where there is none, where it may not be read, where it is a folder, a
+      pipe (which is not waited for) or a device, or where it is too long.
     """
     try:
         file = open(path, "rb", opener=_without_waiting)  # noqa: SIM115 - handed to the caller
@@ -74,7 +76,9 @@ def open_regular(path: str | Path, most_bytes: int | None = None) -> BinaryIO:
         raise FileFormatError(f"no file lies at {path}; check the path.") from None
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         said = error.strerror if isinstance(error, OSError) else error
-        raise FileFormatError(f"{path} cannot be read ({said}); give a file you may read.") from error
+        raise FileFormatError(
+            f"{path} cannot be read ({said}); give a file you may read."
+        ) from error
     length = os.fstat(file.fileno()).st_size
     if most_bytes is not None and length > most_bytes:
         file.close()
@@ -85,26 +89,30 @@ def open_regular(path: str | Path, most_bytes: int | None = None) -> BinaryIO:
 
 
 def check_regular(path: str | Path, most_bytes: int | None = None) -> Path:
-    """The path, for a library that opens files itself. Raises: FileFormatError, as ``open_regular``."""
+    """The path, for a library that opens files itself. Raises: FileFormatError, as
+    ``open_regular``."""
     open_regular(path, most_bytes).close()
     return Path(path)
 
 
 def read_bytes(path: str | Path, most_bytes: int) -> bytes:
-    """The content of a regular file of at most so many bytes. Raises: FileFormatError, as ``open_regular``."""
+    """The content of a regular file of at most so many bytes. Raises: FileFormatError, as
+    ``open_regular``."""
     with open_regular(path, most_bytes) as file, reading(path, "check the disk"):
         return file.read()
 
 
 def read_json(path: str | Path, most_bytes: int = 50_000_000) -> Any:
-    """What a file of JSON in UTF-8 holds. Raises: FileFormatError where it is none, or nested without end."""
+    """What a file of JSON in UTF-8 holds. Raises: FileFormatError where it is none, or nested
+    without end."""
     text = read_text(path, most_bytes)
     with reading(path, "it is no whole JSON file"):
         return json.loads(text, parse_constant=_number, parse_float=_number)
 
 
 def read_text(path: str | Path, most_bytes: int = 50_000_000) -> str:
-    """The text of a regular file in UTF-8, without a byte order mark. Raises: FileFormatError, as ``open_regular``, and where it is no text."""
+    """The text of a regular file in UTF-8, without a byte order mark. Raises: FileFormatError, as
+    ``open_regular``, and where it is no text."""
     content = read_bytes(path, most_bytes)
     with reading(path, "it is no text in UTF-8"):
         return content.decode("utf-8-sig").replace("\r\n", "\n")
@@ -113,7 +121,8 @@ def read_text(path: str | Path, most_bytes: int = 50_000_000) -> str:
 def check_room(
     what: str | Path, shape: tuple[int, ...], item_bytes: int, most_bytes: int = MOST_BYTES
 ) -> None:
-    """Refuse a header that announces more than anyone means, before anything is made of it. Raises: FileFormatError."""
+    """Refuse a header that announces more than anyone means, before anything is made of it. Raises:
+    FileFormatError."""
     if any(size < 0 for size in shape) or math.prod(shape) * item_bytes > most_bytes:
         raise FileFormatError(
             f"{what} announces {' x '.join(map(str, shape))} values of {item_bytes} bytes, more than the {most_bytes} "

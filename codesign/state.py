@@ -1,4 +1,5 @@
-"""The state of an unfinished run: exact tensors and numbers in one file that holds data only, never code."""
+"""The state of an unfinished run: exact tensors and numbers in one file that holds data only, never
+code."""
 
 import io
 import json
@@ -19,15 +20,16 @@ from codesign.reading import reading
 
 @dataclass(frozen=True)
 class State:
-    """What ``write_state`` stored: tensors on the CPU, bit for bit, and a dictionary of plain JSON values."""
+    """What ``write_state`` stored: tensors on the CPU, bit for bit, and a dictionary of plain JSON
+    values."""
 
     tensors: dict[str, Tensor]
     numbers: dict[str, Any]
 
 
 def write_state(path: Path, tensors: dict[str, Tensor], numbers: dict[str, Any]) -> None:
-    """Store tensors (any real, complex, integer or bool dtype numpy knows; a generator's state is one of
-    uint8) and plain numbers.
+    """Store tensors (any real, complex, integer or bool dtype numpy knows; a generator's state is
+    one of uint8) and plain numbers.
 
     Raises: ShapeError for a dtype the file cannot hold; FileFormatError when it cannot be written.
     """
@@ -59,7 +61,10 @@ def read_state(path: Path) -> State | None:
         header = json.loads(stored["header"].tobytes())
         names, numbers = list(header["names"]), dict(header["numbers"])
         return State(
-            {str(name): torch.from_numpy(stored[f"tensor_{index}"]) for index, name in enumerate(names)},
+            {
+                str(name): torch.from_numpy(stored[f"tensor_{index}"])
+                for index, name in enumerate(names)
+            },
             numbers,
         )
 

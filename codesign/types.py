@@ -1,5 +1,5 @@
-"""Frozen dataclasses that cross junctions: camera rays, event streams, event volumes, flow fields, windows to
-learn flow from."""
+"""Frozen dataclasses that cross junctions: camera rays, event streams, event volumes, flow fields,
+windows to learn flow from."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -16,8 +16,8 @@ class Rays:
     origin_m: [N, 3] metres, relative to the centre of the entrance pupil.
     direction: [N, 3] unit vectors.
     weight: [N] share of the light that passes all apertures, 0 to 1; 0 for a ray that failed.
-    irradiance: [N] what an unvignetted ray adds to the irradiance of its image point, relative to the axis
-      (for an ideal lens cos^4 of the angle at the film); None where nobody computed it.
+    irradiance: [N] what an unvignetted ray adds to the irradiance of its image point, relative to
+      the axis (for an ideal lens cos^4 of the angle at the film); None where nobody computed it.
     """
 
     origin_m: Tensor
@@ -30,7 +30,8 @@ class Rays:
 class EventStream:
     """A list of events sorted by (t, y, x, p).
 
-    t_us: [N] int64 microseconds. x, y: [N] int64 pixels (column, row). p: [N] int64, +1 ON or -1 OFF.
+    t_us: [N] int64 microseconds. x, y: [N] int64 pixels (column, row). p: [N] int64, +1 ON or -1
+      OFF.
     height_px, width_px: size of the sensor the events come from.
     """
 
@@ -49,10 +50,11 @@ class EventStream:
 class EventVolume:
     """Event counts on a grid of time bins.
 
-    counts: [B, 2, bins, H, W], ON first; counts per bin, fractional where events are shared between bins.
+    counts: [B, 2, bins, H, W], ON first; counts per bin, fractional where events are shared between
+      bins.
     centroid_s: [bins] mean time of what each bin collects, seconds from the start of the interval.
-    collected_s: [bins] time that each bin collects (half a node spacing at the ends); their sum is the length
-      of the interval.
+    collected_s: [bins] time that each bin collects (half a node spacing at the ends); their sum is
+      the length of the interval.
     """
 
     counts: Tensor
@@ -64,15 +66,15 @@ class EventVolume:
 class FlowField:
     """Motion of every pixel over one interval.
 
-    flow_px: [B, 2, H, W] pixels per interval, +x right, +y down: where the point seen at the start of the
-      interval lies at its end.
+    flow_px: [B, 2, H, W] pixels per interval, +x right, +y down: where the point seen at the start
+      of the interval lies at its end.
     valid: [B, H, W] bool, False where the value means nothing (no ground truth, no events).
     interval_s: length of the interval, seconds.
-    confidence: [B, H, W] in 0..1, 0 where nothing was seen, 1 for a flow known exactly; None where nobody
-      estimated it.
+    confidence: [B, H, W] in 0..1, 0 where nothing was seen, 1 for a flow known exactly; None where
+      nobody estimated it.
     covariance_px2: [B, 3, H, W] of the error, px^2: xx, xy, yy; None where nobody estimated it.
-    net_share: [B] displacement over the length of the way, 1 for motion that does not turn back, about 0 for one that
-      ends where it began; None where nobody looked.
+    net_share: [B] displacement over the length of the way, 1 for motion that does not turn back,
+      about 0 for one that ends where it began; None where nobody looked.
     """
 
     flow_px: Tensor
@@ -87,9 +89,10 @@ class FlowField:
 class FlowWindows:
     """A batch to learn flow from, or to judge it on.
 
-    volume: EventVolume of B samples. truth: FlowField of the same interval, on the pixels of its start.
-    frames: [B, 2, H, W] linear intensity at the start and at the end, 0..255 scale; None where there are
-      none.
+    volume: EventVolume of B samples. truth: FlowField of the same interval, on the pixels of its
+      start.
+    frames: [B, 2, H, W] linear intensity at the start and at the end, 0..255 scale; None where
+      there are none.
     start: FlowField with covariance that a network may begin with; None where it makes its own.
     """
 

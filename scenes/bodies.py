@@ -1,5 +1,5 @@
-"""Triangle meshes: out of boxes and cylinders, or from files, of one colour or of their own. Metres, outward
-faces."""
+"""Triangle meshes: out of boxes and cylinders, or from files, of one colour or of their own.
+Metres, outward faces."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -37,8 +37,8 @@ ALONG = {
 class Body:
     """Triangles in the world: vertices_m [V, 3], faces [F, 3].
 
-    uv: [V, 2] where its paint is laid out by texture coordinates (v up). tint: what the paint's level is
-    times where it has none: one number, [F], or [V] where ``smooth``.
+    uv: [V, 2] where its paint is laid out by texture coordinates (v up). tint: what the paint's
+    level is times where it has none: one number, [F], or [V] where ``smooth``.
     """
 
     vertices_m: np.ndarray
@@ -48,7 +48,8 @@ class Body:
     smooth: bool = False
 
     def placed(self, x=0.0, y=0.0, bottom_m=0.0, turn_deg=0.0):
-        """The body turned about z, its bounding box centred over (x, y) and resting on ``bottom_m``."""
+        """The body turned about z, its bounding box centred over (x, y) and resting on
+        ``bottom_m``."""
         angle = np.radians(turn_deg)
         turned = self.vertices_m @ np.array(
             [[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
@@ -60,11 +61,11 @@ class Body:
 
 
 def read(path: str | Path, scale: float = 1.0) -> Body:
-    """The shapes of a mesh file (scenes.mesh_files.KINDS) as one Body, its coordinates times ``scale`` (0.001
-    for a file in millimetres); its colours are left.
+    """The shapes of a mesh file (scenes.mesh_files.KINDS) as one Body, its coordinates times
+    ``scale`` (0.001 for a file in millimetres); its colours are left.
 
-    Raises: FileFormatError when the file is missing, of another kind, empty or damaged; DomainError for a
-      scale that is not positive.
+    Raises: FileFormatError when the file is missing, of another kind, empty or damaged; DomainError
+      for a scale that is not positive.
     """
     if not 0 < scale < float("inf"):
         raise DomainError(f"mesh {path}: scale = {scale} must be positive and finite.")
@@ -75,8 +76,8 @@ def read(path: str | Path, scale: float = 1.0) -> Body:
 
 
 def skylight(body: Body) -> np.ndarray:
-    """Share of full light from a plain sky with a soft sun: what stands for shading where nothing is lit. [F]
-    on each face, or [V] by the mean normal at each vertex of a ``smooth`` body."""
+    """Share of full light from a plain sky with a soft sun: what stands for shading where nothing
+    is lit. [F] on each face, or [V] by the mean normal at each vertex of a ``smooth`` body."""
     corners = body.vertices_m[body.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     if body.smooth:
@@ -96,12 +97,18 @@ def box(size_m: Sequence[float], centre_m: Sequence[float], turn_deg: float = 0.
     [1.0, 0.5, 1.25]
     """
     angle = np.radians(turn_deg)
-    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-    return Body(CORNERS * np.asarray(size_m, dtype=float) @ turn.T + np.asarray(centre_m, dtype=float), SIDES)
+    turn = np.array(
+        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+    )
+    return Body(
+        CORNERS * np.asarray(size_m, dtype=float) @ turn.T + np.asarray(centre_m, dtype=float),
+        SIDES,
+    )
 
 
 def cylinder(radius_m: float, length_m: float, centre_m: Sequence[float], along: str = "z") -> Body:
-    """A closed cylinder about a point, its axis along "x", "y" or "z"; AROUND flat sides inside the radius.
+    """A closed cylinder about a point, its axis along "x", "y" or "z"; AROUND flat sides inside the
+    radius.
 
     >>> wheel = cylinder(0.1, 0.04, (0.0, 0.0, 0.1), "y")
     >>> wheel.vertices_m.min(0).round(3).tolist()

@@ -1,8 +1,9 @@
-"""What worlds are made of: painted shapes and lamps, and the light levels at which they can be shown.
+"""What worlds are made of: painted shapes and lamps, and the light levels at which they can be
+shown.
 
-A world is described once. At the level "emissive" every surface shows its picture as radiance; at "baked" and
-"path" the same pictures are albedo and the world's lamps light them (see codesign.render.light). Metres, z
-up, radiance on the 0..255 scale.
+A world is described once. At the level "emissive" every surface shows its picture as radiance; at
+"baked" and "path" the same pictures are albedo and the world's lamps light them (see
+codesign.render.light). Metres, z up, radiance on the 0..255 scale.
 """
 
 import math
@@ -25,11 +26,11 @@ WHITE = 0.95  # albedo of a picture's 255
 
 @dataclass(frozen=True)
 class Paint:
-    """What is on a surface. picture: [H, W] radiance 0..255, first row at the top; repeat: times along u and
-    v; wrap: how it goes on.
+    """What is on a surface. picture: [H, W] radiance 0..255, first row at the top; repeat: times
+    along u and v; wrap: how it goes on.
 
-    albedo: of a picture's 255 where the world is lit. glow: uniform radiance that the surface emits there, on
-      top of what it reflects.
+    albedo: of a picture's 255 where the world is lit. glow: uniform radiance that the surface emits
+      there, on top of what it reflects.
     """
 
     picture: Any
@@ -41,9 +42,12 @@ class Paint:
 
 @dataclass(frozen=True)
 class World:
-    """Shapes (name -> (geometry, Paint)) that every level shows; background: sky that every level shows;
-    lamps: Mitsuba lights of the lit levels; texel_m: size of baked light-map texels that suits its things.
-    two_sided: whether surfaces show from behind what they show from in front, or where it is lit reflect there too."""
+    """Shapes (name -> (geometry, Paint)) that every level shows; background: sky that every level
+    shows;
+    lamps: Mitsuba lights of the lit levels; texel_m: size of baked light-map texels that suits its
+      things.
+    two_sided: whether surfaces show from behind what they show from in front, or where it is lit
+      reflect there too."""
 
     shapes: dict[str, tuple[Any, Paint]]
     background: dict[str, Any] = field(default_factory=dict)
@@ -56,26 +60,32 @@ Light = Callable[[World, str], Any]
 
 
 def emissive(world, device="cpu"):
-    """The world with its pictures as radiance: one ray cast and one lookup per ray, no shading but what the
-    pictures hold."""
+    """The world with its pictures as radiance: one ray cast and one lookup per ray, no shading but
+    what the pictures hold."""
     mi = backend.mitsuba(device)
     shapes = {}
     for name, (geometry, paint) in world.shapes.items():
         if isinstance(geometry, bodies.Body):
             shapes[name] = _glowing(mi, name, geometry, paint)
         else:
-            shapes[name] = {**geometry, "emitter": {"type": "area", "radiance": _bitmap(mi, paint, 1.0)}}
+            shapes[name] = {
+                **geometry,
+                "emitter": {"type": "area", "radiance": _bitmap(mi, paint, 1.0)},
+            }
     scene = MitsubaScene({**shapes, **world.background}, device)
     return scene.two_sided() if world.two_sided else scene
 
 
 def baked(world, device="cpu", **options):
     """The world lit by its lamps, worked out once; options go to light.bake."""
-    return light.bake(lit(world, device, world.two_sided), device, **{"texel_m": world.texel_m, **options})
+    return light.bake(
+        lit(world, device, world.two_sided), device, **{"texel_m": world.texel_m, **options}
+    )
 
 
 def path(world, device="cpu", **options):
-    """The world lit by its lamps, by path tracing for every camera ray; options go to light.PathScene."""
+    """The world lit by its lamps, by path tracing for every camera ray; options go to
+    light.PathScene."""
     return light.PathScene(lit(world, device, world.two_sided), device, **options)
 
 
@@ -83,15 +93,18 @@ LEVELS: dict[str, Light] = {"emissive": emissive, "baked": baked, "path": path}
 
 
 def lit(world, device="cpu", two_sided=False):
-    """Mitsuba description of the world as Lambertian surfaces with lamps; meshes reflect on both sides where
-    ``two_sided``."""
+    """Mitsuba description of the world as Lambertian surfaces with lamps; meshes reflect on both
+    sides where ``two_sided``."""
     mi = backend.mitsuba(device)
     shapes = {}
     for name, (geometry, paint) in world.shapes.items():
         if isinstance(geometry, bodies.Body):
             shapes[name] = _lit_body(mi, name, geometry, paint, two_sided)
             continue
-        shapes[name] = {**geometry, "bsdf": {"type": "diffuse", "reflectance": _reflectance(mi, name, paint)}}
+        shapes[name] = {
+            **geometry,
+            "bsdf": {"type": "diffuse", "reflectance": _reflectance(mi, name, paint)},
+        }
         if paint.glow:
             radiance = {"type": "rgb", "value": float(paint.glow)}
             shapes[name]["emitter"] = {"type": "area", "radiance": radiance}
@@ -106,7 +119,8 @@ def _check_albedo(name, brightest):
 
 
 def _glowing(mi, name, body, paint):
-    """A body as it shows its paint: by its texture coordinates, or, where it has none, shaded by a plain sky."""
+    """A body as it shows its paint: by its texture coordinates, or, where it has none, shaded by a
+    plain sky."""
     if body.uv is not None:
         source = {"type": "area", "radiance": _bitmap(mi, paint, 1.0)}
         return emissive_mesh(mi, body.vertices_m, body.faces, source, body.uv)
@@ -192,7 +206,9 @@ def sides(mi, size_m, y=0.0):
         "east": ((width / 2, y, half), length),
         "west": ((-width / 2, y, half), length),
     }
-    walls = {name: rectangle(mi, at, (0, y, half), wide, height) for name, (at, wide) in around.items()}
+    walls = {
+        name: rectangle(mi, at, (0, y, half), wide, height) for name, (at, wide) in around.items()
+    }
     floor = rectangle(mi, (0, y, 0), (0, y, half), width, length, up)
     return {
         **walls,
@@ -219,7 +235,9 @@ def ball(mi, x, y, bottom_m, radius_m):
     check_sizes("ball", radius_m=radius_m)
     return {
         "type": "sphere",
-        "to_world": mi.ScalarTransform4f().translate([x, y, bottom_m + GAP_M + radius_m]).scale(radius_m),
+        "to_world": mi.ScalarTransform4f()
+        .translate([x, y, bottom_m + GAP_M + radius_m])
+        .scale(radius_m),
     }
 
 
@@ -234,18 +252,22 @@ def pole(mi, start, end, radius_m):
     tube = T().look_at(origin=start.tolist(), target=end.tolist(), up=helper) @ T().scale(
         [radius_m, radius_m, length]
     )
-    cap = T().look_at(origin=end.tolist(), target=(2 * end - start).tolist(), up=helper) @ T().scale(
-        [radius_m, radius_m, 1]
-    )
+    cap = T().look_at(
+        origin=end.tolist(), target=(2 * end - start).tolist(), up=helper
+    ) @ T().scale([radius_m, radius_m, 1])
     return {"type": "cylinder", "to_world": tube}, {"type": "disk", "to_world": cap}
 
 
 def sky(mi, picture):
-    """Environment map of an equirectangular picture [H, W], first row at the zenith; columns run from +y over
-    +x, as on a compass."""
+    """Environment map of an equirectangular picture [H, W], first row at the zenith; columns run
+    from +y over +x, as on a compass."""
     values = textures.check_texture(picture, "of the sky")
     bitmap = mi.Bitmap(np.ascontiguousarray(np.repeat(values[..., None], 3, 2)))
-    return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90)}
+    return {
+        "type": "envmap",
+        "bitmap": bitmap,
+        "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90),
+    }
 
 
 def sun(irradiance):
@@ -257,4 +279,8 @@ def sun(irradiance):
         -math.cos(elevation) * math.cos(azimuth),
         -math.sin(elevation),
     ]
-    return {"type": "directional", "direction": towards, "irradiance": {"type": "rgb", "value": irradiance}}
+    return {
+        "type": "directional",
+        "direction": towards,
+        "irradiance": {"type": "rgb", "value": irradiance},
+    }

@@ -1,5 +1,5 @@
-"""Which path a camera takes through a world: one of five families, drawn at random until it keeps clear of
-everything."""
+"""Which path a camera takes through a world: one of five families, drawn at random until it keeps
+clear of everything."""
 
 import inspect
 import math
@@ -28,11 +28,11 @@ LEAD_S = 0.6  # flights start from rest: recorded from here on
 class Stage:
     """Where a camera may move in a world, metres.
 
-    target_m: what it looks at. low_m, high_m: box of the camera. orbit_m: radius and height of orbits, about
-      centre_m (the target when None); sweep_rad: how far round they may go. start_m, yaw_rad, turn_rad_s,
-      height_m: how the robot starts, its mean turn rate, and the height of its body. aside_rad: to which side
-      of the robot's way its camera looks. pitch_rad: how far down cameras on the robot and the quadrotor
-      look.
+    target_m: what it looks at. low_m, high_m: box of the camera. orbit_m: radius and height of
+      orbits, about centre_m (the target when None); sweep_rad: how far round they may go. start_m,
+      yaw_rad, turn_rad_s, height_m: how the robot starts, its mean turn rate, and the height of its
+      body. aside_rad: to which side of the robot's way its camera looks. pitch_rad: how far down
+      cameras on the robot and the quadrotor look.
     """
 
     target_m: tuple[float, float, float] = (0.0, 0.6, 0.7)
@@ -119,7 +119,8 @@ def make_world(name: str, light: str = "emissive") -> tuple[MitsubaScene, Stage]
 
 
 def motion(family, stage, scene, camera, duration_s, generator):
-    """A camera trajectory of a family, that lasts ``duration_s`` from ``LEAD_S`` on and keeps its distance.
+    """A camera trajectory of a family, that lasts ``duration_s`` from ``LEAD_S`` on and keeps its
+    distance.
 
     Raises: DomainError when no path of ``TRIES`` does.
     """
@@ -169,10 +170,15 @@ def _drawn(family, stage, until_s, generator):
         ]
         swing = Swinging.radial if family == "radial" else Swinging.vertical
         return mounted(
-            swing(body_at(place, stage.target_m), between(3, 0.15, 0.3), between(4, 0.4, 0.7)), level
+            swing(body_at(place, stage.target_m), between(3, 0.15, 0.3), between(4, 0.4, 0.7)),
+            level,
         )
     if family == "driving":
-        turn = stage.turn_rad_s * between(0, 0.8, 1.2) * (1 if u[1] < 0.5 or not stage.turn_rad_s else -1)
+        turn = (
+            stage.turn_rad_s
+            * between(0, 0.8, 1.2)
+            * (1 if u[1] < 0.5 or not stage.turn_rad_s else -1)
+        )
         start = dict(zip(("x_m", "y_m"), stage.start_m, strict=True))
         speed = between(2, 0.3, 0.6)
         body = Driving(
@@ -190,7 +196,9 @@ def _drawn(family, stage, until_s, generator):
         body = Flying.random(generator, until_s, stage.low_m, stage.high_m, stage.target_m)
     except DomainError:  # too fast for the draw of waypoints
         return None
-    return mounted(body, Mount((0.0, 0.0, 0.05), (0.0, 0.0, 0.0), pitch_rad=stage.pitch_rad)().detach())
+    return mounted(
+        body, Mount((0.0, 0.0, 0.05), (0.0, 0.0, 0.0), pitch_rad=stage.pitch_rad)().detach()
+    )
 
 
 def _keeps_clear(T_world_cam, scene, camera):

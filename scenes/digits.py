@@ -15,7 +15,14 @@ from skimage.draw import polygon as polygon_pixels
 from scenes import textures
 
 CLASSES = 10
-FONTS = ("DejaVuSans", "DejaVuSans-BoldOblique", "DejaVuSansMono", "DejaVuSerif", "STIXGeneral", "cmss10")
+FONTS = (
+    "DejaVuSans",
+    "DejaVuSans-BoldOblique",
+    "DejaVuSansMono",
+    "DejaVuSerif",
+    "STIXGeneral",
+    "cmss10",
+)
 PHOTOS = {
     "training": ("gravel", "coffee", "astronaut", "rocket", "camera"),
     "test": ("brick", "grass", "chelsea", "hubble_deep_field"),
@@ -32,22 +39,24 @@ LEG_S = 0.06  # duration of one saccade
 
 
 def draw_pictures(count, photos, seed):
-    """Tiles [N, 64, 64], intensity on the 0-255 scale, periodic and band-limited: a digit in a random font,
-    size, place and contrast on a piece of a photograph behind a soft lens. Labels [N], in turn."""
+    """Tiles [N, 64, 64], intensity on the 0-255 scale, periodic and band-limited: a digit in a
+    random font, size, place and contrast on a piece of a photograph behind a soft lens. Labels [N],
+    in turn."""
     random = np.random.default_rng(seed)
     tiles = softened(np.stack([_tile(index % CLASSES, photos, random) for index in range(count)]))
     return torch.from_numpy(tiles.astype(np.float32)), torch.arange(count) % CLASSES
 
 
 def softened(tiles):
-    """Tiles [N, K, K] behind a Gaussian blur of BLUR_PX, exact for the periodic band-limited picture."""
+    """Tiles [N, K, K] behind a Gaussian blur of BLUR_PX, exact for the periodic band-limited
+    picture."""
     fade = np.exp(-2 * (np.pi * BLUR_PX * np.fft.fftfreq(tiles.shape[-1])) ** 2)
     return np.fft.ifft2(np.fft.fft2(tiles) * fade[:, None] * fade).real
 
 
 def coverage(label, font, height_px, turn_deg, centre_px):
-    """Share of each pixel of a tile that a digit covers, [64, 64]. centre_px: (x, y) from the tile's
-    middle."""
+    """Share of each pixel of a tile that a digit covers, [64, 64]. centre_px: (x, y) from the
+    tile's middle."""
     angle = np.deg2rad(turn_deg)
     turn = height_px * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     inside = np.zeros((TILE_PX * FINE,) * 2, dtype=bool)
@@ -98,9 +107,12 @@ def frame_times(rate_hz):
 
 def position_px(t_s):
     """Where a picture has moved to at [T] times: [T, 2] pixels (x right, y down). Three legs of an
-    equilateral triangle, as for N-MNIST (Orchard et al. 2015), each with the course of minimum jerk (Flash
-    and Hogan 1985)."""
-    corners = torch.tensor([[0, 0], [0.5, math.sqrt(0.75)], [1, 0], [0, 0]], dtype=torch.float64) * SIDE_PX
+    equilateral triangle, as for N-MNIST (Orchard et al. 2015), each with the course of minimum jerk
+    (Flash and Hogan 1985)."""
+    corners = (
+        torch.tensor([[0, 0], [0.5, math.sqrt(0.75)], [1, 0], [0, 0]], dtype=torch.float64)
+        * SIDE_PX
+    )
     leg = (t_s / LEG_S).floor().clamp(max=2).long()
     u = t_s / LEG_S - leg
     share = u**3 * (10 - 15 * u + 6 * u**2)
@@ -108,8 +120,8 @@ def position_px(t_s):
 
 
 def frames(tiles, t_s):
-    """What a window in the middle of moving tiles [N, K, K] sees, [T, N, WINDOW_PX, WINDOW_PX]: a tile's own
-    trigonometric polynomial at pixel - position, exact at any fraction of a pixel."""
+    """What a window in the middle of moving tiles [N, K, K] sees, [T, N, WINDOW_PX, WINDOW_PX]: a
+    tile's own trigonometric polynomial at pixel - position, exact at any fraction of a pixel."""
     side = tiles.shape[-1]
     window = (side - WINDOW_PX) // 2 + torch.arange(WINDOW_PX, dtype=torch.float64)
     place = window - position_px(t_s).T[..., None]  # [2, T, W]

@@ -1,9 +1,11 @@
-"""Worlds from Mitsuba scenes that others wrote: files, dictionaries, or scenes that are loaded already.
+"""Worlds from Mitsuba scenes that others wrote: files, dictionaries, or scenes that are loaded
+already.
 
-What is taken is what can be seen and what lights it. Sensors, films, samplers and file output are left out of the
-world; ``view_of`` reads the first perspective sensor as a place to start from. Mitsuba runs in one channel here,
-as event sensors do: colours become luminance before light bounces, so light between strongly coloured surfaces is
-a little off from the luminance of a colour rendering.
+What is taken is what can be seen and what lights it. Sensors, films, samplers and file output are
+left out of the world; ``view_of`` reads the first perspective sensor as a place to start from.
+Mitsuba runs in one channel here, as event sensors do: colours become luminance before light
+bounces, so light between strongly coloured surfaces is a little off from the luminance of a colour
+rendering.
 """
 
 import math
@@ -63,25 +65,29 @@ def from_mitsuba(
     """A world out of a Mitsuba scene.
 
     Args:
-      source: path of an .xml file, a dictionary as mi.load_dict takes it, or an mi.Scene loaded in the variant of
-        ``backend.variant(device)``.
-      light: "path", what Mitsuba renders, by ``samples`` (16) paths per camera ray, without gradient (PathScene);
-        "baked", light worked out once (light.bake); "emissive", without light: what glows shows its emission, and
-        anything else its albedo, as radiance;
-        "auto", emissive where every surface is an emitter, otherwise baked.
-      unit_m: metres per unit of the scene's lengths. up: the axis that points up in it; worlds have z up.
-      gain: factor on its radiance; 255 brings pictures made for a white of 1 to the scale of the other worlds.
-      samples: paths per camera ray, or per texel (64); seed: of their random numbers. Paths are as long as the
-        integrator of the scene has them where it samples camera rays, and of any length where there is none.
-      texel_m: size of the texels of baked light, None for as large as makes TEXELS of them. towards_m, matte: of
-        surfaces that shine, mirror or let light through, as in ``light.bake``.
+      source: path of an .xml file, a dictionary as mi.load_dict takes it, or an mi.Scene loaded in
+        the variant of ``backend.variant(device)``.
+      light: "path", what Mitsuba renders, by ``samples`` (16) paths per camera ray, without
+        gradient (PathScene); "baked", light worked out once (light.bake); "emissive", without
+        light: what glows shows its emission, and anything else its albedo, as radiance; "auto",
+        emissive where every surface is an emitter, otherwise baked.
+      unit_m: metres per unit of the scene's lengths. up: the axis that points up in it; worlds have
+        z up.
+      gain: factor on its radiance; 255 brings pictures made for a white of 1 to the scale of the
+        other worlds.
+      samples: paths per camera ray, or per texel (64); seed: of their random numbers. Paths are as
+        long as the integrator of the scene has them where it samples camera rays, and of any length
+        where there is none.
+      texel_m: size of the texels of baked light, None for as large as makes TEXELS of them.
+        towards_m, matte: of surfaces that shine, mirror or let light through, as in ``light.bake``.
       parameters: values of $parameters in an .xml file.
-    Returns: a scene for ``render.frames`` with ``radiance``, ``radiance_and_distance``, ``hit`` and ``outline``.
+    Returns: a scene for ``render.frames`` with ``radiance``, ``radiance_and_distance``, ``hit`` and
+      ``outline``.
     Gradient: baked and emissive worlds, as MitsubaScene.
     Warns: UserWarning when the scene is more than 100 m or less than 1 cm wide (scenes.units).
-    Raises: FileFormatError for a file that is missing or that Mitsuba cannot load (an unknown plugin, a missing
-      picture); DomainError for a dictionary it cannot load, a scene without shapes or light, what cannot be baked
-      (light.bake), an unknown level, unit or axis.
+    Raises: FileFormatError for a file that is missing or that Mitsuba cannot load (an unknown
+      plugin, a missing picture); DomainError for a dictionary it cannot load, a scene without
+      shapes or light, what cannot be baked (light.bake), an unknown level, unit or axis.
     """
     check_choice(light, "light", LEVELS)
     if samples is not None:
@@ -99,7 +105,9 @@ def from_mitsuba(
             f"{name} has no light, so it is black at the level '{light}'; add an emitter, or choose 'emissive'."
         )
     units.hint(
-        *([unit_m * v for v in corner] for corner in (scene.bbox().min, scene.bbox().max)), name, unit_m
+        *([unit_m * v for v in corner] for corner in (scene.bbox().min, scene.bbox().max)),
+        name,
+        unit_m,
     )
     integrator = _integrator(mi, scene)
     if light == "path":
@@ -130,19 +138,21 @@ def _area(shape):
 
 
 def _integrator(mi, scene):
-    """The scene's own where it gives radiance along camera rays; otherwise paths, through media where there are
-    any."""
+    """The scene's own where it gives radiance along camera rays; otherwise paths, through media
+    where there are any."""
     own = scene.integrator()
     if isinstance(own, mi.SamplingIntegrator) and own.class_name() in INTEGRATORS:
         return own
-    media = any(s.interior_medium() is not None or s.exterior_medium() is not None for s in scene.shapes())
+    media = any(
+        s.interior_medium() is not None or s.exterior_medium() is not None for s in scene.shapes()
+    )
     return mi.load_dict({"type": "volpath" if media else "path", "max_depth": -1})
 
 
 @dataclass(frozen=True)
 class FileView:
-    """A perspective sensor of a scene: T_world_cam [4, 4] (x right, y down, z forward, metres), its horizontal
-    field of view in radians, and the size of its film in pixels."""
+    """A perspective sensor of a scene: T_world_cam [4, 4] (x right, y down, z forward, metres), its
+    horizontal field of view in radians, and the size of its film in pixels."""
 
     T_world_cam: Tensor
     field_of_view_rad: float
@@ -155,8 +165,8 @@ class FileView:
         width_px: int | None = None,
         seed: int = 0,
     ) -> Camera:
-        """A pinhole of this field of view before a film of this size, or of ``width_px`` columns and as many rows
-        as keep its proportions."""
+        """A pinhole of this field of view before a film of this size, or of ``width_px`` columns
+        and as many rows as keep its proportions."""
         columns = self.width_px if width_px is None else width_px
         rows = max(1, round(self.height_px * columns / self.width_px))
         focal_mm = 8.0
@@ -178,9 +188,10 @@ def view_of(
     Args:
       source, unit_m, up, parameters: as for ``from_mitsuba``.
       number: which of its sensors.
-    Returns: FileView. Near and far clipping, an aperture, the film's window and filter are left out.
-    Raises: as ``from_mitsuba``; DomainError when there is no such sensor, or it is not a perspective one, mirrors,
-      or has its principal point off the film's middle.
+    Returns: FileView. Near and far clipping, an aperture, the film's window and filter are left
+      out.
+    Raises: as ``from_mitsuba``; DomainError when there is no such sensor, or it is not a
+      perspective one, mirrors, or has its principal point off the film's middle.
     """
     mi = backend.mitsuba()
     R_world_file = _axes(up, unit_m)
@@ -222,7 +233,9 @@ def view_of(
 def _axes(up, unit_m):
     """R_world_file [3, 3]."""
     check_choice(up, "up", UP)
-    check_positive(unit_m, "unit_m", remedy="it is metres per unit of the file, 0.01 for centimetres")
+    check_positive(
+        unit_m, "unit_m", remedy="it is metres per unit of the file, 0.01 for centimetres"
+    )
     return torch.tensor(UP[up], dtype=torch.float64)
 
 
@@ -230,8 +243,8 @@ def _axes(up, unit_m):
 def loaded(mi: Any, source: Any, parameters: Mapping[str, Any], merge: bool = True) -> Any:
     """The mi.Scene of a path, a dictionary or itself.
 
-    Raises: FileFormatError for a file that is missing or that Mitsuba cannot load; DomainError for what is neither,
-      or a dictionary that Mitsuba cannot load.
+    Raises: FileFormatError for a file that is missing or that Mitsuba cannot load; DomainError for
+      what is neither, or a dictionary that Mitsuba cannot load.
     """
     if isinstance(source, (str, Path)):
         return _from_file(mi, Path(source), parameters, merge)
@@ -259,14 +272,21 @@ def loaded(mi: Any, source: Any, parameters: Mapping[str, Any], merge: bool = Tr
 
 def _from_file(mi, path, parameters, merge):
     if not path.is_file():
-        raise FileFormatError(f"scene '{path}' is not a file; give the path of a Mitsuba scene (.xml).")
+        raise FileFormatError(
+            f"scene '{path}' is not a file; give the path of a Mitsuba scene (.xml)."
+        )
     if path.suffix.lower() != ".xml":
         raise FileFormatError(
             f"scene '{path}' ends in '{path.suffix}'; Mitsuba scenes are .xml files, so export it as one."
         )
-    with _quiet(mi), building(f"scene '{path}'", "Mitsuba cannot load it; correct it, or export it anew"):
+    with (
+        _quiet(mi),
+        building(f"scene '{path}'", "Mitsuba cannot load it; correct it, or export it anew"),
+    ):
         config = mi.parser.ParserConfig(mi.variant())
-        trial_load.check(mi, mi.parser.parse_file(config, str(path), **parameters), path, parameters.items())
+        trial_load.check(
+            mi, mi.parser.parse_file(config, str(path), **parameters), path, parameters.items()
+        )
         found = mi.load_file(str(path), optimize=merge, **parameters)
     if not isinstance(found, mi.Scene):
         raise FileFormatError(
@@ -277,7 +297,10 @@ def _from_file(mi, path, parameters, merge):
 
 def _from_dictionary(mi, source, merge):
     _check_variants(mi, source, "")
-    with _quiet(mi), reading("the scene's dictionary", "Mitsuba cannot build the scene from it", DomainError):
+    with (
+        _quiet(mi),
+        reading("the scene's dictionary", "Mitsuba cannot build the scene from it", DomainError),
+    ):
         scene = {"type": "scene", **source}
         trial_load.check(mi, mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), scene))
         return mi.load_dict(scene, optimize=merge)

@@ -1,4 +1,5 @@
-"""Worlds out of mesh files: a room, a street, a scan, a thing, as modelling programs export them."""
+"""Worlds out of mesh files: a room, a street, a scan, a thing, as modelling programs export
+them."""
 
 import re
 from pathlib import Path
@@ -29,27 +30,33 @@ def from_mesh(
     lamps: dict[str, Any] | None = None,
     device: str = "cpu",
 ) -> Any:
-    """The world in a mesh file: .obj with its .mtl, .ply, .stl, .dae, .gltf or .glb, every mesh at its place.
+    """The world in a mesh file: .obj with its .mtl, .ply, .stl, .dae, .gltf or .glb, every mesh at
+    its place.
 
-    What a material is called base or diffuse colour, times its picture where it has one, is its luminance, from 2
-    (black) to 255 (white): as radiance where ``light`` is "emissive", as albedo (255 is 0.95) otherwise. Meshes
-    without texture coordinates show, where nothing is lit, the share of a plain sky that each face sees, so that
-    their shape is seen. Gloss, transparency, normal maps, lamps and cameras of the file are left.
+    What a material is called base or diffuse colour, times its picture where it has one, is its
+    luminance, from 2 (black) to 255 (white): as radiance where ``light`` is "emissive", as albedo
+    (255 is 0.95) otherwise. Meshes without texture coordinates show, where nothing is lit, the
+    share of a plain sky that each face sees, so that their shape is seen. Gloss, transparency,
+    normal maps, lamps and cameras of the file are left.
 
     Args:
       path, unit_m, up, root: as ``mesh_files.read`` has them.
-      radiance: one radiance 0..255 for all; materials and pictures are not read then. What has no colour has that
-        of a linear luminance of one half.
-      texture_px: most rows and columns of a picture; larger ones are averaged over areas. blur_texels: standard
-        deviation of a Gaussian over pictures: detail finer than a pixel makes frames and gradients noisy.
+      radiance: one radiance 0..255 for all; materials and pictures are not read then. What has no
+        colour has that of a linear luminance of one half.
+      texture_px: most rows and columns of a picture; larger ones are averaged over areas.
+        blur_texels: standard deviation of a Gaussian over pictures: detail finer than a pixel makes
+        frames and gradients noisy.
       light: "emissive", "baked", "path", or a function as in scenes.build.LEVELS.
-      background: what lies at infinity: a number (radiance), a picture [H, W] or the path of an equirectangular
-        .hdr or .exr; None is nothing (radiance 0) where ``light`` is "emissive", else a procedural sky.
-      lamps: Mitsuba lights for "baked" and "path"; None is a sun where the sky is the procedural one.
+      background: what lies at infinity: a number (radiance), a picture [H, W] or the path of an
+        equirectangular .hdr or .exr; None is nothing (radiance 0) where ``light`` is "emissive",
+        else a procedural sky.
+      lamps: Mitsuba lights for "baked" and "path"; None is a sun where the sky is the procedural
+        one.
     Returns: a scene for ``render.frames``; z up, metres. Surfaces show on both sides.
-    Gradient: to the camera's lens and poses, with silhouettes by gradient="boundary" (not at "path").
-    Raises: FileFormatError and DomainError as ``mesh_files.read`` and the light level do. Warns in a sentence where
-      the size is hardly in metres.
+    Gradient: to the camera's lens and poses, with silhouettes by gradient="boundary"
+      (not at "path").
+    Raises: FileFormatError and DomainError as ``mesh_files.read`` and the light level do. Warns in
+      a sentence where the size is hardly in metres.
     """
     level = LEVELS.get(light) if isinstance(light, str) else light
     if level is None:
@@ -65,7 +72,9 @@ def from_mesh(
     high = np.max([part.vertices_m.max(0) for part in parts], 0)
     units.hint(low, high, f"the mesh '{path}'", unit_m or 1.0)
     mi = backend.mitsuba(device)
-    above = {} if background is None and level is LEVELS["emissive"] else _background(mi, background)
+    above = (
+        {} if background is None and level is LEVELS["emissive"] else _background(mi, background)
+    )
     if lamps is None:
         lamps = {"sun": sun(SUN_IRRADIANCE)} if background is None else {}
     shapes = shapes_of(parts, radiance, texture_px, blur_texels)

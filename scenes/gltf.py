@@ -1,5 +1,5 @@
-"""glTF 2.0 as trimesh reads it, with what trimesh leaves out: exact factors, how pictures go on, and which
-extensions a file needs.
+"""glTF 2.0 as trimesh reads it, with what trimesh leaves out: exact factors, how pictures go on,
+and which extensions a file needs.
 
 Source: Khronos Group, glTF 2.0 Specification, 2021.
 """
@@ -42,7 +42,8 @@ UNREAD = (
 
 @dataclass(frozen=True)
 class Surface:
-    """Base colour: linear luminance ``factor`` times ``picture`` [H, W] (first row at the top) or 1."""
+    """Base colour: linear luminance ``factor`` times ``picture`` [H, W] (first row at the top) or
+    1."""
 
     factor: float
     picture: np.ndarray | None = None
@@ -55,8 +56,9 @@ def luminance(image: Any) -> np.ndarray:
 
 
 def opened(path: Path, folder: Folder, materials: bool) -> tuple[bytes, dict[str, Surface]]:
-    """A .gltf, or the same in a .glb, as text that trimesh reads with ``folder``, and its materials by the names
-    that the text gives them: their numbers. Raises: FileFormatError for what is damaged or not read."""
+    """A .gltf, or the same in a .glb, as text that trimesh reads with ``folder``, and its materials
+    by the names that the text gives them: their numbers. Raises: FileFormatError for what is
+    damaged or not read."""
     try:
         with reading(f"mesh '{path}'", "it is no whole glTF 2.0; export it anew"):
             tree = _tree(path.read_bytes(), folder)
@@ -97,9 +99,9 @@ def _tree(data, folder):
 
 
 def _check_read(path, tree):
-    used = {name for name in tree.get("extensionsRequired", []) if not name.startswith(LIGHT_ONLY)} | {
-        name for name in tree.get("extensionsUsed", []) if name in UNREAD
-    }
+    used = {
+        name for name in tree.get("extensionsRequired", []) if not name.startswith(LIGHT_ONLY)
+    } | {name for name in tree.get("extensionsUsed", []) if name in UNREAD}
     if used:
         raise FileFormatError(
             f"mesh '{path}' needs {', '.join(sorted(used))}, which is not read here; export it without compression, "
@@ -117,7 +119,9 @@ def _check_read(path, tree):
 
 def _check_nodes(nodes):
     """What trimesh would go round in, or read as something else."""
-    pairs = [(parent, child) for parent, node in enumerate(nodes) for child in node.get("children", [])]
+    pairs = [
+        (parent, child) for parent, node in enumerate(nodes) for child in node.get("children", [])
+    ]
     often = [child for child, count in Counter(child for _, child in pairs).items() if count > 1]
     looped = unreached(range(len(nodes)), pairs)
     if often or looped:
@@ -126,7 +130,9 @@ def _check_nodes(nodes):
         )
     for number, node in enumerate(nodes):
         if not np.linalg.norm(node.get("rotation", [1.0])) > SHORTEST:
-            raise ValueError(f"node {number} has the rotation {node['rotation']}, which is no quaternion")
+            raise ValueError(
+                f"node {number} has the rotation {node['rotation']}, which is no quaternion"
+            )
 
 
 def _surfaces(tree, folder):
@@ -135,13 +141,17 @@ def _surfaces(tree, folder):
     found = {}
     for number, material in enumerate(tree.get("materials", [])):
         base = material.get("pbrMetallicRoughness", {})
-        factor = float(np.asarray(base.get("baseColorFactor", [1, 1, 1, 1]))[:3] @ textures.LUMINANCE)
+        factor = float(
+            np.asarray(base.get("baseColorFactor", [1, 1, 1, 1]))[:3] @ textures.LUMINANCE
+        )
         texture = base.get("baseColorTexture")
         if texture is None:
             found[str(number)] = Surface(factor)
             continue
         if texture.get("texCoord", 0) != 0:
-            raise ValueError("a base colour is laid out by TEXCOORD_1, and TEXCOORD_0 alone is read")
+            raise ValueError(
+                "a base colour is laid out by TEXCOORD_1, and TEXCOORD_0 alone is read"
+            )
         entry = tree["textures"][texture["index"]]
         if "source" not in entry:
             raise ValueError("a picture is neither PNG nor JPEG")
@@ -160,7 +170,9 @@ def _picture(tree, image, folder):
     if "bufferView" in image:
         view = tree["bufferViews"][image["bufferView"]]
         start = view.get("byteOffset", 0)
-        data = _bytes(tree["buffers"][view["buffer"]]["uri"], folder)[start : start + view["byteLength"]]
+        data = _bytes(tree["buffers"][view["buffer"]]["uri"], folder)[
+            start : start + view["byteLength"]
+        ]
     else:
         data = _bytes(image["uri"], folder)
     with PIL.Image.open(io.BytesIO(data)) as picture:

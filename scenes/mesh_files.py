@@ -1,9 +1,9 @@
-"""Mesh files as parts: triangles with their colours, in metres and z up. .obj with its .mtl, .ply, .stl, .dae,
-.gltf and .glb, read by trimesh.
+"""Mesh files as parts: triangles with their colours, in metres and z up. .obj with its .mtl, .ply,
+.stl, .dae, .gltf and .glb, read by trimesh.
 
-Files are data: nothing in them is run, nothing is fetched over a network, and other files that they name (materials,
-pictures, buffers) are read from their own folder, or from the folder given as ``root``, alone. A part that a file
-cannot give whole is refused in a sentence.
+Files are data: nothing in them is run, nothing is fetched over a network, and other files that they
+name (materials, pictures, buffers) are read from their own folder, or from the folder given as
+``root``, alone. A part that a file cannot give whole is refused in a sentence.
 """
 
 import re
@@ -28,7 +28,8 @@ KINDS = (".obj", ".ply", ".stl", ".dae", ".gltf", ".glb")
 MOST_FACES = 4_000_000  # some 10 s to read; their silhouettes take minutes and GiB
 MOST_BYTES = 1 << 30
 UNCOLOURED = 0.5  # linear luminance of what says none
-# rows: the axes x, y, z here in terms of the file's; x_up and y_up as COLLADA 1.4 names right, up and in
+# rows: the axes x, y, z here in terms of the file's; x_up and y_up as COLLADA 1.4 names right, up
+# and in
 AXES = {
     "x": np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]),
     "y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
@@ -40,9 +41,10 @@ AXES = {
 class Part:
     """Triangles of one material.
 
-    name: of the mesh in its file. vertices_m: [V, 3]; faces: [F, 3]. colour: linear luminance 0..1 (white is
-    1) as a picture [H, W] (first row at the top, looked up at ``uv`` [V, 2], v up), as one number per face [F]
-    where ``uv`` is None, or per vertex [V] where ``smooth``. wrap: how the picture goes on beside the unit square.
+    name: of the mesh in its file. vertices_m: [V, 3]; faces: [F, 3]. colour: linear luminance 0..1
+    (white is 1) as a picture [H, W] (first row at the top, looked up at ``uv`` [V, 2], v up), as
+    one number per face [F] where ``uv`` is None, or per vertex [V] where ``smooth``. wrap: how the
+    picture goes on beside the unit square.
     coloured: whether the file says a colour.
     """
 
@@ -68,17 +70,18 @@ def read(
 
     Args:
       path: .obj, .ply, .stl, .dae, .gltf or .glb.
-      unit_m: metres per unit of the file. None: what a .dae says, 1 otherwise (glTF is in metres by its standard;
-        .obj, .ply and .stl do not say).
-      up: axis of the file that points up, "x", "y" or "z". None: what a .dae says, "y" for glTF by its standard,
-        "z" for .obj, .ply and .stl, which do not say.
+      unit_m: metres per unit of the file. None: what a .dae says, 1 otherwise (glTF is in metres by
+        its standard; .obj, .ply and .stl do not say).
+      up: axis of the file that points up, "x", "y" or "z". None: what a .dae says, "y" for glTF by
+        its standard, "z" for .obj, .ply and .stl, which do not say.
       root: folder that the files it names must lie in; None is its own.
-      materials: whether materials and colours are read; otherwise all is of one colour and no other file is asked
-        for but buffers.
-    Returns: parts, in the order of the file's scene; faces without area are left out, points and lines too.
-    Raises: FileFormatError for a file that is missing, of another kind, too large, empty or damaged, that names
-      files which are missing or elsewhere, or uses what is not read here; DomainError for a unit or an axis that
-      cannot be.
+      materials: whether materials and colours are read; otherwise all is of one colour and no other
+        file is asked for but buffers.
+    Returns: parts, in the order of the file's scene; faces without area are left out, points and
+      lines too.
+    Raises: FileFormatError for a file that is missing, of another kind, too large, empty or
+      damaged, that names files which are missing or elsewhere, or uses what is not read here;
+      DomainError for a unit or an axis that cannot be.
     """
     path = Path(path)
     kind = _checked_kind(path, unit_m, up)
@@ -163,7 +166,8 @@ def _check_count(path, count):
 
 
 def _check_obj(path, data):
-    """What trimesh would read as something else: indices of 0, and those that count back from the line."""
+    """What trimesh would read as something else: indices of 0, and those that count back from the
+    line."""
     wrong = re.search(rb"^f(?=[ \t])[^\n]*?[ \t/](-\d+|0+)(?=[ \t/\r\n]|$)", data, re.MULTILINE)
     if wrong:
         raise FileFormatError(
@@ -196,7 +200,8 @@ def _loaded(path, data, folder, kind, materials):
 
 def _parts(path, scene, told, axes, surfaces, materials) -> Iterator[Part]:
     count = sum(
-        len(getattr(scene.geometry[scene.graph[n][1]], "faces", ())) for n in scene.graph.nodes_geometry
+        len(getattr(scene.geometry[scene.graph[n][1]], "faces", ()))
+        for n in scene.graph.nodes_geometry
     )
     _check_count(path, count)
     if 0 < count < told:
@@ -216,7 +221,9 @@ def _parts(path, scene, told, axes, surfaces, materials) -> Iterator[Part]:
                 f"mesh '{path}', '{name}': vertices have {vertices.shape[1]} coordinates; export it anew."
             )
         if not np.isfinite(vertices).all() or not np.isfinite(frame).all():
-            raise FileFormatError(f"mesh '{path}', '{name}': vertices are not all finite; export it anew.")
+            raise FileFormatError(
+                f"mesh '{path}', '{name}': vertices are not all finite; export it anew."
+            )
         if faces.min() < 0 or faces.max() >= len(vertices):
             raise FileFormatError(
                 f"mesh '{path}', '{name}': a face asks for vertex {int(faces.max())} of {len(vertices)}; export it anew."
@@ -226,7 +233,9 @@ def _parts(path, scene, told, axes, surfaces, materials) -> Iterator[Part]:
         if np.linalg.det(turn) < 0:  # a mirrored instance: keep its outside outside
             faces = faces[:, ::-1]
         corners = vertices[faces]
-        whole = (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) ** 2).sum(1) > 0
+        whole = (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) ** 2).sum(
+            1
+        ) > 0
         if whole.any():
             where = f"mesh '{path}', '{name}'"
             visual = mesh.visual if materials else None
@@ -239,7 +248,9 @@ def _coloured(where, name, vertices, faces, whole, visual, surfaces):
     plain = np.full(len(faces), UNCOLOURED)
     kind = None if visual is None else visual.kind
     if kind == "face":
-        return Part(name, vertices, faces, _vertex_colour(np.asarray(visual.face_colors)[whole], False))
+        return Part(
+            name, vertices, faces, _vertex_colour(np.asarray(visual.face_colors)[whole], False)
+        )
     if kind == "vertex":
         of_vertex = _vertex_colour(visual.vertex_colors, surfaces is not None)
         return Part(name, vertices, faces, of_vertex, smooth=True)
@@ -267,7 +278,8 @@ def _coloured(where, name, vertices, faces, whole, visual, surfaces):
 
 
 def _vertex_colour(values, is_linear):
-    """Luminance [V] of colours [V, 3 or 4] of vertices or faces, of whole numbers of 8 or 16 bits or of 0..1."""
+    """Luminance [V] of colours [V, 3 or 4] of vertices or faces, of whole numbers of 8 or 16 bits
+    or of 0..1."""
     values = np.asarray(values)[:, :3]
     if not is_linear:
         return textures.linear(values[:, None])[:, 0]
@@ -286,13 +298,15 @@ def _surface(material: Any) -> gltf.Surface:
     elif np.size(said) != 3:
         said = np.full(3, np.ravel(said)[0])
     whole = 1.0 if picture is not None or said is not None else UNCOLOURED
-    factor = whole if said is None else float(np.asarray(said, dtype=np.float64) @ textures.LUMINANCE)
+    factor = (
+        whole if said is None else float(np.asarray(said, dtype=np.float64) @ textures.LUMINANCE)
+    )
     return gltf.Surface(factor, None if picture is None else gltf.luminance(picture))
 
 
 def _merged(part):
-    """The part with vertices of one place, colour and texture coordinate as one, where faces share none: an edge
-    between faces that do not share its vertices would count as a seam."""
+    """The part with vertices of one place, colour and texture coordinate as one, where faces share
+    none: an edge between faces that do not share its vertices would count as a seam."""
     if len(part.vertices_m) < 3 * len(part.faces):
         return part
     columns = [part.vertices_m]
@@ -300,7 +314,9 @@ def _merged(part):
     columns += [part.colour[:, None]] if part.smooth else []
     rows = np.ascontiguousarray(np.concatenate(columns, 1)) + 0.0  # no negative zeros
     _, first, index = np.unique(
-        rows.view([("", rows.dtype)] * rows.shape[1]).reshape(-1), return_index=True, return_inverse=True
+        rows.view([("", rows.dtype)] * rows.shape[1]).reshape(-1),
+        return_index=True,
+        return_inverse=True,
     )
     return replace(
         part,

@@ -17,7 +17,8 @@ class Folder:
     Args:
       mesh: path of the mesh file.
       root: the folder that named files must lie in; None is that of the mesh.
-    ``check`` raises for whatever was asked for and could not be given, since trimesh goes on without it.
+    ``check`` raises for whatever was asked for and could not be given, since trimesh goes on
+    without it.
     """
 
     def __init__(self, mesh: Path, root: str | Path | None = None):
@@ -29,7 +30,8 @@ class Folder:
         self.missing: list[str] = []
 
     def get(self, name: str) -> bytes:
-        """Bytes of a named file. Raises: FileFormatError when it is elsewhere, missing or no picture."""
+        """Bytes of a named file. Raises: FileFormatError when it is elsewhere, missing or no
+        picture."""
         if name in self.given:
             return self.given[name]
         try:
@@ -59,7 +61,9 @@ class Folder:
         for candidate in dict.fromkeys((plain, urllib.parse.unquote(plain))):
             path = (self.parent / candidate).resolve()
             if not path.is_relative_to(self.root):
-                raise FileFormatError(f"'{name}' lies outside '{self.root}' (root= names another folder)")
+                raise FileFormatError(
+                    f"'{name}' lies outside '{self.root}' (root= names another folder)"
+                )
             if path.is_file():
                 return path
         raise FileFormatError(f"'{name}' is missing")

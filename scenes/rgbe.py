@@ -1,4 +1,5 @@
-"""Pictures in linear light, .hdr (Radiance RGBE) and .exr, read so that damaged bytes end in a sentence.
+"""Pictures in linear light, .hdr (Radiance RGBE) and .exr, read so that damaged bytes end in a
+sentence.
 
 Source: Ward, Real Pixels, Graphics Gems II, 1991; the run lengths as Radiance's color.c has them.
 """
@@ -15,7 +16,8 @@ from codesign.reading import check_regular, check_room, read_bytes, reading
 
 MOST_BYTES = 1 << 30
 LONGEST_S = 120.0
-# run by a process of its own: a library in C++ that meets damaged bytes may end the process that it runs in
+# run by a process of its own: a library in C++ that meets damaged bytes may end the process that it
+# runs in
 APART = """import sys, numpy, mitsuba
 mitsuba.set_variant("scalar_rgb")
 rgb, number = mitsuba.Bitmap.PixelFormat.RGB, mitsuba.Struct.Type.Float32
@@ -25,19 +27,24 @@ numpy.save(sys.stdout.buffer, numpy.array(mitsuba.Bitmap(sys.argv[1]).convert(rg
 def read(path: str | Path) -> np.ndarray:
     """Values [H, W, C] float64 of an .hdr or .exr picture, in the units of its file.
 
-    Raises: FileFormatError for a file that is missing or damaged, an .hdr in XYZ or one that does not begin at the top
-      left.
+    Raises: FileFormatError for a file that is missing or damaged, an .hdr in XYZ or one that does
+      not begin at the top left.
     """
     if Path(path).suffix.lower() == ".hdr":
         return radiance(path)
     check_regular(path, MOST_BYTES)
     with reading(path, "it is no whole OpenEXR picture; convert it to .hdr or PNG"):
         done = subprocess.run(
-            [sys.executable, "-c", APART, str(path)], capture_output=True, timeout=LONGEST_S, check=False
+            [sys.executable, "-c", APART, str(path)],
+            capture_output=True,
+            timeout=LONGEST_S,
+            check=False,
         )
         if done.returncode:
             said = done.stderr.decode(errors="replace").strip().splitlines()
-            raise ValueError(said[-1] if done.returncode > 0 and said else "its reader ended without a word")
+            raise ValueError(
+                said[-1] if done.returncode > 0 and said else "its reader ended without a word"
+            )
         return np.load(io.BytesIO(done.stdout)).astype(np.float64)
 
 
@@ -59,7 +66,8 @@ def radiance(path: str | Path) -> np.ndarray:
 
 
 def _pixels(data, at, height, width):
-    """RGBE [H, W, 4] uint8 of the bytes from ``at``. Raises: IndexError, ValueError where they do not suffice."""
+    """RGBE [H, W, 4] uint8 of the bytes from ``at``. Raises: IndexError, ValueError where they do
+    not suffice."""
     out = np.empty((height, width, 4), dtype=np.uint8)
     for row in range(height):
         if 8 <= width < 32768 and data[at : at + 2] == b"\2\2" and data[at + 2] < 128:
@@ -83,7 +91,9 @@ def _line(data, at, width):
     line = bytearray()
     while len(line) < width:
         count = data[at]
-        line += data[at + 1 : at + 2] * (count - 128) if count > 128 else data[at + 1 : at + 1 + count]
+        line += (
+            data[at + 1 : at + 2] * (count - 128) if count > 128 else data[at + 1 : at + 1 + count]
+        )
         at += 2 if count > 128 else 1 + count
         if not count or at > len(data):
             raise ValueError("its runs end early")

@@ -1,5 +1,5 @@
-"""Scenes with occluders over a textured wall, for gradients at silhouettes. Textures are smooth at the scale
-of a pixel, so that the silhouettes are what is tested."""
+"""Scenes with occluders over a textured wall, for gradients at silhouettes. Textures are smooth at
+the scale of a pixel, so that the silhouettes are what is tested."""
 
 import numpy as np
 
@@ -10,15 +10,19 @@ NAMES = ("cubes", "spheres", "poles", "fence", "wall")
 
 
 def smooth(seed, size=64, cycles=4, darkest=20.0, brightest=220.0, rows_only=False):
-    """Random texture [size, size, 1] of at most some ``cycles`` periods, periodic in both directions;
-    constant along rows when ``rows_only``."""
+    """Random texture [size, size, 1] of at most some ``cycles`` periods, periodic in both
+    directions; constant along rows when ``rows_only``."""
     frequency = np.fft.fftfreq(size) * size
     noise = np.fft.fft2(np.random.default_rng(seed).standard_normal((size, size)))
     if rows_only:
         noise = noise * (frequency == 0)
-    field = np.fft.ifft2(noise * np.exp(-(frequency[:, None] ** 2 + frequency**2) / (cycles**2))).real
+    field = np.fft.ifft2(
+        noise * np.exp(-(frequency[:, None] ** 2 + frequency**2) / (cycles**2))
+    ).real
     field = (field - field.mean()) / field.std()
-    return (darkest + (brightest - darkest) / (1 + np.exp(-1.5 * field))).astype(np.float32)[..., None]
+    return (darkest + (brightest - darkest) / (1 + np.exp(-1.5 * field))).astype(np.float32)[
+        ..., None
+    ]
 
 
 def _light(mi, seed, **options):
@@ -57,13 +61,15 @@ def _pole(mi, k):
         "p0": [-1.2 + 0.55 * k, 0.5 + 0.2 * k, -1.5],
         "p1": [-0.3 + 0.4 * k, 0.7, 2.6],
         "radius": 0.05,
-        "emitter": _light(mi, 4 + k, cycles=3, rows_only=True, darkest=5 + 60 * k, brightest=40 + 60 * k),
+        "emitter": _light(
+            mi, 4 + k, cycles=3, rows_only=True, darkest=5 + 60 * k, brightest=40 + 60 * k
+        ),
     }
 
 
 def build(name, device="cpu"):
-    """One of NAMES: a wall 2.5 m ahead of the origin with occluders between, for a camera near (0, -1.2, 1)
-    that looks along +y."""
+    """One of NAMES: a wall 2.5 m ahead of the origin with occluders between, for a camera near
+    (0, -1.2, 1) that looks along +y."""
     mi = backend.mitsuba(device)
     wall = mi.ScalarTransform4f().translate([0, 2.5, 0.5]).scale([4, 0.1, 4])
     shapes: dict = {"back": {"type": "cube", "to_world": wall, "emitter": _light(mi, 1, cycles=6)}}
@@ -85,8 +91,8 @@ def build(name, device="cpu"):
 
 
 def room(seed=0, device="cpu"):
-    """A room of 5 x 6 x 3 m with two leaning boxes that touch nothing, for a camera near (0, -1.2, 1) that looks
-    along +y."""
+    """A room of 5 x 6 x 3 m with two leaning boxes that touch nothing, for a camera near
+    (0, -1.2, 1) that looks along +y."""
     mi = backend.mitsuba(device)
     first = 3 * seed + 1000
     walls = {
@@ -110,8 +116,8 @@ def ball(device="cpu"):
 
 
 def robot(device="cpu"):
-    """A robot's deck and mast in the axes of the camera's mount (x right, y ahead, z up), so near that they cross the
-    border of its view."""
+    """A robot's deck and mast in the axes of the camera's mount (x right, y ahead, z up), so near
+    that they cross the border of its view."""
     mi = backend.mitsuba(device)
     deck = (
         mi.ScalarTransform4f()
@@ -122,7 +128,11 @@ def robot(device="cpu"):
     mast = {"type": "cylinder", "p0": [0.08, 0.5, -0.06], "p1": [0.1, 0.47, 0.25], "radius": 0.015}
     return MitsubaScene(
         {
-            "deck": {"type": "cube", "to_world": deck, "emitter": _light(mi, 7, cycles=2, darkest=120)},
+            "deck": {
+                "type": "cube",
+                "to_world": deck,
+                "emitter": _light(mi, 7, cycles=2, darkest=120),
+            },
             "mast": {**mast, "emitter": _light(mi, 8, cycles=2, brightest=90)},
         },
         device,

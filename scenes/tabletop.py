@@ -21,18 +21,21 @@ POSTS = 14  # of the fence
 
 
 def tabletop(seed: int = 0, device: str = "cpu", light: Light = emissive) -> Any:
-    """A table of 1.4 m x 0.9 m in a room, with cubes, spheres, thin poles and a fence, placed at random
-    without touching.
+    """A table of 1.4 m x 0.9 m in a room, with cubes, spheres, thin poles and a fence, placed at
+    random without touching.
 
-    Poles are 5 to 8 mm thick, fence posts 8 mm; the fence stands along the table's far side. The ceiling is
-    the lamp where the world is lit.
+    Poles are 5 to 8 mm thick, fence posts 8 mm; the fence stands along the table's far side. The
+    ceiling is the lamp where the world is lit.
     """
     mi = backend.mitsuba(device)
     random = np.random.default_rng(seed)
-    wood = textures.softened(textures.speckle(seed + 5, finest_px=12.0, coarsest_px=48.0, contrast=0.2), 3.0)
+    wood = textures.softened(
+        textures.speckle(seed + 5, finest_px=12.0, coarsest_px=48.0, contrast=0.2), 3.0
+    )
     shapes = {**_surroundings(mi), **_table(mi, wood)}
     patterns = [
-        textures.softened(textures.speckle(seed + 20 + k, 128, finest_px=20.0, contrast=0.25), 2.0) * scale
+        textures.softened(textures.speckle(seed + 20 + k, 128, finest_px=20.0, contrast=0.25), 2.0)
+        * scale
         for k, scale in enumerate((0.5, 1.0, 1.6, 2.2))
     ]
     patterns = [np.clip(p, 1, 255) for p in patterns]
@@ -44,7 +47,10 @@ def tabletop(seed: int = 0, device: str = "cpu", light: Light = emissive) -> Any
         pattern = patterns[k % len(patterns)]
         if k < CUBES:
             turn_deg = float(random.uniform(0, 90))
-            shapes[f"cube-{k}"] = (block(mi, x, y, TOP_M, (half, half, half), turn_deg), Paint(pattern))
+            shapes[f"cube-{k}"] = (
+                block(mi, x, y, TOP_M, (half, half, half), turn_deg),
+                Paint(pattern),
+            )
         elif not slim:
             shapes[f"sphere-{k}"] = (ball(mi, x, y, TOP_M, half), Paint(pattern))
         else:
@@ -59,7 +65,10 @@ def _surroundings(mi):
     """A room of 5 m about the table, its pictures fading to one colour."""
     back = textures.faded_to(textures.picture("brick"), 60.0)
     plain = textures.faded_to(
-        textures.softened(textures.speckle(3, finest_px=40.0, coarsest_px=160.0, contrast=0.3), 3.0), 60.0
+        textures.softened(
+            textures.speckle(3, finest_px=40.0, coarsest_px=160.0, contrast=0.3), 3.0
+        ),
+        60.0,
     )
     paints = {"north": Paint(back), "ceiling": Paint(plain, glow=250.0)}
     walls = sides(mi, (5.0, 5.0, 2.6))
@@ -69,12 +78,17 @@ def _surroundings(mi):
 
 def _table(mi, wood):
     shapes = {
-        "top": (block(mi, 0, 0, TOP_M - THICK_M - GAP_M, (HALF_X_M, HALF_Y_M, THICK_M / 2)), Paint(wood))
+        "top": (
+            block(mi, 0, 0, TOP_M - THICK_M - GAP_M, (HALF_X_M, HALF_Y_M, THICK_M / 2)),
+            Paint(wood),
+        )
     }
     height = TOP_M - THICK_M - 3 * GAP_M
     for k, (x, y) in enumerate(((-1, -1), (1, -1), (-1, 1), (1, 1))):
         shapes[f"leg-{k}"] = (
-            block(mi, x * (HALF_X_M - 0.05), y * (HALF_Y_M - 0.05), 0.0, (0.025, 0.025, height / 2)),
+            block(
+                mi, x * (HALF_X_M - 0.05), y * (HALF_Y_M - 0.05), 0.0, (0.025, 0.025, height / 2)
+            ),
             Paint(wood, (0.1, 1)),
         )
     return shapes
@@ -87,7 +101,10 @@ def _fence(mi, picture):
     width = 2 * (HALF_X_M - 0.08)
     for k in range(POSTS):
         x = -width / 2 + width * k / (POSTS - 1)
-        shapes[f"post-{k}"] = (block(mi, x, y, TOP_M, (0.004, 0.004, 0.07)), Paint(picture, (0.1, 1)))
+        shapes[f"post-{k}"] = (
+            block(mi, x, y, TOP_M, (0.004, 0.004, 0.07)),
+            Paint(picture, (0.1, 1)),
+        )
     for k, z in enumerate((0.04, 0.11)):
         rail = block(mi, 0.0, y + 0.008 + GAP_M, TOP_M + z, (width / 2 + 0.01, 0.004, 0.006))
         shapes[f"rail-{k}"] = (rail, Paint(picture, (3, 0.1)))

@@ -42,13 +42,13 @@ def photo(source: str | Path, size_px: int = 512) -> np.ndarray:
     """A photograph as linear luminance.
 
     Args:
-      source: a name out of PHOTOS (CC0 and public-domain pictures that come with scikit-image) or a path to an
-        image file.
-      size_px: most rows and columns. A file that has more is averaged over areas, in linear light, until its
-        longer side has as many: all of it is there, in its own proportions. Of a picture out of PHOTOS the
-        first rows and columns are taken, texel by texel.
-    Returns: [H, W] float32, from LIFT to 255; of an .hdr or .exr, whose white is not known, scaled to a mean of
-      HDR_MEAN, with lights as far above 255 as they are in the file.
+      source: a name out of PHOTOS (CC0 and public-domain pictures that come with scikit-image) or a
+        path to an image file.
+      size_px: most rows and columns. A file that has more is averaged over areas, in linear light,
+        until its longer side has as many: all of it is there, in its own proportions. Of a picture
+        out of PHOTOS the first rows and columns are taken, texel by texel.
+    Returns: [H, W] float32, from LIFT to 255; of an .hdr or .exr, whose white is not known, scaled
+      to a mean of HDR_MEAN, with lights as far above 255 as they are in the file.
     Raises: FileFormatError when there is no such picture.
     """
     if str(source) in PHOTOS:
@@ -57,7 +57,9 @@ def photo(source: str | Path, size_px: int = 512) -> np.ndarray:
         stored = getattr(skimage.data, str(source))()[:size_px, :size_px]
         return _radiance(linear(stored), str(source))
     if Path(source).suffix.lower() in HDR:
-        return _scaled(reduced(_unscaled(source, "texture"), size_px), 1.0, HDR_MEAN, f"texture {source}")
+        return _scaled(
+            reduced(_unscaled(source, "texture"), size_px), 1.0, HDR_MEAN, f"texture {source}"
+        )
     return _radiance(reduced(linear(_stored(source)), size_px), str(source))
 
 
@@ -72,8 +74,8 @@ def _stored(path):
 
 
 def decoded(data: bytes, what: str) -> np.ndarray:
-    """Values of a picture in the bytes of its file as they are stored: [H, W] or [H, W, 3]; FileFormatError, which
-    begins with ``what``, for damaged, enormous and other ones."""
+    """Values of a picture in the bytes of its file as they are stored: [H, W] or [H, W, 3];
+    FileFormatError, which begins with ``what``, for damaged, enormous and other ones."""
     with reading(what, "it is no whole picture; convert it to PNG"), warnings.catch_warnings():
         warnings.simplefilter("error", PIL.Image.DecompressionBombWarning)
         with PIL.Image.open(io.BytesIO(data), formats=FORMATS) as image:
@@ -86,7 +88,8 @@ def decoded(data: bytes, what: str) -> np.ndarray:
 
 
 def stored_values(image: PIL.Image.Image) -> np.ndarray:
-    """Values of a picture as they are stored: [H, W] or [H, W, 3]. Raises: ValueError where white is not known."""
+    """Values of a picture as they are stored: [H, W] or [H, W, 3]. Raises: ValueError where white
+    is not known."""
     if image.mode == "I":
         raise ValueError("it holds whole numbers of 32 bits, whose white is not known")
     gray = image.mode in ("L", "F") or image.mode.startswith("I;16")
@@ -94,8 +97,8 @@ def stored_values(image: PIL.Image.Image) -> np.ndarray:
 
 
 def linear(stored: np.ndarray) -> np.ndarray:
-    """Linear luminance 0..1, [H, W] float64, of values coded by the sRGB gamma: [H, W] or [H, W, 3], whole numbers
-    or 0..1."""
+    """Linear luminance 0..1, [H, W] float64, of values coded by the sRGB gamma: [H, W] or
+    [H, W, 3], whole numbers or 0..1."""
     white = np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else 1.0
     if stored.dtype.kind != "u" or stored.dtype.itemsize > 2:
         return luminance(_light(np.asarray(stored, dtype=np.float64) / white))
@@ -112,7 +115,8 @@ def _light(values):
 
 
 def luminance(values: np.ndarray) -> np.ndarray:
-    """Luminance [H, W] of values in linear light, [H, W] or [H, W, C] of which the first three are red, green, blue."""
+    """Luminance [H, W] of values in linear light, [H, W] or [H, W, C] of which the first three are
+    red, green, blue."""
     if values.ndim == 3:
         values = values[..., :3] @ LUMINANCE if values.shape[2] >= 3 else values[..., 0]
     return values
@@ -128,15 +132,17 @@ def reduced(values: np.ndarray, size_px: int) -> np.ndarray:
 
 
 def _averaged(values, size, axis):
-    """``values`` averaged along ``axis`` over ``size`` equal lengths, of texels that are constant inside: the
-    differences of their integral."""
+    """``values`` averaged along ``axis`` over ``size`` equal lengths, of texels that are constant
+    inside: the differences of their integral."""
     values = np.moveaxis(values, axis, 0)
     count = len(values)
     integral = np.concatenate([np.zeros_like(values[:1]), np.cumsum(values, 0)])
     at = np.linspace(0, count, size + 1)
     whole = np.minimum(at.astype(int), count - 1)
     part = (at - whole).reshape(-1, *[1] * (values.ndim - 1))
-    return np.moveaxis(np.diff(integral[whole] + part * values[whole], axis=0) * (size / count), 0, axis)
+    return np.moveaxis(
+        np.diff(integral[whole] + part * values[whole], axis=0) * (size / count), 0, axis
+    )
 
 
 def _radiance(linear, name):
@@ -144,8 +150,8 @@ def _radiance(linear, name):
 
 
 def shrunk(texture: np.ndarray, factor: int) -> np.ndarray:
-    """The texture averaged over factor x factor texels, so that a few samples per pixel see no detail between
-    them."""
+    """The texture averaged over factor x factor texels, so that a few samples per pixel see no
+    detail between them."""
     height, width = (n // factor * factor for n in texture.shape)
     return (
         texture[:height, :width]
@@ -156,11 +162,11 @@ def shrunk(texture: np.ndarray, factor: int) -> np.ndarray:
 
 
 def softened(texture: np.ndarray, texels: float, mode: str = "nearest") -> np.ndarray:
-    """The texture blurred by a Gaussian of this standard deviation, so that the kinks between bilinear texels
-    become small; beside its border it goes on as SciPy's ``mode`` says."""
-    return gaussian_filter(check_texture(texture, "to soften").astype(np.float64), texels, mode=mode).astype(
-        np.float32
-    )
+    """The texture blurred by a Gaussian of this standard deviation, so that the kinks between
+    bilinear texels become small; beside its border it goes on as SciPy's ``mode`` says."""
+    return gaussian_filter(
+        check_texture(texture, "to soften").astype(np.float64), texels, mode=mode
+    ).astype(np.float32)
 
 
 def speckle(
@@ -170,7 +176,8 @@ def speckle(
     coarsest_px: float = 64.0,
     contrast: float = 0.5,
 ) -> np.ndarray:
-    """Random pattern with equal power per octave between two periods (texels), exp of a Gaussian field:
+    """Random pattern with equal power per octave between two periods (texels), exp of a Gaussian
+    field:
     [size, size] float32."""
     frequency = np.fft.fftfreq(size_px)
     radius = np.hypot(frequency[:, None], frequency)
@@ -190,8 +197,8 @@ def checkerboard(
 
 
 def faded_to(texture: np.ndarray, level: float, margin: float = 0.12) -> np.ndarray:
-    """The texture with its borders fading smoothly to a constant, so that adjoining walls meet without a
-    jump."""
+    """The texture with its borders fading smoothly to a constant, so that adjoining walls meet
+    without a jump."""
     texture = check_texture(texture, "to fade")
     ramps = []
     for size in texture.shape:
@@ -203,8 +210,9 @@ def faded_to(texture: np.ndarray, level: float, margin: float = 0.12) -> np.ndar
 
 
 def check_texture(values, name):
-    """Radiances [H, W] as float32. Raises: DomainError unless all are finite and at least 0, and for whole numbers of 8
-    or 16 bits, which may be light or be coded by the sRGB gamma (``picture`` is told which)."""
+    """Radiances [H, W] as float32. Raises: DomainError unless all are finite and at least 0, and
+    for whole numbers of 8 or 16 bits, which may be light or be coded by the sRGB gamma (``picture``
+    is told which)."""
     values = np.asarray(values)
     if values.dtype.kind == "u":
         raise DomainError(
@@ -212,7 +220,9 @@ def check_texture(values, name):
             "textures.picture(array, encoding='srgb') or encoding='linear'."
         )
     if values.dtype.kind not in "bif":
-        raise DomainError(f"texture {name}: it holds no numbers; give radiances of at least 0, [H, W].")
+        raise DomainError(
+            f"texture {name}: it holds no numbers; give radiances of at least 0, [H, W]."
+        )
     with np.errstate(over="ignore"):
         values = values.astype(np.float32)
     wrong = None
@@ -232,13 +242,13 @@ def check_texture(values, name):
 def picture(
     source: str | Path | np.ndarray, blur_texels: float = 2.0, encoding: str | None = None
 ) -> np.ndarray:
-    """What a world's surface is given: an array [H, W], a path, one of PHOTOS, or "speckle-3" (seed 3); files
-    and photographs softened by ``blur_texels``.
+    """What a world's surface is given: an array [H, W], a path, one of PHOTOS, or "speckle-3"
+    (seed 3); files and photographs softened by ``blur_texels``.
 
     Args:
-      encoding: of an array: None or "linear" takes it as radiance 0..255, "srgb" as pixels [H, W] or [H, W,
-        3], whole numbers or 0..1, coded as those of a PNG. Whole numbers of 8 or 16 bits are refused without
-        it.
+      encoding: of an array: None or "linear" takes it as radiance 0..255, "srgb" as pixels [H, W]
+        or [H, W, 3], whole numbers or 0..1, coded as those of a PNG. Whole numbers of 8 or 16 bits
+        are refused without it.
     """
     if encoding not in (None, "linear", "srgb"):
         raise DomainError(f"encoding = {encoding!r} is not known; give 'linear' or 'srgb'.")
@@ -256,7 +266,8 @@ def picture(
     else:
         values = np.asarray(source)
         return check_texture(
-            values.astype(float) if encoding and values.dtype.kind == "u" else values, "given as an array"
+            values.astype(float) if encoding and values.dtype.kind == "u" else values,
+            "given as an array",
         )
     if str(source).startswith("speckle-") and str(source)[8:].isdigit():
         return np.minimum(
@@ -270,8 +281,8 @@ def sky(
     height_px: int = 256,
     sun_azimuth_deg: float = SUN_AZIMUTH_DEG,
 ) -> np.ndarray:
-    """A procedural sky as an equirectangular picture [height, 2 height], first row at the zenith: a gradient,
-    soft clouds, a broad soft sun; 255 at most."""
+    """A procedural sky as an equirectangular picture [height, 2 height], first row at the zenith: a
+    gradient, soft clouds, a broad soft sun; 255 at most."""
     width = 2 * height_px
     elevation = np.pi / 2 - (np.arange(height_px)[:, None] + 0.5) * np.pi / height_px
     azimuth = (np.arange(width) + 0.5) * 2 * np.pi / width
@@ -288,15 +299,17 @@ def sky(
     cosine = np.sin(elevation) * np.sin(e) + np.cos(elevation) * np.cos(e) * np.cos(azimuth - a)
     bright = clear + (250 - clear) * np.exp(20 * (cosine - 1))
     below = 1 / (1 + np.exp(elevation / 0.02))  # no jump at the horizon
-    return check_texture(np.clip(bright + (BELOW - bright) * below, 0, 255), "of the procedural sky")
+    return check_texture(
+        np.clip(bright + (BELOW - bright) * below, 0, 255), "of the procedural sky"
+    )
 
 
 def environment(path: str | Path, mean: float = 80.0) -> np.ndarray:
-    """Luminance of an equirectangular HDR file (.hdr, .exr, or any picture Mitsuba reads), scaled to a mean
-    radiance over the sphere: [H, W] float32.
+    """Luminance of an equirectangular HDR file (.hdr, .exr, or any picture Mitsuba reads), scaled
+    to a mean radiance over the sphere: [H, W] float32.
 
-    Bright lamps and suns stay as far above 255 as they are in the file. Raises: FileFormatError when it is
-    missing or unreadable, DomainError for bad values.
+    Bright lamps and suns stay as far above 255 as they are in the file. Raises: FileFormatError
+    when it is missing or unreadable, DomainError for bad values.
     """
     values = _unscaled(path, "environment map")
     weight = np.sin((np.arange(len(values)) + 0.5) * np.pi / len(values))[:, None]
@@ -306,7 +319,9 @@ def environment(path: str | Path, mean: float = 80.0) -> np.ndarray:
 def _unscaled(path, what):
     """Luminance [H, W] float64 of a picture in linear light, in the units of its file."""
     if not Path(path).is_file():
-        raise FileFormatError(f"{what} '{path}' is not a file; give the path of an .hdr or .exr picture.")
+        raise FileFormatError(
+            f"{what} '{path}' is not a file; give the path of an .hdr or .exr picture."
+        )
     if Path(path).suffix.lower() not in HDR:
         return linear(_stored(path))
     values = rgbe.read(path)
@@ -329,8 +344,8 @@ def waves(
     coarsest_period_m: float = 0.5,
     log_contrast: float = 0.4,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Random plane waves for TexturedPlane: frequency [K, 2] (per metre), amplitude [K], phase [K]; periods
-    spread evenly in octaves."""
+    """Random plane waves for TexturedPlane: frequency [K, 2] (per metre), amplitude [K], phase [K];
+    periods spread evenly in octaves."""
     generator = torch.Generator().manual_seed(seed)
     u = torch.rand(3, count, generator=generator, dtype=torch.float64)
     period = finest_period_m * (coarsest_period_m / finest_period_m) ** u[0]

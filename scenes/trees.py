@@ -8,7 +8,8 @@ Name = TypeVar("Name", bound=Hashable)
 
 
 def unreached(names: Sequence[Name], pairs: Iterable[tuple[Name, Name]]) -> list[Name]:
-    """Names that no chain of pairs leads to from a name that is nobody's child: those of a loop, and below it.
+    """Names that no chain of pairs leads to from a name that is nobody's child: those of a loop,
+    and below it.
 
     >>> unreached([0, 1, 2, 3], [(0, 1), (2, 3), (3, 2)])
     [2, 3]

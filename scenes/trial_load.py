@@ -1,4 +1,5 @@
-"""What Mitsuba would read is read before it, and once in a process of its own: some of it would end the process.
+"""What Mitsuba would read is read before it, and once in a process of its own: some of it would end
+the process.
 
 Mitsuba's readers in C++ meet a bitmap without a file, or damaged bytes, with more than an error.
 """
@@ -42,16 +43,18 @@ def check(
     """Refuse a parsed scene (mi.parser.ParserState) that Mitsuba would not survive.
 
     Args:
-      file, parameters: where it was parsed from, if from a file; that is loaded as a whole, and what a
-        dictionary names one by one.
-    Raises: FileFormatError for a bitmap without a file, for a damaged .hdr, .exr or mesh that is named, and whatever
-      else ends Mitsuba, or takes it more than LONGEST_S.
+      file, parameters: where it was parsed from, if from a file; that is loaded as a whole, and
+        what a dictionary names one by one.
+    Raises: FileFormatError for a bitmap without a file, for a damaged .hdr, .exr or mesh that is
+      named, and whatever else ends Mitsuba, or takes it more than LONGEST_S.
     """
     named = []
     for node in state.nodes:
         kind, values = node.props.plugin_name(), node.props
         if kind == "bitmap" and not any(key in values for key in SOURCES):
-            raise FileFormatError("a bitmap of the scene names no file; give its filename, or take it out.")
+            raise FileFormatError(
+                "a bitmap of the scene names no file; give its filename, or take it out."
+            )
         name = values.get("filename", None)
         if not isinstance(name, str):
             continue
@@ -63,7 +66,11 @@ def check(
     texts = {name: str(value) for name, value in dict(parameters).items()}
     asked = json.dumps([mi.variant(), file and str(file), texts, [] if file else named])
     files = [Path(name) for _, name in named] + [Path(str(each)) for each in state.files]
-    facts = [(str(each), each.stat().st_size, each.stat().st_mtime_ns) for each in files if each.is_file()]
+    facts = [
+        (str(each), each.stat().st_size, each.stat().st_mtime_ns)
+        for each in files
+        if each.is_file()
+    ]
     tried = (TRIAL, asked, *facts)
     if (file is None and not named) or tried in SURVIVED:
         return
@@ -72,11 +79,15 @@ def check(
             begin = opened.read(2)
         # Mitsuba goes by the first bytes, not by the ending
         if begin == b"#?" and kind in ("bitmap", "envmap"):
-            # a reader that writes past its end may go on for a while, so a trial would not always tell
+            # a reader that writes past its end may go on for a while, so a trial would not always
+            # tell
             rgbe.radiance(name)
     try:
         done = subprocess.run(
-            [sys.executable, "-c", TRIAL, asked], capture_output=True, timeout=LONGEST_S, check=False
+            [sys.executable, "-c", TRIAL, asked],
+            capture_output=True,
+            timeout=LONGEST_S,
+            check=False,
         )
     except subprocess.TimeoutExpired:
         raise FileFormatError(

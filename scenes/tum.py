@@ -1,10 +1,10 @@
-"""Trajectories as TUM text files: one pose per line, ``timestamp tx ty tz qx qy qz qw``; and a trajectory
-through recorded poses.
+"""Trajectories as TUM text files: one pose per line, ``timestamp tx ty tz qx qy qz qw``; and a
+trajectory through recorded poses.
 
-Lines that begin with # and empty lines are skipped; numbers are separated by spaces or tabs, or by commas (CSV), and
-the first line may be a header such as ``t_s,x,y,z,qx,qy,qz,qw``. Source: the file
-formats of the TUM RGB-D benchmark (Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS
-2012).
+Lines that begin with # and empty lines are skipped; numbers are separated by spaces or tabs, or by
+commas (CSV), and the first line may be a header such as ``t_s,x,y,z,qx,qy,qz,qw``. Source: the file
+formats of the TUM RGB-D benchmark (Sturm et al., A benchmark for the evaluation of RGB-D SLAM
+systems, IROS 2012).
 """
 
 import re
@@ -38,14 +38,16 @@ def write_tum(path: str | Path, t_s: torch.Tensor, poses: torch.Tensor) -> None:
     Args:
       t_s: [n] increasing seconds.
       poses: [n, 4, 4] rigid, for example T_world_cam.
-    Raises: ShapeError, DomainError for anything else; FileFormatError when the folder is not writable.
+    Raises: ShapeError, DomainError for anything else; FileFormatError when the folder is not
+      writable.
     """
     t_s, poses = _checked(t_s, poses)
     turn = Rotation.from_matrix(poses[:, :3, :3].numpy()).as_quat(canonical=True)
     rows = np.concatenate([t_s.numpy()[:, None], poses[:, :3, 3].numpy(), turn], 1).tolist()
     with replacing(path) as temporary:
         temporary.write_text(
-            "\n".join([HEADER, *(" ".join(map(repr, row)) for row in rows)]) + "\n", encoding="utf-8"
+            "\n".join([HEADER, *(" ".join(map(repr, row)) for row in rows)]) + "\n",
+            encoding="utf-8",
         )
 
 
@@ -53,9 +55,9 @@ def read_tum(path: str | Path) -> tuple[torch.Tensor, torch.Tensor]:
     """Read a trajectory.
 
     Returns: t_s [n] float64 seconds, poses [n, 4, 4] float64. Quaternions are normalised.
-    Raises: FileFormatError, with the line, for anything but eight finite numbers, times that do not increase,
-      or a quaternion whose length is not 1 to 0.001; for files that are missing, empty, or larger than 64 MB
-      or a million poses.
+    Raises: FileFormatError, with the line, for anything but eight finite numbers, times that do not
+      increase, or a quaternion whose length is not 1 to 0.001; for files that are missing, empty,
+      or larger than 64 MB or a million poses.
     """
     path = Path(path)
     rows = []
@@ -73,7 +75,9 @@ def read_tum(path: str | Path) -> tuple[torch.Tensor, torch.Tensor]:
                 "finite decimal numbers."
             )
         if len(rows) == MOST_POSES:
-            raise FileFormatError(f"{path}, line {number}: more than {MOST_POSES} poses; split the file.")
+            raise FileFormatError(
+                f"{path}, line {number}: more than {MOST_POSES} poses; split the file."
+            )
         rows.append([float(word) for word in words])
         numbers.append(number)
     if not rows:
@@ -103,16 +107,16 @@ def _words(line):
 
 
 class Recorded(Trajectory):
-    """A trajectory through poses at times: between two of them the constant twist that leads from one to the
-    next (a geodesic of SE(3)).
+    """A trajectory through poses at times: between two of them the constant twist that leads from
+    one to the next (a geodesic of SE(3)).
 
     Continuous, with a velocity that jumps at the recorded times; there the segment behind counts.
 
     Args:
       t_s: [n >= 2] increasing seconds.
       poses: [n, 4, 4] rigid.
-    Raises: ShapeError; DomainError, also when the body turns by more than 3 rad between two poses, where the
-      way is not clear.
+    Raises: ShapeError; DomainError, also when the body turns by more than 3 rad between two poses,
+      where the way is not clear.
     """
 
     def __init__(self, t_s, poses):
@@ -122,7 +126,9 @@ class Recorded(Trajectory):
         self.span_s = (float(self.t_s[0]), float(self.t_s[-1]))
         step = inverse(self.poses[:-1]) @ self.poses[1:]
         turn = torch.from_numpy(
-            Rotation.from_matrix(step[:, :3, :3].numpy()).as_quat(canonical=True)[:, [3, 0, 1, 2]].copy()
+            Rotation.from_matrix(step[:, :3, :3].numpy())
+            .as_quat(canonical=True)[:, [3, 0, 1, 2]]
+            .copy()
         )
         twist = Se3(So3.from_wxyz(turn), step[:, :3, 3]).log().detach()
         if float(twist[:, 3:].norm(dim=1).max()) > 3:

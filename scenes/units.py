@@ -11,8 +11,8 @@ UNITS = (("centimetres", 0.01), ("millimetres", 0.001))
 def hint(
     low_m: Sequence[float], high_m: Sequence[float], what: str = "the world", unit_m: float = 1.0
 ) -> str | None:
-    """A sentence when a box of these two corners, sequences of three numbers in metres, is too large or too small
-    for a room or a robot, also given as a UserWarning; None when it is not.
+    """A sentence when a box of these two corners, sequences of three numbers in metres, is too
+    large or too small for a room or a robot, also given as a UserWarning; None when it is not.
 
     Args:
       what: name of what the box holds, with its file.
@@ -27,7 +27,9 @@ def hint(
     units = size_m / unit_m
     if size_m > LARGE_M:
         other = " or ".join(
-            f"unit_m={metres:g} ({name}: {units * metres:.3g} m)" for name, metres in UNITS if metres < unit_m
+            f"unit_m={metres:g} ({name}: {units * metres:.3g} m)"
+            for name, metres in UNITS
+            if metres < unit_m
         )
         remedy = f"if its file is not in units of {unit_m:g} m, give {other or 'a smaller unit_m'}"
     else:

@@ -1,11 +1,12 @@
-"""Worlds: one function each, in metres, z up, radiance on the 0..255 scale. WORLDS names those that need no
-argument.
+"""Worlds: one function each, in metres, z up, radiance on the 0..255 scale. WORLDS names those that
+need no argument.
 
-Worlds with a ``light`` argument can be shown at three levels (scenes.build.LEVELS): emissive (their pictures
-as radiance), baked and path (their pictures as albedo under their own lamps). Things that rest on each other
-keep a gap of 1 mm, and no two shapes interpenetrate. Pictures may be arrays, paths, names of textures.PHOTOS,
-or "speckle-<seed>"; those from files are softened by two texels, because at the grain of a photograph
-bilinear texels have kinks and gradients, though right, are as rough as the grain.
+Worlds with a ``light`` argument can be shown at three levels (scenes.build.LEVELS): emissive (their
+pictures as radiance), baked and path (their pictures as albedo under their own lamps). Things that
+rest on each other keep a gap of 1 mm, and no two shapes interpenetrate. Pictures may be arrays,
+paths, names of textures.PHOTOS, or "speckle-<seed>"; those from files are softened by two texels,
+because at the grain of a photograph bilinear texels have kinks and gradients, though right, are as
+rough as the grain.
 """
 
 import math
@@ -73,8 +74,8 @@ def wall(
     wrap: str = "mirror",
     device: str = "cpu",
 ) -> MitsubaScene:
-    """One endless-looking wall, the plane y = 0 seen from y < 0, tiled (wrap "mirror" or "repeat") with a
-    picture (an array, a path such as "photo.jpg", or a name) at ``texel_m`` per texel."""
+    """One endless-looking wall, the plane y = 0 seen from y < 0, tiled (wrap "mirror" or "repeat")
+    with a picture (an array, a path such as "photo.jpg", or a name) at ``texel_m`` per texel."""
     return _plane("wall", texture, texel_m, half_width_m, (0, -1, 0), (0, 0, 1), wrap, device)
 
 
@@ -93,19 +94,24 @@ def ground(
 def _plane(name, texture, texel_m, half_width_m, towards, up, wrap, device):
     check_sizes(name, texel_m=texel_m, half_width_m=half_width_m)
     named = isinstance(texture, str | Path)
-    texture = textures.picture(texture) if named else textures.check_texture(texture, "of the scene")
+    texture = (
+        textures.picture(texture) if named else textures.check_texture(texture, "of the scene")
+    )
     repeat = (
         2 * half_width_m / (texel_m * texture.shape[1]),
         2 * half_width_m / (texel_m * texture.shape[0]),
     )
-    shape = rectangle(backend.mitsuba(device), (0, 0, 0), towards, 2 * half_width_m, 2 * half_width_m, up)
+    shape = rectangle(
+        backend.mitsuba(device), (0, 0, 0), towards, 2 * half_width_m, 2 * half_width_m, up
+    )
     return emissive(World({name: (shape, Paint(texture, repeat, wrap))}), device)
 
 
 def _walls(mi, paints, size_m):
     """Six inner sides of a box, each with its paint."""
     return {
-        name: (side, paint) for (name, side), paint in zip(sides(mi, size_m).items(), paints, strict=True)
+        name: (side, paint)
+        for (name, side), paint in zip(sides(mi, size_m).items(), paints, strict=True)
     }
 
 
@@ -119,9 +125,9 @@ def room(
     """A room with photographs on its four walls, floor and ceiling, and two crates and a ball when
     ``objects``.
 
-    Every picture fades to one wall colour at its border, so walls meet without a jump of radiance; without
-    objects the image has no discontinuities that move, and its interior gradient is the whole gradient. Where
-    it is lit, its ceiling is the lamp.
+    Every picture fades to one wall colour at its border, so walls meet without a jump of radiance;
+    without objects the image has no discontinuities that move, and its interior gradient is the
+    whole gradient. Where it is lit, its ceiling is the lamp.
     """
     mi = backend.mitsuba(device)
     pictures = [textures.faded_to(textures.picture(p), PAINT) for p in photos]
@@ -129,7 +135,10 @@ def room(
     shapes = _walls(mi, paints, size_m)
     if objects:
         shapes["crate"] = (block(mi, -0.9, 0.9, 0.0, (0.3, 0.3, 0.3), 25), Paint(pictures[0]))
-        shapes["box"] = (block(mi, 0.8, 1.2, 0.0, (0.35, 0.2, 0.2), -15), Paint(pictures[1 % len(pictures)]))
+        shapes["box"] = (
+            block(mi, 0.8, 1.2, 0.0, (0.35, 0.2, 0.2), -15),
+            Paint(pictures[1 % len(pictures)]),
+        )
         shapes["ball"] = (ball(mi, 0.1, 0.5, 0.0, 0.25), Paint(pictures[2 % len(pictures)]))
     return light(World(shapes), device)
 
@@ -140,11 +149,11 @@ def blank_room(
     device: str = "cpu",
     light: Light = emissive,
 ) -> Any:
-    """A closed room whose every surface has one radiance: the negative control, in which no motion makes an
-    event.
+    """A closed room whose every surface has one radiance: the negative control, in which no motion
+    makes an event.
 
-    Where it is lit it stays so: its walls reflect a half and emit the other half of their radiance (a white
-    furnace).
+    Where it is lit it stays so: its walls reflect a half and emit the other half of their radiance
+    (a white furnace).
     """
     even = Paint(
         np.full((8, 8), level, dtype=np.float32),
@@ -155,7 +164,8 @@ def blank_room(
 
 
 def corridor(device: str = "cpu", light: Light = emissive) -> Any:
-    """A corridor along +y, entered at y = 0, with pillars on both sides. Luminous ceiling where it is lit."""
+    """A corridor along +y, entered at y = 0, with pillars on both sides. Luminous ceiling where it
+    is lit."""
     mi = backend.mitsuba(device)
     length_m, width_m, height_m = CORRIDOR_M
     side, floor, column = (textures.picture(p) for p in ("brick", "gravel", "speckle-4"))
@@ -188,14 +198,15 @@ def outdoor(
     device: str = "cpu",
     light: Light = emissive,
 ) -> Any:
-    """Open ground with crates, balls and posts under a sky; a clear lane along x = 0 to drive or fly in.
+    """Open ground with crates, balls and posts under a sky; a clear lane along x = 0 to drive or
+    fly in.
 
     Args:
       clutter: how many things.
       environment: path of an equirectangular .hdr or .exr map; None is a procedural sky with a sun.
-      meshes: robot bodies as (path, x, y, turn_deg) or (path, x, y, turn_deg, scale), each resting on the
-        ground. Where it is lit, the sky lights it, with a sun of its own when the sky is procedural. The sky
-        lies at infinity: no point of it has a depth.
+      meshes: robot bodies as (path, x, y, turn_deg) or (path, x, y, turn_deg, scale), each resting
+        on the ground. Where it is lit, the sky lights it, with a sun of its own when the sky is
+        procedural. The sky lies at infinity: no point of it has a depth.
     """
     mi = backend.mitsuba(device)
     random = np.random.default_rng(seed)
@@ -225,7 +236,14 @@ def outdoor(
         paint = Paint(pictures[k % 4])
         if k % 3 == 0:
             shapes[f"crate-{k}"] = (
-                block(mi, x, y, 0.0, (size, size, size * random.uniform(0.6, 1.6)), random.uniform(0, 90)),
+                block(
+                    mi,
+                    x,
+                    y,
+                    0.0,
+                    (size, size, size * random.uniform(0.6, 1.6)),
+                    random.uniform(0, 90),
+                ),
                 paint,
             )
         elif k % 3 == 1:
@@ -254,7 +272,9 @@ def dark_room(seed: int = 0, device: str = "cpu", light: Light = emissive) -> An
         * (DARK / PAINT)
         for k in range(6)
     ]
-    shapes = _walls(mi, [Paint(picture, albedo=0.25 * 255 / float(picture.max())) for picture in dim], ROOM_M)
+    shapes = _walls(
+        mi, [Paint(picture, albedo=0.25 * 255 / float(picture.max())) for picture in dim], ROOM_M
+    )
     low, high = np.array([-1.6, -1.6, 0.4]), np.array([1.6, 1.6, ROOM_M[2] - 0.4])
     places = []
     while len(places) < SPOTS:
@@ -277,7 +297,8 @@ def smooth_plane(
     T_world_plane: Tensor | None = None,
     **options: Any,
 ) -> TexturedPlane:
-    """A band-limited analytic wall in the plane z = 0 of its frame; options go to textures.waves."""
+    """A band-limited analytic wall in the plane z = 0 of its frame; options go to
+    textures.waves."""
     return TexturedPlane(*textures.waves(seed, **options), T_world_plane=T_world_plane)
 
 

@@ -1,11 +1,13 @@
-"""Run every command that README, docs and Makefile name, in its quick form, and print what became of each.
+"""Run every command that README, docs and Makefile name, in its quick form, and print what became
+of each.
 
     make try-all                      from a fresh clone; ARGS="--only lens --limit 120" runs a part
     make try-all ARGS="--resume"      after a cut: what went as it should is not run again
 
-Results are kept command by command in runs/try_all.jsonl, with the commit that they are of.
-A new command on a page is tried by itself. A study runs with --quick in a folder of its own, through its target of
-make where it has one. A command that names a file of the reader's own must end in a sentence (exit 2).
+Results are kept command by command in runs/try_all.jsonl, with the commit that they are of. A new
+command on a page is tried by itself. A study runs with --quick in a folder of its own, through its
+target of make where it has one. A command that names a file of the reader's own must end in a
+sentence (exit 2).
 """
 
 import argparse
@@ -43,7 +45,8 @@ ELSEWHERE = ("help", "setup", "test", "test-bits", "lint", "core-check", "clean"
 
 
 def commands() -> dict[str, str]:
-    """{command: the page that names it first}: code spans, lines of code blocks, targets of studies no page names."""
+    """{command: the page that names it first}: code spans, lines of code blocks, targets of studies
+    no page names."""
     found = {}
     for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "Makefile"):
         text = page.read_text(encoding="utf-8").replace("```", "")
@@ -61,8 +64,11 @@ def commands() -> dict[str, str]:
 
 
 def normal(said: str) -> str:
-    """One spelling of a command: without remarks, what may be left out, --quick and --out; "" where it is none."""
-    said = re.sub(r"\s+#.*|\s{2,}.*|\[[^]]*\]|…|\.venv/bin/|--quick|--out [^\s\"]+", "", said).strip()
+    """One spelling of a command: without remarks, what may be left out, --quick and --out; "" where
+    it is none."""
+    said = re.sub(
+        r"\s+#.*|\s{2,}.*|\[[^]]*\]|…|\.venv/bin/|--quick|--out [^\s\"]+", "", said
+    ).strip()
     for word, value in INSTEAD.items():
         said = said.replace(word, value)
     try:
@@ -105,7 +111,13 @@ def outcome(command: str, limit_s: float) -> tuple[bool, str, str]:
         pipe = subprocess.PIPE
         # in a session of its own, so that what make has started ends with it
         started = subprocess.Popen(
-            words, cwd=folder, env=environment, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+            words,
+            cwd=folder,
+            env=environment,
+            stdout=pipe,
+            stderr=pipe,
+            text=True,
+            start_new_session=True,
         )
         try:
             _, errors = started.communicate(timeout=limit_s)
@@ -117,14 +129,20 @@ def outcome(command: str, limit_s: float) -> tuple[bool, str, str]:
             return False, "time", ""
     code = re.findall(r"^make: \*\*\* .* Error (\d+)", errors, re.M) or [str(started.returncode)]
     traced = "Traceback (most" in errors
-    lines = [line for line in errors.splitlines() if line.strip() and not line.startswith("make")] or [""]
-    # exit 2 is right only where the command names data of the reader's own, or asks for an option that it lacks;
-    # an option that is not there is refused without such a sentence
+    lines = [
+        line for line in errors.splitlines() if line.strip() and not line.startswith("make")
+    ] or [""]
+    # exit 2 is right only where the command names data of the reader's own, or asks for an option
+    # that it lacks; an option that is not there is refused without such a sentence
     sentence = next((line for line in lines if line.startswith("error: ")), "")
     asked = NEEDS.search(sentence)
     theirs = OWN.search(command) or (asked and asked[1] not in command)
     right = code[0] == "0" or (code[0] == "2" and bool(sentence and theirs))
-    return right, code[0], "" if code[0] == "0" else (lines[-1] if traced else sentence or lines[0])[:160]
+    return (
+        right,
+        code[0],
+        "" if code[0] == "0" else (lines[-1] if traced else sentence or lines[0])[:160],
+    )
 
 
 def cpu_s() -> float:
@@ -138,10 +156,15 @@ def main() -> int:
     asked.add_argument("--only", default="", help="try the commands that hold this text")
     asked.add_argument("--metrics", type=Path, help="file for the figures commands and failed")
     asked.add_argument("--limit", type=float, default=900.0, help="seconds that a command may take")
-    asked.add_argument("--resume", action="store_true", help="leave out what went as it should before")
+    asked.add_argument(
+        "--resume", action="store_true", help="leave out what went as it should before"
+    )
     options = asked.parse_args()
     commit = subprocess.run(
-        ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
+        ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"],
+        capture_output=True,
+        text=True,
+        check=False,
     ).stdout.strip()
     KEPT.parent.mkdir(exist_ok=True)
     if not options.resume:
@@ -149,7 +172,9 @@ def main() -> int:
     lines = KEPT.read_text(encoding="utf-8").splitlines() if KEPT.exists() else []
     known = {row["command"]: row for row in map(json.loads, lines) if row["right"]}
     tried = failed = 0
-    print("| command | page | exit | seconds | CPU-s | first line of the error |\n|---|---|---|---|---|---|")
+    print(
+        "| command | page | exit | seconds | CPU-s | first line of the error |\n|---|---|---|---|---|---|"
+    )
     for command, page in commands().items():
         if options.only not in command or command.split()[1] in ELSEWHERE:
             continue
@@ -163,10 +188,14 @@ def main() -> int:
                 file.write(json.dumps({**row, "commit": commit}) + "\n")
         tried, failed = tried + 1, failed + (not row["right"])
         if options.metrics:
-            options.metrics.write_text(json.dumps({"commands": tried, "failed": failed}), encoding="utf-8")
+            options.metrics.write_text(
+                json.dumps({"commands": tried, "failed": failed}), encoding="utf-8"
+            )
         mark = "" if row["right"] else " **fails**"
         times = f"{row['seconds']} | {row['cpu_s']}"
-        print(f"| `{command}` | {page} | {row['exit']}{mark} | {times} | {row['said']} |", flush=True)
+        print(
+            f"| `{command}` | {page} | {row['exit']}{mark} | {times} | {row['said']} |", flush=True
+        )
     print(f"{failed} failed; {', '.join(ELSEWHERE)} are left to CI and to you")
     return min(failed, 1)
 

@@ -1,5 +1,5 @@
-"""One runnable file or folder per question: `python -m studies` lists them, `python -m studies.NAME --help`
-explains one."""
+"""One runnable file or folder per question: `python -m studies` lists them, `python -m studies.NAME
+--help` explains one."""
 
 import sys
 

@@ -2,8 +2,8 @@
 
     lens ──rays──▶ frames ──▶ events ──▶ flow
 
-A traced lens on a drifting, turning robot looks into a room with crates and a ball. The picture is the one that the README
-shows (docs/chain.png).
+A traced lens on a drifting, turning robot looks into a room with crates and a ball. The picture is
+the one that the README shows (docs/chain.png).
 """
 
 import sys
@@ -41,28 +41,45 @@ def study(run: Run[Config]):
     published = lens.load(config.lens)
     geo = published.scaled(11.0 / float(published.first_order().efl_mm.detach())).freeze()
     system = System(
-        camera=render.Camera(geo, config.width_px, config.height_px, PITCH_MM, config.samples, config.seed),
+        camera=render.Camera(
+            geo, config.width_px, config.height_px, PITCH_MM, config.samples, config.seed
+        ),
         events=events.HardSensor(events.SensorModel(theta_on=0.15, theta_off=0.15), 8),
         flow=flow.load("refiner"),
         objectives={
-            "endpoint error": lambda field, truth: flow.metrics.aee(field.flow_px, truth.flow_px, truth.valid)
+            "endpoint error": lambda field, truth: flow.metrics.aee(
+                field.flow_px, truth.flow_px, truth.valid
+            )
         },
         scene=worlds.room(),
     )
     t_s = torch.linspace(0, DURATION_S, 33, dtype=torch.float64)
     # m/s and rad/s in camera axes
     twist = torch.tensor([0.5, -0.1, 1.0, 0.0, 0.1, 0.25], dtype=torch.float64)
-    batch = Batch(trajectories.body_twist(pose.look_at((0.1, -1.5, 0.7), (0.0, 1.0, 0.35)), twist, t_s), t_s)
+    batch = Batch(
+        trajectories.body_twist(pose.look_at((0.1, -1.5, 0.7), (0.0, 1.0, 0.35)), twist, t_s), t_s
+    )
     with run.progress(1, "one pass") as bar, torch.no_grad():
         seen = system.begin(batch)
-        error = float(flow.metrics.aee(seen["field"].flow_px, seen["truth"].flow_px, seen["truth"].valid))
+        error = float(
+            flow.metrics.aee(seen["field"].flow_px, seen["truth"].flow_px, seen["truth"].valid)
+        )
         bar.advance(error_px=error)
     true = seen["truth"]
     moved = float(true.flow_px.square().sum(1).sqrt()[true.valid].mean())
-    run.record(endpoint_error_px=error, true_motion_px=moved, events=float(seen["volume"].counts.sum()))
-    run.card("Endpoint error", f"{error:.2f} px", f"true motion {moved:.2f} px in {DURATION_S * 1e3:g} ms")
+    run.record(
+        endpoint_error_px=error, true_motion_px=moved, events=float(seen["volume"].counts.sum())
+    )
+    run.card(
+        "Endpoint error",
+        f"{error:.2f} px",
+        f"true motion {moved:.2f} px in {DURATION_S * 1e3:g} ms",
+    )
     run.figure(
-        draw(geo, seen), "chain", "Lens, first frame, signed events, flow as estimated and as it is.", dpi=110
+        draw(geo, seen),
+        "chain",
+        "Lens, first frame, signed events, flow as estimated and as it is.",
+        dpi=110,
     )
     run.finish("The chain in one picture", "One pass from glass to flow, with the hard sensor.")
 

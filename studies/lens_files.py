@@ -1,9 +1,9 @@
-"""What becomes of published lens files: which load, why the others are refused, and whether focal lengths are
-those their makers claim.
+"""What becomes of published lens files: which load, why the others are refused, and whether focal
+lengths are those their makers claim.
 
-Every .json, .zmx, .seq and .txt file of a folder is loaded. Where a header, title, catalogue number, patent
-or file note claims a focal length, it is compared with the paraxial one of the loaded lens, at the wavelength
-of the claim.
+Every .json, .zmx, .seq and .txt file of a folder is loaded. Where a header, title, catalogue
+number, patent or file note claims a focal length, it is compared with the paraxial one of the
+loaded lens, at the wavelength of the claim.
 """
 
 import csv
@@ -24,7 +24,16 @@ from studies.frame.run import Run, StudyConfig, main
 EXTENSIONS = (".json", ".zmx", ".seq", ".txt")
 ALLOWED = 0.005  # relative difference of focal lengths up to which a claim counts as met
 D_UM = 0.5875618
-COLUMNS = ("file", "result", "surfaces", "pupil mm", "EFL mm", "claimed mm", "claimed by", "difference %")
+COLUMNS = (
+    "file",
+    "result",
+    "surfaces",
+    "pupil mm",
+    "EFL mm",
+    "claimed mm",
+    "claimed by",
+    "difference %",
+)
 COLUMNS += ("remark",)
 
 
@@ -50,14 +59,14 @@ CLAIMS = dict(_claims())
 @dataclass(frozen=True)
 class Config(StudyConfig):
     folder: Path | None = None
-    """Folder of lens files, searched with its subfolders; ../shared/data/lenses beside the repository when
-    left out."""
+    """Folder of lens files, searched with its subfolders; ../shared/data/lenses beside the
+    repository when left out."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one file: why it is refused, or its focal length in mm (None when afocal) at the wavelength of
-    the first claim, and each claim with the lens's own for it."""
+    """What became of one file: why it is refused, or its focal length in mm (None when afocal) at
+    the wavelength of the first claim, and each claim with the lens's own for it."""
 
     file: str
     reason: str = ""
@@ -68,7 +77,12 @@ class Outcome:
         """Rows of the table: one per claim, at least one."""
         if self.geo is None:
             return [(self.file, "refused", *[None] * 6, self.reason)]
-        start = self.file, "loads", len(self.geo.surfaces), f"{self.geo.entrance_pupil_diameter_mm:.5g}"
+        start = (
+            self.file,
+            "loads",
+            len(self.geo.surfaces),
+            f"{self.geo.entrance_pupil_diameter_mm:.5g}",
+        )
         if not self.claims:
             efl = efl_mm(self.geo)
             return [(*start, "afocal" if efl is None else f"{efl:.6g}", None, None, None, "")]
@@ -111,10 +125,16 @@ def study(run: Run[Config]) -> None:
     )
     rows = [row for outcome in outcomes for row in outcome.rows()]
     lines = [COLUMNS, ["---"] * len(COLUMNS), *rows]
-    text = "\n".join("| " + " | ".join("" if v is None else str(v) for v in line) + " |" for line in lines)
+    text = "\n".join(
+        "| " + " | ".join("" if v is None else str(v) for v in line) + " |" for line in lines
+    )
     write_atomic(run.path("table.md"), f"{text}\n".encode())
-    run.card("Files that load", f"{loaded} of {len(files)}", "the others are refused with their reason")
-    run.card("Focal lengths", f"{met} of {len(claims)}", f"within {100 * ALLOWED:g} % of what is claimed")
+    run.card(
+        "Files that load", f"{loaded} of {len(files)}", "the others are refused with their reason"
+    )
+    run.card(
+        "Focal lengths", f"{met} of {len(claims)}", f"within {100 * ALLOWED:g} % of what is claimed"
+    )
     run.table(
         "Every file",
         COLUMNS,
@@ -136,7 +156,9 @@ def examine(path, folder):
     except CodesignError as error:
         return Outcome(name, str(error).replace(f"lens file {path}: ", "", 1))
     claims = ([CLAIMS[name]] if name in CLAIMS else []) + header_claims(path, geo)
-    return Outcome(name, "", geo, tuple((claim, efl_mm(geo, claim.wavelength_um)) for claim in claims))
+    return Outcome(
+        name, "", geo, tuple((claim, efl_mm(geo, claim.wavelength_um)) for claim in claims)
+    )
 
 
 def efl_mm(geo, wavelength_um=D_UM):
@@ -148,8 +170,8 @@ def efl_mm(geo, wavelength_um=D_UM):
 
 
 def header_claims(path, geo):
-    """The focal length in the header of a DeepLens file; some headers hold the one of the image's edge, which
-    distortion changes."""
+    """The focal length in the header of a DeepLens file; some headers hold the one of the image's
+    edge, which distortion changes."""
     page = json.loads(path.read_text(encoding="utf-8")) if path.suffix.lower() == ".json" else {}
     if "foclen" not in page:
         return []
@@ -158,22 +180,30 @@ def header_claims(path, geo):
     if abs(efl_mm(geo) / claimed - 1) > ALLOWED:
         edge = edge_focal_length_mm(geo, page["r_sensor"])
         is_edge = abs(edge / claimed - 1) < 2 * ALLOWED
-        remark = "the header holds the focal length of the image's edge" if is_edge else "unexplained"
+        remark = (
+            "the header holds the focal length of the image's edge" if is_edge else "unexplained"
+        )
         remark += f": at the sensor's edge, radius / tan(field) = {edge:.4g} mm"
     return [Claim(claimed, D_UM, "header", remark)]
 
 
 def edge_focal_length_mm(geo, radius_mm):
-    """Image height / tan(field) where the chief ray meets the image at ``radius_mm``; NaN where it never
-    does."""
+    """Image height / tan(field) where the chief ray meets the image at ``radius_mm``; NaN where it
+    never does."""
     angles = torch.arange(1, 800, dtype=torch.float64).mul(math.radians(0.1))
     towards = torch.stack([torch.zeros_like(angles), angles.sin(), angles.cos()], 1)
-    centre = torch.tensor([0.0, 0.0, float(geo.first_order().entrance_pupil_z_mm)], dtype=torch.float64)
+    centre = torch.tensor(
+        [0.0, 0.0, float(geo.first_order().entrance_pupil_z_mm)], dtype=torch.float64
+    )
     out = geo.trace(centre - 50 * towards, towards)
     # a ray that fails ends the search
     heights = torch.where(out.status == 0, out.position_mm[:, 1].detach().abs(), math.inf)
     first = int((heights >= radius_mm).int().argmax())
-    return radius_mm / math.tan(float(angles[first])) if math.isfinite(float(heights[first])) else math.nan
+    return (
+        radius_mm / math.tan(float(angles[first]))
+        if math.isfinite(float(heights[first]))
+        else math.nan
+    )
 
 
 if __name__ == "__main__":

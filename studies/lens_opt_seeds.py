@@ -1,4 +1,5 @@
-"""lens_opt over several detunings: does the flow design beat its rivals every time? Its losses are shown too."""
+"""lens_opt over several detunings: does the flow design beat its rivals every time? Its losses are
+shown too."""
 
 import dataclasses
 import sys
@@ -44,7 +45,11 @@ def study(run: Run[Config]):
             pairs[RIVALS[rival]] = pair
             name = rival
             run.record(**{f"{rival}_seeds_better": int((logs.mean(1) < 0).sum())})
-            run.card(f"Against {RIVALS[rival]}", pair.percent(), "flow error of the flow design, all seeds")
+            run.card(
+                f"Against {RIVALS[rival]}",
+                pair.percent(),
+                "flow error of the flow design, all seeds",
+            )
         else:
             name = design
         run.record(**pair.metrics(f"{name}_log_ratio"))
@@ -55,14 +60,24 @@ def study(run: Run[Config]):
         "Geometric mean over held-out cases, the same for every seed. An interval of all seeds is the wider of two: "
         "over cases, each averaged over the seeds, and over seeds, each averaged over its cases.",
     )
-    run.table("Rivals", ["rival", *(f"seed {s}" for s in parts), "all seeds", "the flow design"], rows)
+    run.table(
+        "Rivals", ["rival", *(f"seed {s}" for s in parts), "all seeds", "the flow design"], rows
+    )
     names = ("nominal", "detuned", *COMPARED, "optimised", "after_spots")
     run.section("Flow error and spots of every lens")
-    for key, title in (("flow_error_mrad_hard", "Flow error (mrad)"), ("rms_spot_um", "Mean RMS spot (µm)")):
-        rows = [[seed, *(part.metrics[f"{key}_{name}"] for name in names)] for seed, part in parts.items()]
+    for key, title in (
+        ("flow_error_mrad_hard", "Flow error (mrad)"),
+        ("rms_spot_um", "Mean RMS spot (µm)"),
+    ):
+        rows = [
+            [seed, *(part.metrics[f"{key}_{name}"] for name in names)]
+            for seed, part in parts.items()
+        ]
         run.table(title, ["seed", *(label(name, "flow") for name in names)], rows)
         for seed, *figures in rows:
-            run.record(**{f"seed{seed}_{key}_{name}": f for name, f in zip(names, figures, strict=True)})
+            run.record(
+                **{f"seed{seed}_{key}_{name}": f for name, f in zip(names, figures, strict=True)}
+            )
     run.record(seeds=len(parts))
     said = verdict(DESIGNS["flow"], pairs)
     run.finish(
@@ -93,7 +108,9 @@ def _one(run, seed):
 def _log_ratios(part, design, rival):
     """Of the flow errors of two lenses of a finished run on its held-out cases, [cases]."""
     found = part.load_state().numbers["found"]
-    return log_ratios(*([row["flow_error_mrad"] for row in found[name]] for name in (design, rival)))
+    return log_ratios(
+        *([row["flow_error_mrad"] for row in found[name]] for name in (design, rival))
+    )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
 """What manufacturing errors do to a lens: forecast from derivatives, judged by Monte Carlo.
 
-Radii, thicknesses, indices, decentres and tilts of every surface err independently. Focal lengths, distortion
-and image shift are forecast linearly. The spot is not linear near an optimum, so its square is forecast by
-the quadratic form of the ray errors, with the image plane fixed and refocused. Trials draw the same errors
-for both, so forecast and truth are compared lens by lens. At the end the other way round: what precision each
-part needs for a spot that grows by 10 %.
+Radii, thicknesses, indices, decentres and tilts of every surface err independently. Focal lengths,
+distortion and image shift are forecast linearly. The spot is not linear near an optimum, so its
+square is forecast by the quadratic form of the ray errors, with the image plane fixed and
+refocused. Trials draw the same errors for both, so forecast and truth are compared lens by lens. At
+the end the other way round: what precision each part needs for a spot that grows by 10 %.
 """
 
 import dataclasses
@@ -94,7 +94,9 @@ def study(run: Run[Config]):
     rays = {"fixed": fixed, "refocused": compensated(fixed, refocus)}
     slopes = sensitivities(geo, tolerances, linear)
     forecasts = {
-        name: forecast_spot(figure(geo).detach(), sensitivities(geo, tolerances, figure), len(FIELDS))
+        name: forecast_spot(
+            figure(geo).detach(), sensitivities(geo, tolerances, figure), len(FIELDS)
+        )
         for name, figure in rays.items()
     }
     errors = slopes.shape[1]
@@ -106,7 +108,9 @@ def study(run: Run[Config]):
 
     trials = simulate(run, geo, tolerances, figures)
     count = len(LINEAR_FIGURES)
-    first = dataclasses.replace(trials, figures=trials.figures[:, :count], nominal=trials.nominal[:count])
+    first = dataclasses.replace(
+        trials, figures=trials.figures[:, :count], nominal=trials.nominal[:count]
+    )
     report_linear(run, slopes, first)
     for k, (name, forecast) in enumerate(forecasts.items()):
         squares = trials.figures[:, count + k * len(FIELDS) :][:, : len(FIELDS)]
@@ -123,7 +127,8 @@ def study(run: Run[Config]):
 
 
 def half_field_of(geo, config):
-    """Half field in radians, from the command line or the lens. Raises: DomainError when none says."""
+    """Half field in radians, from the command line or the lens. Raises: DomainError when none
+    says."""
     found = geo.half_field_deg if config.half_field_deg is None else config.half_field_deg
     if found is None or not 0 < found < 90:
         raise DomainError(
@@ -143,7 +148,9 @@ def simulate(run, geo, tolerances, figures):
         parts.append(Trials(**stored.tensors, failed=int(stored.numbers["failed"])))
 
     def join():
-        amounts, tables = (torch.cat([getattr(p, name) for p in parts]) for name in ("amounts", "figures"))
+        amounts, tables = (
+            torch.cat([getattr(p, name) for p in parts]) for name in ("amounts", "figures")
+        )
         return Trials(amounts, tables, parts[0].nominal, sum(p.failed for p in parts))
 
     def save():
@@ -155,7 +162,9 @@ def simulate(run, geo, tolerances, figures):
     chunks = math.ceil(total / CHUNK)
     with run.progress(chunks, "trials", done) as progress:
         for chunk in range(done, chunks):
-            parts.append(monte_carlo(geo, tolerances, figures, min(CHUNK, total - chunk * CHUNK), generator))
+            parts.append(
+                monte_carlo(geo, tolerances, figures, min(CHUNK, total - chunk * CHUNK), generator)
+            )
             progress.advance(failed=sum(p.failed for p in parts))
     save()
     return join()
@@ -176,7 +185,9 @@ def report_linear(run, slopes, trials):
         run.record(**{f"{key}_{figure}": value for figure, value in known.items()})
         figures = {"nominal": trials.nominal[k], **known, "mean shift / deviation": found.bias[k]}
         figures |= {f"{q:.0%}": value for q, value in zip(QUANTILES, quantiles[:, k], strict=True)}
-        rows.append({"figure": name, **{title: f"{float(value):.6g}" for title, value in figures.items()}})
+        rows.append(
+            {"figure": name, **{title: f"{float(value):.6g}" for title, value in figures.items()}}
+        )
     run.card(
         "Linear figures",
         f"{min(found.correlation.tolist()):.6f}",
@@ -224,7 +235,8 @@ def report_spot(run, name, forecast, amounts, squares):
         "deviation_ratio": spread / deviation,
         "linear_deviation_ratio": torch.linalg.vector_norm(forecast.linear, dim=1) / deviation,
         "correlation": [
-            torch.corrcoef(torch.stack(pair))[0, 1] for pair in zip(predicted.T, squares.T, strict=True)
+            torch.corrcoef(torch.stack(pair))[0, 1]
+            for pair in zip(predicted.T, squares.T, strict=True)
         ],
     }
     expected = forecast.nominal + added
@@ -237,17 +249,30 @@ def report_spot(run, name, forecast, amounts, squares):
         run.record(**{f"{key}_{figure}": value for figure, value in figures_of.items()})
         sizes = nominal_um[f], 1e3 * expected[f].sqrt(), 1e3 * mean[f].sqrt()
         rows.append(
-            [f"{share:g}", *(f"{float(size):.2f}" for size in sizes), *(f"{v:.5f}" for v in figures.values())]
-            + [f"{a:.2f} / {b:.2f}" for a, b in zip(*(q[:, f].tolist() for q in quantiles), strict=True)]
+            [
+                f"{share:g}",
+                *(f"{float(size):.2f}" for size in sizes),
+                *(f"{v:.5f}" for v in figures.values()),
+            ]
+            + [
+                f"{a:.2f} / {b:.2f}"
+                for a, b in zip(*(q[:, f].tolist() for q in quantiles), strict=True)
+            ]
         )
     worst = float((known["mean_square_same_draws_ratio"] - 1).abs().max())
-    run.card(f"Spot, {name}", f"{worst:.2%}", "largest error of the mean square spot over the same draws")
+    run.card(
+        f"Spot, {name}", f"{worst:.2%}", "largest error of the mean square spot over the same draws"
+    )
     run.section(f"Spot with the image plane {name}")
     run.table(
         "Forecast and trials",
         ["field", "nominal (µm)", "root mean square forecast (µm)", "simulated"]
         + ["mean square of the same draws: forecast / simulated", "its deviation"]
-        + ["deviation of the square: quadratic / simulated", "linear / simulated", "correlation of squares"]
+        + [
+            "deviation of the square: quadratic / simulated",
+            "linear / simulated",
+            "correlation of squares",
+        ]
         + [f"{q:.0%} forecast / simulated (µm)" for q in QUANTILES],
         rows,
         "RMS spots over F, d and C. Over the same draws only the forecast errs; over all draws the trials' "
@@ -265,7 +290,9 @@ def report_spot(run, name, forecast, amounts, squares):
         axis.set(xlabel="RMS spot (µm)", title=f"field {FIELDS[f]:g}")
     axes[0].legend(frameon=False, fontsize=8)
     run.figure(
-        figure, f"spot_{name}", "Distribution of the RMS spot: trials, and draws of the quadratic forecast."
+        figure,
+        f"spot_{name}",
+        "Distribution of the RMS spot: trials, and draws of the quadratic forecast.",
     )
 
 
@@ -279,7 +306,11 @@ def report_offenders(run, geo, tolerances, slopes, forecasts):
             f"Spot, {name}",
             ["error", "mean square added (µm²)", "share"],
             [
-                [errors[k].name, f"{1e6 * float(added[k]):.3f}", f"{float(added[k] / added.sum()):.1%}"]
+                [
+                    errors[k].name,
+                    f"{1e6 * float(added[k]):.3f}",
+                    f"{float(added[k] / added.sum()):.1%}",
+                ]
                 for k in added.argsort(descending=True)[:10].tolist()
             ],
             "Mean over the fields, per one standard deviation of the error.",
@@ -287,11 +318,14 @@ def report_offenders(run, geo, tolerances, slopes, forecasts):
     for k in (0, 2):
         found = worst_offenders(geo, tolerances, slopes, k, 8)
         rows = [[name, f"{change:+.4g}", f"{share:.1%}"] for name, change, share in found]
-        run.table(LINEAR_FIGURES[k], ["error", "change per standard deviation", "share of variance"], rows)
+        run.table(
+            LINEAR_FIGURES[k], ["error", "change per standard deviation", "share of variance"], rows
+        )
 
 
 def report_needed(run, geo, figure, refocus):
-    """Table and metrics of the cheapest precision of surfaces and elements that a spot 10 % larger leaves."""
+    """Table and metrics of the cheapest precision of surfaces and elements that a spot 10 % larger
+    leaves."""
     config = run.config
     tolerances = Tolerances(
         radius_relative=config.radius_relative,

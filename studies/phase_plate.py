@@ -1,10 +1,10 @@
 """What does a phase plate in the stop buy an event camera that looks from 0.3 to 5 m at once?
 
-A plate in Zernike terms is designed by gradient on point spreads over depth and field: contrast at the
-frequencies of the pixels, in all directions, at the worst of the depths. It is judged, in light of three
-wavelengths and at depths in between, against the same lens without it, opened and stopped down, each refocused
-by the same objective. A stop costs light, a plate none: beside contrast stands contrast times the root of the
-light, the signal over shot noise at equal exposure.
+A plate in Zernike terms is designed by gradient on point spreads over depth and field: contrast at
+the frequencies of the pixels, in all directions, at the worst of the depths. It is judged, in light
+of three wavelengths and at depths in between, against the same lens without it, opened and stopped
+down, each refocused by the same objective. A stop costs light, a plate none: beside contrast stands
+contrast times the root of the light, the signal over shot noise at equal exposure.
 """
 
 import math
@@ -32,7 +32,10 @@ FINER = 2  # samples of the point spread per pixel
 SAMPLES = 64
 TERMS: tuple[int, ...] = (4, 7, 8, 9, 10, 11, 22)
 # radians RMS; the cubic is x^3 + y^3
-STARTS: dict[str, dict[int, float]] = {"cubic": {7: 0.7, 8: 0.7, 9: -0.7, 10: 0.7}, "round": {11: 0.8}}
+STARTS: dict[str, dict[int, float]] = {
+    "cubic": {7: 0.7, 8: 0.7, 9: -0.7, 10: 0.7},
+    "round": {11: 0.8},
+}
 FOCI = 9  # distances tried for a lens without a plate
 LINES = tuple(WAVELENGTH_UM[line] for line in "dFC")
 SHOWN_M = (0.3, 0.42, 0.8, 5.0)
@@ -41,7 +44,14 @@ PLATED = "open, plate"
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
-    QUICK: ClassVar = {"steps": 2, "depths": 2, "judged": 3, "stops": (0.5,), "starts": 1, "fields": (0.0,)}
+    QUICK: ClassVar = {
+        "steps": 2,
+        "depths": 2,
+        "judged": 3,
+        "stops": (0.5,),
+        "starts": 1,
+        "fields": (0.0,),
+    }
     lens: str = "cooke-triplet"
     """Lens out of the catalogue, or a file."""
     efl_mm: float = 11.0
@@ -80,7 +90,9 @@ def study(run: Run[Config]):
         )
     geo = lens.load(config.lens)
     if geo.half_field_deg is None:
-        raise DomainError(f"{geo.name} names no half field; give a lens that does, or one of the catalogue.")
+        raise DomainError(
+            f"{geo.name} names no half field; give a lens that does, or one of the catalogue."
+        )
     geo = geo.scaled(config.efl_mm / float(geo.first_order().efl_mm.detach())).requires_grad_(False)
     middle = geo.focus_at(2 / (1 / config.near_m + 1 / config.far_m))
     plate, losses = design(run, middle)
@@ -88,7 +100,9 @@ def study(run: Run[Config]):
     rivals = {PLATED: (with_plate(middle, plate, z_mm=config.plate_z_mm), 1.0)}
     for share in (1.0, *config.stops):
         diameter = geo.entrance_pupil_diameter_mm * share
-        stopped = GeoLens(geo.to_surfaces(), diameter, name=geo.name, half_field_deg=geo.half_field_deg)
+        stopped = GeoLens(
+            geo.to_surfaces(), diameter, name=geo.name, half_field_deg=geo.half_field_deg
+        )
         name = "open" if share == 1 else f"stopped to {share:g}"
         rivals[name] = (refocused(config, stopped.requires_grad_(False)), share**2)
     compare(run, rivals, losses)
@@ -107,7 +121,8 @@ def contrast(
     share: float,
     light: Light = WAVELENGTH_UM["d"],
 ) -> Tensor:
-    """Contrast [periods] of a point spread: the root mean square of its transfer over all directions."""
+    """Contrast [periods] of a point spread: the root mean square of its transfer over all
+    directions."""
     energy = spread(config, geo, at_m, share, light).energy
     turn = torch.arange(DIRECTIONS, dtype=D) * (math.pi / DIRECTIONS)
     radians = 2 * math.pi / (FINER * torch.tensor(PERIODS_PX, dtype=D))[:, None, None]
@@ -118,8 +133,11 @@ def contrast(
 
 
 def shortfall(config, geo, per_m):
-    """What is minimised: log of the harmonic mean square of the contrast over depths, by field and period."""
-    found = [torch.stack([contrast(config, geo, 1 / p, share) for p in per_m]) for share in config.fields]
+    """What is minimised: log of the harmonic mean square of the contrast over depths, by field and
+    period."""
+    found = [
+        torch.stack([contrast(config, geo, 1 / p, share) for p in per_m]) for share in config.fields
+    ]
     return torch.stack([0.5 * f.pow(-2).mean(0).log() for f in found]).mean()
 
 
@@ -160,11 +178,14 @@ def descended(start, config, geo, radius_mm):
 
 
 def refocused(config, geo):
-    """A lens without a plate, focused where the same objective is least over the depths it is judged at."""
+    """A lens without a plate, focused where the same objective is least over the depths it is
+    judged at."""
     per_m = config.per_m(config.judged)
     with torch.no_grad():
         foci = [1 / float(p) for p in torch.linspace(float(per_m[0]), float(per_m[-1]), FOCI)[1:-1]]
-        return min((geo.focus_at(m) for m in foci), key=lambda g: float(shortfall(config, g, per_m)))
+        return min(
+            (geo.focus_at(m) for m in foci), key=lambda g: float(shortfall(config, g, per_m))
+        )
 
 
 def compare(run, rivals, losses):
@@ -203,7 +224,8 @@ def compare(run, rivals, losses):
 
 
 def verdict(run, rivals, curves):
-    """The first lines of the page: the plate against no plate, and against the stop of equal contrast."""
+    """The first lines of the page: the plate against no plate, and against the stop of equal
+    contrast."""
     found = []
     for index, period in enumerate(PERIODS_PX):
         worst = {name: float(curve.amin((0, 1))[index]) for name, curve in curves.items()}
@@ -243,7 +265,9 @@ def draw(run, rivals, curves, per_m, losses):
             spreads = [spread(run.config, rivals[name][0], at_m, 0.0, LINES) for at_m in SHOWN_M]
         titles = [f"{at_m:g} m" for at_m in SHOWN_M]
         run.figure(
-            lens_figures.psf_pictures(spreads, titles), f"psf_{plain(name)}", f"Point spreads, {name}."
+            lens_figures.psf_pictures(spreads, titles),
+            f"psf_{plain(name)}",
+            f"Point spreads, {name}.",
         )
 
 

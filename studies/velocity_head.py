@@ -78,28 +78,36 @@ def study(run: Run[Config]) -> None:
     for name, before, after in zip(config.pair, plain, ours, strict=True):
         run.record(**{f"{name}_plain_error": before, f"{name}_head_error": after})
         run.card(name, f"{after:.2f}", f"typical error; {before:.2f} by least squares")
-    run.finish("One velocity head for all designs", "Errors are of worlds that were kept from training.")
+    run.finish(
+        "One velocity head for all designs", "Errors are of worlds that were kept from training."
+    )
 
 
 def check(config: Config) -> None:
     """Raises: DomainError for pairs that are unknown, and sizes out of range."""
     check_pairs(config.pair)
     if min(config.designs, config.steps, config.batch, config.width) < 1 or config.worlds < 2:
-        raise DomainError("--designs, --steps, --batch and --width need at least 1, --worlds at least 2.")
+        raise DomainError(
+            "--designs, --steps, --batch and --width need at least 1, --worlds at least 2."
+        )
     if not 1 <= config.motions <= AT_ONCE:
         raise DomainError(f"--motions is {config.motions}; a design has 1 to {AT_ONCE} in a world.")
 
 
 def designs(pair: RobotPair, count: int, seed: int) -> list[Design]:
     """Spread evenly over the bounds, focal lengths by their logarithm."""
-    names = [f.name for f in fields(Design) if getattr(pair.low, f.name) < getattr(pair.high, f.name)]
+    names = [
+        f.name for f in fields(Design) if getattr(pair.low, f.name) < getattr(pair.high, f.name)
+    ]
     found = []
     for shares in SobolEngine(len(names), scramble=True, seed=seed).draw(count).double().tolist():
         numbers = {}
         for name, share in zip(names, shares, strict=True):
             low, high = getattr(pair.low, name), getattr(pair.high, name)
             at = MARGIN + (1 - 2 * MARGIN) * share
-            numbers[name] = low * (high / low) ** at if name == "efl_mm" else low + (high - low) * at
+            numbers[name] = (
+                low * (high / low) ** at if name == "efl_mm" else low + (high - low) * at
+            )
         found.append(pair.check(replace(pair.design, **numbers)))
     return found
 
@@ -114,8 +122,12 @@ def samples(run: Run[Config], pair: RobotPair) -> tuple[Samples, Samples]:
             path = run.folder / "samples" / f"{pair.name}_{index:03d}.safetensors"
             if not path.exists():
                 path.parent.mkdir(exist_ok=True)
-                checkpoint.write_tensors(path, rendered(pair, design, index, config), {"kind": "evidence"})
-            tensors = {name: value.double() for name, value in checkpoint.read_tensors(path)[0].items()}
+                checkpoint.write_tensors(
+                    path, rendered(pair, design, index, config), {"kind": "evidence"}
+                )
+            tensors = {
+                name: value.double() for name, value in checkpoint.read_tensors(path)[0].items()
+            }
             seen = Evidence(*(tensors[f.name] for f in fields(Evidence)))
             parts.append(Samples(seen, tensors["twist"], pair.axes))
             bar.advance()
@@ -141,7 +153,9 @@ def rendered(pair: RobotPair, design: Design, index: int, config: Config) -> dic
     plain = EgoVelocity(tuple(range(6)), pair.prior, pair.depth)
     system = pair.system(design, "sensor").replaced(estimate=VelocityHead(plain).evidence)
     seen = system.begin(batch)["estimate"]
-    return {f.name: getattr(seen, f.name).float() for f in fields(seen)} | {"twist": batch.twist.float()}
+    return {f.name: getattr(seen, f.name).float() for f in fields(seen)} | {
+        "twist": batch.twist.float()
+    }
 
 
 def bounded(velocity: Tensor, samples: Samples) -> Tensor:
@@ -175,7 +189,8 @@ def lesson(predictions: list[tuple[Tensor, ...]], batch: list[Samples]) -> Tenso
 
 
 def fit(head: VelocityHead, lessons, held_out, config: Config) -> None:
-    """Train on samples of each pair in equal shares; of the weights on its way those that judge best."""
+    """Train on samples of each pair in equal shares; of the weights on its way those that judge
+    best."""
     generator = torch.Generator().manual_seed(config.seed)
 
     def judged(network, batch):
@@ -183,7 +198,9 @@ def fit(head: VelocityHead, lessons, held_out, config: Config) -> None:
 
     def draw(step):
         each = max(1, config.batch // len(lessons))
-        return [part[torch.randint(len(part.twist), (each,), generator=generator)] for part in lessons]
+        return [
+            part[torch.randint(len(part.twist), (each,), generator=generator)] for part in lessons
+        ]
 
     train.fit(
         head,

@@ -1,4 +1,5 @@
-"""A flow field whose confidence and covariance are known to be there, for tests of the closed form."""
+"""A flow field whose confidence and covariance are known to be there, for tests of the closed
+form."""
 
 from dataclasses import dataclass
 

@@ -36,7 +36,9 @@ EXTRAS = {
 EXTRAS |= {"yourdfpy", "lxml", "tensorboard", "cma", "optuna", "onnx", "onnxscript"}
 ABSENT = {name for name in EXTRAS if importlib.util.find_spec(name) is None}
 ROOT = Path(__file__).resolve().parents[1]
-SHARED = next((folder for folder in (ROOT / "shared", ROOT.parent / "shared") if folder.is_dir()), None)
+SHARED = next(
+    (folder for folder in (ROOT / "shared", ROOT.parent / "shared") if folder.is_dir()), None
+)
 SUBSET = ROOT / "tests" / "data"  # of the reference values; see its README.md
 
 
@@ -65,9 +67,9 @@ def pytest_runtest_makereport(item):
 
 @pytest.fixture(scope="session")
 def shared():
-    """Function from a relative name ("refs/lens/rays.json") to its path in the shared folder beside the
-    checkout. Where that has none, reference values come from the subset in tests/data, and a test that needs a
-    recording, a lens file or a mesh is skipped."""
+    """Function from a relative name ("refs/lens/rays.json") to its path in the shared folder beside
+    the checkout. Where that has none, reference values come from the subset in tests/data, and a
+    test that needs a recording, a lens file or a mesh is skipped."""
 
     def find(name):
         for folder in (SHARED, SUBSET):
@@ -88,7 +90,10 @@ def generator():
 
 @pytest.fixture(autouse=True)
 def _processor(request):
-    """With CODESIGN_TEST_ROUNDING=place, tests of equal bits run on a processor that rounds by place."""
-    rounds = os.environ.get("CODESIGN_TEST_ROUNDING") == "place" and request.node.get_closest_marker("bits")
+    """With CODESIGN_TEST_ROUNDING=place, tests of equal bits run on a processor that rounds by
+    place."""
+    rounds = os.environ.get(
+        "CODESIGN_TEST_ROUNDING"
+    ) == "place" and request.node.get_closest_marker("bits")
     with RoundsByPlace() if rounds else nullcontext():
         yield

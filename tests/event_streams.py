@@ -1,4 +1,5 @@
-"""Event streams that tests make and compare, and files of them put together by the published layouts."""
+"""Event streams that tests make and compare, and files of them put together by the published
+layouts."""
 
 import io
 import struct
@@ -14,7 +15,9 @@ DAT = b"% Data file containing CD events\n% Version 2\n% Width 640\n% Height 480
 
 def rows(stream):
     """Events as tuples, in order."""
-    return [tuple(row) for row in torch.stack([getattr(stream, name) for name in FIELDS], 1).tolist()]
+    return [
+        tuple(row) for row in torch.stack([getattr(stream, name) for name in FIELDS], 1).tolist()
+    ]
 
 
 def same(first, second):
@@ -52,11 +55,14 @@ def evt2(*words):
 
 def dat(*events):
     """A DAT file of (t_us, x, y, 1 or 0)."""
-    return DAT + np.array([(t_us, p << 28 | y << 14 | x) for t_us, x, y, p in events], "<u4").tobytes()
+    return (
+        DAT + np.array([(t_us, p << 28 | y << 14 | x) for t_us, x, y, p in events], "<u4").tobytes()
+    )
 
 
 def packed_aedat4(data, code, packet):
-    """An AEDAT 4.0 file of one packet of this compression, whose recording was interrupted: it has no table."""
+    """An AEDAT 4.0 file of one packet of this compression, whose recording was interrupted: it has
+    no table."""
     start = 18 + struct.unpack_from("<I", data, 14)[0]
     changed = bytearray(data[:start] + struct.pack("<ii", 0, len(packet)) + packet)
     struct.pack_into("<i", changed, 14 + 32, code)
@@ -65,8 +71,8 @@ def packed_aedat4(data, code, packet):
 
 
 def in_hdf5(datasets, fill=None, userblock=0, **packing):
-    """Bytes of an HDF5 file of datasets, None: left out; fill: what else is done to it; userblock: bytes of
-    another program's at its start."""
+    """Bytes of an HDF5 file of datasets, None: left out; fill: what else is done to it; userblock:
+    bytes of another program's at its start."""
     import h5py
 
     buffer = io.BytesIO()

@@ -1,5 +1,5 @@
-"""A training run small enough for tests: a linear network, windows with one known answer, and the command on
-both."""
+"""A training run small enough for tests: a linear network, windows with one known answer, and the
+command on both."""
 
 import json
 import os
@@ -49,8 +49,8 @@ class Own(Linear):
 
 
 class Made:
-    """Source of windows whose flow is TRUE_WEIGHTS times the counts; ``before`` is called with the indices of
-    every batch; blind: no pixel has known flow."""
+    """Source of windows whose flow is TRUE_WEIGHTS times the counts; ``before`` is called with the
+    indices of every batch; blind: no pixel has known flow."""
 
     def __init__(self, seed=0, frames=True, before=lambda indices: None, blind=False):
         self.seed = seed
@@ -61,12 +61,19 @@ class Made:
     def batch(self, indices):
         self.before(indices)
         draws = [torch.Generator().manual_seed(1000 * self.seed + index) for index in indices]
-        counts = torch.stack([torch.randn(2, BINS, SIDE, SIDE, generator=draw).square() for draw in draws])
+        counts = torch.stack(
+            [torch.randn(2, BINS, SIDE, SIDE, generator=draw).square() for draw in draws]
+        )
         flow = torch.einsum("fc,bchw->bfhw", TRUE_WEIGHTS, counts.flatten(1, 2))
         valid = torch.full((len(counts), SIDE, SIDE), not self.blind)
-        times = torch.tensor([0.25, 0.75], dtype=torch.float64), torch.tensor([0.5, 0.5], dtype=torch.float64)
+        times = (
+            torch.tensor([0.25, 0.75], dtype=torch.float64),
+            torch.tensor([0.5, 0.5], dtype=torch.float64),
+        )
         return FlowWindows(
-            EventVolume(counts, *times), FlowField(flow, valid, 1.0), counts[:, 0] if self.frames else None
+            EventVolume(counts, *times),
+            FlowField(flow, valid, 1.0),
+            counts[:, 0] if self.frames else None,
         )
 
 
@@ -120,7 +127,9 @@ BASE = [
 
 
 def train(folder, options=""):
-    return main(train_flow.study, train_flow.Config, [*BASE, "--out", str(folder), *options.split()])
+    return main(
+        train_flow.study, train_flow.Config, [*BASE, "--out", str(folder), *options.split()]
+    )
 
 
 def resume(folder):
@@ -128,7 +137,8 @@ def resume(folder):
 
 
 def in_two_processes(script, *arguments):
-    """(exit codes, outputs) of a script run by two processes, with the variables that torchrun sets."""
+    """(exit codes, outputs) of a script run by two processes, with the variables that torchrun
+    sets."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

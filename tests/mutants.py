@@ -2,9 +2,9 @@
 
     python -m tests.mutants COPY --count 100 --seed 1
 
-COPY is a clone of the repository in which files are changed and put back; the rows go to tests/mutants.csv of this one as
-they are found, and a run that is cut goes on where it stopped. A change is noticed when a test of its room fails, or the
-tests do not end.
+COPY is a clone of the repository in which files are changed and put back; the rows go to
+tests/mutants.csv of this one as they are found, and a run that is cut goes on where it stopped. A
+change is noticed when a test of its room fails, or the tests do not end.
 """
 
 import argparse
@@ -44,7 +44,8 @@ ELSEWHERE = {  # rooms of the library without a folder of tests that bears their
 
 
 def sites(source: str):
-    """List of (line, first column, last column, old, new) of all changes of one line of a module."""
+    """List of (line, first column, last column, old, new) of all changes of one line of a
+    module."""
     lines = source.encode().splitlines()
     tree = ast.parse(source)
     annotations = {id(part) for node in ast.walk(tree) for part in _annotations(node)}
@@ -53,7 +54,8 @@ def sites(source: str):
 
 
 def _site(lines, node):
-    """The change of a node, None where there is none: another operator or number, a sign or ``not`` left out."""
+    """The change of a node, None where there is none: another operator or number, a sign or ``not``
+    left out."""
     match node:
         case ast.BinOp(left, operator, right) | ast.Compare(left, [operator, *_], [right, *_]):
             return _between(lines, left, right, operator)
@@ -64,7 +66,9 @@ def _site(lines, node):
             return _from_to(lines, node, node.end_col_offset, lambda old: repr(new))
         case ast.UnaryOp(ast.Not() | ast.USub(), operand) if not isinstance(operand, ast.Constant):
             if node.lineno == operand.lineno:
-                return _from_to(lines, node, operand.col_offset, lambda old: re.sub("not |-", "", old))
+                return _from_to(
+                    lines, node, operand.col_offset, lambda old: re.sub("not |-", "", old)
+                )
     return None
 
 
@@ -102,13 +106,13 @@ def drawn(root: Path, count: int, seed: int):
 
 
 def tests_of(root: Path, file: str):
-    """Files of tests to run: the room's own, those first that name most of what the module defines, then the eight of
-    other rooms that name most of it."""
+    """Files of tests to run: the room's own, those first that name most of what the module defines,
+    then the eight of other rooms that name most of it."""
     room = file.split("/")[1] if file.count("/") > 1 else ""
     tree = ast.parse((root / file).read_text())
-    names = {node.name for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)} | {
-        Path(file).stem
-    }
+    names = {
+        node.name for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)
+    } | {Path(file).stem}
     pattern = re.compile(r"\b(" + "|".join(map(re.escape, sorted(names))) + r")\b")
     near = ELSEWHERE.get(room, (f"tests/{room}",))
     own, others = [], []
@@ -131,7 +135,16 @@ def noticed(root: Path, file: str, site):
     text = lines[number - 1]
     lines[number - 1] = text[:first] + new.encode() + text[last:]
     path.write_bytes(b"".join(lines))
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests_of(root, file)]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-x",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        *tests_of(root, file),
+    ]
     try:
         done = subprocess.run(
             command,

@@ -1,4 +1,5 @@
-"""Random events and a calibration in the layout of the Event-Camera Dataset, for tests of recordings."""
+"""Random events and a calibration in the layout of the Event-Camera Dataset, for tests of
+recordings."""
 
 import shutil
 

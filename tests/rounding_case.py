@@ -32,10 +32,12 @@ PERIOD = 7
 
 
 class RoundsByPlace(TorchDispatchMode):
-    """Matrix products, convolutions and functions such as log round by the place of a number in the result
-    and by where in memory their input begins, as the libraries behind them may: by up to 6 eps.
+    """Matrix products, convolutions and functions such as log round by the place of a number in the
+    result and by where in memory their input begins, as the libraries behind them may: by up to 6
+    eps.
 
-    What keeps its bits under it gives each of these operations the same shapes at the same alignment.
+    What keeps its bits under it gives each of these operations the same shapes at the same
+    alignment.
     """
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):

@@ -1,4 +1,5 @@
-"""Public functions say the type of every parameter and of what they return; pyright holds them to it."""
+"""Public functions say the type of every parameter and of what they return; pyright holds them to
+it."""
 
 import ast
 import importlib
@@ -57,7 +58,9 @@ def missing(source):
             elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and public:
                 a = node.args
                 given = [*a.posonlyargs, *a.args, *a.kwonlyargs, *filter(None, (a.vararg, a.kwarg))]
-                bare = [x.arg for x in given if x.annotation is None and x.arg not in ("self", "cls")]
+                bare = [
+                    x.arg for x in given if x.annotation is None and x.arg not in ("self", "cls")
+                ]
                 bare += ["return"] if node.returns is None and name != "__init__" else []
                 found.update(f"{prefix}{name}.{x}" for x in bare)
 
@@ -77,7 +80,10 @@ def test_what_packages_export_is_annotated(package):
     named = [getattr(module, name) for name in module.__all__]
     ours = [v for v in named if inspect.isroutine(v) or inspect.isclass(v)]
     assert ours
-    assert set().union(*(missing(textwrap.dedent(inspect.getsource(value))) for value in ours)) == set()
+    assert (
+        set().union(*(missing(textwrap.dedent(inspect.getsource(value))) for value in ours))
+        == set()
+    )
 
 
 def test_what_is_missing_is_found():

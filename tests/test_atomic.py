@@ -49,7 +49,9 @@ def test_a_full_disk_is_one_sentence(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(FileFormatError, match=r"cannot write .*a\.txt: No space left on device; is the disk"):
+    with pytest.raises(
+        FileFormatError, match=r"cannot write .*a\.txt: No space left on device; is the disk"
+    ):
         write_atomic(tmp_path / "a.txt", b"new")
     assert list(tmp_path.iterdir()) == []
 
@@ -101,11 +103,15 @@ def written(call):
     owner = ast.unparse(call.func.value) if isinstance(call.func, ast.Attribute) else ""
     if name in ("open", "File", "h5"):
         modes = [
-            a.value for a in [*call.args, *(k.value for k in call.keywords)] if isinstance(a, ast.Constant)
+            a.value
+            for a in [*call.args, *(k.value for k in call.keywords)]
+            if isinstance(a, ast.Constant)
         ]
         if any(isinstance(m, str) and len(m) < 4 and set(m) & set("wax+") for m in modes):
             return (
-                owner if name == "open" and owner not in ("", "os", "archive") else ast.unparse(call.args[0])
+                owner
+                if name == "open" and owner not in ("", "os", "archive")
+                else ast.unparse(call.args[0])
             )
     if name in ("write_text", "write_bytes"):
         return owner

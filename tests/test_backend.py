@@ -1,4 +1,5 @@
-"""The torch-drjit bridge: right derivatives, the same at every pass, memory of its own, clear refusals."""
+"""The torch-drjit bridge: right derivatives, the same at every pass, memory of its own, clear
+refusals."""
 
 import pytest
 import torch
@@ -27,7 +28,9 @@ def same_in_torch(x, y, a):
 
 @pytest.fixture(params=[torch.float32, torch.float64], ids=str)
 def inputs(request, generator):
-    x, y = (torch.randn(N, dtype=request.param, generator=generator).requires_grad_() for _ in range(2))
+    x, y = (
+        torch.randn(N, dtype=request.param, generator=generator).requires_grad_() for _ in range(2)
+    )
     return x, y, torch.tensor([0.7], dtype=request.param, requires_grad=True)
 
 
@@ -39,12 +42,17 @@ def test_values_and_dtype_follow_the_inputs(inputs):
     # drjit's sin and exp are within 2 units in the last place; values here stay below 8
     for got, want in zip(outputs, expected, strict=True):
         torch.testing.assert_close(
-            got, want, rtol=4 * torch.finfo(inputs[0].dtype).eps, atol=8 * torch.finfo(inputs[0].dtype).eps
+            got,
+            want,
+            rtol=4 * torch.finfo(inputs[0].dtype).eps,
+            atol=8 * torch.finfo(inputs[0].dtype).eps,
         )
 
 
 def test_gradcheck_in_double(generator):
-    x, y = (torch.randn(N, dtype=torch.float64, generator=generator).requires_grad_() for _ in range(2))
+    x, y = (
+        torch.randn(N, dtype=torch.float64, generator=generator).requires_grad_() for _ in range(2)
+    )
     a = torch.tensor([0.7], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda *v: call(*v)[:2], (x, y, a))
 
@@ -145,7 +153,9 @@ def test_integer_outputs_carry_no_gradient(inputs):
 def test_mixed_dtypes_are_refused():
     with pytest.raises(GradientError, match=r"float32.*float64"):
         backend.run_kernel(
-            lambda arr, x, y: (x + y,), (torch.zeros(2), torch.zeros(2, dtype=torch.float64)), [(2,)]
+            lambda arr, x, y: (x + y,),
+            (torch.zeros(2), torch.zeros(2, dtype=torch.float64)),
+            [(2,)],
         )
     with pytest.raises(GradientError, match="float16"):
         backend.run_kernel(lambda arr, x: (x,), (torch.zeros(2, dtype=torch.float16),), [(2,)])

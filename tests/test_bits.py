@@ -1,4 +1,5 @@
-"""Tests that compare two ways to the same numbers for equal bits are run as other processors round."""
+"""Tests that compare two ways to the same numbers for equal bits are run as other processors
+round."""
 
 import ast
 import re
@@ -11,14 +12,20 @@ BY_CONSTRUCTION = {"test_two_processes_interrupted_and_resumed_learn_what_one_do
 
 
 def unmarked(source):
-    """Names of tests that promise equality of parts, batches or repetitions, compare with torch.equal or
-    array_equal, and lack the marker."""
+    """Names of tests that promise equality of parts, batches or repetitions, compare with
+    torch.equal or array_equal, and lack the marker."""
     for node in ast.walk(ast.parse(source)):
         if not isinstance(node, ast.FunctionDef) or not node.name.startswith("test_"):
             continue
         body = ast.get_source_segment(source, node) or ""
-        marked = any(ast.unparse(decorator) == "pytest.mark.bits" for decorator in node.decorator_list)
-        if PROMISE.search(node.name) and re.search(r"torch\.equal|array_equal", body) and not marked:
+        marked = any(
+            ast.unparse(decorator) == "pytest.mark.bits" for decorator in node.decorator_list
+        )
+        if (
+            PROMISE.search(node.name)
+            and re.search(r"torch\.equal|array_equal", body)
+            and not marked
+        ):
             yield node.name
 
 

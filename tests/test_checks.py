@@ -142,7 +142,9 @@ def test_kinds_and_values_of_tensors(value, options, sentence):
 
 def test_infinities_of_both_signs_are_found_by_themselves():
     assert check_finite(FLOW, "x") is FLOW
-    with pytest.raises(DomainError, match=r"2 of 3 values \(first at index \[0\]\); take smaller steps\.$"):
+    with pytest.raises(
+        DomainError, match=r"2 of 3 values \(first at index \[0\]\); take smaller steps\.$"
+    ):
         check_finite(EITHER_INFINITY, "x", "take smaller steps")
 
 
@@ -204,7 +206,10 @@ REFUSED = [
         "x must be a finite number > 0 and <= 1, got 0.0; 0.15 is typical.",
     ),
     (lambda: check_positive(0, "x"), "x must be a finite number > 0, got 0."),
-    (lambda: check_positive(1e31, "x"), "x must be a finite number from 1e-30 to 1e+30, got 1e+31."),
+    (
+        lambda: check_positive(1e31, "x"),
+        "x must be a finite number from 1e-30 to 1e+30, got 1e+31.",
+    ),
     (
         lambda: check_positive(1e-10, "x", 1e-9),
         "x must be a finite number from 1e-09 to 1e+30, got 1e-10.",
@@ -217,7 +222,10 @@ REFUSED = [
         )
     ),
     (lambda: check_whole(0.5, "x", None), "x must be a whole number, got 0.5."),
-    (lambda: check_whole(9, "x", 1, 8, "split it"), "x must be a whole number from 1 to 8, got 9; split it."),
+    (
+        lambda: check_whole(9, "x", 1, 8, "split it"),
+        "x must be a whole number from 1 to 8, got 9; split it.",
+    ),
     (lambda: check_seed(2**63, "x"), "x must be a whole number"),
     (lambda: check_seed(-(2**31), "x", bits=31), "x must be a whole number from -2.14748e+09 to"),
     (lambda: check_flag(1, "x"), "x must be True or False, got 1."),

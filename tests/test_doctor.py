@@ -1,5 +1,5 @@
-"""The doctor and the renderer check, in processes of their own: a bad LLVM may abort the process, and must
-not."""
+"""The doctor and the renderer check, in processes of their own: a bad LLVM may abort the process,
+and must not."""
 
 import os
 import subprocess
@@ -14,7 +14,8 @@ LLVM_15 = Path("/usr/lib/x86_64-linux-gnu/libLLVM-15.so")
 
 
 def python(*arguments, **environment):
-    """Run Python with ``arguments`` and extra environment variables; returns the finished process."""
+    """Run Python with ``arguments`` and extra environment variables; returns the finished
+    process."""
     return subprocess.run(
         [sys.executable, *arguments],
         capture_output=True,
@@ -95,7 +96,9 @@ def test_renderer_check_raises_instead_of_aborting(unfit, tmp_path):
 
 
 def test_doctor_survives_a_broken_drjit(tmp_path):
-    (tmp_path / "drjit.py").write_text("raise OSError('libdrjit-core.so: cannot open shared object file')")
+    (tmp_path / "drjit.py").write_text(
+        "raise OSError('libdrjit-core.so: cannot open shared object file')"
+    )
     done = python("-m", "codesign", "doctor", PYTHONPATH=str(tmp_path))
     assert done.returncode == 2
     assert "Traceback" not in done.stderr

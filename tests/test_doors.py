@@ -35,16 +35,36 @@ from tests.hostile import calls
             lambda: lens.analysis.ideal_mtf((10.0,), float("nan")),
             r"analysis.ideal_mtf: an argument is NaN, which is no number; give one \(.*fno = nan",
         ),
-        (lambda: render.project(7, torch.ones(1, 3)), "render.project: camera = 7, but a Camera is needed"),
         (
-            lambda: list(render.frame_chunks(None, None, pose.look_at((0, 0, 0), (1, 0, 0))[None], 2)),
+            lambda: render.project(7, torch.ones(1, 3)),
+            "render.project: camera = 7, but a Camera is needed",
+        ),
+        (
+            lambda: list(
+                render.frame_chunks(None, None, pose.look_at((0, 0, 0), (1, 0, 0))[None], 2)
+            ),
             "render.frame_chunks: camera = None",
         ),
-        (lambda: worlds.from_mesh(None), "worlds.from_mesh: path = None, but a str or a path is needed"),
-        (lambda: worlds.from_mesh("a.stl", unit_m="mm"), "unit_m = 'mm', but a number or None is needed"),
-        (lambda: robots.from_urdf(None), "robots.from_urdf: path = None, but a str or a path is needed"),
-        (lambda: textures.photo("gravel", "512"), "textures.photo: size_px = '512', but a whole number"),
-        (lambda: textures.speckle("a"), "textures.speckle: seed = 'a', but a whole number is needed"),
+        (
+            lambda: worlds.from_mesh(None),
+            "worlds.from_mesh: path = None, but a str or a path is needed",
+        ),
+        (
+            lambda: worlds.from_mesh("a.stl", unit_m="mm"),
+            "unit_m = 'mm', but a number or None is needed",
+        ),
+        (
+            lambda: robots.from_urdf(None),
+            "robots.from_urdf: path = None, but a str or a path is needed",
+        ),
+        (
+            lambda: textures.photo("gravel", "512"),
+            "textures.photo: size_px = '512', but a whole number",
+        ),
+        (
+            lambda: textures.speckle("a"),
+            "textures.speckle: seed = 'a', but a whole number is needed",
+        ),
     ],
 )
 def test_arguments_that_do_not_fit_are_named(call, sentence):
@@ -61,7 +81,8 @@ def test_arguments_are_named_also_where_the_package_is_installed_among_libraries
 def test_shapes_that_do_not_fit_are_a_shape_error():
     told = doors.door(lambda a, b: a @ b, "product")
     with pytest.raises(
-        ShapeError, match=r"product cannot work with a = Tensor \[2, 3\] float32, b = Tensor \[2, 3\]"
+        ShapeError,
+        match=r"product cannot work with a = Tensor \[2, 3\] float32, b = Tensor \[2, 3\]",
     ):
         _ours(told)(torch.ones(2, 3), torch.ones(2, 3))
 

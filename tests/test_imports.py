@@ -1,5 +1,5 @@
-"""Imports run one way: every room of the toolkit imports the floors below it alone, and no files go in a
-circle."""
+"""Imports run one way: every room of the toolkit imports the floors below it alone, and no files go
+in a circle."""
 
 import ast
 from functools import cache
@@ -49,8 +49,8 @@ def modules():
 
 
 def imports(sources):
-    """Dictionary name -> set of (module imported, line), at the top or inside a function; of a name imported
-    from a package, the module it is, where it is one."""
+    """Dictionary name -> set of (module imported, line), at the top or inside a function; of a name
+    imported from a package, the module it is, where it is one."""
     found = {}
     for name, source in sources.items():
         found[name] = set()
@@ -66,7 +66,8 @@ def imports(sources):
 
 
 def room(module):
-    """("codesign", room), ("scenes", "") or ("studies", study) of a module; ("", "") for other people's."""
+    """("codesign", room), ("scenes", "") or ("studies", study) of a module; ("", "") for other
+    people's."""
     top, *rest = module.split(".")
     if top not in ("codesign", "scenes", "studies"):
         return "", ""
@@ -133,8 +134,8 @@ def test_no_files_import_each_other_in_a_circle():
 
 
 def test_mitsuba_is_for_pictures_and_worlds():
-    """`import mitsuba` stands in codesign.backend alone, which hands it out after checking what is installed;
-    these ask for it."""
+    """`import mitsuba` stands in codesign.backend alone, which hands it out after checking what is
+    installed; these ask for it."""
     importers = []
     askers = set()
     for name, source in modules().items():
@@ -179,4 +180,6 @@ def test_circles_are_found_inside_functions_too():
         "codesign.lens.c": "import codesign.lens.a",
         "codesign.lens.d": "from codesign.lens import a",
     }
-    assert circles(sources) == {frozenset({"codesign.lens.a", "codesign.lens.b", "codesign.lens.c"})}
+    assert circles(sources) == {
+        frozenset({"codesign.lens.a", "codesign.lens.b", "codesign.lens.c"})
+    }

@@ -1,5 +1,5 @@
-"""Packages that the core does without: nothing needs them to be imported, and a missing one is named in a
-sentence."""
+"""Packages that the core does without: nothing needs them to be imported, and a missing one is
+named in a sentence."""
 
 import ast
 import os
@@ -24,7 +24,16 @@ EXTRAS = {
     extra: {re.split(r"[^A-Za-z0-9_-]", line)[0] for line in lines}
     for extra, lines in PROJECT["optional-dependencies"].items()
 }
-LEFT_OUT = ("h5py", "hdf5plugin", "lz4", "zstandard", "imageio", "imageio_ffmpeg", "tifffile", "tensorboard")
+LEFT_OUT = (
+    "h5py",
+    "hdf5plugin",
+    "lz4",
+    "zstandard",
+    "imageio",
+    "imageio_ffmpeg",
+    "tifffile",
+    "tensorboard",
+)
 
 
 CALLS = {
@@ -104,7 +113,8 @@ def test_a_package_that_cannot_be_imported_is_named(tmp_path, monkeypatch):
     (tmp_path / "half_installed.py").write_text("raise ImportError('libgone.so: no such file')")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(
-        MissingPackageError, match=r"half_installed, which is installed .* \(libgone.so: no such file\)"
+        MissingPackageError,
+        match=r"half_installed, which is installed .* \(libgone.so: no such file\)",
     ):
         require("half_installed", "video", "this")
 

@@ -38,7 +38,12 @@ def test_the_import_alone_loads_nothing_heavy():
         "print([name for name in heavy if name in sys.modules])"
     )
     done = subprocess.run(
-        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", script],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
     )
     assert done.stdout == "[]\n"
 
@@ -53,9 +58,16 @@ def test_every_room_is_reachable_from_the_package():
     rooms = {name for name in codesign.__all__ if name.islower()}
     assert rooms == standing - PRIVATE
     assert set(codesign.__all__) <= set(dir(codesign))
-    script = "import codesign; print(codesign.errors.DomainError.__name__, codesign.lens.load.__name__)"
+    script = (
+        "import codesign; print(codesign.errors.DomainError.__name__, codesign.lens.load.__name__)"
+    )
     done = subprocess.run(
-        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True, timeout=120
+        [sys.executable, "-c", script],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
     )
     assert done.stdout == "DomainError load\n"
 

@@ -20,7 +20,9 @@ PAGES = (
 
 @pytest.mark.parametrize("page", PAGES)
 def test_blocks_of_a_page_run_in_one_session(page, tmp_path, monkeypatch, capsys):
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), flags=re.S)
+    blocks = re.findall(
+        r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), flags=re.S
+    )
     assert blocks
     monkeypatch.chdir(tmp_path)
     names = {"__name__": "page"}

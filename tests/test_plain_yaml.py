@@ -1,4 +1,5 @@
-"""What is written is the YAML that others read, and comes back to the bit; what is no data is refused."""
+"""What is written is the YAML that others read, and comes back to the bit; what is no data is
+refused."""
 
 import math
 import struct
@@ -17,12 +18,17 @@ def test_floats_come_back_to_the_bit_here_and_elsewhere(generator):
     values += [0.0, -0.0, 1.0, 1e16, 1e-7, 5e-324, 1.7976931348623157e308, 0.1, -123456789.0]
     text = plain_yaml.dump({"values": values})
     for found in (plain_yaml.load(text), yaml.safe_load(text)):
-        assert struct.pack(f"{len(values)}d", *found["values"]) == struct.pack(f"{len(values)}d", *values)
+        assert struct.pack(f"{len(values)}d", *found["values"]) == struct.pack(
+            f"{len(values)}d", *values
+        )
 
 
 def test_pages_come_back():
     page = {
-        "a": {"b": {"c": 1, "d": [1, 2.5, [True, None], "x: #y"]}, "text": 'quotes " and \n lines, #, é'},
+        "a": {
+            "b": {"c": 1, "d": [1, 2.5, [True, None], "x: #y"]},
+            "text": 'quotes " and \n lines, #, é',
+        },
         "last": -3,
         "yes": "yes",
         "number": "1e-3",

@@ -30,7 +30,9 @@ def test_exponential_is_that_of_the_matrix(angle, generator):
         axis = torch.nn.functional.normalize(torch.randn(3, dtype=D, generator=generator), dim=0)
         twist = torch.cat([torch.randn(3, dtype=D, generator=generator), angle * axis])
         # torch's Pade form is good to some 1e-15 of a norm of at most 5
-        torch.testing.assert_close(se3_exp(twist), torch.linalg.matrix_exp(wedge(twist)), rtol=0, atol=2e-14)
+        torch.testing.assert_close(
+            se3_exp(twist), torch.linalg.matrix_exp(wedge(twist)), rtol=0, atol=2e-14
+        )
 
 
 def test_a_quarter_turn_about_z_with_translation_by_hand():
@@ -52,10 +54,14 @@ def test_gradcheck(scale, generator):
 def test_the_derivative_at_zero_is_the_generators():
     zero = torch.zeros(6, dtype=D, requires_grad=True)
     transform = se3_exp(zero)
-    rows = [torch.autograd.grad(entry, zero, retain_graph=True)[0] for entry in transform.reshape(-1)]
+    rows = [
+        torch.autograd.grad(entry, zero, retain_graph=True)[0] for entry in transform.reshape(-1)
+    ]
     jacobian = torch.stack(rows).reshape(4, 4, 6)
     for k in range(6):
-        torch.testing.assert_close(jacobian[:, :, k], wedge(torch.eye(6, dtype=D)[k]), rtol=0, atol=1e-14)
+        torch.testing.assert_close(
+            jacobian[:, :, k], wedge(torch.eye(6, dtype=D)[k]), rtol=0, atol=1e-14
+        )
 
 
 def test_inverse_and_apply(generator):
@@ -75,18 +81,23 @@ def test_inverse_and_apply(generator):
 
 def test_the_gradient_of_the_inverse_is_that_of_differences_and_of_the_group(generator):
     transform = se3_exp(torch.randn(2, 3, 6, dtype=D, generator=generator))
-    # any change of the entries, as differences see it: the formula is quadratic, so central ones are exact
+    # any change of the entries, as differences see it: the formula is quadratic, so central ones
+    # are exact
     entries = transform.clone().requires_grad_()
     weights = torch.randn(transform.shape, dtype=D, generator=generator)
     (found,) = torch.autograd.grad((inverse(entries) * weights).sum(), entries)
     change = torch.randn(transform.shape, dtype=D, generator=generator)
-    ahead, behind = ((inverse(transform + sign * 1e-2 * change) * weights).sum() for sign in (1, -1))
+    ahead, behind = (
+        (inverse(transform + sign * 1e-2 * change) * weights).sum() for sign in (1, -1)
+    )
     assert float((found * change).sum()) == pytest.approx(float((ahead - behind) / 2e-2), rel=1e-12)
     # a rigid change T exp(w): the inverse becomes exp(-w) T^-1, whose derivative is -[w] T^-1
     twist = torch.zeros(2, 3, 6, dtype=D, requires_grad=True)
     (found,) = torch.autograd.grad((inverse(transform @ se3_exp(twist)) * weights).sum(), twist)
     for k in range(6):
-        truth = (-wedge(torch.eye(6, dtype=D)[k]) @ torch.linalg.inv(transform) * weights).sum((-2, -1))
+        truth = (-wedge(torch.eye(6, dtype=D)[k]) @ torch.linalg.inv(transform) * weights).sum(
+            (-2, -1)
+        )
         torch.testing.assert_close(found[..., k], truth, rtol=0, atol=1e-12)
 
 

@@ -1,4 +1,5 @@
-"""The house stays as large as it was decided to be: syntax nodes of every room, without contexts and operators."""
+"""The house stays as large as it was decided to be: syntax nodes of every room, without contexts
+and operators."""
 
 import ast
 from collections import Counter
@@ -60,7 +61,8 @@ BUDGETS = {
 
 
 def nodes_by_room():
-    """Nodes of each folder two deep ("codesign/lens", "tests/flow"); files beside folders count for the folder above."""
+    """Nodes of each folder two deep ("codesign/lens", "tests/flow"); files beside folders count for
+    the folder above."""
     found = Counter()
     for top in ("codesign", "scenes", "studies", "tests", "setup"):
         for path in (ROOT / top).rglob("*.py"):
@@ -78,5 +80,7 @@ def test_no_room_grows_past_its_budget():
         for room, count in found.items()
         if count > BUDGETS.get(room, 0)
     }
-    assert not grown, f"{grown}: make it smaller, or raise the budget in the same commit and say why there"
+    assert not grown, (
+        f"{grown}: make it smaller, or raise the budget in the same commit and say why there"
+    )
     assert BUDGETS.keys() == found.keys(), f"rooms that are gone: {BUDGETS.keys() - found.keys()}"

@@ -1,4 +1,5 @@
-"""Threads that compute gradients at once give what one after the other gives; what was forked says what to do."""
+"""Threads that compute gradients at once give what one after the other gives; what was forked says
+what to do."""
 
 import os
 import subprocess
@@ -50,7 +51,12 @@ def test_many_threads_with_gradients_equal_serial_ones():
     kinds = "('traced', 'estimated', 'counted')"
     script = f"from tests.hostile.threads import *; k = {kinds}; found = run(8, 1, k); print(max(found[n] for n in k))"
     done = subprocess.run(
-        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, "-c", script],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
     )
     assert done.returncode == 0, done.stderr[-2000:]
     # sums of doubles, in an order that drjit's own threads choose
@@ -59,7 +65,12 @@ def test_many_threads_with_gradients_equal_serial_ones():
 
 def test_a_process_forked_after_the_first_kernel_is_told_to_spawn():
     done = subprocess.run(
-        [sys.executable, "-c", FORKED], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-c", FORKED],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
     )
     assert done.stdout.strip() == "7", done.stderr[-2000:]
 

@@ -23,7 +23,9 @@ def test_every_study_that_a_page_names_is_there_and_is_tried(try_all):
     found = try_all.commands()
     tried = {re.split(r"[ .]", command)[-1] for command in (c.split(" --")[0] for c in found)}
     tried |= {
-        module for module, target in try_all.MODULES.items() if any(c.split()[1] == target for c in found)
+        module
+        for module, target in try_all.MODULES.items()
+        if any(c.split()[1] == target for c in found)
     }
     pages = "".join(p.read_text() for p in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")))
     named = set(re.findall(r"python -m studies\.([a-z_]+)", pages))
@@ -35,7 +37,10 @@ def test_every_study_that_a_page_names_is_there_and_is_tried(try_all):
     ("said", "plain"),
     [
         ('make lens-opt ARGS="--quick --out runs/mine"', "make lens-opt"),
-        (".venv/bin/python -m studies.train_flow --seed 1     # another", 'make train-flow ARGS="--seed 1"'),
+        (
+            ".venv/bin/python -m studies.train_flow --seed 1     # another",
+            'make train-flow ARGS="--seed 1"',
+        ),
         ("python -m studies.phase_plate [--steps 3]", "python -m studies.phase_plate"),
         ("make it", ""),
         ("codesign run NAME …", ""),

@@ -1,8 +1,8 @@
 """Events: from frames to counts, streams and volumes, hard and differentiable.
 
 Hard: ``simulate`` (sensor), ``naive`` (frame difference). Differentiable: ``memory`` (default),
-``soft_counts``, ``soft``, ``dense``, ``expected``, ``sensor_counts``, ``srm``; ``layer(name)`` makes a module
-of any of them, with learnable sensor values.
+``soft_counts``, ``soft``, ``dense``, ``expected``, ``sensor_counts``, ``srm``; ``layer(name)``
+makes a module of any of them, with learnable sensor values.
 """
 
 from codesign.doors import explain

@@ -17,8 +17,9 @@ CHUNK = 100_000  # events
 class EventColumns:
     """Events in order of time, 13 bytes each.
 
-    t_us: [N] int64 microseconds. x, y: [N] int16. on: [N] bool. height_px, width_px: sensor size. size_from:
-      a phrase that says where that came from. left_out: how many events of which fault were left out.
+    t_us: [N] int64 microseconds. x, y: [N] int16. on: [N] bool. height_px, width_px: sensor size.
+      size_from: a phrase that says where that came from. left_out: how many events of which fault
+      were left out.
     """
 
     t_us: np.ndarray
@@ -43,15 +44,15 @@ class EventColumns:
         return self[first:last].stream()
 
     def chunks(self, size: int = CHUNK, start_us: int | None = None) -> Iterator[EventStream]:
-        """EventStreams of ``size`` events each, in order, from ``start_us`` on; events of one microsecond may
-        part."""
+        """EventStreams of ``size`` events each, in order, from ``start_us`` on; events of one
+        microsecond may part."""
         first = 0 if start_us is None else int(np.searchsorted(self.t_us, start_us))
         for k in range(first, len(self), size):
             yield self[k : k + size].stream()
 
     def stream(self) -> EventStream:
-        """EventStream of all, sorted by (t, y, x, p): by one packed key where time and pixel fit 63 bits
-        together, several times faster than by indices."""
+        """EventStream of all, sorted by (t, y, x, p): by one packed key where time and pixel fit 63
+        bits together, several times faster than by indices."""
         cells = 2 * self.height_px * self.width_px
         first_us, last_us = (int(self.t_us[0]), int(self.t_us[-1])) if len(self) else (0, 0)
         cell = (self.y.astype(np.int64) * self.width_px + self.x) * 2 + self.on

@@ -1,4 +1,5 @@
-"""What may enter an event layer: frames, thresholds, times. Everything else is refused with a sentence."""
+"""What may enter an event layer: frames, thresholds, times. Everything else is refused with a
+sentence."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,21 +12,30 @@ from codesign.checks import FLOATS, LEAST, MOST, check, check_finite, check_kind
 from codesign.errors import DomainError, ShapeError, shown
 
 Times = Tensor | Sequence[float] | np.ndarray  # seconds
-REAL = (torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.int32, torch.int16)
+REAL = (
+    torch.float64,
+    torch.float32,
+    torch.float16,
+    torch.bfloat16,
+    torch.int64,
+    torch.int32,
+    torch.int16,
+)
 MOST_VALUES = 2**32  # that are made in one call: 16 GB in single precision
 
 
 def check_frames(
     frames: Tensor, minimum: int = 2, *, name: str = "frames", non_negative: bool = True
 ) -> Tensor:
-    """Return ``frames`` unchanged when they are a float32 or float64 tensor [T, ...] of finite values.
+    """Return ``frames`` unchanged when they are a float32 or float64 tensor [T, ...] of finite
+    values.
 
     Args:
       frames: [T, ...] tensor, time first.
       minimum: least number of frames allowed.
       non_negative: also refuse values below 0 (linear intensity).
-    Raises: ShapeError for too few frames or no pixels; DomainError for other types, NaN, infinite or negative
-      values.
+    Raises: ShapeError for too few frames or no pixels; DomainError for other types, NaN, infinite
+      or negative values.
     """
     axes = f"T>={minimum} ..."
     least = 0.0 if non_negative else None
@@ -36,14 +46,14 @@ def check_frames(
 def check_per_pixel(
     value: Tensor | float, name: str, frames: Tensor, dtype: torch.dtype | None = None
 ) -> Tensor:
-    """Return a contrast threshold or time constant as a tensor on the frames' device that broadcasts over
-    one frame.
+    """Return a contrast threshold or time constant as a tensor on the frames' device that
+    broadcasts over one frame.
 
     Args:
-      value: number, 0-dim tensor, or tensor that broadcasts to the pixel shape ``frames.shape[1:]``; > 0,
-        thresholds in natural log units. dtype: None: of the frames.
-    Raises: DomainError when a value is no number from 1e-30 to 1e30, beyond which single precision ends;
-      ShapeError when it does not broadcast.
+      value: number, 0-dim tensor, or tensor that broadcasts to the pixel shape
+        ``frames.shape[1:]``; > 0, thresholds in natural log units. dtype: None: of the frames.
+    Raises: DomainError when a value is no number from 1e-30 to 1e30, beyond which single precision
+      ends; ShapeError when it does not broadcast.
     """
     if not isinstance(value, Tensor):
         value = check_positive(value, name)
@@ -52,7 +62,9 @@ def check_per_pixel(
             f"{name} is a tensor of {value.dtype} on {value.device}; give a real number, or a dense tensor "
             "of them, > 0."
         )
-    value = torch.as_tensor(value, dtype=torch.float64 if dtype is None else dtype, device=frames.device)
+    value = torch.as_tensor(
+        value, dtype=torch.float64 if dtype is None else dtype, device=frames.device
+    )
     pixels = frames.shape[1:]
     fits = value.ndim <= len(pixels) and all(
         a in (1, b) for a, b in zip(reversed(value.shape), reversed(pixels), strict=False)
@@ -85,14 +97,17 @@ def as_seconds(times: Any, name: str) -> Tensor:
 
 
 def check_times(t_s: Times, count: int | None = None) -> Tensor:
-    """Return frame times as a float64 tensor [count] on the CPU, strictly increasing; any number with None.
+    """Return frame times as a float64 tensor [count] on the CPU, strictly increasing; any number
+    with None.
 
-    Raises: ShapeError when the number of times differs; DomainError when they are no real numbers, do not
-      increase strictly, are not finite, or require a gradient, which nothing gives to times.
+    Raises: ShapeError when the number of times differs; DomainError when they are no real numbers,
+      do not increase strictly, are not finite, or require a gradient, which nothing gives to times.
     """
     times_s = as_seconds(t_s, "t_s")
     if isinstance(t_s, Tensor) and t_s.requires_grad:
-        raise DomainError("t_s requires a gradient, and events give none to frame times; pass t_s.detach().")
+        raise DomainError(
+            "t_s requires a gradient, and events give none to frame times; pass t_s.detach()."
+        )
     times_s = times_s.cpu()
     if times_s.ndim != 1 or count not in (None, len(times_s)):
         raise ShapeError(
@@ -126,14 +141,16 @@ def check_room(values: float, what: str) -> None:
 
 
 def check_counts(counts: Tensor, *, non_negative: bool = False) -> None:
-    """Raise unless ``counts`` are a float32 or float64 tensor [T-1, 2, ..., H, W] of finite numbers, 0 or
-    more where asked; ShapeError for the axes, DomainError for the rest."""
-    check(counts, "T-1 2 ... H W", "counts", FLOATS, least=0.0 if non_negative else None, finite=True)
+    """Raise unless ``counts`` are a float32 or float64 tensor [T-1, 2, ..., H, W] of finite
+    numbers, 0 or more where asked; ShapeError for the axes, DomainError for the rest."""
+    check(
+        counts, "T-1 2 ... H W", "counts", FLOATS, least=0.0 if non_negative else None, finite=True
+    )
 
 
 def check_level(state: Tensor, level: Tensor) -> Tensor:
-    """Return a level carried from an earlier chunk unchanged when it has the shape and type of one frame of
-    ``level``, finite; ShapeError, DomainError otherwise."""
+    """Return a level carried from an earlier chunk unchanged when it has the shape and type of one
+    frame of ``level``, finite; ShapeError, DomainError otherwise."""
     return check(state, tuple(level.shape[1:]), "the state", (level.dtype,), finite=True)
 
 
@@ -144,8 +161,8 @@ def check_state(state: object, kind: type) -> None:
 
 
 def check_chunk(frames: Tensor, shape: torch.Size, dtype: torch.dtype) -> None:
-    """Raise ShapeError for frames [T, ...] of another size or type than the frame [...] of the chunk
-    before."""
+    """Raise ShapeError for frames [T, ...] of another size or type than the frame [...] of the
+    chunk before."""
     if (frames.shape[1:], frames.dtype) != (shape, dtype):
         raise ShapeError(
             f"{frames.dtype} frames of {list(frames.shape[1:])} follow {dtype} frames of {list(shape)}; chunks "
@@ -154,7 +171,8 @@ def check_chunk(frames: Tensor, shape: torch.Size, dtype: torch.dtype) -> None:
 
 
 def check_later(times_s: Tensor, before_s: float) -> Tensor:
-    """The times of a chunk with that of the frame before it ahead; DomainError where they go back."""
+    """The times of a chunk with that of the frame before it ahead; DomainError where they go
+    back."""
     if float(times_s[0]) <= before_s:
         raise DomainError(
             f"the chunk starts at {float(times_s[0])!r} s, the last frame seen was at {before_s!r} s; times "

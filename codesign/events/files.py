@@ -1,6 +1,6 @@
-"""Event streams to and from files: a file -> packets of t, x, y, p, by the reader of its ending and content
--> checked and put in order (Arrival) -> EventColumns -> an EventStream (``read``), or windows
-(codesign.flow.sources)."""
+"""Event streams to and from files: a file -> packets of t, x, y, p, by the reader of its ending and
+content -> checked and put in order (Arrival) -> EventColumns -> an EventStream (``read``), or
+windows (codesign.flow.sources)."""
 
 from pathlib import Path
 
@@ -59,17 +59,18 @@ def read(
     """Read an event stream.
 
     Args:
-      path: file ending in .h5 or .hdf5 (DSEC's, v2e's or MVSEC's layout), .aedat4, .raw (EVT 2.0, EVT 3.0),
-        .dat, .csv or .txt (lines t x y p, with or without a header), .npz or .npy.
-      height_px, width_px: sensor size. Taken where the file has none (else the smallest that holds the
-        events); checked against the file otherwise.
-      columns: order of the columns of rows, such as "xytp"; "auto": what the file says, or its numbers tell
-        beyond doubt (t x y p or x y t p).
-      time_unit: "s", "ms", "us" or "ns"; "auto": what the file says, else seconds where a time has a
-        fraction, else microseconds.
+      path: file ending in .h5 or .hdf5 (DSEC's, v2e's or MVSEC's layout), .aedat4, .raw
+        (EVT 2.0, EVT 3.0), .dat, .csv or .txt (lines t x y p, with or without a header), .npz or
+        .npy.
+      height_px, width_px: sensor size. Taken where the file has none (else the smallest that holds
+        the events); checked against the file otherwise.
+      columns: order of the columns of rows, such as "xytp"; "auto": what the file says, or its
+        numbers tell beyond doubt (t x y p or x y t p).
+      time_unit: "s", "ms", "us" or "ns"; "auto": what the file says, else seconds where a time has
+        a fraction, else microseconds.
     Returns: EventStream sorted by (t, y, x, p), times as the file gives them, in microseconds.
-    Raises: FileFormatError when the file is missing, malformed (with the line or event where there is one) or
-      of another kind.
+    Raises: FileFormatError when the file is missing, malformed (with the line or event where there
+      is one) or of another kind.
 
     Example:
     >>> import torch
@@ -80,13 +81,16 @@ def read(
     [2885, 5771, 8656]
     """
     sides = (("height_px", height_px), ("width_px", width_px))
-    size_px = (None if side is None else check_whole(side, name, 1, LIMIT_PX) for name, side in sides)
+    size_px = (
+        None if side is None else check_whole(side, name, 1, LIMIT_PX) for name, side in sides
+    )
     asked = Asked(*size_px, columns=columns, time_unit=time_unit)
     return read_columns(check_path(path), asked).stream()
 
 
 def read_columns(path: Path, asked: Asked) -> EventColumns:
-    """The events of a file with all that the caller says of it; see ``read``, which takes the same files."""
+    """The events of a file with all that the caller says of it; see ``read``, which takes the same
+    files."""
     reader = _choose(READERS, path, "read")
     check_asked(path, asked)
     if path.suffix.lower() not in TABLES and (asked.columns, asked.time_unit) != ("auto", "auto"):
@@ -111,20 +115,20 @@ def write(
     evt: int | None = None,
     t0_us: int | None = None,
 ) -> None:
-    """Write an event stream; the file appears whole or not at all, and an earlier one stays when writing
-    fails.
+    """Write an event stream; the file appears whole or not at all, and an earlier one stays when
+    writing fails.
 
     Args:
-      path: file ending in .h5, .aedat4, .raw, .dat, .aedat or .aedat2 (both AEDAT 2.0), .csv or .npz, in an
-        existing folder.
+      path: file ending in .h5, .aedat4, .raw, .dat, .aedat or .aedat2 (both AEDAT 2.0), .csv or
+        .npz, in an existing folder.
       stream: EventStream.
       evt: encoding of .raw files, 2 or 3 (the default); for no other.
-      t0_us: start time, microseconds, that .raw and .dat files keep in their header (``% t0``) while their
-        clocks of few bits count from there; 0 by default, for no other format. ``events.read`` and faery add
-        it back, other readers give the times less t0_us.
-    Raises: FileFormatError for an unknown extension, a stream that the format cannot hold, or a folder that
-      is missing or not writable; DomainError, ShapeError for what is no stream (times that go back, pixels
-      beyond the sensor, other polarities).
+      t0_us: start time, microseconds, that .raw and .dat files keep in their header (``% t0``)
+        while their clocks of few bits count from there; 0 by default, for no other format.
+        ``events.read`` and faery add it back, other readers give the times less t0_us.
+    Raises: FileFormatError for an unknown extension, a stream that the format cannot hold, or a
+      folder that is missing or not writable; DomainError, ShapeError for what is no stream (times
+      that go back, pixels beyond the sensor, other polarities).
 
     Example:
     >>> import torch
@@ -145,7 +149,8 @@ def write(
     with replacing(path) as temporary:
         try:
             writer(temporary, stream, **options)
-        except FileFormatError as error:  # writers know what does not fit, not where the file will lie
+        # writers know what does not fit, not where the file will lie
+        except FileFormatError as error:
             raise FileFormatError(f"cannot write {path}: {error}") from error
 
 

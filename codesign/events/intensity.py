@@ -20,13 +20,13 @@ def lin_log(frames: Tensor) -> Tensor:
     """Log intensity with a linear part for dark pixels.
 
     Args:
-      frames: [T, ...] linear intensity on the 0-255 scale, finite, >= 0 (values above 255 are taken as they
-        are).
+      frames: [T, ...] linear intensity on the 0-255 scale, finite, >= 0 (values above 255 are taken
+        as they are).
     Returns:
-      [T, ...] natural log units: I ln(20)/20 for I <= 20, ln I above. Continuous; v2e's rounding to 1e-8 is
-      left out.
-    Gradient: frames. Slope ln(20)/20 = 0.1498 up to and including I = 20, 1/I above (it drops to 0.05 at the
-      joint, as in v2e).
+      [T, ...] natural log units: I ln(20)/20 for I <= 20, ln I above. Continuous; v2e's rounding to
+      1e-8 is left out.
+    Gradient: frames. Slope ln(20)/20 = 0.1498 up to and including I = 20, 1/I above (it drops to
+      0.05 at the joint, as in v2e).
     Raises: DomainError for NaN, infinite or negative values.
     Source: v2e (Hu, Liu, Delbruck, CVPR-W 2021), lin-log mapping.
     """
@@ -34,8 +34,8 @@ def lin_log(frames: Tensor) -> Tensor:
 
 
 def _lin_log(frames):
-    # the logarithm gets a safe input where it is not selected, so that its gradient there is 0 and not 0 *
-    # inf
+    # the logarithm gets a safe input where it is not selected, so that its gradient there is 0 and
+    # not 0 * inf
     return torch.where(frames <= JOINT, frames * DARK_SLOPE, frames.clamp(min=JOINT).log())
 
 
@@ -49,15 +49,15 @@ def _linear(arr, level):
 
 
 def light_share(intensity: Any) -> Any:
-    """How far the photoreceptor's speed and noise are from dark to full light: (I + 20)/275, 1 at I = 255.
-    Tensors and drjit arrays. Source: v2e."""
+    """How far the photoreceptor's speed and noise are from dark to full light: (I + 20)/275, 1 at I
+    = 255. Tensors and drjit arrays. Source: v2e."""
     return (intensity + 20) / 275
 
 
 @dataclass(frozen=True)
 class FrontEnd:
-    """How frames become log levels: lin-log of the 0-255 scale, or frames that are log levels already
-    (``log_input``)."""
+    """How frames become log levels: lin-log of the 0-255 scale, or frames that are log levels
+    already (``log_input``)."""
 
     log_input: bool = False
 
@@ -69,7 +69,8 @@ class FrontEnd:
         return frames if self.log_input else _lin_log(frames)
 
     def frames(self, level):
-        """Frames [...] whose level a tensor is, the inverse of ``level``; a linear one is never below 0."""
+        """Frames [...] whose level a tensor is, the inverse of ``level``; a linear one is never
+        below 0."""
         return level if self.log_input else backend.run_kernel(_linear, (level,), [level.shape])[0]
 
     def slope(self, frames):
@@ -79,7 +80,8 @@ class FrontEnd:
         return torch.where(frames <= JOINT, DARK_SLOPE, 1 / frames.clamp(min=JOINT))
 
     def traced(self, dr, frames):
-        """The same of a drjit array, and its slope as a function (called where a gradient is wanted)."""
+        """The same of a drjit array, and its slope as a function (called where a gradient is
+        wanted)."""
         if self.log_input:
             return frames, lambda: frames * 0 + 1
         dark = frames <= JOINT
@@ -94,8 +96,9 @@ class FrontEnd:
 
 @exclusive
 def kernel_levels(frames, front_end):
-    """Log levels of frames by the arithmetic of the kernels, which rounds alike on every processor (torch's
-    logarithm does not); also whether one may not enter (then the levels mean nothing). No gradient."""
+    """Log levels of frames by the arithmetic of the kernels, which rounds alike on every processor
+    (torch's logarithm does not); also whether one may not enter (then the levels mean nothing). No
+    gradient."""
     import drjit as dr
 
     arr = backend.arrays(frames.device.type, frames.dtype)

@@ -1,5 +1,5 @@
-"""Kernels over pixels: one lane per pixel, memory by rows of lanes, loops over time; and a recursion over
-time whose loop backward lets drjit differentiate one step after the other.
+"""Kernels over pixels: one lane per pixel, memory by rows of lanes, loops over time; and a
+recursion over time whose loop backward lets drjit differentiate one step after the other.
 """
 
 import math
@@ -16,7 +16,8 @@ from codesign.exclusive import exclusive
 
 
 class Lanes:
-    """drjit, its array types, and a lane for every pixel of a frame; flat arrays hold rows of pixels."""
+    """drjit, its array types, and a lane for every pixel of a frame; flat arrays hold rows of
+    pixels."""
 
     def __init__(self, like, width):
         import drjit as dr
@@ -38,7 +39,8 @@ class Lanes:
         return [self.load(row) for row in tensor]
 
     def fresh(self, rows):
-        """Rows to be filled by kernels. The memory is drjit's, which hands the same pages out again and
+        """Rows to be filled by kernels. The memory is drjit's, which hands the same pages out again
+        and
         again: new pages from the system cost more than the kernel."""
         target = self.dr.empty(self.arr.Float, rows * self.width)
         self.dr.eval(target)
@@ -66,7 +68,9 @@ class Lanes:
             return index + 1, *body(index, *carried)
 
         start = first + self.dr.zeros(self.arr.UInt32, self.width)
-        return self.dr.while_loop((start, *carried), lambda index, *_: index < end, step, mode="symbolic")[1:]
+        return self.dr.while_loop(
+            (start, *carried), lambda index, *_: index < end, step, mode="symbolic"
+        )[1:]
 
     def loop_back(self, first, end, body, *carried) -> Any:
         """The same from ``end`` - 1 down to ``first``."""
@@ -75,9 +79,9 @@ class Lanes:
             return index - 1, *body(index - 1, *carried)
 
         start = end + self.dr.zeros(self.arr.UInt32, self.width)
-        return self.dr.while_loop((start, *carried), lambda index, *_: index > first, step, mode="symbolic")[
-            1:
-        ]
+        return self.dr.while_loop(
+            (start, *carried), lambda index, *_: index > first, step, mode="symbolic"
+        )[1:]
 
     def tensor(self, value, shape):
         """A tensor with memory of its own."""
@@ -85,8 +89,8 @@ class Lanes:
 
 
 def beyond(dr, level, centre, theta_on, theta_off):
-    """How far a level lies above and below a play as wide as the mean threshold, >= 0 each: what the mean of
-    hard counts, and the play's centre, move by (docs/events.md)."""
+    """How far a level lies above and below a play as wide as the mean threshold, >= 0 each: what
+    the mean of hard counts, and the play's centre, move by (docs/events.md)."""
     half = (theta_on + theta_off) * 0.25
     above, below = level - centre - half, centre - half - level
     return dr.select(above > 0, above, 0), dr.select(below > 0, below, 0)
@@ -98,8 +102,8 @@ def recursion(
     """Carry states over time.
 
     Args:
-      step: (drjit, value, numbers, states) -> (output, states), of arrays of all pixels; it may hold no
-        others.
+      step: (drjit, value, numbers, states) -> (output, states), of arrays of all pixels; it may
+        hold no others.
       values: [T, N] one per step.
       numbers: [K, N] that stay.
       start: [S, N] states; all of one floating type.
@@ -123,7 +127,9 @@ class _Recursion(Function):
         ctx.step = step
         ctx.starts = states[1:-1]
         ctx.save_for_backward(values, numbers, start)
-        return output.torch().reshape(values.shape), torch.stack([state.torch() for state in states[-1]])
+        return output.torch().reshape(values.shape), torch.stack(
+            [state.torch() for state in states[-1]]
+        )
 
     @staticmethod
     @once_differentiable
@@ -136,7 +142,9 @@ class _Recursion(Function):
         seeds = steps.load(grad_output)
         gathered = [steps.dr.zeros(steps.arr.Float, steps.width) for _ in numbers]
         carried = steps.rows(grad_after)
-        for span, states in reversed(list(zip(steps.spans, [steps.rows(start), *ctx.starts], strict=True))):
+        for span, states in reversed(
+            list(zip(steps.spans, [steps.rows(start), *ctx.starts], strict=True))
+        ):
             if ctx.kept is None:
                 steps.run(span, states, None, kept)
             gathered, carried = steps.run_back(span, gathered, carried, kept, seeds, target)
@@ -146,8 +154,8 @@ class _Recursion(Function):
 
 
 class _Steps(Lanes):
-    """The loops over time, in spans whose states all take as much memory as the values, or as few as there
-    are spans."""
+    """The loops over time, in spans whose states all take as much memory as the values, or as few
+    as there are spans."""
 
     def __init__(self, step, values, numbers, states):
         super().__init__(values, values.shape[1])
@@ -182,7 +190,8 @@ class _Steps(Lanes):
         return states
 
     def run_back(self, span, gathered, carried, kept, seeds, target):
-        """Gradients before a span, of numbers and states, from those after it; of the values into target."""
+        """Gradients before a span, of numbers and states, from those after it; of the values into
+        target."""
         first, end = map(self.opaque, span)
         count = len(self.numbers)
 
@@ -195,7 +204,9 @@ class _Steps(Lanes):
             given = [self.at(self.values, t), *self.numbers, *before]
             value, *found = pull_back(step, given, [self.at(seeds, t), *carried])
             self.put(target, value, t)
-            return [total + more for total, more in zip(gathered, found, strict=False)], found[count:]
+            return [total + more for total, more in zip(gathered, found, strict=False)], found[
+                count:
+            ]
 
         with self.dr.suspend_grad():
             gathered, carried = self.loop_back(first, end, body, gathered, carried)

@@ -1,7 +1,8 @@
-"""The log level between frames: a cubic through the levels of the frames, sampled as finely as a use asks
-for.
+"""The log level between frames: a cubic through the levels of the frames, sampled as finely as a
+use asks for.
 
-Frames of a moving scene are samples of smooth curves. A straight line between them, h apart, is wrong by h^2
+Frames of a moving scene are samples of smooth curves. A straight line between them, h apart, is
+wrong by h^2
 |L''|/8: it cuts off every crest, and with it events. The cubic through central slopes is wrong by h^3
 |L'''|/62.
 """
@@ -29,18 +30,20 @@ def finer(
     """Frames between frames, so that no interval is longer than asked for.
 
     Args:
-      frames: [T, ...] linear intensity on the 0-255 scale, or log levels with ``log_input``. t_s: [T]
-        seconds, strictly increasing. longest_s: > 0; an interval longer than that by more than a thousandth
-        is cut into equal parts.
-    Returns: frames [T', ...] of the same kind and times [T'] float64, the given ones among them exactly; the
-      given frames themselves where no interval is too long.
-      Between two frames the log level is the cubic with the slopes of parabolas through three frames each: a
-      parabola is met exactly, and where the four frames around are equal nothing moves. A step within one
-      interval rings by 7 % of it in the intervals beside. Linear frames are never below 0.
+      frames: [T, ...] linear intensity on the 0-255 scale, or log levels with ``log_input``. t_s:
+        [T] seconds, strictly increasing. longest_s: > 0; an interval longer than that by more than
+        a thousandth is cut into equal parts.
+    Returns: frames [T', ...] of the same kind and times [T'] float64, the given ones among them
+      exactly; the given frames themselves where no interval is too long. Between two frames the log
+      level is the cubic with the slopes of parabolas through three frames each: a parabola is met
+      exactly, and where the four frames around are equal nothing moves. A step within one interval
+      rings by 7 % of it in the intervals beside. Linear frames are never below 0.
     Gradient: frames, exact; none to times.
-    Raises: ShapeError, DomainError for frames and times as ``memory``, and for a length that is not positive.
-    Source: Catmull and Rom 1974, for uneven times. Slopes limited so that nothing rings (Fritsch and Carlson,
-      SIAM J. Numer. Anal. 1980) flatten the crests, and steer worse than straight lines.
+    Raises: ShapeError, DomainError for frames and times as ``memory``, and for a length that is not
+      positive.
+    Source: Catmull and Rom 1974, for uneven times. Slopes limited so that nothing rings (Fritsch
+      and Carlson, SIAM J. Numer. Anal. 1980) flatten the crests, and steer worse than straight
+      lines.
 
     Example:
     >>> level = torch.tensor([0.0, 1.0, 0.0]).reshape(3, 1)
@@ -69,9 +72,10 @@ def parts(times_s: Tensor, longest_s: float, values: int = 1) -> tuple[Tensor, T
       times_s: [T] float64, strictly increasing, as from ``check_times``.
       longest_s: > 0.
       values: that will be made of each part.
-    Returns: of each of the K parts the interval it lies in [K] and the share of it [K] at which it ends;
-      times [K + 1] float64 of all ends, the given ones among them exactly.
-    Raises: DomainError for a length that is not positive, or so short that the parts would fill the memory.
+    Returns: of each of the K parts the interval it lies in [K] and the share of it [K] at which it
+      ends; times [K + 1] float64 of all ends, the given ones among them exactly.
+    Raises: DomainError for a length that is not positive, or so short that the parts would fill the
+      memory.
     """
     longest = longest_s if longest_s == math.inf else check_positive(longest_s, "longest_s")
     duration_s = times_s.diff()
@@ -92,7 +96,8 @@ def _cubic(level, duration_s, interval, share):
     """Levels [K, ...] at shares [K] of intervals [K]."""
     rise = level.diff(dim=0)
     slope = _slopes(rise, duration_s)
-    # weights of the rises and slopes in every level wanted: few intervals, so a full matrix is cheapest
+    # weights of the rises and slopes in every level wanted: few intervals, so a full matrix is
+    # cheapest
     row = torch.arange(len(interval))
     of_rise = torch.zeros(len(interval), len(rise), dtype=torch.float64)
     of_slope = torch.zeros(len(interval), len(level), dtype=torch.float64)

@@ -1,5 +1,5 @@
-"""The one-pole low-pass of a level that runs linearly between its samples: one formula for the hard sensor's
-kernel, the differentiable layers and Spike-ESIM."""
+"""The one-pole low-pass of a level that runs linearly between its samples: one formula for the hard
+sensor's kernel, the differentiable layers and Spike-ESIM."""
 
 import math
 from collections.abc import Callable
@@ -20,8 +20,8 @@ SERIES = 0.05  # below it (1 - e^-a)/a comes from a series: its first term left 
 def coefficients(
     pace: Any, exp: Callable[[Any], Any], select: Callable[[Any, Any, Any], Any]
 ) -> tuple[Any, Any]:
-    """What an interval of a = ``pace`` time constants does: e^-a, and the mean of e^-s over 0 < s < a, that
-    is (1 - e^-a)/a, for small a without loss, value and derivative.
+    """What an interval of a = ``pace`` time constants does: e^-a, and the mean of e^-s over 0 < s <
+    a, that is (1 - e^-a)/a, for small a without loss, value and derivative.
 
     Tensors and drjit arrays alike: ``exp`` and ``select`` are those of their library.
     """
@@ -39,8 +39,8 @@ def _coefficients(arr, pace):
 
 
 def passed(filtered: Any, before: Any, now: Any, fade: Any, mean: Any) -> Any:
-    """The filter behind an interval over which its input runs from ``before`` to ``now``: the exact answer
-    to y' = (L - y)/tau, stable for every pace.
+    """The filter behind an interval over which its input runs from ``before`` to ``now``: the exact
+    answer to y' = (L - y)/tau, stable for every pace.
 
     Args:
       filtered: y at the start of the interval.
@@ -53,11 +53,14 @@ def one_pole(level: Tensor, pace: Tensor, start: Tensor | None = None) -> Tensor
     """A level behind a one-pole filter, exact for input that is linear between its samples.
 
     Args:
-      level: [T, ...]. pace: [T-1, ...] > 0, length of each interval over the time constant, broadcasting.
+      level: [T, ...]. pace: [T-1, ...] > 0, length of each interval over the time constant,
+        broadcasting.
       start: [...] filtered level at the first sample; None: the level itself.
-    Returns: [T, ...] filtered levels, the start included. A steady ramp comes out a time constant later.
+    Returns: [T, ...] filtered levels, the start included. A steady ramp comes out a time constant
+      later.
     Gradient: level, pace, start; exact.
-    Raises: ShapeError when there are not as many paces as intervals; DomainError for levels of another type.
+    Raises: ShapeError when there are not as many paces as intervals; DomainError for levels of
+      another type.
     """
     check(level, "T>=2 ...", "levels", FLOATS, finite=True)
     check(pace, "T-1 ...", "paces", FLOATS)
@@ -69,7 +72,9 @@ def one_pole(level: Tensor, pace: Tensor, start: Tensor | None = None) -> Tensor
             f"[{len(level) - 1}, ...] of at most {level.ndim} axes."
         )
     filtered = [level[0] if start is None else start]
-    steps = zip(level[:-1], level[1:], *run_kernel(_coefficients, (pace,), [pace.shape] * 2), strict=True)
+    steps = zip(
+        level[:-1], level[1:], *run_kernel(_coefficients, (pace,), [pace.shape] * 2), strict=True
+    )
     for step in steps:
         filtered.append(passed(filtered[-1], *step))
     return torch.stack(filtered)
@@ -82,7 +87,8 @@ def low_pass(
     cutoff_hz: Tensor | float,
     start: Tensor | None = None,
 ) -> Tensor:
-    """The photoreceptor's low-pass of log levels: ``one_pole`` with a bandwidth that follows intensity.
+    """The photoreceptor's low-pass of log levels: ``one_pole`` with a bandwidth that follows
+    intensity.
 
     Its pace is a = 2 pi f (I + 20)/275 dt, I the mean intensity of the two frames of an interval.
 
@@ -92,8 +98,8 @@ def low_pass(
       start: [...] filtered level at the first frame; None: the level itself.
     Returns: [T, ...] filtered levels, the start included.
     Gradient: level, intensity, cutoff_hz, start; exact.
-    Raises: ShapeError, DomainError as ``one_pole``; DomainError for a bandwidth that is not one number above
-      0.
+    Raises: ShapeError, DomainError as ``one_pole``; DomainError for a bandwidth that is not one
+      number above 0.
     """
     check(level, "T>=2 ...", "levels", FLOATS)
     check_positive(cutoff_hz, "cutoff_hz")

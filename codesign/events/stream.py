@@ -24,8 +24,8 @@ def ordered(
     Args:
       t_us, x, y, p: [N] tensors of whole numbers: microseconds, column, row, polarity +1 or -1.
       height_px, width_px: sensor size.
-    Raises: ShapeError when lengths differ; DomainError for fractions, events outside the sensor or another
-      polarity.
+    Raises: ShapeError when lengths differ; DomainError for fractions, events outside the sensor or
+      another polarity.
     """
     for values, name in ((t_us, "t_us"), (x, "x"), (y, "y"), (p, "p")):
         if not isinstance(values, Tensor) or values.is_complex():
@@ -33,7 +33,9 @@ def ordered(
             raise DomainError(f"{name} is {given}; a tensor of whole numbers is needed.")
         if values.is_floating_point() and bool((values != values.round()).any()):
             first = float(values[values != values.round()][0])
-            raise DomainError(f"{name} holds {first!r}; whole numbers are needed: round them first.")
+            raise DomainError(
+                f"{name} holds {first!r}; whole numbers are needed: round them first."
+            )
     t_us, x, y, p = (values.to(torch.int64) for values in (t_us, x, y, p))
     _check_columns(t_us, x, y, p, height_px, width_px)
     rank = torch.argsort((y * width_px + x) * 2 + (p > 0), stable=True)
@@ -42,9 +44,12 @@ def ordered(
 
 
 def check_stream(stream: EventStream, part: slice = slice(None)) -> EventStream:
-    """Return ``stream`` when it is one: lists of int64 of equal length and, in ``part``, times that do not go
-    back, pixels of the sensor, polarities +1 and -1; DomainError, ShapeError otherwise."""
-    check_kind(stream, EventStream, "the events", "events.read and events.simulate give an EventStream")
+    """Return ``stream`` when it is one: lists of int64 of equal length and, in ``part``, times that
+    do not go back, pixels of the sensor, polarities +1 and -1; DomainError, ShapeError
+    otherwise."""
+    check_kind(
+        stream, EventStream, "the events", "events.read and events.simulate give an EventStream"
+    )
     for side, name in ((stream.height_px, "height_px"), (stream.width_px, "width_px")):
         check_whole(side, f"{name} of the stream", 0, 2**31 - 1)
     columns = (stream.t_us, stream.x, stream.y, stream.p)
@@ -56,16 +61,21 @@ def check_stream(stream: EventStream, part: slice = slice(None)) -> EventStream:
         for values in columns
     ):
         given = [getattr(values, "dtype", type(values).__name__) for values in columns]
-        raise DomainError(f"t_us, x, y, p of the stream are {given}; dense tensors of int64 are needed.")
+        raise DomainError(
+            f"t_us, x, y, p of the stream are {given}; dense tensors of int64 are needed."
+        )
     _check_columns(*columns, stream.height_px, stream.width_px, part)
     t_us = stream.t_us[part]
     if bool((t_us[1:] < t_us[:-1]).any()):
-        raise DomainError("the times of the stream go back; order it with codesign.events.stream.ordered.")
+        raise DomainError(
+            "the times of the stream go back; order it with codesign.events.stream.ordered."
+        )
     return stream
 
 
 def _check_columns(t_us, x, y, p, height_px, width_px, part=slice(None)):
-    """Refuse lists of unequal length and, in ``part``, events outside the sensor or of another polarity."""
+    """Refuse lists of unequal length and, in ``part``, events outside the sensor or of another
+    polarity."""
     if not (t_us.shape == x.shape == y.shape == p.shape == (t_us.numel(),)):
         raise ShapeError(
             f"t_us, x, y, p have shapes {[list(v.shape) for v in (t_us, x, y, p)]}; four lists of equal "
@@ -79,13 +89,16 @@ def _check_columns(t_us, x, y, p, height_px, width_px, part=slice(None)):
             )
     p = p[part]
     if bool((p.abs() != 1).any()):
-        raise DomainError(f"polarity {int(p[p.abs() != 1][0])} found; +1 (ON) or -1 (OFF) is allowed.")
+        raise DomainError(
+            f"polarity {int(p[p.abs() != 1][0])} found; +1 (ON) or -1 (OFF) is allowed."
+        )
 
 
 def concatenate(streams: Iterable[EventStream]) -> EventStream:
     """One ordered stream of several from the same sensor (for example of consecutive chunks).
 
-    Raises: ShapeError for none, or for sensors of several sizes; DomainError for anything but streams.
+    Raises: ShapeError for none, or for sensors of several sizes; DomainError for anything but
+      streams.
     """
     if not isinstance(streams, Iterable):
         raise DomainError(f"the streams are {streams!r}; a list of EventStreams is needed.")
@@ -107,9 +120,9 @@ def to_counts(stream: EventStream, t_s: Times, *, dtype: torch.dtype = torch.flo
 
     Args:
       stream: EventStream.
-      t_s: [T] times, seconds, strictly increasing, used to the nearest microsecond. An event at a time
-        belongs to the interval that ends there; one at the first time belongs to the first interval. Events
-        before the first and after the last time are not asked for.
+      t_s: [T] times, seconds, strictly increasing, used to the nearest microsecond. An event at a
+        time belongs to the interval that ends there; one at the first time belongs to the first
+        interval. Events before the first and after the last time are not asked for.
     Returns: [T-1, 2, H, W] counts, ON first.
     Gradient: none.
     """

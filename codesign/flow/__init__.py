@@ -1,5 +1,5 @@
-"""Event flow: the closed form, the refiner and the networks it is compared with, losses, error measures,
-network files, flow files, sources of windows, and flow along a stream of events."""
+"""Event flow: the closed form, the refiner and the networks it is compared with, losses, error
+measures, network files, flow files, sources of windows, and flow along a stream of events."""
 
 from codesign.doors import explain
 from codesign.flow import contrast, losses, metrics, sources

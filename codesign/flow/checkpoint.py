@@ -1,5 +1,5 @@
-"""Trained networks on disk: weights in safetensors, everything else as JSON in the file's header; data only,
-never code.
+"""Trained networks on disk: weights in safetensors, everything else as JSON in the file's header;
+data only, never code.
 
 A network file can be damaged, cut short, or written by another version; each of these ends in one
 FileFormatError, before any number is computed.
@@ -41,8 +41,8 @@ DELIVERED = {"refiner": Path(__file__).with_name("refiner.safetensors")}
 
 @dataclass(frozen=True)
 class NetworkFile:
-    """What a network file holds: name of the network, its constructor's arguments, weights, and what the
-    writer added."""
+    """What a network file holds: name of the network, its constructor's arguments, weights, and
+    what the writer added."""
 
     network: str
     config: dict[str, Any]
@@ -53,11 +53,13 @@ class NetworkFile:
 def network_class(name: str) -> type[Any]:
     """Class of the network called ``name``.
 
-    Raises: DomainError for a name that is not in NETWORKS, also for one of a class of the user's own:
-      no file makes anything be imported.
+    Raises: DomainError for a name that is not in NETWORKS, also for one of a class of the user's
+      own: no file makes anything be imported.
     """
     if ":" in name:
-        raise DomainError(f"'{name}' is a class of your own; hand it over: flow.load(path, kind=...).")
+        raise DomainError(
+            f"'{name}' is a class of your own; hand it over: flow.load(path, kind=...)."
+        )
     if name in ("ecn", "idnet") and name not in NETWORKS:
         raise DomainError(
             f"'{name}' stands with the study that races it: import studies.train_flow.peers first."
@@ -68,7 +70,8 @@ def network_class(name: str) -> type[Any]:
 
 
 def network_name(network: nn.Module) -> str:
-    """The name under which a network's class stands in NETWORKS, or module:Class of one of the user's own.
+    """The name under which a network's class stands in NETWORKS, or module:Class of one of the
+    user's own.
 
     Raises: DomainError for a class that does not keep its constructor's arguments in ``config``.
     """
@@ -129,13 +132,13 @@ def load(name_or_path: str | Path, kind: Callable[..., Any] | None = None) -> "N
     """A trained network, in evaluation mode, on the CPU.
 
     Args:
-      name_or_path: "refiner", the one delivered with the package, or the path of a file that ``save``
-        wrote.
+      name_or_path: "refiner", the one delivered with the package, or the path of a file that
+        ``save`` wrote.
       kind: the class of a network of one's own, called with the stored ``config``.
-    Returns: the network, a callable from EventVolume to FlowField. Its weights still take gradients;
-      ``requires_grad_(False)`` saves their cost.
-    Raises: FileFormatError when the file is missing, damaged, of another version, or does not fit its
-      network.
+    Returns: the network, a callable from EventVolume to FlowField. Its weights still take
+      gradients; ``requires_grad_(False)`` saves their cost.
+    Raises: FileFormatError when the file is missing, damaged, of another version, or does not fit
+      its network.
 
     >>> from codesign.flow.export import evenly_timed
     >>> network = load("refiner")
@@ -181,8 +184,12 @@ def build(
     """
     own = getattr(kind, "__qualname__", None)
     if kind is not None and own != stored.network.partition(":")[2]:
-        raise FileFormatError(f"'{path}' holds a network '{stored.network}', not a {own}; give its class.")
-    with building(f"'{path}'", f"it was written by another version of the network '{stored.network}'"):
+        raise FileFormatError(
+            f"'{path}' holds a network '{stored.network}', not a {own}; give its class."
+        )
+    with building(
+        f"'{path}'", f"it was written by another version of the network '{stored.network}'"
+    ):
         network = (kind or network_class(stored.network))(**stored.config)
     fill(network, stored.weights, path)
     return network
@@ -191,7 +198,8 @@ def build(
 def fill(network: nn.Module, weights: Mapping[str, Tensor], path: str | Path) -> None:
     """Copy weights into a network of the same form.
 
-    Raises: FileFormatError naming the first weight that is missing, unknown, of another shape, or not finite.
+    Raises: FileFormatError naming the first weight that is missing, unknown, of another shape, or
+      not finite.
     """
     own = network.state_dict()
     for name in sorted(own.keys() | weights.keys()):
@@ -206,7 +214,9 @@ def fill(network: nn.Module, weights: Mapping[str, Tensor], path: str | Path) ->
                 f"{list(own[name].shape)}; it is of another network."
             )
         if not bool(weights[name].isfinite().all()):
-            raise FileFormatError(f"'{path}': weight '{name}' is NaN or infinite; the file is of no use.")
+            raise FileFormatError(
+                f"'{path}': weight '{name}' is NaN or infinite; the file is of no use."
+            )
     network.load_state_dict(weights)
 
 

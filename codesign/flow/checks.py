@@ -1,5 +1,5 @@
-"""What may enter a function of flow: volumes, flows, masks, numbers. Everything else is refused with a
-sentence."""
+"""What may enter a function of flow: volumes, flows, masks, numbers. Everything else is refused
+with a sentence."""
 
 import math
 from itertools import pairwise
@@ -24,10 +24,13 @@ def check_volume(volume: EventVolume, bins: int | None = None, least_bins: int =
 
     Args:
       bins: as many are needed; None: at least ``least_bins``.
-    Raises: DomainError for anything but an EventVolume, counts that are not float32 or float64, NaN, infinite
-      or below -0.001, bins that collect no time; ShapeError for other axes, empty ones, or other bins.
+    Raises: DomainError for anything but an EventVolume, counts that are not float32 or float64,
+      NaN, infinite or below -0.001, bins that collect no time; ShapeError for other axes, empty
+      ones, or other bins.
     """
-    check_kind(volume, EventVolume, "the events", "events.from_stream and events.from_counts make one")
+    check_kind(
+        volume, EventVolume, "the events", "events.from_stream and events.from_counts make one"
+    )
     sizes = {} if bins is None else {"bins": bins}
     axes = f"B 2 bins{f'>={least_bins}' if least_bins > 1 else ''} H W"
     counts = check(volume.counts, axes, "the counts of the event volume", FLOATS, sizes=sizes)
@@ -70,15 +73,15 @@ def check_flow(
     shape: tuple[int, ...] | None = None,
     name: str = "the flow",
 ) -> Tensor:
-    """``flow_px`` unchanged when it is a real tensor [B, 2, H, W] with pixels, of this shape where given, and
-    finite; DomainError, ShapeError otherwise."""
+    """``flow_px`` unchanged when it is a real tensor [B, 2, H, W] with pixels, of this shape where
+    given, and finite; DomainError, ShapeError otherwise."""
     axes = "B 2 H W" if shape is None else shape
     return check(flow_px, axes, name, finite=True)
 
 
 def check_field(field: FlowField, name: str) -> FlowField:
-    """``field`` unchanged when it is a FlowField whose parts fit; values are not looked at: what is not valid
-    may be NaN."""
+    """``field`` unchanged when it is a FlowField whose parts fit; values are not looked at: what is
+    not valid may be NaN."""
     sizes = {}
     check_kind(field, FlowField, name)
     check(field.flow_px, "B 2 H W", f"flow_px of {name}", sizes=sizes)

@@ -1,11 +1,12 @@
-"""Flow whose prior, levels, model and clock are chosen by how well the bins agree along it, zero flow
-among the candidates.
+"""Flow whose prior, levels, model and clock are chosen by how well the bins agree along it, zero
+flow among the candidates.
 
 A flow that is right carries every bin to the same signed picture. The agreement r of a flow is the
 correlation of pairs of blurred bins read along it, at least two bins apart, since neighbours share
-events. Events scattered at random have r = 0 along any flow, with a variance that their density tells;
-no flow gains by squeezing events together, since r is relative to what is read. Twice the likelihood
-gained over zero flow is about n log((1 - r0^2) / (1 - r^2)), n the inverse of that variance.
+events. Events scattered at random have r = 0 along any flow, with a variance that their density
+tells; no flow gains by squeezing events together, since r is relative to what is read. Twice the
+likelihood gained over zero flow is about n log((1 - r0^2) / (1 - r^2)), n the inverse of that
+variance.
 """
 
 import math
@@ -50,8 +51,9 @@ LEAST = 1e-3
 
 
 class Agreed(NamedTuple):
-    """alike: [B] the agreement r. sure: [B] inverse of its variance for scattered events. z: [B, H, W]
-    of the pixels' share in it, over its deviation for scattered events; empty where not asked for."""
+    """alike: [B] the agreement r. sure: [B] inverse of its variance for scattered events. z:
+    [B, H, W] of the pixels' share in it, over its deviation for scattered events; empty where not
+    asked for."""
 
     alike: Tensor
     sure: Tensor
@@ -99,23 +101,23 @@ class Agreement:
 
 
 def estimate(volume: EventVolume, start_px: Tensor | None = None) -> FlowField:
-    """Flow over the volume's interval, with its uncertainty, where nothing is known of scene, motion
-    and sensor.
+    """Flow over the volume's interval, with its uncertainty, where nothing is known of scene,
+    motion and sensor.
 
-    Chosen for each sample by the agreement of the bins: time or events as the clock, or a motion that
-    turns back once (``net_share`` tells); a local field with the prior of ``estimate_lk`` or a wide
-    one for motions of many pixels; and zero flow, towards which all shrinks where it explains the
-    events as well. Where few places give nearly all events and do not move as one, they are taken for
-    bodies before still ground, and there is no flow beyond their outlines.
+    Chosen for each sample by the agreement of the bins: time or events as the clock, or a motion
+    that turns back once (``net_share`` tells); a local field with the prior of ``estimate_lk`` or a
+    wide one for motions of many pixels; and zero flow, towards which all shrinks where it explains
+    the events as well. Where few places give nearly all events and do not move as one, they are
+    taken for bodies before still ground, and there is no flow beyond their outlines.
 
     Args:
       volume, start_px: as of ``estimate_lk``; with fewer than 4 bins little can be told apart.
-    Returns: as of ``estimate_lk``. The covariance takes in how far the candidates are apart, and what
-      was shrunk.
+    Returns: as of ``estimate_lk``. The covariance takes in how far the candidates are apart, and
+      what was shrunk.
     Gradient: counts, as of ``estimate_lk``, through what was chosen; none through the choice.
     Raises: ShapeError, DomainError.
-    Cost: forward 4 times a local field (docs/flow_closed_form.md); where a gradient is asked for, one
-      field more.
+    Cost: forward 4 times a local field (docs/flow_closed_form.md); where a gradient is asked for,
+      one field more.
 
     >>> import torch
     >>> from codesign.flow.export import evenly_timed
@@ -151,7 +153,9 @@ def _followed(volume, chosen, start):
             part = replace(volume, counts=volume.counts[these])
             path = along_path(part, CLOCKS[turned])
             from_px = None if start is None else start[these]
-            parts.append(field(part, path[0], *descended(part, path, **OPTIONS[far], start_px=from_px)))
+            parts.append(
+                field(part, path[0], *descended(part, path, **OPTIONS[far], start_px=from_px))
+            )
             places.append(these)
     order = torch.cat(places).argsort()
     names = ("flow_px", "valid", "confidence", "covariance_px2", "net_share")
@@ -160,8 +164,8 @@ def _followed(volume, chosen, start):
 
 
 class _Chosen(NamedTuple):
-    """found: the fields chosen, without gradient. turned, far: [B] bool. believed: [B, H, W] share of
-    the flow. apart: [B, 3, H, W] what is added to the claim."""
+    """found: the fields chosen, without gradient. turned, far: [B] bool. believed: [B, H, W] share
+    of the flow. apart: [B, 3, H, W] what is added to the claim."""
 
     found: FlowField
     turned: Tensor
@@ -173,7 +177,9 @@ class _Chosen(NamedTuple):
 def _chosen(volume, start):
     agreement = Agreement(volume)
     found = [along_path(volume, clock) for clock in CLOCKS.values()]
-    missing = [1 - agreement.along(descended(volume, path, **COARSE)[0], path[0]).alike for path in found]
+    missing = [
+        1 - agreement.along(descended(volume, path, **COARSE)[0], path[0]).alike for path in found
+    ]
     turned = missing[1] < TURNED * missing[0]
     straight, turning = (vars(path[0]) for path in found)
     way = Path(**{name: _where(turned, turning[name], straight[name]) for name in straight})
@@ -194,9 +200,13 @@ def _chosen(volume, start):
     ground = (bodies > SURE) & ~_enclosed(best.z > MOVES)
     believed = torch.where(ground, 0.0, shrunk.expand_as(best.z))
     doubt = believed * (1 - believed) + torch.where(ground, 1 - bodies, 0.0)
-    apart = doubt[:, None] * _squared(chosen[0]) + sum(_squared(other - chosen[0]) for other in flows)
+    apart = doubt[:, None] * _squared(chosen[0]) + sum(
+        _squared(other - chosen[0]) for other in flows
+    )
     found = field(volume, way, *chosen)
-    return _Chosen(found, turned, far, believed, way.net.to(apart)[:, None, None, None].square() * apart)
+    return _Chosen(
+        found, turned, far, believed, way.net.to(apart)[:, None, None, None].square() * apart
+    )
 
 
 def _unexplained(alike):
@@ -205,7 +215,8 @@ def _unexplained(alike):
 
 
 def _bodies(local, shifts, one):
-    """Probability [B] that what agrees along the local field are bodies before still ground. shifts,
+    """Probability [B] that what agrees along the local field are bodies before still ground.
+    shifts,
     one: [B] what shifts of places and one affine field leave of it."""
     cells = avg_pool2d(local.z.clamp_min(0)[:, None], CELL, ceil_mode=True)[:, 0]
     share = cells.sum((1, 2)).square() / (cells.square().sum((1, 2)) + TINY) / cells[0].numel()

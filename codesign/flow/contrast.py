@@ -1,11 +1,12 @@
-"""Images of warped events: each event moves along the flow to one time, and a flow that is right makes the
-image sharp.
+"""Images of warped events: each event moves along the flow to one time, and a flow that is right
+makes the image sharp.
 
-Time runs from 0 at the start of the window to 1 at its end. An event at pixel x and time tau lies at x + (at
-- tau) flow at time ``at``. Its flow is that of its own pixel (``carry_steps=0``, what the literature does),
-or, since a FlowField lives on the pixels of the window's start, that of the pixel it came from: x0 = x - tau
-flow(x0), by fixed-point steps from x0 = x, bilinear between pixels. Each step leaves an error one order
-higher in the slope of the flow.
+Time runs from 0 at the start of the window to 1 at its end. An event at pixel x and time tau lies
+at x + (at
+- tau) flow at time ``at``. Its flow is that of its own pixel (``carry_steps=0``, what the
+literature does), or, since a FlowField lives on the pixels of the window's start, that of the pixel
+it came from: x0 = x - tau flow(x0), by fixed-point steps from x0 = x, bilinear between pixels. Each
+step leaves an error one order higher in the slope of the flow.
 """
 
 import itertools
@@ -30,8 +31,8 @@ LATEST_US = 2**60
 class EventTracks:
     """Events (or contents of bins) with the straight lines they move along.
 
-    x_px, y_px: [N] pixel where each was seen. time: [N] when, as a share of the window. count: [B, 2, N] how
-      many, ON first.
+    x_px, y_px: [N] pixel where each was seen. time: [N] when, as a share of the window. count:
+      [B, 2, N] how many, ON first.
     flow_px: [B, 2, N] pixels per window. height_px, width_px: size of the sensor.
     """
 
@@ -76,7 +77,9 @@ def volume_tracks(volume: EventVolume, flow_px: Tensor, carry_steps: int = 0) ->
     flow = _entered(flow_px, (batch, 2, height, width))
     time = volume_times(volume, flow)
     x, y = pixel_grid(height, width, flow)
-    x, y, time = (values.expand(bins, height, width).flatten() for values in (x, y, time[:, None, None]))
+    x, y, time = (
+        values.expand(bins, height, width).flatten() for values in (x, y, time[:, None, None])
+    )
     own = flow[:, :, None].expand(batch, 2, bins, height, width).flatten(2)
     return EventTracks(
         x, y, time, counts.flatten(2), _carried(flow, own, x, y, time, carry_steps), height, width
@@ -100,8 +103,8 @@ def stream_tracks(
       carry_steps: as in volume_tracks.
     Returns: EventTracks of B = 1.
     Gradient: flow_px.
-    Raises: ShapeError; DomainError for an empty interval, an interval without events, or a flow that is not
-      finite.
+    Raises: ShapeError; DomainError for an empty interval, an interval without events, or a flow
+      that is not finite.
     """
     check_stream(stream)
     t0_us, t1_us = (
@@ -109,7 +112,9 @@ def stream_tracks(
         for end, name in ((t0_us, "t0_us"), (t1_us, "t1_us"))
     )
     if not -LATEST_US < t0_us < t1_us < LATEST_US:
-        raise DomainError(f"the interval is {t0_us} to {t1_us} us; t1 > t0, both within 2^60 us, are needed.")
+        raise DomainError(
+            f"the interval is {t0_us} to {t1_us} us; t1 > t0, both within 2^60 us, are needed."
+        )
     check(flow_px, "...>=0", "the flow of these events")
     flow = _entered(
         flow_px if flow_px.ndim == 4 else flow_px[None], (1, 2, stream.height_px, stream.width_px)
@@ -131,16 +136,22 @@ def stream_tracks(
     x = x.to(flow)
     y = y.to(flow)
     return EventTracks(
-        x, y, time, count, _carried(flow, own, x, y, time, carry_steps), stream.height_px, stream.width_px
+        x,
+        y,
+        time,
+        count,
+        _carried(flow, own, x, y, time, carry_steps),
+        stream.height_px,
+        stream.width_px,
     )
 
 
 def count_image(tracks: EventTracks, at: float | Tensor) -> Tensor:
-    """Image [B, 2, H, W] of the events moved to the time ``at``, each shared between the four pixels around
-    it in proportion to its nearness.
+    """Image [B, 2, H, W] of the events moved to the time ``at``, each shared between the four
+    pixels around it in proportion to its nearness.
 
-    A share that falls on no pixel is lost. Gradient: counts and flow; piecewise smooth, with a kink where
-    an event crosses the centre line of a pixel.
+    A share that falls on no pixel is lost. Gradient: counts and flow; piecewise smooth, with a kink
+    where an event crosses the centre line of a pixel.
     """
     x, y = check_kind(tracks, EventTracks, "the tracks").positions(at)
     left = x.detach().floor()
@@ -158,8 +169,8 @@ def count_image(tracks: EventTracks, at: float | Tensor) -> Tensor:
 
 
 def nearest_images(tracks: EventTracks, at: float | Tensor) -> tuple[Tensor, Tensor]:
-    """Counts and mean times, [B, 2, H, W] each, with every event on the pixel nearest to it (a tie goes right
-    and down). Gradient: none in the flow."""
+    """Counts and mean times, [B, 2, H, W] each, with every event on the pixel nearest to it (a tie
+    goes right and down). Gradient: none in the flow."""
     check_kind(tracks, EventTracks, "the tracks")
     column, row = (torch.floor(value.detach() + 0.5).long() for value in tracks.positions(at))
     counts, sums = (
@@ -171,12 +182,12 @@ def nearest_images(tracks: EventTracks, at: float | Tensor) -> tuple[Tensor, Ten
 
 
 def smooth_image(tracks: EventTracks, at: float | Tensor, weight: Tensor | None = None) -> Tensor:
-    """Like count_image, with each event spread over the nine pixels around it by the quadratic B-spline
-    (Gaussian-like, variance 1/4 px^2).
+    """Like count_image, with each event spread over the nine pixels around it by the quadratic
+    B-spline (Gaussian-like, variance 1/4 px^2).
 
-    The spread is alike wherever an event falls, so the image is no sharper for whole-pixel motion (bilinear
-    shares have a variance between 0 and 1/4), and its gradient has no jumps. weight: [B, N] factor per event,
-    or None. Gradient: counts, flow and weight; continuous.
+    The spread is alike wherever an event falls, so the image is no sharper for whole-pixel motion
+    (bilinear shares have a variance between 0 and 1/4), and its gradient has no jumps. weight:
+    [B, N] factor per event, or None. Gradient: counts, flow and weight; continuous.
     """
     x, y = check_kind(tracks, EventTracks, "the tracks").positions(at)
     column, row = (value.detach().add(0.5).floor() for value in (x, y))
@@ -199,11 +210,11 @@ def still_image(counts: Tensor) -> Tensor:
 def warp_jacobian(
     tracks: EventTracks, bins: int, at: float | Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Jacobian of the warp to the time ``at`` at each pixel of each bin of a volume, by central differences
-    over the flow of its tracks.
+    """Jacobian of the warp to the time ``at`` at each pixel of each bin of a volume, by central
+    differences over the flow of its tracks.
 
-    Returns: dx'/dx, dx'/dy, dy'/dx, dy'/dy, [B, bins, H, W] each. Gradient: flow. Raises: ShapeError for
-      images less than 2 pixels high or wide.
+    Returns: dx'/dx, dx'/dy, dy'/dx, dy'/dy, [B, bins, H, W] each. Gradient: flow. Raises:
+      ShapeError for images less than 2 pixels high or wide.
     """
     check_kind(tracks, EventTracks, "the tracks")
     shape = (check_whole(bins, "bins", 1), tracks.height_px, tracks.width_px)
@@ -224,8 +235,8 @@ def warp_jacobian(
 def area_change(jacobian: tuple[Tensor, Tensor, Tensor, Tensor]) -> Tensor:
     """Factor by which a warp with this Jacobian changes a small area; negative where it folds over.
 
-    Source: Shiba, Aoki, Gallego, Event collapse in contrast maximization frameworks, Sensors 2022, sec.
-      3.4.2.
+    Source: Shiba, Aoki, Gallego, Event collapse in contrast maximization frameworks, Sensors 2022,
+      sec. 3.4.2.
     """
     xx, xy, yx, yy = jacobian
     return xx * yy - xy * yx
@@ -245,8 +256,8 @@ def sharpness(image: Tensor) -> Tensor:
 
 
 def _spline(offset):
-    """Shares of the pixel before, the nearest and the one after, at an offset of -1/2 to 1/2 from the
-    nearest."""
+    """Shares of the pixel before, the nearest and the one after, at an offset of -1/2 to 1/2 from
+    the nearest."""
     return (0.5 - offset).square() / 2, 0.75 - offset.square(), (0.5 + offset).square() / 2
 
 
@@ -273,17 +284,19 @@ def _carried(flow, own, x, y, time, steps):
 
 
 def _gathered(tracks, column, row, parts):
-    """Sums on the pixels [B, 2, H, W] of parts (step right, step down, values [B, 2, N]), steps from -1 to 1
-    from whole pixels [B, N].
+    """Sums on the pixels [B, 2, H, W] of parts (step right, step down, values [B, 2, N]), steps
+    from -1 to 1 from whole pixels [B, N].
 
-    What is outside falls on a margin that is cut off: places beyond are held two pixels from the image, so
-    that no step leads back to it.
+    What is outside falls on a margin that is cut off: places beyond are held two pixels from the
+    image, so that no step leads back to it.
     """
     height = tracks.height_px
     width = tracks.width_px
     margin = 3
     padded_width = width + 2 * margin
-    cell = (row.clamp(-2, height + 1) + margin) * padded_width + column.clamp(-2, width + 1) + margin
+    cell = (
+        (row.clamp(-2, height + 1) + margin) * padded_width + column.clamp(-2, width + 1) + margin
+    )
     image = torch.zeros(
         *tracks.count.shape[:2],
         (height + 2 * margin) * padded_width,
@@ -292,6 +305,10 @@ def _gathered(tracks, column, row, parts):
     )
     for step_x, step_y, values in parts:
         image = image.scatter_add(
-            2, (cell + (step_y * padded_width + step_x))[:, None].expand_as(values), values.to(image.dtype)
+            2,
+            (cell + (step_y * padded_width + step_x))[:, None].expand_as(values),
+            values.to(image.dtype),
         )
-    return image.unflatten(2, (height + 2 * margin, padded_width))[..., margin:-margin, margin:-margin]
+    return image.unflatten(2, (height + 2 * margin, padded_width))[
+        ..., margin:-margin, margin:-margin
+    ]

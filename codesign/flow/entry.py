@@ -1,5 +1,6 @@
-"""The layer that networks are made of, and what each does around its layers: check the volume and bring it
-to the weights' type, normalise it, pad it to the stride, and fade the flow in with the events."""
+"""The layer that networks are made of, and what each does around its layers: check the volume and
+bring it to the weights' type, normalise it, pad it to the stride, and fade the flow in with the
+events."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -46,7 +47,9 @@ def check_bins(bins: int, even: bool = False) -> None:
 def check_sizes(width: float, hidden: int | None) -> None:
     """Raise DomainError unless layers can have these widths."""
     check_number(width, "width", above=0.0, most=WIDEST)
-    if hidden is not None and (not isinstance(hidden, int) or not 4 <= hidden <= 8 * WIDEST or hidden % 4):
+    if hidden is not None and (
+        not isinstance(hidden, int) or not 4 <= hidden <= 8 * WIDEST or hidden % 4
+    ):
         raise DomainError(
             f"hidden is {shown(hidden)}; a multiple of 4, or None for 8 times the width, is needed."
         )
@@ -55,11 +58,12 @@ def check_sizes(width: float, hidden: int | None) -> None:
 def takes_volume(
     method: Callable[Concatenate[Any, EventVolume, Given], Found],
 ) -> Callable[Concatenate[Any, EventVolume, Given], Found]:
-    """Make a network's method of an EventVolume refuse what is none, and compute in the type of the weights.
+    """Make a network's method of an EventVolume refuse what is none, and compute in the type of the
+    weights.
 
     The counts are converted to the weights' type, float32 as delivered; the flow, confidence and
-    covariance that come back have the type of the counts, so a chain in float64 stays in float64, to
-    the precision of the weights.
+    covariance that come back have the type of the counts, so a chain in float64 stays in float64,
+    to the precision of the weights.
     Raises: as check_volume, for another number of bins than ``config["bins"]`` too; DomainError for
       events and weights on different devices.
     """
@@ -91,12 +95,14 @@ def _in_type(found, dtype):
     if isinstance(found, list):
         return [_in_type(field, dtype) for field in found]
     parts = {name: getattr(found, name) for name in ("flow_px", "confidence", "covariance_px2")}
-    return replace(found, **{name: part.to(dtype) for name, part in parts.items() if part is not None})
+    return replace(
+        found, **{name: part.to(dtype) for name, part in parts.items() if part is not None}
+    )
 
 
 def normalise(counts: Tensor) -> Tensor:
-    """Counts of each sample over the mean count that an event finds in its own bin: about 1 where there are
-    events, whatever contrast and threshold.
+    """Counts of each sample over the mean count that an event finds in its own bin: about 1 where
+    there are events, whatever contrast and threshold.
 
     Args: counts [B, ...].
     Returns: the same shape.
@@ -108,24 +114,28 @@ def normalise(counts: Tensor) -> Tensor:
 
 
 def presence(counts: Tensor) -> Tensor:
-    """n^2 / (n^2 + FEW^2) of the n events of each sample, [B, 1, 1, 1]: flow and gradient are 0 for an empty
-    one."""
+    """n^2 / (n^2 + FEW^2) of the n events of each sample, [B, 1, 1, 1]: flow and gradient are 0 for
+    an empty one."""
     square = counts.flatten(1).sum(1).square()
     return (square / (square + FEW**2))[:, None, None, None]
 
 
 def pad_to(image: Tensor, stride: int) -> Tensor:
-    """Zeros to the right and below, up to the next multiple of ``stride``; pixels keep their places. Crop
-    with ``[..., :H, :W]``."""
+    """Zeros to the right and below, up to the next multiple of ``stride``; pixels keep their
+    places. Crop with ``[..., :H, :W]``."""
     return pad(image, (0, -image.shape[-1] % stride, 0, -image.shape[-2] % stride))
 
 
 def to_field(flow_px: Tensor, volume: EventVolume) -> FlowField:
-    """FlowField of a network without a confidence of its own: ``presence`` of the sample stands for it."""
+    """FlowField of a network without a confidence of its own: ``presence`` of the sample stands for
+    it."""
     counts = volume.counts
     shown = presence(counts)
     batch, _, height, width = flow_px.shape
     valid = (counts.detach().flatten(1).sum(1) > 0)[:, None, None].expand(batch, height, width)
     return FlowField(
-        flow_px * shown, valid, float(volume.collected_s.sum()), shown[:, 0].expand(batch, height, width)
+        flow_px * shown,
+        valid,
+        float(volume.collected_s.sum()),
+        shown[:, 0].expand(batch, height, width),
     )

@@ -1,5 +1,5 @@
-"""Flow networks as programs that run without this package: torch.export (.pt2) and, where every operation has
-a counterpart, ONNX (.onnx)."""
+"""Flow networks as programs that run without this package: torch.export (.pt2) and, where every
+operation has a counterpart, ONNX (.onnx)."""
 
 import contextlib
 import io
@@ -23,8 +23,8 @@ from codesign.types import EventVolume
 
 
 def evenly_timed(counts: Tensor) -> EventVolume:
-    """EventVolume of counts [B, 2, bins, H, W] whose bins are those of codesign.events.from_stream: equally
-    spaced nodes, the two at the ends collecting half, in an interval of 1 s."""
+    """EventVolume of counts [B, 2, bins, H, W] whose bins are those of codesign.events.from_stream:
+    equally spaced nodes, the two at the ends collecting half, in an interval of 1 s."""
     check(counts, "B>=0 2 bins>=2 H>=0 W>=0", "the counts")
     return EventVolume(counts, *bin_times(counts.shape[2], 1.0))
 
@@ -43,12 +43,12 @@ def export(
       path: .pt2 (torch.export) or .onnx.
       height_px, width_px, batch: of the counts [batch, 2, bins, H, W] that the program takes; it
         returns flow [batch, 2, H, W] and confidence [batch, H, W].
-    Raises: MissingPackageError for ONNX without its packages; DomainError for another extension, and
-      for a network with an operation that ONNX lacks; FileFormatError when the
-      file cannot be written.
+    Raises: MissingPackageError for ONNX without its packages; DomainError for another extension,
+      and for a network with an operation that ONNX lacks; FileFormatError when the file cannot be
+      written.
 
-    Load .pt2 by ``torch.export.load(path).module()``, .onnx by any ONNX runtime (input "counts", outputs
-    "flow_px", "confidence").
+    Load .pt2 by ``torch.export.load(path).module()``, .onnx by any ONNX runtime (input "counts",
+    outputs "flow_px", "confidence").
 
     >>> from codesign.flow import FlowNetEvents
     >>> export(FlowNetEvents(bins=2, width=4.0), "network.pt2", height_px=32, width_px=32)
@@ -82,13 +82,16 @@ def trace(
 ) -> torch.export.ExportedProgram:
     """torch.export's ExportedProgram of a network, in evaluation mode.
 
-    What depends on the bins' times alone becomes a constant. The program looks at no value and so refuses
+    What depends on the bins' times alone becomes a constant. The program looks at no value and so
+    refuses
     none: counts that are not finite give a flow that is not.
     """
 
     def program(counts):
         field = network(evenly_timed(counts))
-        return field.flow_px, field.valid.to(field.flow_px) if field.confidence is None else field.confidence
+        return field.flow_px, field.valid.to(
+            field.flow_px
+        ) if field.confidence is None else field.confidence
 
     height_px, width_px, batch = (
         check_whole(value, name, 1, MOST_SIDE_PX)
@@ -104,9 +107,11 @@ def trace(
     counts = torch.zeros(batch, 2, config["bins"], height_px, width_px)
     try:
         with torch.no_grad(), plain_operations():
-            # traced with values, since torch.export alone cannot follow a check for finite input or a number
-            # computed from the bins' times
-            graph = make_fx(program, tracing_mode="real", _error_on_data_dependent_ops=False)(counts)
+            # traced with values, since torch.export alone cannot follow a check for finite input or
+            # a number computed from the bins' times
+            graph = make_fx(program, tracing_mode="real", _error_on_data_dependent_ops=False)(
+                counts
+            )
             _tidy(graph)
             return torch.export.export(graph, (counts,), strict=False)
     finally:
@@ -114,9 +119,12 @@ def trace(
 
 
 def _tidy(graph):
-    """Drop what only looked at values while tracing; give every constant storage of its own, so that none is
-    saved with a larger one it is a view of."""
-    for looking in (torch.ops.aten._local_scalar_dense.default, torch.ops.aten._linalg_check_errors.default):
+    """Drop what only looked at values while tracing; give every constant storage of its own, so
+    that none is saved with a larger one it is a view of."""
+    for looking in (
+        torch.ops.aten._local_scalar_dense.default,
+        torch.ops.aten._linalg_check_errors.default,
+    ):
         for node in graph.graph.find_nodes(op="call_function", target=looking):
             if not node.users:
                 graph.graph.erase_node(node)
@@ -129,8 +137,8 @@ def _tidy(graph):
 
 
 def eliminate(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solution [..., n, m] of positive definite systems [..., n, n] by Gauss-Jordan elimination, which needs
-    no exchange of rows there: plain operations alone."""
+    """Solution [..., n, m] of positive definite systems [..., n, n] by Gauss-Jordan elimination,
+    which needs no exchange of rows there: plain operations alone."""
     size = matrix.shape[-1]
     unit = torch.eye(size, dtype=matrix.dtype)
     rows = torch.cat([matrix, right], -1)
@@ -153,9 +161,9 @@ def _solve_ex(matrix, right, *, left=True, check_errors=False):
 
 
 def _inverse_ex(matrix, *, check_errors=False):
-    return eliminate(matrix, torch.eye(matrix.shape[-1], dtype=matrix.dtype).expand_as(matrix)), matrix[
-        ..., 0, 0
-    ].to(torch.int32)
+    return eliminate(
+        matrix, torch.eye(matrix.shape[-1], dtype=matrix.dtype).expand_as(matrix)
+    ), matrix[..., 0, 0].to(torch.int32)
 
 
 # ONNX has neither
@@ -166,8 +174,8 @@ PLAIN = {
 
 
 def _onnx(program, name):
-    """Bytes of an ONNX model with its weights inside. The small systems that flow networks solve are positive
-    definite."""
+    """Bytes of an ONNX model with its weights inside. The small systems that flow networks solve
+    are positive definite."""
     for module in ("onnx", "onnxscript"):
         require(module, "export", "writing .onnx (.pt2 needs nothing more)")
     log = logging.getLogger("torch.onnx")

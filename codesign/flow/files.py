@@ -1,11 +1,14 @@
-"""Flow fields to and from files: 16-bit PNG as in DSEC, and Middlebury .flo. The extension says which.
+"""Flow fields to and from files: 16-bit PNG as in DSEC, and Middlebury .flo. The extension says
+which.
 
-DSEC: three channels of 16 bits. The first two are round(128 v) + 2^15 for the flow v to the right and down
-  (px), the third is 1 where it is valid, else 0. Flows from -256 to 255.99 px fit, to 1/256 px; larger valid
-  ones are refused, never clipped. Invalid pixels are written as 0, 0, 0 and read as flow 0.
-Middlebury: the float32 202021.25, width and height as int32, then (right, down) float32 pixel by pixel, all
-  little-endian. Invalid pixels hold 1e10, and components above 1e9 in size read as invalid. Sources: the DSEC
-  data format page; Baker et al., A database and evaluation methodology for optical flow, IJCV 2011.
+DSEC: three channels of 16 bits. The first two are round(128 v) + 2^15 for the flow v to the right
+  and down (px), the third is 1 where it is valid, else 0. Flows from -256 to 255.99 px fit, to
+  1/256 px; larger valid ones are refused, never clipped. Invalid pixels are written as 0, 0, 0 and
+  read as flow 0.
+Middlebury: the float32 202021.25, width and height as int32, then (right, down) float32 pixel by
+  pixel, all little-endian. Invalid pixels hold 1e10, and components above 1e9 in size read as
+  invalid. Sources: the DSEC data format page; Baker et al., A database and evaluation methodology
+  for optical flow, IJCV 2011.
 """
 
 import io
@@ -139,14 +142,19 @@ def _to_png(flow, valid):
             f"the flow ({x:.4g}, {y:.4g}) px at column {column}, row {row} does not fit 16 bits (-256 to "
             "255.99 px); mark it as not valid, shorten the interval, or write .flo."
         )
-    pixels = np.concatenate([np.where(valid, value, 0), valid[None]]).transpose(1, 2, 0).astype(">u2")
+    pixels = (
+        np.concatenate([np.where(valid, value, 0), valid[None]]).transpose(1, 2, 0).astype(">u2")
+    )
     rows = pixels.reshape(flow.shape[1], -1).view(np.uint8)
     above = np.vstack([np.zeros_like(rows[:1]), rows[:-1]])
     # every row as its difference from the one above (PNG filter 2), modulo 256
     filtered = np.hstack([np.full((len(rows), 1), 2, np.uint8), rows - above])
     header = struct.pack(">IIBBBBB", flow.shape[2], flow.shape[1], 16, 2, 0, 0, 0)
     return (
-        PNG_START + _chunk(b"IHDR", header) + _chunk(b"IDAT", zlib.compress(filtered.tobytes(), 3)) + PNG_END
+        PNG_START
+        + _chunk(b"IHDR", header)
+        + _chunk(b"IDAT", zlib.compress(filtered.tobytes(), 3))
+        + PNG_END
     )
 
 
@@ -163,7 +171,9 @@ def _from_png(path, content):
             f"{kind[1]}, interlacing {kind[4]}."
         )
     if not 1 <= width * height <= MOST_PIXELS:
-        raise FileFormatError(f"{path} announces {width} x {height} pixels; up to {MOST_PIXELS} are read.")
+        raise FileFormatError(
+            f"{path} announces {width} x {height} pixels; up to {MOST_PIXELS} are read."
+        )
     with reading(path, "it is cut off or damaged"):
         with Image.open(io.BytesIO(content), formats=["PNG"]) as image:
             image.verify()
@@ -183,8 +193,8 @@ def _from_png(path, content):
 
 
 def _bytes(content, order):
-    """The upper bytes [H, W, 3] of a PNG of 16 bits, or the lower ones where ``order`` says that they
-    stand first: Pillow keeps one byte of each number."""
+    """The upper bytes [H, W, 3] of a PNG of 16 bits, or the lower ones where ``order`` says that
+    they stand first: Pillow keeps one byte of each number."""
     with Image.open(io.BytesIO(content), formats=["PNG"]) as image:
         image.tile = [(*tile[:3], f"RGB;16{order}") for tile in image.tile]
         return np.asarray(image)

@@ -1,8 +1,8 @@
 """Losses to learn flow with: from true flow, from the events alone, and from frames.
 
-Every loss is a mean over the samples of a batch of a mean over the pixels of the sample, so that equal shares
-of a batch, on several machines, average to the loss of the whole. They are smooth (C1) in the flow unless the
-docstring says otherwise. Non-finite predictions show as a non-finite loss.
+Every loss is a mean over the samples of a batch of a mean over the pixels of the sample, so that
+equal shares of a batch, on several machines, average to the loss of the whole. They are smooth (C1)
+in the flow unless the docstring says otherwise. Non-finite predictions show as a non-finite loss.
 """
 
 import math
@@ -35,7 +35,8 @@ PUBLISHED = (1e-3, 0.45)  # epsilon and exponent of EV-FlowNet's losses
 PRIOR_PX = 8.0  # of a prediction that claims a confidence only
 FLOOR_PX = 0.05  # deviation added to every claim, in squares
 SLOWEST_PX = 1.0  # motion that errors are shares of, at least
-# sharpness, (events per pixel)^2, far below that of any scene: no events count as sharp as at zero flow
+# sharpness, (events per pixel)^2, far below that of any scene: no events count as sharp as at zero
+# flow
 _FAINT = 1e-6
 # area changes from _FOLD to _FREE count in full; folds count 0, no event counts more than _MOST
 _FOLD = 0.2
@@ -44,8 +45,8 @@ _MOST = 2.5
 
 
 def charbonnier(squared: Tensor, epsilon: float, exponent: float = 0.5) -> Tensor:
-    """(s + epsilon^2)^exponent - epsilon^(2 exponent) of squared lengths s: 0 at 0 to rounding, smooth,
-    s^exponent far away. Source: Charbonnier et al., ICIP 1994; Sun et al., IJCV 2014."""
+    """(s + epsilon^2)^exponent - epsilon^(2 exponent) of squared lengths s: 0 at 0 to rounding,
+    smooth, s^exponent far away. Source: Charbonnier et al., ICIP 1994; Sun et al., IJCV 2014."""
     epsilon = check_positive(epsilon, "epsilon")
     return (squared + epsilon**2) ** exponent - epsilon ** (2 * exponent)
 
@@ -66,8 +67,9 @@ def supervised_loss(
       epsilon: width of the parabola at 0, in the unit of the error.
       unit_per_px: what one pixel is worth, a number or [B]: 1 for an error in px,
         ``relative_unit(truth)`` for parts of the motion of the sample.
-    Returns: scalar. Only valid pixels of the truth count. A sample without any counts 0, its place in the
-      mean of the batch included, so that the denominator does not depend on how a batch is split.
+    Returns: scalar. Only valid pixels of the truth count. A sample without any counts 0, its place
+      in the mean of the batch included, so that the denominator does not depend on how a batch is
+      split.
     Gradient: flow_px of the predictions.
     Raises: ShapeError.
     Source: the weights are those of Teed and Deng, RAFT, ECCV 2020, sec. 3.4.
@@ -91,24 +93,25 @@ def laplace_loss(
     truth: FlowField,
     gamma: float = 0.8,
 ) -> Tensor:
-    """Negative log likelihood of the error under the covariance that each prediction claims for itself,
-    for errors with long tails: a density that falls as exp(-sqrt(3) m), less its constant.
+    """Negative log likelihood of the error under the covariance that each prediction claims for
+    itself, for errors with long tails: a density that falls as exp(-sqrt(3) m), less its constant.
 
     Args:
       predictions, truth, gamma: as in supervised_loss. Each prediction has covariance_px2, or else
         confidence c, read as the share of the prior that the events have removed: variance 64 px^2
         (1 - c) per axis.
     Returns: scalar, sqrt(3) m + ln det S / 2 with m^2 = e^T S^-1 e, over the valid pixels as in
-      supervised_loss; S is the claim and 0.05 px in squares, so that no claim is exact and the loss stays
-      bounded below. Of all densities exp(-k m) of two components this one has the covariance S. A pixel
-      far off pulls no harder than one at a deviation; where little is claimed errors count less, so what
-      nothing can be known of leaves the rest alone. Another unit only shifts it.
+      supervised_loss; S is the claim and 0.05 px in squares, so that no claim is exact and the loss
+      stays bounded below. Of all densities exp(-k m) of two components this one has the covariance
+      S. A pixel far off pulls no harder than one at a deviation; where little is claimed errors
+      count less, so what nothing can be known of leaves the rest alone. Another unit only shifts
+      it.
     Gradient: flow_px, covariance_px2 or confidence; smooth below a hundredth of a deviation.
-    Raises: ShapeError; DomainError for a prediction with neither claim, and for a covariance that is not
-      positive semidefinite.
+    Raises: ShapeError; DomainError for a prediction with neither claim, and for a covariance that
+      is not positive semidefinite.
     Source: Ilg et al., Uncertainty estimates and multi-hypotheses networks for optical flow, ECCV
-      2018, for the likelihood; the covariance follows from the integral of m^3 exp(-k m) over that of
-      m exp(-k m), 6 / k^2 = 2.
+      2018, for the likelihood; the covariance follows from the integral of m^3 exp(-k m) over that
+      of m exp(-k m), 6 / k^2 = 2.
     """
 
     def nll(field, error):
@@ -119,8 +122,8 @@ def laplace_loss(
 
 
 def relative_unit(truth: FlowField) -> Tensor:
-    """[B] 1 / sqrt(mean squared length of the valid true flow + 1 px^2): turns an error in px into a
-    share of the sample's motion. Gradient: none."""
+    """[B] 1 / sqrt(mean squared length of the valid true flow + 1 px^2): turns an error in px into
+    a share of the sample's motion. Gradient: none."""
     squared = _known(truth).detach().square().sum(1).flatten(1).sum(1) / truth.valid.flatten(1).sum(
         1
     ).clamp_min(1)
@@ -128,23 +131,24 @@ def relative_unit(truth: FlowField) -> Tensor:
 
 
 def contrast_loss(volume: EventVolume, flow_px: Tensor) -> Tensor:
-    """Contrast maximisation without event collapse: zero-flow sharpness of the events over their sharpness
-    when warped.
+    """Contrast maximisation without event collapse: zero-flow sharpness of the events over their
+    sharpness when warped.
 
     Args:
       volume: EventVolume, counts [B, 2, bins, H, W].
       flow_px: [B, 2, H, W] pixels per window.
-    Returns: scalar mean over the batch of the weighted mean of the ratios at the times of REFERENCES; 1
-      for zero flow, less for flow that explains the events; 1 for a sample without events.
-    Guard: an event counts as much as the warp stretches the area around it (from 0 where it folds or turns
-      over to 2.5). Squeezing the events into less space then leaves the mean squared slope of their image
-      unchanged (in two dimensions it is invariant under change of scale), so only alignment pays; and ratios
-      are averaged, not sharpnesses, so that one very sharp image does not make up for blurred others. What
-      leaves the image is lost, which costs sharpness.
+    Returns: scalar mean over the batch of the weighted mean of the ratios at the times of
+      REFERENCES; 1 for zero flow, less for flow that explains the events; 1 for a sample without
+      events.
+    Guard: an event counts as much as the warp stretches the area around it (from 0 where it folds
+      or turns over to 2.5). Squeezing the events into less space then leaves the mean squared slope
+      of their image unchanged (in two dimensions it is invariant under change of scale), so only
+      alignment pays; and ratios are averaged, not sharpnesses, so that one very sharp image does
+      not make up for blurred others. What leaves the image is lost, which costs sharpness.
     Gradient: counts and flow; 0 in both for an empty volume.
     Raises: as volume_tracks.
-    Source: Shiba, Aoki, Gallego, Secrets of event-based optical flow, ECCV 2022, sec. 3.2; area change: Shiba
-      et al., Sensors 2022, sec. 3.4.2, here as a weight.
+    Source: Shiba, Aoki, Gallego, Secrets of event-based optical flow, ECCV 2022, sec. 3.2; area
+      change: Shiba et al., Sensors 2022, sec. 3.4.2, here as a weight.
     """
     tracks = volume_tracks(volume, flow_px, carry_steps=1)
     still = sharpness(still_image(volume.counts)) + _FAINT
@@ -162,12 +166,13 @@ def photometric_loss(frames: Tensor | None, flow_px: Tensor) -> Tensor:
       frames: [B, 2, H, W] intensity at the start and at the end, 0..255.
       flow_px: [B, 2, H, W] pixels per window.
     Returns: scalar, differences in units of 255. A pixel that leaves the image keeps its zero-flow
-      difference, so that leaving never pays; over the last pixel before the border one blends into the other.
-    Gradient: frames and flow; bilinear reading makes it piecewise smooth, with kinks where the flow leads to
-      a pixel's centre line.
+      difference, so that leaving never pays; over the last pixel before the border one blends into
+      the other.
+    Gradient: frames and flow; bilinear reading makes it piecewise smooth, with kinks where the flow
+      leads to a pixel's centre line.
     Raises: ShapeError.
-    Source: Zhu et al., EV-FlowNet, RSS 2018 (there pixels that leave are not treated); used by Lee et al.,
-      Spike-FlowNet, ECCV 2020.
+    Source: Zhu et al., EV-FlowNet, RSS 2018 (there pixels that leave are not treated); used by Lee
+      et al., Spike-FlowNet, ECCV 2020.
     """
     flow_px = _full(flow_px)
     check(frames, tuple(flow_px.shape), "frames at start and end")
@@ -211,13 +216,16 @@ def _over_predictions(predictions, truth, gamma, per_pixel):
     for field in predictions:
         check_kind(field, FlowField, "a prediction")
         check(field.flow_px, tuple(target.shape), "the flow of a prediction")
-        total = gamma * total + _valid_mean(per_pixel(field, _full(field.flow_px) - target), truth.valid)
+        total = gamma * total + _valid_mean(
+            per_pixel(field, _full(field.flow_px) - target), truth.valid
+        )
         weights = gamma * weights + 1
     return total / weights
 
 
 def _known(truth):
-    """True flow, 0 where it is unknown: what is not valid may be NaN and must not reach the gradient."""
+    """True flow, 0 where it is unknown: what is not valid may be NaN and must not reach the
+    gradient."""
     check_field(truth, "the truth")
     return torch.where(truth.valid[:, None], truth.flow_px, 0.0)
 
@@ -241,8 +249,8 @@ def _distance(field, error):
     """m^2 = e^T S^-1 e and ln det S of errors [B, 2, H, W], S the claim + FLOOR_PX^2."""
     xx, xy, yy = _covariance(field)
     spare = FLOOR_PX**2
-    # xx yy - xy^2 >= 0 apart from rounding; taken by itself it cannot cancel the floor's part of the
-    # determinant
+    # xx yy - xy^2 >= 0 apart from rounding; taken by itself it cannot cancel the floor's part of
+    # the determinant
     determinant = spare**2 + spare * (xx + yy) + (xx * yy - xy.square()).clamp_min(0)
     u, v = error.unbind(1)
     squared = ((yy + spare) * u.square() - 2 * xy * u * v + (xx + spare) * v.square()) / determinant
@@ -278,12 +286,16 @@ def _covariance(field):
 
 
 def _stretch(jacobian):
-    """Weight of events where a warp has this Jacobian: the area change, smoothly 0 where the warp folds or
-    turns over and at most _MOST where it tears apart."""
+    """Weight of events where a warp has this Jacobian: the area change, smoothly 0 where the warp
+    folds or turns over and at most _MOST where it tears apart."""
     area = area_change(jacobian)
     upright = (jacobian[0] + jacobian[3]) / 2
     over = (area - _FREE).clamp_min(0)
-    return _rise(area) * _rise(upright) * (area - over + (_MOST - _FREE) * torch.tanh(over / (_MOST - _FREE)))
+    return (
+        _rise(area)
+        * _rise(upright)
+        * (area - over + (_MOST - _FREE) * torch.tanh(over / (_MOST - _FREE)))
+    )
 
 
 def _rise(value):
@@ -293,6 +305,7 @@ def _rise(value):
 
 
 def _full(flow_px):
-    """The flow in at least single precision: places and squares in half precision would be far off."""
+    """The flow in at least single precision: places and squares in half precision would be far
+    off."""
     check(flow_px, "B 2 H W", "the flow")
     return flow_px.to(torch.promote_types(flow_px.dtype, torch.float32))

@@ -1,8 +1,8 @@
-"""Flow errors as the field defines them. Conventions are in each docstring and in docs/flow_metrics.md, since
-published code disagrees.
+"""Flow errors as the field defines them. Conventions are in each docstring and in
+docs/flow_metrics.md, since published code disagrees.
 
-Flows are [..., 2, H, W] pixels per window, masks [..., H, W] bool. Every mean runs over the masked pixels of
-all samples together.
+Flows are [..., 2, H, W] pixels per window, masks [..., H, W] bool. Every mean runs over the masked
+pixels of all samples together.
 """
 
 import torch
@@ -34,7 +34,8 @@ def _check(flow, truth):
 
 
 def _masked(values, mask):
-    """The values under the mask, flat; a non-finite one would count as no outlier, so it is refused."""
+    """The values under the mask, flat; a non-finite one would count as no outlier, so it is
+    refused."""
     if mask is not None:
         check(mask, tuple(values.shape), "the mask", (torch.bool,))
         if not bool(mask.any()):
@@ -62,8 +63,8 @@ def aee(flow: Tensor, truth: Tensor, mask: Tensor | None = None) -> Tensor:
 
 
 def zero_flow_error(truth: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Average endpoint error of the estimate "nothing moves", px: the mean true length, which every error
-    should be compared with."""
+    """Average endpoint error of the estimate "nothing moves", px: the mean true length, which every
+    error should be compared with."""
     return aee(torch.zeros_like(check(truth, "...>=0", "the truth")), truth, mask)
 
 
@@ -74,8 +75,8 @@ def outlier_percent(
     pixels: float = 3.0,
     share: float = 0.05,
 ) -> Tensor:
-    """Share of pixels, in percent, whose endpoint error is above ``pixels`` AND above ``share`` of the true
-    length (KITTI 2015: 3 px and 5 %).
+    """Share of pixels, in percent, whose endpoint error is above ``pixels`` AND above ``share`` of
+    the true length (KITTI 2015: 3 px and 5 %).
 
     >>> truth = torch.full((2, 1, 4), 100.0)
     >>> float(outlier_percent(truth + torch.tensor([0.0, 2.0, 5.0, 9.0]), truth))  # 7.1 px is 5 % of 141 px
@@ -91,8 +92,8 @@ def outlier_percent(
 
 
 def npe(flow: Tensor, truth: Tensor, pixels: float, mask: Tensor | None = None) -> Tensor:
-    """Share of pixels, in percent, whose endpoint error is above ``pixels`` (DSEC's 1PE, 2PE, 3PE; what event
-    papers on MVSEC call outliers is ``pixels=3``).
+    """Share of pixels, in percent, whose endpoint error is above ``pixels`` (DSEC's 1PE, 2PE, 3PE;
+    what event papers on MVSEC call outliers is ``pixels=3``).
 
     >>> error = torch.tensor([0.0, 0.5, 1.5, 4.0]).expand(2, 1, 4) * torch.tensor([1.0, 0.0])[:, None, None]
     >>> float(npe(error, torch.zeros(2, 1, 4), pixels=1.0))
@@ -104,8 +105,8 @@ def npe(flow: Tensor, truth: Tensor, pixels: float, mask: Tensor | None = None) 
 
 
 def angular_error_deg(flow: Tensor, truth: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Mean angle in space-time between (u, v, 1) and the truth, degrees (Barron et al., 1994), by atan2 for
-    accuracy at small angles.
+    """Mean angle in space-time between (u, v, 1) and the truth, degrees (Barron et al., 1994), by
+    atan2 for accuracy at small angles.
 
     >>> flow = torch.tensor([1.0, 0.0])[:, None, None].expand(2, 8, 8)
     >>> round(float(angular_error_deg(flow, torch.zeros(2, 8, 8))), 3)
@@ -124,7 +125,8 @@ def event_mask(volume: EventVolume) -> Tensor:
 
 
 def masks(volume: EventVolume, truth: FlowField) -> dict[str, Tensor]:
-    """The three masks that errors are reported under: {"valid", "events", "both"}, each [B, H, W] bool."""
+    """The three masks that errors are reported under: {"valid", "events", "both"}, each [B, H, W]
+    bool."""
     events = event_mask(volume)
     valid = check_field(truth, "the truth").valid
     if events.shape != valid.shape:
@@ -142,8 +144,8 @@ def fwl(
     at: float = 1.0,
     carry_steps: int = 0,
 ) -> float:
-    """Flow warp loss: variance of the image of warped events over its variance at zero flow. Above 1 the flow
-    makes the events sharper.
+    """Flow warp loss: variance of the image of warped events over its variance at zero flow. Above
+    1 the flow makes the events sharper.
 
     Args:
       stream: EventStream.
@@ -151,14 +153,17 @@ def fwl(
       t0_us, t1_us: whole microseconds, both ends included.
       at: time the events are moved to, 0 for t0, 1 for t1.
       carry_steps: see contrast; 0 gives each event the flow of its own pixel, as published.
-    Returns: float. Polarities added, every event on its nearest pixel, variance over all pixels of the
-      sensor. Events that leave the image count in the denominator only.
-    Gradient: none. Raises: DomainError for an interval without events, or with equally many events on every
-      pixel. Source: Stoffregen et al., ECCV 2020, sec. 4.1.
+    Returns: float. Polarities added, every event on its nearest pixel, variance over all pixels of
+      the sensor. Events that leave the image count in the denominator only.
+    Gradient: none. Raises: DomainError for an interval without events, or with equally many events
+      on every pixel. Source: Stoffregen et al., ECCV 2020, sec. 4.1.
     """
-    tracks = stream_tracks(stream, check(flow_px, "...>=0", "the flow").detach(), t0_us, t1_us, carry_steps)
+    tracks = stream_tracks(
+        stream, check(flow_px, "...>=0", "the flow").detach(), t0_us, t1_us, carry_steps
+    )
     still, moved = (
-        nearest_images(tracks, time)[0].double().sum(1).var(correction=0) for time in (tracks.time, at)
+        nearest_images(tracks, time)[0].double().sum(1).var(correction=0)
+        for time in (tracks.time, at)
     )
     if float(still) == 0:
         raise DomainError(
@@ -175,17 +180,19 @@ def rsat(
     t1_us: int,
     carry_steps: int = 0,
 ) -> float:
-    """Ratio of the squared average time stamps, warped to t1 over unwarped. Below 1 the flow aligns the
-    events.
+    """Ratio of the squared average time stamps, warped to t1 over unwarped. Below 1 the flow aligns
+    the events.
 
     Args: as fwl.
-    Returns: float; of either image, the sum over pixels and polarities of the squared mean time (0 at t0, 1
-      at t1) over the number of pixels with events of any polarity. Every event on its nearest pixel; events
-      that leave the image are lost from the warped one.
-    Gradient: none. Raises: DomainError for an interval without events, or when all leave the image, or lie at
-      t0. Source: Hagenaars et al., NeurIPS 2021.
+    Returns: float; of either image, the sum over pixels and polarities of the squared mean time
+      (0 at t0, 1 at t1) over the number of pixels with events of any polarity. Every event on its
+      nearest pixel; events that leave the image are lost from the warped one.
+    Gradient: none. Raises: DomainError for an interval without events, or when all leave the image,
+      or lie at t0. Source: Hagenaars et al., NeurIPS 2021.
     """
-    tracks = stream_tracks(stream, check(flow_px, "...>=0", "the flow").detach(), t0_us, t1_us, carry_steps)
+    tracks = stream_tracks(
+        stream, check(flow_px, "...>=0", "the flow").detach(), t0_us, t1_us, carry_steps
+    )
     squares = []
     for time in (tracks.time, 1.0):
         counts, mean_time = (image.double() for image in nearest_images(tracks, time))
@@ -204,4 +211,6 @@ def rsat(
 
 
 def _angle(a, b):
-    return torch.atan2(torch.linalg.vector_norm(torch.linalg.cross(a, b, dim=-3), dim=-3), (a * b).sum(-3))
+    return torch.atan2(
+        torch.linalg.vector_norm(torch.linalg.cross(a, b, dim=-3), dim=-3), (a * b).sum(-3)
+    )

@@ -1,5 +1,5 @@
-"""A small network that corrects the closed form: the volume is warped along the flow so far, and what still
-moves says what to add."""
+"""A small network that corrects the closed form: the volume is warped along the flow so far, and
+what still moves says what to add."""
 
 import math
 from dataclasses import replace
@@ -29,7 +29,8 @@ OWN = 7  # what is told beside bins and evidence
 WIDEST = 10.0  # logarithm of the largest factor on a claim
 SMALLEST_PX2 = 1e-4
 SPARE_PX2 = 0.01  # unit of the variance that is added to the start's claim
-# what one quadratic field leaves of the start, over its length, at which the correction counts by half,
+# what one quadratic field leaves of the start, over its length, at which the correction counts by
+# half,
 BENT = 0.01
 BENT_PX = 0.03  # and in px
 
@@ -42,15 +43,16 @@ class Refiner(nn.Module):
       width: channels on cells of 4 px, a multiple of 16.
       steps: corrections, by the same weights.
     A correction reads the volume along the flow so far and solves V_t + u V_x + v V_y = 0 by least
-    squares for what still moves, on cells of 4 px, at three blurs and in windows of 12, 28 and 36 px,
-    and tries the flows of cells around (refiner_evidence). A U-Net on cells of 4, 8 and 16 px reads
-    these solutions and how sure they are, the bins as they are and along the flow so far, all in units
-    of the noise of scattered events, the density of events, the flow so far and the deviation that the
-    closed form claims. It says cell by cell how much of each solution and neighbour to add, adds
-    something of its own in units of the claimed deviation, and says how pixels mix cells and how wide
-    the claim is to be. Fresh weights give the closed form as it is. Bins are read at q + t flow(q), so
-    the flow belongs to the pixels of the window's start. The correction counts as far as the closed
-    form bends away from one quadratic field: it does so where the events have evidence for it, and
+    squares for what still moves, on cells of 4 px, at three blurs and in windows of 12, 28 and 36
+    px, and tries the flows of cells around (refiner_evidence). A U-Net on cells of 4, 8 and 16 px
+    reads these solutions and how sure they are, the bins as they are and along the flow so far, all
+    in units of the noise of scattered events, the density of events, the flow so far and the
+    deviation that the closed form claims. It says cell by cell how much of each solution and
+    neighbour to add, adds something of its own in units of the claimed deviation, and says how
+    pixels mix cells and how wide the claim is to be. Fresh weights give the closed form as it is.
+    Bins are read at q + t flow(q), so the flow belongs to the pixels of the window's start. The
+    correction counts as far as the closed form bends away from one quadratic field: it does so
+    where the events have evidence for it, and
       without any (noise, thin packets, cameras that turn) the closed form stands as it is.
 
     >>> from codesign.flow.export import evenly_timed
@@ -92,13 +94,15 @@ class Refiner(nn.Module):
         """Flow of an EventVolume [B, 2, bins, H, W] of any H, W.
 
         Args:
-          start_px: [B, 2] or [B, 2, H, W] flow that is expected, px per interval, such as that of the
-            window before: the closed form begins from it too (``estimate_lk``).
-          clock: "time" or "events", as of ``estimate_lk``; corrections fade where motion turns back.
-        Returns: FlowField with confidence and covariance. An empty sample has flow 0, confidence 0 and
-          no gradient.
+          start_px: [B, 2] or [B, 2, H, W] flow that is expected, px per interval, such as that of
+            the window before: the closed form begins from it too (``estimate_lk``).
+          clock: "time" or "events", as of ``estimate_lk``; corrections fade where motion turns
+            back.
+        Returns: FlowField with confidence and covariance. An empty sample has flow 0, confidence 0
+          and no gradient.
         Gradient: counts and weights.
-        Raises: ShapeError for other shapes or numbers of bins; DomainError for counts that are no events.
+        Raises: ShapeError for other shapes or numbers of bins; DomainError for counts that are no
+          events.
         """
         return self.predictions(volume, start_px, clock)[-1]
 
@@ -110,7 +114,10 @@ class Refiner(nn.Module):
         start = self.start(volume, start_px, clock)
         with torch.autocast(volume.counts.device.type, enabled=False):
             share = _bends(start.flow_px)
-        return [_mixed(volume, start, field, share) for field in self.refined(volume, start, clock=clock)]
+        return [
+            _mixed(volume, start, field, share)
+            for field in self.refined(volume, start, clock=clock)
+        ]
 
     def start(
         self,
@@ -126,8 +133,9 @@ class Refiner(nn.Module):
     def refined(
         self, volume: EventVolume, start: FlowField, through: bool = True, clock: str = "time"
     ) -> list[FlowField]:
-        """FlowFields after each whole correction, as it is trained, of an estimate with covariance, such as
-        ``start(volume)``, whose covariance says how far it may be off. Gradient: counts, start and weights.
+        """FlowFields after each whole correction, as it is trained, of an estimate with covariance,
+        such as ``start(volume)``, whose covariance says how far it may be off. Gradient: counts,
+        start and weights.
 
         through: False leaves out the gradient through the places at which bins are read, as in the
           training of RAFT (Teed and Deng, ECCV 2020): it takes a third off a step.
@@ -161,7 +169,8 @@ class Refiner(nn.Module):
         return [_field(volume, start, present, shown, *parts) for parts in found]
 
     def _core(self, known):
-        """Features [B, width, h, w] of the cells, from what is known of them; beyond the image nothing is."""
+        """Features [B, width, h, w] of the cells, from what is known of them; beyond the image
+        nothing is."""
         rows, columns = known.shape[-2:]
         fine = self.fine(pad_to(known, COARSEST))
         middle = self.middle(fine)
@@ -179,8 +188,9 @@ def _on_cells(image):
 
 
 def mixed(image: Tensor, logits: Tensor) -> Tensor:
-    """Pixels [B, C, side h, side w] of an image [B, C, h, w] on cells: each a mean of the nine cells
-    around, by weights of these logits [B, 9 side^2, h, w]. Source: Teed and Deng, RAFT, ECCV 2020, sec. 3.3."""
+    """Pixels [B, C, side h, side w] of an image [B, C, h, w] on cells: each a mean of the nine
+    cells around, by weights of these logits [B, 9 side^2, h, w]. Source: Teed and Deng, RAFT, ECCV
+    2020, sec. 3.3."""
     channels, rows, columns = image.shape[1:]
     side = math.isqrt(logits.shape[1] // 9)
     weights = logits.unflatten(1, (9, side, side)).softmax(1).flatten(4)
@@ -190,7 +200,8 @@ def mixed(image: Tensor, logits: Tensor) -> Tensor:
 
 
 def _on_pixels(image, edges):
-    """``mixed`` by weights that begin as those of linear interpolation (edges [B, 9 CELL^2, h, w] are 0)."""
+    """``mixed`` by weights that begin as those of linear interpolation (edges [B, 9 CELL^2, h, w]
+    are 0)."""
     return mixed(image, edges + _linear().to(edges).log().flatten()[:, None, None])
 
 
@@ -203,9 +214,10 @@ def _linear():
 
 
 def _field(volume, start, present, shown, change, claim):
-    """FlowField from the change of the flow [B, 2, >= H, >= W] px and the claim [B, 2, h, w] on cells:
-    logarithms of the factor on the start's covariance and of the variance that is added; ``shown`` [B,
-    1, 1, 1] is how much of both counts."""
+    """FlowField from the change of the flow [B, 2, >= H, >= W] px and the claim [B, 2, h, w] on
+    cells:
+    logarithms of the factor on the start's covariance and of the variance that is added; ``shown``
+    [B, 1, 1, 1] is how much of both counts."""
     height, width = start.flow_px.shape[-2:]
     change, claim = (part[..., :height, :width] for part in (change, larger(claim, CELL)))
     factor, added = (WIDEST * torch.tanh(claim / WIDEST)).exp().split(1, 1)
@@ -224,8 +236,8 @@ def _claiming(volume, flow, covariance, present):
 
 
 def _bends(flow):
-    """[B, 1, 1, 1] in 0..1 by the root mean square of what a quadratic field leaves of a flow [B, 2,
-    H, W]."""
+    """[B, 1, 1, 1] in 0..1 by the root mean square of what a quadratic field leaves of a flow
+    [B, 2, H, W]."""
     y, x = (torch.linspace(-1, 1, size).to(flow) for size in flow.shape[2:])
     y, x = torch.meshgrid(y, x, indexing="ij")
     basis = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1).flatten(0, 1)
@@ -237,9 +249,12 @@ def _bends(flow):
 
 
 def _mixed(volume, start, corrected, share):
-    """Mean and covariance of the belief that the correction is right by ``share``, and else the start."""
+    """Mean and covariance of the belief that the correction is right by ``share``, and else the
+    start."""
     change = corrected.flow_px - start.flow_px
     x, y = change.unbind(1)
     apart = share * (1 - share) * torch.stack([x * x, x * y, y * y], 1)
     covariance = torch.lerp(start.covariance_px2, corrected.covariance_px2, share.expand_as(apart))
-    return _claiming(volume, start.flow_px + share * change, covariance + apart, presence(volume.counts))
+    return _claiming(
+        volume, start.flow_px + share * change, covariance + apart, presence(volume.counts)
+    )

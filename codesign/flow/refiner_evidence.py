@@ -1,15 +1,16 @@
-"""What bins read along a flow say about the flow that is still missing: local least squares for V_t +
-u V_x + v V_y = 0 at several blurs and in windows of several sizes, weighed by the noise of events
+"""What bins read along a flow say about the flow that is still missing: local least squares for V_t
++ u V_x + v V_y = 0 at several blurs and in windows of several sizes, weighed by the noise of events
 scattered at random.
 
 The noise is that of the closed form (lk.level): rho scattered events per pixel behind a Gaussian of
 sigma give temporal slopes of variance rho / (4 pi sigma^2 sum w t^2) and slopes of the mean of
-variance about rho / (8 pi sigma^4), alike over 4 pi sigma^2 px. With N the sums of products of slopes
-in a window, the precision is N over that variance and overlap; it counts by the share (g / (g + 4
-z))^2 of the trace g of N, z what scattered events add to it.
+variance about rho / (8 pi sigma^4), alike over 4 pi sigma^2 px. With N the sums of products of
+slopes in a window, the precision is N over that variance and overlap; it counts by the share (g /
+(g + 4 z))^2 of the trace g of N, z what scattered events add to it.
 
-At the border between two motions no window says where it runs, but the events near by are sharp along
-one of the two: flows of cells around are tried as they are (PatchMatch: Barnes et al., SIGGRAPH 2009).
+At the border between two motions no window says where it runs, but the events near by are sharp
+along one of the two: flows of cells around are tried as they are (PatchMatch: Barnes et al.,
+SIGGRAPH 2009).
 """
 
 import math
@@ -76,21 +77,23 @@ class Evidence:
             self.levels.append((blur, grid, counts, pooled))
 
     def at(self, flow: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-        """What is still missing along a flow [B, 2, h, w] px on cells, of which ``variance`` [B, 1, h,
-        w] px^2 is claimed.
+        """What is still missing along a flow [B, 2, h, w] px on cells, of which ``variance``
+        [B, 1, h, w] px^2 is claimed.
 
-        Returns: told [B, TOLD, h, w]: per blur and window the two flows below (4), logarithms of twice
-          the likelihood gained and of the precision, orientation of the texture (2), logarithms of
-          what moves and of the texture over their noise. solved [B, SOLVED, 2, h, w]: per blur and
-          window two flows in px, where next to nothing is expected (MOST_PX), and where the claim is
-          believed (MISFIT).
+        Returns: told [B, TOLD, h, w]: per blur and window the two flows below (4), logarithms of
+          twice the likelihood gained and of the precision, orientation of the texture (2),
+          logarithms of what moves and of the texture over their noise. solved [B, SOLVED, 2, h, w]:
+          per blur and window two flows in px, where next to nothing is expected (MOST_PX), and
+          where the claim is believed (MISFIT).
         Gradient: flow, variance, volume.
         """
         told = []
         solved = []
         for (blur, grid, counts, density), sizes in zip(self.levels, WINDOWS, strict=True):
             there = larger(flow, CELL // blur) if blur < CELL else flow
-            mean, slope, seen = moving(counts, there, self.time, self.contrast, grid, fade_px=1.0 + blur)
+            mean, slope, seen = moving(
+                counts, there, self.time, self.contrast, grid, fade_px=1.0 + blur
+            )
             sums = cell_sums(mean, slope, seen, density, grid, CELL // blur)
             for size in sizes:
                 wide = avg_pool2d(sums, size, 1, size // 2) * size**2
@@ -104,9 +107,9 @@ class Evidence:
 
         Args:
           flow: [B, 2, h, w] px on cells.
-        Returns: told [B, TRIED, h, w]: for each cell of AROUND and window of TRIED_IN, by how much the
-          events have more contrast along its flow than along the cell's own, over the sum of both and
-          of noise. offered [B, len(AROUND), 2, h, w]: its flow less the cell's own, px.
+        Returns: told [B, TRIED, h, w]: for each cell of AROUND and window of TRIED_IN, by how much
+          the events have more contrast along its flow than along the cell's own, over the sum of
+          both and of noise. offered [B, len(AROUND), 2, h, w]: its flow less the cell's own, px.
         Gradient: flow, volume.
         """
         blur, grid, counts, _ = self.levels[TRIED_AT]
@@ -114,7 +117,9 @@ class Evidence:
 
         def contrast(flow):
             there = larger(flow, CELL // blur)
-            mean, _, seen = moving(counts, there, self.time, self.contrast, grid, fade_px=1.0 + blur)
+            mean, _, seen = moving(
+                counts, there, self.time, self.contrast, grid, fade_px=1.0 + blur
+            )
             square = avg_pool2d((seen * mean.square())[:, None], CELL // blur)
             return [avg_pool2d(square, size, 1, size // 2) for size in TRIED_IN]
 
@@ -125,17 +130,23 @@ class Evidence:
         for down, right in AROUND:
             edge = max(abs(down), abs(right))
             other = pad(flow, (edge,) * 4, mode="replicate")
-            other = other[:, :, edge + down : edge + down + rows, edge + right : edge + right + columns]
+            other = other[
+                :, :, edge + down : edge + down + rows, edge + right : edge + right + columns
+            ]
             told += [(a - b) / (a + b + least) for a, b in zip(contrast(other), own, strict=True)]
             offered.append(other - flow)
         return torch.cat(told, 1), torch.stack(offered, 1)
 
     def bins(self, flow: Tensor) -> Tensor:
         """Bins [B, 2 n, 2 h, 2 w] averaged over 2 x 2 px, over the noise of scattered events, large
-        ones compressed: as they are, and along a flow [B, 2, h, w] px on cells. Gradient: flow, volume."""
+        ones compressed: as they are, and along a flow [B, 2, h, w] px on cells. Gradient: flow,
+        volume."""
         along = larger(flow, CELL // POOL) / POOL
         bins, height, width = self.pooled.shape[1:]
-        at = pixel_grid(height, width, along) + self.time.to(along)[:, None, None, None] * along[:, None]
+        at = (
+            pixel_grid(height, width, along)
+            + self.time.to(along)[:, None, None, None] * along[:, None]
+        )
         found = read_at(self.pooled.flatten(0, 1)[:, None], at.flatten(0, 1))
         return torch.cat([self.pooled, found.unflatten(0, (-1, bins))[:, :, 0]], 1)
 
@@ -182,10 +193,17 @@ def larger(image: Tensor, factor: int) -> Tensor:
 
 
 def _least(weight, matrix, xs, ys, prior):
-    """Flow (u, v) of the normal equations, and their matrix (xx, yy, xy), with a prior precision."""
+    """Flow (u, v) of the normal equations, and their matrix (xx, yy, xy), with a prior
+    precision."""
     xx, xy, yy = matrix
     a = weight * xx + prior
     b = weight * yy + prior
     c = weight * xy
     determinant = a * b - c * c
-    return weight * (c * ys - b * xs) / determinant, weight * (c * xs - a * ys) / determinant, a, b, c
+    return (
+        weight * (c * ys - b * xs) / determinant,
+        weight * (c * xs - a * ys) / determinant,
+        a,
+        b,
+        c,
+    )

@@ -30,9 +30,10 @@ MOST_EMPTY = 10_000  # windows without events that one chunk may bring
 class TrackedWindow:
     """One window of a stream and its flow.
 
-    t0_us, t1_us: from its start, included, to its end, which belongs to the next window. events: how
-      many it has.
-    field: FlowField [1, ...], px from t0 to t1. warm: the estimator was given the flow of the window before.
+    t0_us, t1_us: from its start, included, to its end, which belongs to the next window. events:
+      how many it has.
+    field: FlowField [1, ...], px from t0 to t1. warm: the estimator was given the flow of the
+      window before.
     processor_s: processor time that volume and estimate took, of all threads.
     """
 
@@ -48,18 +49,18 @@ class Tracker:
     """Flow of one window after the other.
 
     Args:
-      estimate: estimator, EventVolume -> FlowField: flow.estimate_lk, a network, or a function of your
-        own.
-      window_s: length of the windows in seconds, whole microseconds; or events: number of events of a
-        window, which then lasts until the first event of the next.
+      estimate: estimator, EventVolume -> FlowField: flow.estimate_lk, a network, or a function of
+        your own.
+      window_s: length of the windows in seconds, whole microseconds; or events: number of events of
+        a window, which then lasts until the first event of the next.
       bins: of the volumes; the network's own, else 8, when None.
       size_px: (height, width) of the sensor, for events as arrays; an EventStream says it itself.
       warm_start: hand the flow of the window before, scaled to the new duration and carried along
         itself, to estimators that take ``start_px``; for others it changes nothing.
-      skip: faults that are left out and counted in ``left_out`` instead of refused (events) or handed
-        out with flow 0, confidence 0 and valid False (windows): names of SKIPPABLE.
-    windows, events: how many came out so far. processor_s: processor time spent, event_s: time of the
-      stream that was covered, seconds. left_out: {fault: number}.
+      skip: faults that are left out and counted in ``left_out`` instead of refused (events) or
+        handed out with flow 0, confidence 0 and valid False (windows): names of SKIPPABLE.
+    windows, events: how many came out so far. processor_s: processor time spent, event_s: time of
+      the stream that was covered, seconds. left_out: {fault: number}.
     Every event is in one window, whatever the chunks; memory is that of one chunk and one window.
     Raises: DomainError, ShapeError.
 
@@ -85,19 +86,27 @@ class Tracker:
         skip: tuple[str, ...] = (),
     ) -> None:
         if not callable(estimate):
-            raise DomainError(f"the estimator is {shown(estimate)}; a function of an EventVolume is needed.")
+            raise DomainError(
+                f"the estimator is {shown(estimate)}; a function of an EventVolume is needed."
+            )
         if (window_s is None) == (events is None):
             raise DomainError(
                 f"window_s is {shown(window_s)} and events {shown(events)}; windows are cut by time or by number of "
                 "events: give one of both."
             )
         if not isinstance(skip, tuple) or not set(skip) <= set(SKIPPABLE):
-            raise DomainError(f"skip is {shown(skip)}; a tuple of {', '.join(SKIPPABLE)} is possible.")
+            raise DomainError(
+                f"skip is {shown(skip)}; a tuple of {', '.join(SKIPPABLE)} is possible."
+            )
         self.estimate = estimate
-        self.window_us = None if window_s is None else round(1e6 * check_number(window_s, "window_s", 1e-6))
+        self.window_us = (
+            None if window_s is None else round(1e6 * check_number(window_s, "window_s", 1e-6))
+        )
         self.number = None if events is None else check_whole(events, "events", 1)
         config = getattr(estimate, "config", None)
-        self.bins: int = (config.get("bins", 8) if isinstance(config, dict) else 8) if bins is None else bins
+        self.bins: int = (
+            (config.get("bins", 8) if isinstance(config, dict) else 8) if bins is None else bins
+        )
         check_bins(self.bins)
         self.size_px = None if size_px is None else check_size(size_px, "size_px")
         self.warm_start = bool(warm_start) and _takes_start(estimate)
@@ -111,9 +120,12 @@ class Tracker:
 
     @property
     def real_time_factor(self) -> float:
-        """Processor time over the time of the stream: below 1 where one core keeps up with the camera."""
+        """Processor time over the time of the stream: below 1 where one core keeps up with the
+        camera."""
         if not self.event_s:
-            raise DomainError("no window is done, so there is no real-time factor; give events first.")
+            raise DomainError(
+                "no window is done, so there is no real-time factor; give events first."
+            )
         return self.processor_s / self.event_s
 
     def track(self, chunks: Iterable[Chunk]) -> Iterator[TrackedWindow]:
@@ -126,10 +138,10 @@ class Tracker:
         """Take the next events in and return the windows that they complete.
 
         Args:
-          chunk: EventStream, or arrays (t_us, x, y, p) of whole numbers, p +1 and -1 or 1 and 0, with
-            rising times; of any length, 0 included.
-        Raises: DomainError for what is no such stream, for events before those of the chunks before or
-          off the sensor; ShapeError for another sensor.
+          chunk: EventStream, or arrays (t_us, x, y, p) of whole numbers, p +1 and -1 or 1 and 0,
+            with rising times; of any length, 0 included.
+        Raises: DomainError for what is no such stream, for events before those of the chunks before
+          or off the sensor; ShapeError for another sensor.
         """
         rows = self._checked(chunk)
         if not rows.shape[1]:
@@ -145,8 +157,8 @@ class Tracker:
         return self._cut(self._start_us, last=False)
 
     def finish(self) -> list[TrackedWindow]:
-        """Return the last window, which ends at the last event (a microsecond later where that is its start),
-        and forget stream and clock: what is added next is another stream."""
+        """Return the last window, which ends at the last event (a microsecond later where that is
+        its start), and forget stream and clock: what is added next is another stream."""
         found = [] if self._start_us is None else self._cut(self._start_us, last=True)
         self._forget()
         return found
@@ -158,7 +170,8 @@ class Tracker:
         self._before: TrackedWindow | None = None
 
     def _checked(self, chunk):
-        """The chunk as rows [4, N] of this sensor, no event before the last one of the chunks before."""
+        """The chunk as rows [4, N] of this sensor, no event before the last one of the chunks
+        before."""
         if isinstance(chunk, EventStream):
             stream = check_stream(chunk, slice(0))
             size_px = stream.height_px, stream.width_px
@@ -178,7 +191,9 @@ class Tracker:
         height, width = self.size_px
         _, x, y, _ = rows
         outside = (x < 0) | (x >= width) | (y < 0) | (y >= height)
-        rows = self._without(OFF_SENSOR, outside, rows, f"lies outside the sensor of {width} x {height} px")
+        rows = self._without(
+            OFF_SENSOR, outside, rows, f"lies outside the sensor of {width} x {height} px"
+        )
         t_us = rows[0]
         before = t_us[:1] if self._last_us is None else t_us.new_tensor([self._last_us])
         latest = torch.cat([before, t_us]).cummax(0).values[1:] if len(t_us) else t_us
@@ -201,8 +216,8 @@ class Tracker:
         return rows[:, ~bad]
 
     def _cut(self, start_us: int, last: bool) -> list[TrackedWindow]:
-        """The complete windows of the waiting events, and with ``last`` the rest of them; what is not
-        complete waits on."""
+        """The complete windows of the waiting events, and with ``last`` the rest of them; what is
+        not complete waits on."""
         rows = torch.cat(self._rows, 1)
         t_us = rows[0]
         found = []
@@ -225,8 +240,8 @@ class Tracker:
         return found
 
     def _end(self, t_us, at, start_us):
-        """Number of the first event behind the window that begins with event ``at``; all of them where
-        there is none."""
+        """Number of the first event behind the window that begins with event ``at``; all of them
+        where there is none."""
         if self.number is not None:
             return min(at + self.number, len(t_us))
         return int(torch.searchsorted(t_us, start_us + (self.window_us or 0)))
@@ -311,8 +326,8 @@ def _rows_of(chunk):
 
 
 def _carried_on(before, duration_us):
-    """Flow [1, 2, H, W] of the window before, at the same speed over the new duration, on the pixels
-    it has led to: read where each pixel came from."""
+    """Flow [1, 2, H, W] of the window before, at the same speed over the new duration, on the
+    pixels it has led to: read where each pixel came from."""
     flow = before.field.flow_px
     came_from = pixel_grid(*flow.shape[2:], flow) - flow
     return read_at(flow, came_from) * (duration_us / (before.t1_us - before.t0_us))

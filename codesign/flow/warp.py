@@ -1,4 +1,5 @@
-"""Pixel grids, images read between pixels, and flow over a long window from flows over parts of it."""
+"""Pixel grids, images read between pixels, and flow over a long window from flows over parts of
+it."""
 
 import torch
 from torch import Tensor
@@ -39,11 +40,11 @@ def chained(flows_px: Tensor, valid: Tensor, hidden: Tensor | None = None) -> tu
     Args:
       flows_px: [K, 2, H, W] px, each on the pixels of the start of its own part.
       valid: [K, H, W] bool.
-      hidden: [K, H, W] bool: the point is hidden by something at the end of the part, so that the next
-        flow read there would be that of another surface.
-    Returns: flow_px [2, H, W] on the pixels of the first instant, 0 where not valid; valid [H, W]: every part
-      was, the place stayed in the picture up to the last one, was not hidden before it, and never between
-      surfaces whose flows differ by more than 0.75 px.
+      hidden: [K, H, W] bool: the point is hidden by something at the end of the part, so that the
+        next flow read there would be that of another surface.
+    Returns: flow_px [2, H, W] on the pixels of the first instant, 0 where not valid; valid [H, W]:
+      every part was, the place stayed in the picture up to the last one, was not hidden before it,
+      and never between surfaces whose flows differ by more than 0.75 px.
     Gradient: flows_px.
     """
     height, width = flows_px.shape[2:]

@@ -1,8 +1,9 @@
-"""Central differences with common random numbers over a ladder of step sizes, and what they are worth.
+"""Central differences with common random numbers over a ladder of step sizes, and what they are
+worth.
 
-A difference over a step h is wrong by truncation, which falls with h^2, and by rounding, which grows with
-1/h. ``Ladder`` weighs both: rounding is measured (``rounding_noise``), truncation read off the rungs by
-extrapolation.
+A difference over a step h is wrong by truncation, which falls with h^2, and by rounding, which
+grows with 1/h. ``Ladder`` weighs both: rounding is measured (``rounding_noise``), truncation read
+off the rungs by extrapolation.
 """
 
 import math
@@ -30,8 +31,8 @@ NEIGHBOURS = 5.0
 class Difference:
     """A derivative by differences.
 
-    value: the derivative. step: the (smaller) rung it was taken from. noise: its standard deviation. ladder: (step,
-      difference) of every rung, large to small.
+    value: the derivative. step: the (smaller) rung it was taken from. noise: its standard
+      deviation. ladder: (step, difference) of every rung, large to small.
     left_out: steps where the function was not finite, or its argument did not move.
     """
 
@@ -45,16 +46,20 @@ class Difference:
 def rounding_noise(
     fn: Scalar, point: torch.Tensor, direction: torch.Tensor, step: float, spacings: int = 4
 ) -> float:
-    """Standard deviation of f's rounding errors: nine points on a line, ``step`` apart, and the differences
-    of fourth to sixth order between them, from which anything smooth has gone. 0 where f is not finite there.
+    """Standard deviation of f's rounding errors: nine points on a line, ``step`` apart, and the
+    differences of fourth to sixth order between them, from which anything smooth has gone. 0 where
+    f is not finite there.
 
-    What falls by powers of the spacing is f itself, too quick for it, and the points are taken closer; errors stay alike,
-    or are gone at once where all points lie on one stair. The largest of ``spacings`` that stay alike counts. No
-    closer at first than some roundings of the parameter, where points would repeat each other.
+    What falls by powers of the spacing is f itself, too quick for it, and the points are taken
+    closer; errors stay alike, or are gone at once where all points lie on one stair. The largest of
+    ``spacings`` that stay alike counts. No closer at first than some roundings of the parameter,
+    where points would repeat each other.
     Source: Moré and Wild, Estimating computational noise, SIAM J. Sci. Comput. 33(3), 2011.
     """
     unit = direction.double()
-    step = max(step, POINTS * torch.finfo(point.dtype).eps * float(point.double().norm() / unit.norm()))
+    step = max(
+        step, POINTS * torch.finfo(point.dtype).eps * float(point.double().norm() / unit.norm())
+    )
     found = [_nine(fn, point, step * unit)]
     alike = 1
     while alike < spacings:
@@ -81,7 +86,8 @@ def _nine(fn, point, unit):
 
 
 class Ladder:
-    """Central differences along one direction, rung by rung, each with what rounding may do to it."""
+    """Central differences along one direction, rung by rung, each with what rounding may do to
+    it."""
 
     def __init__(
         self,
@@ -96,7 +102,8 @@ class Ladder:
         fn: function of one tensor -> scalar tensor. point, direction: tensors of one shape.
         noise: standard deviation of f's own errors, measured.
         eps: of f's number format, whose rounding counts on top.
-        grad: gradient that is asked about; how far rounding of the parameter, aside of the line, may move f.
+        grad: gradient that is asked about; how far rounding of the parameter, aside of the line,
+          may move f.
         """
         self.fn = fn
         self.point = point
@@ -109,8 +116,8 @@ class Ladder:
         self.left_out: list[float] = []
 
     def take(self, steps: Sequence[float]) -> None:
-        """Evaluate the function at both ends of every step; what is not finite, or does not move the point in
-        its number format, is left out."""
+        """Evaluate the function at both ends of every step; what is not finite, or does not move
+        the point in its number format, is left out."""
         start = self.point.double()
         unit = self.direction.double()
         length = float(unit.square().sum())
@@ -124,17 +131,21 @@ class Ladder:
             low = _value(self.fn, behind)
             if width > 0 and math.isfinite(high) and math.isfinite(low):
                 error = math.hypot(self.noise, _rounding(max(abs(high), abs(low)), self.eps))
-                aside = 0.0 if self.grad is None else float((self.grad * (moved - width * unit)).norm())
-                self.rungs.append((step, (high - low) / width, math.hypot(2**0.5 * error, aside) / width))
+                aside = (
+                    0.0 if self.grad is None else float((self.grad * (moved - width * unit)).norm())
+                )
+                self.rungs.append(
+                    (step, (high - low) / width, math.hypot(2**0.5 * error, aside) / width)
+                )
             else:
                 self.left_out.append(step)
 
     def difference(self) -> Difference:
         """The derivative, from the pair of neighbouring rungs that can be trusted most.
 
-        Rungs h1 > h2 give (h1^2 D2 - h2^2 D1) / (h1^2 - h2^2), free of h^2; by how much that moves D2 stands
-        for what truncation is left. The pair with the smallest sum of that and of rounding wins; one that the
-        next two contradict beyond rounding pays for that too.
+        Rungs h1 > h2 give (h1^2 D2 - h2^2 D1) / (h1^2 - h2^2), free of h^2; by how much that moves
+        D2 stands for what truncation is left. The pair with the smallest sum of that and of
+        rounding wins; one that the next two contradict beyond rounding pays for that too.
 
         Raises: NonFiniteError when no rung is left.
         Source: Ridders, Accurate computation of F'(x) and F'(x)F''(x), Adv. Eng. Softw. 4(2), 1982.
@@ -166,7 +177,9 @@ class Ladder:
             contradicted = 0.0
             for other in range(k + 1, len(rungs)) or range(max(k - 1, 0), k):
                 unsure = math.hypot(sigmas[k], 0.0 if firm[other] else sigmas[other])
-                contradicted = max(contradicted, abs(values[k] - values[other]) - NEIGHBOURS * unsure)
+                contradicted = max(
+                    contradicted, abs(values[k] - values[other]) - NEIGHBOURS * unsure
+                )
             spreads.append(math.hypot(sigmas[k], bends[k], contradicted))
         best = min(range(len(rungs)), key=spreads.__getitem__)
         return Difference(

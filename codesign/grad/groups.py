@@ -16,8 +16,8 @@ def check_groups(
     params: Mapping[str, torch.Tensor],
     scales: Mapping[str, float | torch.Tensor],
 ) -> None:
-    """Raise DomainError or ShapeError for parameters that are not floating or are empty, and for scales that are of none,
-    do not fit, or are not positive and finite."""
+    """Raise DomainError or ShapeError for parameters that are not floating or are empty, and for
+    scales that are of none, do not fit, or are not positive and finite."""
     if not params:
         raise DomainError("there are no parameters; give a dict of names and tensors.")
     for name, value in params.items():
@@ -27,10 +27,14 @@ def check_groups(
                 if isinstance(value, torch.Tensor)
                 else f"a {type(value).__name__}"
             )
-            raise DomainError(f"'{name}' is {given}; gradients are taken at floating, non-empty tensors.")
+            raise DomainError(
+                f"'{name}' is {given}; gradients are taken at floating, non-empty tensors."
+            )
     for name, scale in scales.items():
         if name not in params:
-            raise DomainError(f"scales name '{name}', which is no parameter; there are {', '.join(params)}.")
+            raise DomainError(
+                f"scales name '{name}', which is no parameter; there are {', '.join(params)}."
+            )
         unit = torch.as_tensor(scale)
         shape = tuple(params[name].shape)
         if unit.numel() > 1 and tuple(unit.shape) != shape[-unit.ndim :]:
@@ -74,8 +78,8 @@ def random_lines(
 def gradients(fn: Loss, point: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """Gradient to every group by one pass of autograd.
 
-    Raises: GradientError where the loss is no floating scalar, or the graph is cut; NonFiniteError where a gradient is
-      not finite.
+    Raises: GradientError where the loss is no floating scalar, or the graph is cut; NonFiniteError
+      where a gradient is not finite.
     """
     leaves = {name: value.clone().requires_grad_(True) for name, value in point.items()}
     with torch.enable_grad():
@@ -102,9 +106,11 @@ def gradients(fn: Loss, point: Mapping[str, torch.Tensor]) -> dict[str, torch.Te
 
 
 def repeated(judge: Loss, point: Mapping[str, torch.Tensor]) -> tuple[float, float]:
-    """(eps of the loss, difference of two calls at the point); random numbers must be the same in both.
+    """(eps of the loss, difference of two calls at the point); random numbers must be the same in
+    both.
 
-    Raises: GradientError where they are not, or the loss is no floating scalar; NonFiniteError where it is not finite.
+    Raises: GradientError where they are not, or the loss is no floating scalar; NonFiniteError
+      where it is not finite.
     """
     with torch.no_grad():
         first = judge(dict(point))
@@ -112,7 +118,9 @@ def repeated(judge: Loss, point: Mapping[str, torch.Tensor]) -> tuple[float, flo
     check_scalar(first)
     one, two = float(first), float(again)
     if not (math.isfinite(one) and math.isfinite(two)):
-        raise NonFiniteError(f"the loss is {one} at the point itself; choose a point inside its domain.")
+        raise NonFiniteError(
+            f"the loss is {one} at the point itself; choose a point inside its domain."
+        )
     if abs(one - two) > SAME_NUMBERS * max(abs(one), abs(two)):
         raise GradientError(
             f"two calls at the same point gave {one:g} and {two:g}, so differences would be those of random "

@@ -12,23 +12,31 @@ Jacobian = Callable[[Callable[[Tensor], Tensor], Tensor, Tensor], Tensor]
 
 
 def by_autograd(residuals: Callable[[Tensor], Tensor], variables: Tensor, value: Tensor) -> Tensor:
-    """Jacobian [M, V] by one backward pass per residual: exact; for few residuals, or as a reference."""
+    """Jacobian [M, V] by one backward pass per residual: exact; for few residuals, or as a
+    reference."""
     at = variables.detach().requires_grad_()
     with torch.enable_grad():
         found = residuals(at)
     if not found.requires_grad:
-        raise DomainError("the residuals do not depend on the variables through torch; use by_differences.")
-    rows = [torch.autograd.grad(entry, at, retain_graph=True, allow_unused=True)[0] for entry in found]
-    return torch.stack([torch.zeros_like(variables) if row is None else row for row in rows]).detach()
+        raise DomainError(
+            "the residuals do not depend on the variables through torch; use by_differences."
+        )
+    rows = [
+        torch.autograd.grad(entry, at, retain_graph=True, allow_unused=True)[0] for entry in found
+    ]
+    return torch.stack(
+        [torch.zeros_like(variables) if row is None else row for row in rows]
+    ).detach()
 
 
 def by_differences(step: float | Tensor, central: bool = False) -> Jacobian:
     """A Jacobian by differences of the variables: V more evaluations, 2 V when ``central``.
 
     Args:
-      step: a number or [V]; the error is about step (step^2 when central) times curvature, plus rounding over
-        step.
-    Where the far side is not finite the other side is used; where neither is, the Jacobian is not finite.
+      step: a number or [V]; the error is about step (step^2 when central) times curvature, plus
+        rounding over step.
+    Where the far side is not finite the other side is used; where neither is, the Jacobian is not
+    finite.
 
     >>> x = torch.tensor([1.0, 2.0], dtype=torch.float64)
     >>> by_differences(1e-4, central=True)(torch.square, x, x.square()).round(decimals=6).tolist()
@@ -36,7 +44,9 @@ def by_differences(step: float | Tensor, central: bool = False) -> Jacobian:
     """
 
     def jacobian(residuals, variables, value):
-        steps = torch.as_tensor(step, dtype=variables.dtype, device=variables.device).expand_as(variables)
+        steps = torch.as_tensor(step, dtype=variables.dtype, device=variables.device).expand_as(
+            variables
+        )
         with torch.no_grad():
             return torch.stack(
                 [
@@ -62,7 +72,9 @@ def _slope(residuals, variables, value, at, step, central):
     minus, minus_step = moved(-step)
     if not finite(plus):
         return (minus - value) / minus_step
-    return (plus - minus) / (plus_step - minus_step) if finite(minus) else (plus - value) / plus_step
+    return (
+        (plus - minus) / (plus_step - minus_step) if finite(minus) else (plus - value) / plus_step
+    )
 
 
 def finite(value: Tensor) -> bool:
@@ -71,7 +83,8 @@ def finite(value: Tensor) -> bool:
 
 
 def column_scales(jacobian: Tensor, limit: float | Tensor = math.inf) -> Tensor:
-    """Step per variable [V] that changes the residuals by 1: one over the column norms, at most ``limit``.
+    """Step per variable [V] that changes the residuals by 1: one over the column norms, at most
+    ``limit``.
 
     Args: jacobian [M, V]; limit: number or [V], for variables the residuals hardly see.
     """
@@ -81,14 +94,18 @@ def column_scales(jacobian: Tensor, limit: float | Tensor = math.inf) -> Tensor:
     )
 
 
-def principal_modes(jacobian: Tensor, limit: float = math.inf, size: Tensor | float = 1.0) -> Tensor:
-    """Basis [V, V] whose columns are directions with effects at right angles, each of which changes the
-    residuals by 1, the weakest first.
+def principal_modes(
+    jacobian: Tensor, limit: float = math.inf, size: Tensor | float = 1.0
+) -> Tensor:
+    """Basis [V, V] whose columns are directions with effects at right angles, each of which changes
+    the residuals by 1, the weakest first.
 
     Args:
       jacobian: [M, V], by variables in units of their ``size``.
-      limit: largest change of any variable by a column, in these units, for directions the residuals hardly see.
-      size: [V] or one of all, what makes variables comparable; the basis is in the variables' own units.
+      limit: largest change of any variable by a column, in these units, for directions the
+        residuals hardly see.
+      size: [V] or one of all, what makes variables comparable; the basis is in the variables' own
+        units.
     Source: eigenvectors of J^T J.
     """
     power, modes = torch.linalg.eigh(jacobian.T @ jacobian)

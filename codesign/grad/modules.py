@@ -18,11 +18,12 @@ def by_group(
     """What ``certify`` takes, for a Module.
 
     Args:
-      module: any Module, such as a System. loss: gets the module as a function of its inputs, returns a scalar,
-        for example ``lambda system: system(batch).loss``.
-      groups: group -> what the names of its parameters start with, for example {"lens": "lens.", "network":
-        "flow."}; only parameters that ask for gradients count.
-    Returns: fn and params: a function of {group: flat vector}, and the vectors as the module has them now.
+      module: any Module, such as a System. loss: gets the module as a function of its inputs,
+        returns a scalar, for example ``lambda system: system(batch).loss``.
+      groups: group -> what the names of its parameters start with, for example {"lens": "lens.",
+        "network": "flow."}; only parameters that ask for gradients count.
+    Returns: fn and params: a function of {group: flat vector}, and the vectors as the module has
+      them now.
     Raises: DomainError for a group without parameters.
 
     >>> layer = nn.Linear(2, 1)
@@ -32,7 +33,9 @@ def by_group(
     """
     members = {
         group: {
-            name: p for name, p in module.named_parameters() if p.requires_grad and name.startswith(prefix)
+            name: p
+            for name, p in module.named_parameters()
+            if p.requires_grad and name.startswith(prefix)
         }
         for group, prefix in groups.items()
     }
@@ -51,5 +54,8 @@ def by_group(
                 tensors[name] = part.reshape(q.shape).to(q.dtype)
         return loss(lambda *inputs, **named: functional_call(module, tensors, inputs, named))
 
-    flat = {g: torch.cat([q.detach().reshape(-1) for q in found.values()]) for g, found in members.items()}
+    flat = {
+        g: torch.cat([q.detach().reshape(-1) for q in found.values()])
+        for g, found in members.items()
+    }
     return fn, flat

@@ -1,4 +1,5 @@
-"""A row of the certificate: what autograd and differences say of one group of parameters, and the verdict."""
+"""A row of the certificate: what autograd and differences say of one group of parameters, and the
+verdict."""
 
 import math
 from collections.abc import Sequence
@@ -18,20 +19,21 @@ MOST_EXCLUDED = 0.1
 class Row:
     """The certificate of one group of parameters.
 
-    autograd, difference: one number per parameter (or per random direction). relative_error: L2 of their
-      difference over L2 of the differences (over that of autograd where the differences are zero; 0 for two
-      zeros).
-    cosine: of the two vectors. signed_bias: (autograd . difference) / |difference|^2 - 1; negative means too
-      small.
-    noise_floor: L2 of the differences' standard deviations, relative like the error. step_plateau: step that
-      each difference was taken from.
-    verdict: at three noise floors, "fail" (the error is above the tolerance), "pass" (it may be within the
-      tolerance, and more than ten tolerances, or 0.1, is excluded; 0 against 0 passes) or "noise" (the
-      differences cannot tell).
-    length_bias: signed error of the gradient's length, by a difference along the gradient itself: only where
-      the numbers above are lost in noise. The row fails when this is above the tolerance.
-    left_out: steps of the ladder not taken somewhere, because the function is not finite there or the
-      parameter does not move in its number format.
+    autograd, difference: one number per parameter (or per random direction). relative_error: L2 of
+      their difference over L2 of the differences (over that of autograd where the differences are
+      zero; 0 for two zeros).
+    cosine: of the two vectors. signed_bias: (autograd . difference) / |difference|^2 - 1; negative
+      means too small.
+    noise_floor: L2 of the differences' standard deviations, relative like the error. step_plateau:
+      step that each difference was taken from.
+    verdict: at three noise floors, "fail" (the error is above the tolerance), "pass" (it may be
+      within the tolerance, and more than ten tolerances, or 0.1, is excluded; 0 against 0 passes)
+      or "noise" (the differences cannot tell).
+    length_bias: signed error of the gradient's length, by a difference along the gradient itself:
+      only where the numbers above are lost in noise. The row fails when this is above the
+      tolerance.
+    left_out: steps of the ladder not taken somewhere, because the function is not finite there or
+      the parameter does not move in its number format.
     """
 
     name: str

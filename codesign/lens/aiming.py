@@ -1,9 +1,11 @@
-"""Ray aiming: rays that meet the real stop at given points, and the image irradiance that follows from them.
+"""Ray aiming: rays that meet the real stop at given points, and the image irradiance that follows
+from them.
 
-Paraxial pupils are where thin pencils near the axis see the stop; off the axis the real pupil moves, tilts
-and shrinks. Aiming solves, ray by ray, for the point of the paraxial pupil plane through which the ray must
-start: Newton steps with the exact derivative of each ray, halved until the miss falls; rays that do not get
-there are led to their field from the axis in small steps.
+Paraxial pupils are where thin pencils near the axis see the stop; off the axis the real pupil
+moves, tilts and shrinks. Aiming solves, ray by ray, for the point of the paraxial pupil plane
+through which the ray must
+start: Newton steps with the exact derivative of each ray, halved until the miss falls; rays that do
+not get there are led to their field from the axis in small steps.
 """
 
 import warnings
@@ -23,7 +25,8 @@ FIELD_STEPS = 16
 # miss at the stop, relative to the stop's radius: where rounding of a float64 trace begins
 REACHED = 1e-11
 SINGULAR = 1e-12  # determinant at the stop of rays that stay where they are
-# step of the derivative that goes into the irradiance, relative to the pupil's size; its error is the square
+# step of the derivative that goes into the irradiance, relative to the pupil's size; its error is
+# the square
 DIFFERENCE = 1e-3
 START_Z_MM = -5.0  # where aimed rays start, from the first vertex
 
@@ -32,8 +35,8 @@ START_Z_MM = -5.0  # where aimed rays start, from the first vertex
 class Aim:
     """Where rays cross the paraxial pupil's plane to meet the stop.
 
-    point_mm: [N, 2]. found: [N] bool; where False, no ray meets the stop there and the point is the paraxial
-      one.
+    point_mm: [N, 2]. found: [N] bool; where False, no ray meets the stop there and the point is the
+      paraxial one.
     """
 
     point_mm: Tensor
@@ -50,12 +53,12 @@ def aim_at_stop(
     """Solve for the points of the pupil plane whose rays meet the stop at the targets.
 
     Args:
-      rays: function (points [K N, 2], share [K N, 1]) -> origin, direction [K N, 3], for the N rays K times
-        over; share scales the field from the axis (0) to where it is wanted (1).
-      until_stop: Prescription that ends on the stop. pupil: [N, 2] points of the unit disc; the radii give it
-        its size on the stop and on the pupil plane.
-    Returns: Aim. Gradient: point_mm to every tensor behind ``rays``, ``until_stop`` and the radii, by the
-      implicit function theorem.
+      rays: function (points [K N, 2], share [K N, 1]) -> origin, direction [K N, 3], for the N rays
+        K times over; share scales the field from the axis (0) to where it is wanted (1).
+      until_stop: Prescription that ends on the stop. pupil: [N, 2] points of the unit disc; the
+        radii give it its size on the stop and on the pupil plane.
+    Returns: Aim. Gradient: point_mm to every tensor behind ``rays``, ``until_stop`` and the radii,
+      by the implicit function theorem.
     Warns: when some rays cannot be aimed; they keep their guess.
     """
     target_mm = pupil * stop_radius_mm
@@ -89,8 +92,8 @@ def area_at_stop(
     aim: Aim,
     pupil_radius_mm: Tensor,
 ) -> Tensor:
-    """Area that aimed rays cover at the stop per area of the pupil's plane, [N], with its sign; 1 where no
-    ray was found.
+    """Area that aimed rays cover at the stop per area of the pupil's plane, [N], with its sign; 1
+    where no ray was found.
 
     Args: as for ``aim_at_stop``, which returns ``aim``.
     Gradient: to every tensor behind ``rays`` and ``until_stop``, and through the aimed points.
@@ -151,8 +154,8 @@ def _meet(rays, until_stop, points, share):
 
 
 def _newton(rays, until_stop, target, at, share, scale):
-    """Newton steps from ``at`` [N, 2]; returns points and whether each ray reached its target. Rays that have
-    no derivative stay."""
+    """Newton steps from ``at`` [N, 2]; returns points and whether each ray reached its target. Rays
+    that have no derivative stay."""
     miss, passes = _miss(rays, until_stop, target, at, share)
     for _ in range(NEWTON_STEPS):
         active = torch.nonzero(passes & (miss.norm(dim=1) > REACHED * scale))[:, 0]
@@ -178,8 +181,8 @@ def _newton(rays, until_stop, target, at, share, scale):
 
 
 def _from_the_axis(rays, until_stop, target, guess, rows, scale):
-    """Follow rays from the axis, where the paraxial guess holds, to their field in small steps; returns
-    points and whether they arrived."""
+    """Follow rays from the axis, where the paraxial guess holds, to their field in small steps;
+    returns points and whether they arrived."""
     full = torch.zeros_like(target[:, :1])
     at = guess.clone()
     before = guess.clone()
@@ -198,10 +201,12 @@ def _miss(rays, until_stop, target, at, share):
 
 
 def _jacobian(rays, until_stop, at, share, rows):
-    """Motion at the stop per motion on the pupil plane, [rows, 2, 2]; exact, since each ray depends on its
-    own point only."""
+    """Motion at the stop per motion on the pupil plane, [rows, 2, 2]; exact, since each ray depends
+    on its own point only."""
     with torch.enable_grad():
         points = at.clone().requires_grad_(True)
         stop = _meet(rays, until_stop, points, share).position_mm
-        found = [torch.autograd.grad(stop[:, i].sum(), points, retain_graph=i == 0)[0] for i in (0, 1)]
+        found = [
+            torch.autograd.grad(stop[:, i].sum(), points, retain_graph=i == 0)[0] for i in (0, 1)
+        ]
     return torch.stack(found, 1)[rows]

@@ -24,7 +24,9 @@ def camera_rays(
     if aim and lens.dtype != torch.float64:
         return camera_rays(in_float64(lens), film_mm, pupil, wavelength_um, aim)
     f = lens.first_order(wavelength_um)
-    if not (math.isfinite(f.exit_pupil_z_mm.item()) and math.isfinite(f.entrance_pupil_z_mm.item())):
+    if not (
+        math.isfinite(f.exit_pupil_z_mm.item()) and math.isfinite(f.entrance_pupil_z_mm.item())
+    ):
         raise DomainError(
             f"{lens.name}: a pupil lies at infinity (the lens is telecentric), so pupil points have no "
             "place; move the stop off the focal plane."
@@ -48,7 +50,9 @@ def camera_rays(
         start, direction = (v.to(film_mm.dtype) for v in towards(film, at.point_mm))
         spread = ((f.stop_semi_aperture_mm / radius).square() / area.abs()).to(film_mm.dtype)
     else:
-        start, direction = (v.to(film_mm.dtype) for v in towards(film_mm, pupil * radius.to(film_mm.dtype)))
+        start, direction = (
+            v.to(film_mm.dtype) for v in towards(film_mm, pupil * radius.to(film_mm.dtype))
+        )
         spread = torch.ones_like(film_mm[:, 0])
     out = trace(back.to(film_mm.dtype).opened(at_stop), start, direction)
     if bool((out.weight.detach() <= 0).all()):
@@ -67,8 +71,12 @@ def film_points(
     flip = points_mm.new_tensor([1.0, 1.0, -1.0])
     start = points_mm * flip
     direction = torch.nn.functional.normalize((at - points_mm) * flip, dim=1)
-    start = torch.cat([start[:, :2], start[:, 2:] + _origin_z_mm(lens, f, wavelength_um).to(dtype)], 1)
-    out = trace(lens.prescription(wavelength_um).to(dtype).opened(lens.stop_index), start, direction)
+    start = torch.cat(
+        [start[:, :2], start[:, 2:] + _origin_z_mm(lens, f, wavelength_um).to(dtype)], 1
+    )
+    out = trace(
+        lens.prescription(wavelength_um).to(dtype).opened(lens.stop_index), start, direction
+    )
     to_pupil = (f.exit_pupil_z_mm - lens.thickness_mm[-1]).to(dtype)
     back = to_pupil * out.direction[:, :2] / out.direction[:, 2:]
     return (
@@ -85,7 +93,8 @@ def _origin_z_mm(lens, f, wavelength_um):
 
 
 def _where(lens, out):
-    """What became of most rays of a backward trace, in words; surfaces are counted from the object."""
+    """What became of most rays of a backward trace, in words; surfaces are counted from the
+    object."""
     failed = out.failed_surface[out.status != Status.OK]
     if failed.numel() == 0 and any(s.inner_semi_aperture_mm for s in lens.surfaces):
         return (
@@ -103,8 +112,8 @@ def _where(lens, out):
 
 
 def _towards(film_mm, at_mm, last_mm, exit_z_mm):
-    """Rays from upright image points [N, 2] to points [N, 2] of the exit pupil's plane, in the axes of the
-    reversed lens: start and direction [N, 3]."""
+    """Rays from upright image points [N, 2] to points [N, 2] of the exit pupil's plane, in the axes
+    of the reversed lens: start and direction [N, 3]."""
 
     def place(points, z):
         return torch.cat([points, -z.to(points.dtype).expand(points.shape[0], 1)], 1)

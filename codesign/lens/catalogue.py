@@ -6,8 +6,8 @@ from codesign.lens.surface import Surface
 
 _INF = float("inf")
 
-# Schott catalogue values (2017) at F, d, C, rounded to 1e-9 as the published reference traces of these lenses
-# used them
+# Schott catalogue values (2017) at F, d, C, rounded to 1e-9 as the published reference traces of
+# these lenses used them
 GLASSES = {
     "N-BK7": (1.52237629, 1.516800035, 1.514322347),
     "N-SK16": (1.627556349, 1.620409965, 1.61727166),
@@ -17,8 +17,8 @@ GLASSES = {
     "F5": (1.614612261, 1.603420257, 1.598745273),
 }
 
-# name -> (entrance pupil diameter mm, half field degrees, stop index, rows of radius, thickness, glass,
-# semi-aperture)
+# name -> (entrance pupil diameter mm, half field degrees, stop index, rows of radius, thickness,
+# glass, semi-aperture)
 LENSES = {
     # Cooke triplet, 50 mm f/5, 40 degrees (Zemax sample lens)
     "cooke-triplet": (
@@ -69,7 +69,10 @@ def named_surfaces(name: str) -> tuple[list[Surface], float]:
 
 
 def half_field_deg(name: str) -> float:
-    """Published half field of view, degrees. Raises: DomainError for a lens that is not in the catalogue."""
+    """Published half field of view, degrees. Raises: DomainError for a lens that is not in the
+    catalogue."""
     if name not in LENSES:
-        raise DomainError(f"no published lens is called {name!r}; choose one of {', '.join(LENSES)}.")
+        raise DomainError(
+            f"no published lens is called {name!r}; choose one of {', '.join(LENSES)}."
+        )
     return LENSES[name][1]

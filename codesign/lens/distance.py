@@ -1,5 +1,5 @@
-"""How far away the object is: distances in metres from the camera's origin, as vergences, so that parallel
-light is 0 and needs no branch."""
+"""How far away the object is: distances in metres from the camera's origin, as vergences, so that
+parallel light is 0 and needs no branch."""
 
 import math
 from collections.abc import Sequence
@@ -23,12 +23,12 @@ def vergence_per_mm(
     """1 / distance of an object plane, per mm.
 
     Args:
-      at_m: metres before the camera's origin, the entrance pupil of the d line; one number, or [D] of them;
-        inf is parallel light.
+      at_m: metres before the camera's origin, the entrance pupil of the d line; one number, or [D]
+        of them; inf is parallel light.
       origin_z_mm: that pupil's place behind the first vertex, where it is known already.
     Returns: scalar, or [D], in the precision of the lens. Gradient: to at_m where it is a tensor.
-    Raises: DomainError for a distance that is not positive, lies in the lens or is NaN; ShapeError for more
-      than one axis or none given.
+    Raises: DomainError for a distance that is not positive, lies in the lens or is NaN; ShapeError
+      for more than one axis or none given.
     """
     like = lens.thickness_mm
     at = real_numbers(at_m, "object distances").to(like)
@@ -65,7 +65,9 @@ def real_numbers(values: Any, name: str) -> Tensor:
     except (TypeError, ValueError, RuntimeError, OverflowError):
         found = None
     if found is None or found.is_complex():
-        raise DomainError(f"{name}: {values!r} is no real number and no list of them; give numbers.")
+        raise DomainError(
+            f"{name}: {values!r} is no real number and no list of them; give numbers."
+        )
     return found
 
 
@@ -73,5 +75,7 @@ def one_distance(at_m: Distances) -> Distances:
     """The distance itself, where a result is that of one: ShapeError for several."""
     count = real_numbers(at_m, "object distances").shape
     if count:
-        raise ShapeError(f"this is a figure of one object distance, got {tuple(count)}; call it for each.")
+        raise ShapeError(
+            f"this is a figure of one object distance, got {tuple(count)}; call it for each."
+        )
     return at_m

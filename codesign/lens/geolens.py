@@ -1,4 +1,5 @@
-"""A ray-traced lens whose curvatures, thicknesses, conics, asphere terms and indices carry gradients."""
+"""A ray-traced lens whose curvatures, thicknesses, conics, asphere terms and indices carry
+gradients."""
 
 import dataclasses
 import itertools
@@ -36,7 +37,8 @@ LEARNABLES = (
 
 
 class GeoLens(Replaceable):
-    """Sequential lens. First vertex at z = 0, light along +z, flat image plane behind the last thickness.
+    """Sequential lens. First vertex at z = 0, light along +z, flat image plane behind the last
+    thickness.
 
     >>> from codesign import lens
     >>> geo = lens.load("cooke-triplet")
@@ -44,16 +46,16 @@ class GeoLens(Replaceable):
     >>> geo.focus_at(2.0).thickness_mm[-1] > geo.thickness_mm[-1]
     tensor(True)
 
-    Learnables (nn.Parameter, one row per surface): curvature_per_mm [S], thickness_mm [S], conic [S], asphere
-    [S, A], index_offset [S] (added to the index of the glass behind each surface, dimensionless, zero at
-    first; rows of air and of mirrors do nothing and have no gradient), phase [S, P] (radians per mm^2, mm^4,
-    ...).
-    ``variables`` turns the named ones into functions of dimensionless variables and holds the others.
-    Errors of assembly (buffers, with gradients after ``requires_grad_`` or through ``replace``): decentre_mm
-    [S, 2], tilt_rad [S, 2]; and semi_aperture_mm [S], the same way.
+    Learnables (nn.Parameter, one row per surface): curvature_per_mm [S], thickness_mm [S], conic
+    [S], asphere [S, A], index_offset [S] (added to the index of the glass behind each surface,
+    dimensionless, zero at first; rows of air and of mirrors do nothing and have no gradient), phase
+    [S, P] (radians per mm^2, mm^4, ...).
+    ``variables`` turns the named ones into functions of dimensionless variables and holds the
+    others. Errors of assembly (buffers, with gradients after ``requires_grad_`` or through
+    ``replace``): decentre_mm [S, 2], tilt_rad [S, 2]; and semi_aperture_mm [S], the same way.
     half_field_deg: the half field the lens is made for, or None where nobody said.
-    plate: a phase plate, see ``diffraction.with_plate``; plate_at: the surface it follows, and mm behind its
-      vertex.
+    plate: a phase plate, see ``diffraction.with_plate``; plate_at: the surface it follows, and mm
+      behind its vertex.
     """
 
     tensor_names: tuple[str, ...] = (*LEARNABLES, "semi_aperture_mm")
@@ -87,7 +89,9 @@ class GeoLens(Replaceable):
         super().__init__()
         surfaces, stop = checked(name, surfaces)
         check_positive(entrance_pupil_diameter_mm, f"{name}: entrance_pupil_diameter_mm")
-        check_number(soft_edge_mm, f"{name}: soft_edge_mm", 0.0, remedy="about 0.1 keeps gradients true")
+        check_number(
+            soft_edge_mm, f"{name}: soft_edge_mm", 0.0, remedy="about 0.1 keeps gradients true"
+        )
         if half_field_deg is not None:
             check_number(half_field_deg, f"{name}: half_field_deg", above=0.0, below=90.0)
         self.name = name
@@ -126,10 +130,10 @@ class GeoLens(Replaceable):
     ) -> list[nn.Parameter]:
         """Make the named numbers variables for torch.optim; every other number of the lens is held.
 
-        From then on the lens's tensors are functions of these Parameters: trace, render, go backward, and
-        step. They are dimensionless, zero now, and a unit of each moves the rays of a bundle on the film by
-        ``step_mm`` RMS, so one learning rate suits them all, whatever the lens's size. Another call starts
-        anew from the lens as it then is.
+        From then on the lens's tensors are functions of these Parameters: trace, render, go
+        backward, and step. They are dimensionless, zero now, and a unit of each moves the rays of a
+        bundle on the film by ``step_mm`` RMS, so one learning rate suits them all, whatever the
+        lens's size. Another call starts anew from the lens as it then is.
 
         >>> from codesign import lens
         >>> geo = lens.load("cooke-triplet")
@@ -138,22 +142,28 @@ class GeoLens(Replaceable):
         >>> curvature, focus = geo.variables("curvature", "focus", bounds={"focus": (40.0, 45.0)})
 
         Args:
-          names: of "curvature", "thickness" (all gaps but the last), "focus" (the last), "conic", "asphere"
-            (coefficients, surface after surface), "index" (offset of every glass), "phase". Numbers that
-            move no ray (the curvature of a stop in air, the conic of a plane, what a solve makes) and
-            thicknesses of 0 are left out.
-          step_mm: the natural step, for example the pixel pitch; None is 1/1000 of the focal length.
-          bounds: (low, high) per name, numbers or one per entry, None for no bound; reached only in the
-            limit. Thicknesses and focus stay above 0 unless others are given.
-          mask: per name, which of its entries (one per surface, gap, coefficient or glass) may vary.
-          keep_efl: whether the curvature of ``solves.holding_surface`` is solved for today's focal length.
+          names: of "curvature", "thickness" (all gaps but the last), "focus" (the last), "conic",
+            "asphere" (coefficients, surface after surface), "index" (offset of every glass),
+            "phase". Numbers that move no ray (the curvature of a stop in air, the conic of a plane,
+            what a solve makes) and thicknesses of 0 are left out.
+          step_mm: the natural step, for example the pixel pitch; None is 1/1000 of the focal
+            length.
+          bounds: (low, high) per name, numbers or one per entry, None for no bound; reached only in
+            the limit. Thicknesses and focus stay above 0 unless others are given.
+          mask: per name, which of its entries (one per surface, gap, coefficient or glass) may
+            vary.
+          keep_efl: whether the curvature of ``solves.holding_surface`` is solved for today's focal
+            length.
           focus_at_m: the distance that stays in focus, the last thickness being solved for it; see
             ``focus_at``.
-          fields_rad: fields of the bundle; None is 0, 0.7 and 1 of the half field (10 degrees where unknown).
-        A number so weak that its natural step would be out of proportion (0.1 focal lengths of a thickness, a
-        sag slope of 0.1 at the rim for a shape, 0.05 of an index) gets that as its unit.
+          fields_rad: fields of the bundle; None is 0, 0.7 and 1 of the half field
+            (10 degrees where unknown).
+        A number so weak that its natural step would be out of proportion (0.1 focal lengths of a
+        thickness, a sag slope of 0.1 at the rim for a shape, 0.05 of an index) gets that as its
+        unit.
         Returns: one Parameter [K] per name.
-        Raises: DomainError for unknown names, values outside their bounds, and names with nothing to vary.
+        Raises: DomainError for unknown names, values outside their bounds, and names with nothing
+          to vary.
         """
         efl = self.first_order().efl_mm.detach()
         held = {}
@@ -205,7 +215,9 @@ class GeoLens(Replaceable):
             twin = hold_efl(twin, held["efl_mm"], int(held["efl_surface"]))
         if "focus_m" in held:
             twin = twin.focus_at(held["focus_m"])
-        return tensors | {name: getattr(twin, name) for name in ("curvature_per_mm", "thickness_mm")}
+        return tensors | {
+            name: getattr(twin, name) for name in ("curvature_per_mm", "thickness_mm")
+        }
 
     def _landing(self, fields_rad, wavelength_um):
         return spots(self, fields_rad, wavelength_um, grid=8)
@@ -217,8 +229,8 @@ class GeoLens(Replaceable):
         wavelength_um: float = D_UM,
         spot_grid: int | None = None,
     ) -> "GeoLens":
-        """The lens with its film where a point of the axis at ``distance_m`` is imaged: a solve of the last
-        thickness in closed form.
+        """The lens with its film where a point of the axis at ``distance_m`` is imaged: a solve of
+        the last thickness in closed form.
 
         >>> from codesign import lens
         >>> geo = lens.load("cooke-triplet")
@@ -227,22 +239,22 @@ class GeoLens(Replaceable):
         True
 
         Args:
-          distance_m: number or scalar tensor, metres before the camera's origin (the entrance pupil of the d
-            line); inf is allowed.
+          distance_m: number or scalar tensor, metres before the camera's origin (the entrance pupil
+            of the d line); inf is allowed.
           wavelength_um: whose paraxial rays meet on the film.
-          spot_grid: pupil samples across, for the film of the least RMS spot of the point in place of the
-            paraxial one.
-        Returns: a lens as from ``replace``; this one stays as it is. Its last thickness is the image
-          distance.
+          spot_grid: pupil samples across, for the film of the least RMS spot of the point in place
+            of the paraxial one.
+        Returns: a lens as from ``replace``; this one stays as it is. Its last thickness is the
+          image distance.
         Gradient: to every lens tensor that bends or moves light, and to the distance.
-        Raises: DomainError for a point that does not lie before the lens and beyond its front focal plane,
-          and for a spot of a single ray.
+        Raises: DomainError for a point that does not lie before the lens and beyond its front focal
+          plane, and for a spot of a single ray.
         """
         return focus_at(self, distance_m, wavelength_um, spot_grid)
 
     def replace_glass(self, surface: int, glass: Glass | str | None) -> "GeoLens":
-        """The lens with another medium behind a surface; shapes, gaps and apertures stay, the focal length
-        does not (``design.with_glass`` holds it).
+        """The lens with another medium behind a surface; shapes, gaps and apertures stay, the focal
+        length does not (``design.with_glass`` holds it).
 
         >>> from codesign import lens
         >>> geo = lens.load("cooke-triplet").replace_glass(2, "SF2")
@@ -252,12 +264,13 @@ class GeoLens(Replaceable):
         Args:
           surface: counted from 0, from the last when negative.
           glass: a Glass, a name or code as ``Glass.named`` takes, None for air.
-        Returns: a lens as from ``replace``, without Parameters and variables of its own; this one stays as
-          it is.
-        Gradient: to every tensor of this lens but the index offset of that surface, which belonged to the
-          glass that went: the new one has 0.
-        Raises: DomainError for a surface that is not there or a mirror, for glass that the light passes again
-          behind a mirror, and for a name the catalogue does not know, with the nearest it knows.
+        Returns: a lens as from ``replace``, without Parameters and variables of its own; this one
+          stays as it is.
+        Gradient: to every tensor of this lens but the index offset of that surface, which belonged
+          to the glass that went: the new one has 0.
+        Raises: DomainError for a surface that is not there or a mirror, for glass that the light
+          passes again behind a mirror, and for a name the catalogue does not know, with the nearest
+          it knows.
         """
         surfaces = with_medium(self.name, self.surfaces, surface, glass)
         row = torch.arange(len(surfaces), device=self.glass.device) == range(len(surfaces))[surface]
@@ -270,13 +283,15 @@ class GeoLens(Replaceable):
     def with_pupil(self, diameter_mm: float | torch.Tensor) -> "GeoLens":
         """The lens with another entrance pupil, all else as it is; gradients reach a tensor."""
         twin = self._with(self._now())
-        twin.entrance_pupil_diameter_mm = check_positive(diameter_mm, f"{self.name}: pupil diameter, mm,")
+        twin.entrance_pupil_diameter_mm = check_positive(
+            diameter_mm, f"{self.name}: pupil diameter, mm,"
+        )
         twin.pupil_mm = torch.as_tensor(diameter_mm).to(self.semi_aperture_mm)
         return twin
 
     def scaled(self, factor: float) -> "GeoLens":
-        """A new lens with all lengths multiplied by ``factor`` (same f-number and angles), from the current
-        values."""
+        """A new lens with all lengths multiplied by ``factor`` (same f-number and angles), from the
+        current values."""
         surfaces = [scaled(s, factor) for s in self.to_surfaces()]
         return GeoLens(
             surfaces,
@@ -289,8 +304,9 @@ class GeoLens(Replaceable):
 
     @settled
     def to_surfaces(self) -> tuple[Surface, ...]:
-        """The current values as a tuple of Surface; index offsets go into the media. A curvature or tilt that
-        never changed keeps its value to the last bit. Raises: DomainError for a lens with a phase plate."""
+        """The current values as a tuple of Surface; index offsets go into the media. A curvature or
+        tilt that never changed keeps its value to the last bit. Raises: DomainError for a lens with
+        a phase plate."""
         if self.plate is not None:
             raise DomainError(
                 f"{self.name}: its phase plate is no surface, so files, drawings and copies by surfaces "
@@ -301,9 +317,20 @@ class GeoLens(Replaceable):
         now = self._now() | {"index_offset": torch.where(self.glass, self.index_offset, 0)}
         columns = (now[name].tolist() for name in self.tensor_names)
         found = []
-        for old, first_c, first_tilt, c, t, k, a, shift, phase, decentre, tilt, semi_aperture in zip(
-            self.surfaces, bent, tilted, *columns, strict=True
-        ):
+        for (
+            old,
+            first_c,
+            first_tilt,
+            c,
+            t,
+            k,
+            a,
+            shift,
+            phase,
+            decentre,
+            tilt,
+            semi_aperture,
+        ) in zip(self.surfaces, bent, tilted, *columns, strict=True):
             found.append(
                 dataclasses.replace(
                     old,
@@ -321,24 +348,27 @@ class GeoLens(Replaceable):
         return tuple(found)
 
     def index(self, wavelength_um: float = D_UM) -> torch.Tensor:
-        """Indices [S + 1] at a wavelength, the first before the lens (air). Behind a mirror it is the index
-        before it."""
+        """Indices [S + 1] at a wavelength, the first before the lens (air). Behind a mirror it is
+        the index before it."""
         media = (s.medium for s in self.surfaces)
-        values = [1.0 if medium is None else medium.index(wavelength_um) for medium in (None, *media)]
+        values = [
+            1.0 if medium is None else medium.index(wavelength_um) for medium in (None, *media)
+        ]
         base = torch.tensor(values, dtype=self.dtype, device=self.semi_aperture_mm.device)
         offset = torch.where(self.glass, self.index_offset, 0)
         found = base + torch.cat([torch.zeros_like(offset[:1]), offset])
         return found[self._unfolded([*range(len(values))])] if any(self.mirrors) else found
 
     def _unfolded(self, gaps):
-        """What is said of gaps [S + 1], the one before the lens among them; behind a mirror that of the one
-        before."""
+        """What is said of gaps [S + 1], the one before the lens among them; behind a mirror that of
+        the one before."""
         for i, mirror in enumerate(self.mirrors):
             gaps[i + 1] = gaps[i] if mirror else gaps[i + 1]
         return gaps
 
     def path_mm(self, wavelength_um: float = D_UM) -> torch.Tensor:
-        """Optical path that the diffractive phases add, as coefficients [S, P] of r^2, r^4, ... in mm."""
+        """Optical path that the diffractive phases add, as coefficients [S, P] of r^2, r^4, ... in
+        mm."""
         orders = torch.tensor(
             [s.phase.order if s.phase else 0 for s in self.surfaces],
             dtype=self.dtype,
@@ -348,10 +378,12 @@ class GeoLens(Replaceable):
 
     @settled
     def surface_power(self, wavelength_um: float = D_UM) -> torch.Tensor:
-        """Paraxial power of each surface, [S] per mm: vertex curvature (with the r^2 asphere term) times
-        bending, and diffraction."""
+        """Paraxial power of each surface, [S] per mm: vertex curvature (with the r^2 asphere term)
+        times bending, and diffraction."""
         vertex = (
-            self.curvature_per_mm + 2 * self.asphere[:, 0] if self.asphere.shape[1] else self.curvature_per_mm
+            self.curvature_per_mm + 2 * self.asphere[:, 0]
+            if self.asphere.shape[1]
+            else self.curvature_per_mm
         )
         power = vertex * paraxial.bending(self.index(wavelength_um), self.mirrors)
         return power - 2 * self.path_mm(wavelength_um)[:, 0] if self.phase.shape[1] else power
@@ -401,11 +433,11 @@ class GeoLens(Replaceable):
     def trace(
         self, origin_mm: torch.Tensor, direction: torch.Tensor, wavelength_um: float = D_UM
     ) -> TraceResult:
-        """Trace rays to the image plane: origins [N, 3] relative to the first vertex, unit directions [N, 3]
-        -> TraceResult.
+        """Trace rays to the image plane: origins [N, 3] relative to the first vertex, unit
+        directions [N, 3] -> TraceResult.
 
-        Raises: ShapeError; DomainError for origins that are not finite or directions that are not unit
-          vectors.
+        Raises: ShapeError; DomainError for origins that are not finite or directions that are not
+          unit vectors.
 
         Example:
         >>> from codesign import lens
@@ -437,14 +469,14 @@ class GeoLens(Replaceable):
         """Rays from image points through the lens towards the scene.
 
         Args:
-          film_mm: [N, 2] image points as seen upright (x right, y down), millimetres from the axis; their
-            dtype is that of the computation.
-          pupil: [N, 2] points of the unit disc; (0, 0) is the chief ray. They lie on the paraxial exit pupil,
-            or with ``aim`` on the real stop, which is solved for in float64.
-        Returns: Rays in camera axes, origins on the plane of the entrance pupil of the d line (the camera's
-          origin), in metres.
-        Gradient: to every lens tensor. The pupil sampling itself is the stop; the other surfaces clip with
-          soft edges.
+          film_mm: [N, 2] image points as seen upright (x right, y down), millimetres from the axis;
+            their dtype is that of the computation.
+          pupil: [N, 2] points of the unit disc; (0, 0) is the chief ray. They lie on the paraxial
+            exit pupil, or with ``aim`` on the real stop, which is solved for in float64.
+        Returns: Rays in camera axes, origins on the plane of the entrance pupil of the d line
+          (the camera's origin), in metres.
+        Gradient: to every lens tensor. The pupil sampling itself is the stop; the other surfaces
+          clip with soft edges.
         Raises: DomainError when no ray passes or a pupil lies at infinity.
         """
         return camera.camera_rays(self, film_mm, pupil, wavelength_um, aim)
@@ -453,14 +485,14 @@ class GeoLens(Replaceable):
     def film_points(
         self, points_mm: torch.Tensor, pupil: torch.Tensor, wavelength_um: float = D_UM
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Where light from points of space meets the film, through points of the paraxial entrance pupil; the
-        other way of ``camera_rays``.
+        """Where light from points of space meets the film, through points of the paraxial entrance
+        pupil; the other way of ``camera_rays``.
 
-        Args: points_mm [N, 3] in camera axes, millimetres from the entrance pupil's centre; pupil [N, 2] on
-          the unit disc, aimed at the entrance pupil.
-        Returns: film_mm [N, 2] as seen upright; pupil [N, 2], the point of the exit pupil that the light
-          passed, so that ``camera_rays(film_mm, pupil)`` goes back to the point; passes [N] bool. Gradient:
-          to points, pupil and lens.
+        Args: points_mm [N, 3] in camera axes, millimetres from the entrance pupil's centre; pupil
+          [N, 2] on the unit disc, aimed at the entrance pupil.
+        Returns: film_mm [N, 2] as seen upright; pupil [N, 2], the point of the exit pupil that the
+          light passed, so that ``camera_rays(film_mm, pupil)`` goes back to the point; passes [N]
+          bool. Gradient: to points, pupil and lens.
         """
         return camera.film_points(self, points_mm, pupil, wavelength_um)
 
@@ -473,7 +505,8 @@ def _tilt_rad(surface):
 
 
 def _tensors(surfaces, dtype):
-    """The tensors of a lens of these surfaces, by name; rows of different length are filled up with zeros."""
+    """The tensors of a lens of these surfaces, by name; rows of different length are filled up with
+    zeros."""
 
     def filled(rows):
         width = max(map(len, rows))

@@ -1,4 +1,5 @@
-"""Optical media: refractive index, relative to air, as a function of wavelength (um, in air at 20 C)."""
+"""Optical media: refractive index, relative to air, as a function of wavelength
+(um, in air at 20 C)."""
 
 import difflib
 import functools
@@ -35,8 +36,8 @@ _MAKERS = (
     "MISC",
     "PLASTIC",
 )
-# other spellings in use -> row; CODE V's manufacturer suffixes and all of "-", "_" and " " are dropped before
-# a name is looked up
+# other spellings in use -> row; CODE V's manufacturer suffixes and all of "-", "_" and " " are
+# dropped before a name is looked up
 ALIASES = {
     "SILICA": "F-SILICA",
     "FUSED SILICA": "F-SILICA",
@@ -67,8 +68,8 @@ def _area(a, b, c):
 
 
 def _through_lines(indices, wavelength_um):
-    """A + B/w + C/w^3.5 through the indices at F, d and C, exact at each. Source: Conrady, Applied Optics and
-    Optical Design."""
+    """A + B/w + C/w^3.5 through the indices at F, d and C, exact at each. Source: Conrady, Applied
+    Optics and Optical Design."""
     F, d, C, w = (_conrady(x) for x in (*WAVELENGTH_UM.values(), wavelength_um))
     whole = _area(F, d, C)
     return (
@@ -82,13 +83,17 @@ def _sellmeier(coefficients, wavelength_um):
     """n^2 - 1 = sum of B w^2 / (w^2 - C); coefficients B1, C1 (um^2), B2, C2, ..."""
     square = wavelength_um**2
     return _root(
-        1 + sum(b * square / (square - c) for b, c in zip(coefficients[::2], coefficients[1::2], strict=True))
+        1
+        + sum(
+            b * square / (square - c)
+            for b, c in zip(coefficients[::2], coefficients[1::2], strict=True)
+        )
     )
 
 
 def _schott(coefficients, wavelength_um):
-    """n^2 = sum of a w^k, k = 0, 2, -2, -4, -6, -8 (Schott before 1992), then -10, -12 and 4 (Hikari's
-    extension)."""
+    """n^2 = sum of a w^k, k = 0, 2, -2, -4, -6, -8 (Schott before 1992), then -10, -12 and 4
+    (Hikari's extension)."""
     return _root(
         sum(
             a * wavelength_um**k
@@ -117,11 +122,13 @@ MODELS = {
 
 @dataclass(frozen=True)
 class Glass:
-    """A medium: a dispersion model of ``MODELS``, its coefficients, and the wavelengths (um) they hold for.
+    """A medium: a dispersion model of ``MODELS``, its coefficients, and the wavelengths (um) they
+    hold for.
 
-    offset: added to the model's index at every wavelength (melt data, or an index that was optimised).
-    Raises: DomainError for a name, model, coefficients or range that cannot be, or an index outside [1, 5) at
-      F, d or C.
+    offset: added to the model's index at every wavelength (melt data, or an index that was
+      optimised).
+    Raises: DomainError for a name, model, coefficients or range that cannot be, or an index outside
+      [1, 5) at F, d or C.
     """
 
     name: str
@@ -163,7 +170,9 @@ class Glass:
                 f"glass {self.name}: range_um {span} must be two increasing wavelengths in micrometres, 0.1 "
                 "to 100."
             )
-        if self.model == "sellmeier" and any(span[0] ** 2 <= c <= span[1] ** 2 for c in coefficients[1::2]):
+        if self.model == "sellmeier" and any(
+            span[0] ** 2 <= c <= span[1] ** 2 for c in coefficients[1::2]
+        ):
             raise DomainError(
                 f"glass {self.name}: a resonance lies inside {span[0]:g} to {span[1]:g} um, where the index "
                 "is infinite; give a range on one side of it."
@@ -177,11 +186,11 @@ class Glass:
 
     @staticmethod
     def from_indices(F: float, d: float, C: float, name: str = "custom") -> "Glass":
-        """Glass from its indices at the F, d and C lines, each in [1, 5); exact there, valid from 0.36 to 1.1
-        um.
+        """Glass from its indices at the F, d and C lines, each in [1, 5); exact there, valid from
+        0.36 to 1.1 um.
 
-        Errors over the catalogue, median and 95th percentile: 2e-5, 1.5e-4 from 0.45 to 0.70 um; 7e-5, 1.4e-4
-        at 0.85 um.
+        Errors over the catalogue, median and 95th percentile: 2e-5, 1.5e-4 from 0.45 to 0.70 um;
+        7e-5, 1.4e-4 at 0.85 um.
         Source: Conrady's three-term formula. Raises: DomainError.
         """
         if not all(_is_number(n) and LEAST_INDEX <= n < INDEX_LIMIT for n in (F, d, C)):
@@ -195,12 +204,13 @@ class Glass:
     def from_abbe(nd: float, Vd: float, name: str | None = None) -> "Glass":
         """Glass from nd and the Abbe number Vd = (nd - 1) / (nF - nC), which it has exactly.
 
-        The third condition is the partial dispersion (nF - nd) / (nF - nC) = 0.6831 + 0.7828 / Vd, the
-        least-squares line over 429 glasses of the catalogue: they scatter about it by 0.0019 (about a line in
-        Vd by 0.0028). Errors over these glasses, median, 95th percentile and worst: 1.6e-5, 5e-5, 3.3e-4 at F
-        and C; 6e-5, 1.7e-4, 7e-4 from 0.45 to 0.70 um; 9e-5, 2.8e-4, 6e-4 at g (0.4358 um); 1.1e-4, 3.7e-4,
-        2.2e-3 at 0.85 um. The normal line P_gF = 0.6438 - 0.001682 Vd in its place has the same medians, but
-        3.0e-4 and 1.5e-3 from 0.45 to 0.70 um: dense flints lie far from it.
+        The third condition is the partial dispersion (nF - nd) / (nF - nC) = 0.6831 + 0.7828 / Vd,
+        the least-squares line over 429 glasses of the catalogue: they scatter about it by 0.0019
+        (about a line in Vd by 0.0028). Errors over these glasses, median, 95th percentile and
+        worst: 1.6e-5, 5e-5, 3.3e-4 at F and C; 6e-5, 1.7e-4, 7e-4 from 0.45 to 0.70 um; 9e-5,
+        2.8e-4, 6e-4 at g (0.4358 um); 1.1e-4, 3.7e-4, 2.2e-3 at 0.85 um. The normal line P_gF =
+        0.6438 - 0.001682 Vd in its place has the same medians, but 3.0e-4 and 1.5e-3 from 0.45 to
+        0.70 um: dense flints lie far from it.
         Args: nd in (1, 5); Vd from 10 to 150.
         Raises: DomainError.
         """
@@ -216,11 +226,11 @@ class Glass:
 
     @staticmethod
     def named(name: str) -> "Glass":
-        """Glass by its catalogue name; case, "-", "_", spaces and a manufacturer suffix (NBK7_SCHOTT) do not
-        matter.
+        """Glass by its catalogue name; case, "-", "_", spaces and a manufacturer suffix
+        (NBK7_SCHOTT) do not matter.
 
-        What looks like a code stands for nd and Vd, as in ``from_abbe``: 517642, 517.642, 517642.251,
-        517000.642000, 1.5168/64.17.
+        What looks like a code stands for nd and Vd, as in ``from_abbe``: 517642, 517.642,
+        517642.251, 517000.642000, 1.5168/64.17.
         Raises: DomainError that offers the three nearest names.
 
         Example:
@@ -230,7 +240,9 @@ class Glass:
         ('N-BK7', 1.5168, 64.17)
         """
         if not isinstance(name, str) or len(name) > LONGEST_NAME:
-            raise DomainError(f"glass name {_cut(name)} must be a text of at most {LONGEST_NAME} characters.")
+            raise DomainError(
+                f"glass name {_cut(name)} must be a text of at most {LONGEST_NAME} characters."
+            )
         text = name.strip().upper()
         stem, _, maker = text.rpartition("_")
         known = _by_key()
@@ -253,8 +265,8 @@ class Glass:
 
     @staticmethod
     def from_dict(page: dict[str, Any]) -> "Glass":
-        """Glass from what ``dataclasses.asdict`` gives of one, or from {"name", "F", "d", "C"}; anything else is
-        a DomainError."""
+        """Glass from what ``dataclasses.asdict`` gives of one, or from {"name", "F", "d", "C"};
+        anything else is a DomainError."""
         if not isinstance(page, dict):
             raise DomainError(
                 f"glass {_cut(page)} must be an object with name, model, coefficients and range_um, or with "
@@ -279,8 +291,8 @@ class Glass:
         return replace(self, offset=self.offset + offset)
 
     def index(self, wavelength_um: float) -> float:
-        """Index at a wavelength in micrometres. Raises: DomainError outside the range of the glass, or where
-        the model leaves [1, 5)."""
+        """Index at a wavelength in micrometres. Raises: DomainError outside the range of the glass,
+        or where the model leaves [1, 5)."""
         first, last = self.range_um
         if not first <= wavelength_um <= last:
             raise DomainError(
@@ -314,15 +326,21 @@ class Glass:
         return (self.index_d - 1) / spread if spread else math.inf
 
 
-def rows() -> Iterator[tuple[str, str, tuple[float, float], tuple[float, float], tuple[float, ...], str]]:
-    """Name, model, range in um, published (nd, Vd), coefficients and source of each entry of glasses.txt.
+def rows() -> Iterator[
+    tuple[str, str, tuple[float, float], tuple[float, float], tuple[float, ...], str]
+]:
+    """Name, model, range in um, published (nd, Vd), coefficients and source of each entry of
+    glasses.txt.
 
-    A row there holds them in this order; a line that starts with # names the source of the rows below it.
-    Indices are relative to air at 20 to 25 C, wavelengths in air, as the catalogues state. Coefficients are
-    facts of the makers' catalogues; read from the refractiveindex.info database (CC0) and public catalogue files.
+    A row there holds them in this order; a line that starts with # names the source of the rows
+    below it. Indices are relative to air at 20 to 25 C, wavelengths in air, as the catalogues
+    state. Coefficients are facts of the makers' catalogues; read from the refractiveindex.info
+    database (CC0) and public catalogue files.
     """
     source = ""
-    for line in files("codesign.lens").joinpath("glasses.txt").read_text(encoding="utf-8").splitlines():
+    for line in (
+        files("codesign.lens").joinpath("glasses.txt").read_text(encoding="utf-8").splitlines()
+    ):
         if line.startswith("#"):
             source = line[2:]
             continue
@@ -351,14 +369,17 @@ def _key(name):
 
 
 def _from_code(text):
-    """Glass of a six-digit code (517642 is nd 1.517, Vd 64.2) or an nd/Vd pair; None when it is neither."""
+    """Glass of a six-digit code (517642 is nd 1.517, Vd 64.2) or an nd/Vd pair; None when it is
+    neither."""
     if pair := _PAIR.fullmatch(text):
         return Glass.from_abbe(float(pair[1]), float(pair[2]), text)
     if code := _CODE.fullmatch(text):
         index, abbe = (code[1], code[2]) if code[1] else (code[3], code[4])
         nd = 1 + int(index) / 10 ** len(index)
         # no glass lies below 1.28, so 003283 is nd 2.003
-        return Glass.from_abbe(nd if nd >= 1.28 else nd + 1, int(abbe) / 10 ** (len(abbe) - 2), text)
+        return Glass.from_abbe(
+            nd if nd >= 1.28 else nd + 1, int(abbe) / 10 ** (len(abbe) - 2), text
+        )
     return None
 
 
@@ -368,7 +389,11 @@ def _is_number(value):
 
 
 def _numbers(glass, field, values):
-    if not isinstance(values, (tuple, list)) or len(values) > 12 or not all(map(_is_number, values)):
+    if (
+        not isinstance(values, (tuple, list))
+        or len(values) > 12
+        or not all(map(_is_number, values))
+    ):
         raise DomainError(
             f"glass {glass.name}: {field} {_cut(values)} must be at most 12 finite numbers of at most 1e6."
         )
@@ -381,7 +406,9 @@ def _cut(value):
         return f"({type(value).__name__} of {len(value)})"
     if isinstance(value, int) and abs(value) > 10**20:
         return "(an integer of more than 20 digits)"
-    text = repr(value) if not isinstance(value, str) or len(value) <= 40 else repr(value[:40]) + "..."
+    text = (
+        repr(value) if not isinstance(value, str) or len(value) <= 40 else repr(value[:40]) + "..."
+    )
     return text if len(text) <= 60 else text[:60] + "..."
 
 

@@ -1,11 +1,11 @@
 """The ray-trace kernel: one fused drjit program for a whole lens.
 
-Intersection with a conic in the form t = F / (G + sqrt(G^2 - A F)), regular at zero curvature (Welford,
-Aberrations of Optical Systems, ch. 4); even aspheres by Newton steps from the conic, the last one
-differentiable, so that the gradient is that of the implicit function; vector forms of Snell's law, reflection
-and the local grating equation. A ray that fails is frozen where it failed: its square roots keep safe inputs,
-so gradients stay finite, and it carries weight 0, a status and a deficit (how far its radicand fell below
-zero; 1 where Newton steps found no point of an asphere).
+Intersection with a conic in the form t = F / (G + sqrt(G^2 - A F)), regular at zero curvature
+(Welford, Aberrations of Optical Systems, ch. 4); even aspheres by Newton steps from the conic, the
+last one differentiable, so that the gradient is that of the implicit function; vector forms of
+Snell's law, reflection and the local grating equation. A ray that fails is frozen where it failed:
+its square roots keep safe inputs, so gradients stay finite, and it carries weight 0, a status and a
+deficit (how far its radicand fell below zero; 1 where Newton steps found no point of an asphere).
 """
 
 from dataclasses import dataclass
@@ -33,7 +33,8 @@ class Status(IntEnum):
 class Works:
     """What one surface needs of the kernel; what it does not need is not compiled.
 
-    conic, refracts, mirror, moved (decentred or tilted), obstructed: whether; asphere, path: how many terms.
+    conic, refracts, mirror, moved (decentred or tilted), obstructed: whether; asphere, path: how
+    many terms.
     """
 
     conic: bool
@@ -47,8 +48,8 @@ class Works:
 
 @dataclass(frozen=True)
 class Kernel:
-    """The program for one sequence of surfaces. Called with flat drjit arrays: see ``trace.trace`` for what
-    they hold."""
+    """The program for one sequence of surfaces. Called with flat drjit arrays: see ``trace.trace``
+    for what they hold."""
 
     works: tuple[Works, ...]
     asphere_width: int
@@ -155,7 +156,8 @@ class Kernel:
 
 @dataclass(frozen=True)
 class _Frame:
-    """Axes of a decentred and tilted surface: shifted by (x, y), turned about x (a), then about its own y (b)."""
+    """Axes of a decentred and tilted surface: shifted by (x, y), turned about x (a), then about its
+    own y (b)."""
 
     x: Any
     y: Any
@@ -183,8 +185,8 @@ class _Frame:
 
 
 def _intersect(arr, o, d, c, conic, asphere, alive):
-    """Distance along the ray to the surface, whether it is met, and the shortfall of the radicand where it
-    is not (elsewhere it means nothing)."""
+    """Distance along the ray to the surface, whether it is met, and the shortfall of the radicand
+    where it is not (elsewhere it means nothing)."""
     import drjit as dr
 
     square = dr.squared_norm(o)
@@ -199,14 +201,16 @@ def _intersect(arr, o, d, c, conic, asphere, alive):
     radicand = G * G - A * F
     near = (
         G > 0
-        # else the ray starts behind the centre, as in a ball lens: the other form of the same root, without
-        # cancellation
+        # else the ray starts behind the centre, as in a ball lens: the other form of the same root,
+        # without cancellation
     )
     hit = alive & (radicand > GRAZING) & (near | (dr.abs(A) > FLAT))
     root = dr.sqrt(dr.select(hit, radicand, 1))
     step = dr.select(near, F, G - root) / dr.select(hit, dr.select(near, G + root, A), 1)
     side = 1 - (c if conic is None else c * (1 + conic)) * (o.z + d.z * step)
-    shortfall = dr.select(radicand > GRAZING, dr.select(hit, GRAZING - side, GRAZING - G), GRAZING - radicand)
+    shortfall = dr.select(
+        radicand > GRAZING, dr.select(hit, GRAZING - side, GRAZING - G), GRAZING - radicand
+    )
     hit &= side > GRAZING  # the half (or sheet) that holds the vertex
     step = dr.select(hit, step, 0)
     if not asphere:
@@ -235,7 +239,8 @@ def _intersect(arr, o, d, c, conic, asphere, alive):
 
 
 def _implicit(p, d, c, conic, asphere):
-    """z - sag(r^2) at a point, its derivative along the ray, and whether the conic part exists there."""
+    """z - sag(r^2) at a point, its derivative along the ray, and whether the conic part exists
+    there."""
     r2, slope, root, inside = _slope(p, c, conic, asphere)
     sag = c * r2 / (1 + root)
     power = r2
@@ -285,8 +290,8 @@ def _soft_edge(x):
 
 
 def _refract(d, normal, ratio, alive):
-    """Direction after the surface, whether light passes, and the shortfall of the radicand where it is
-    totally reflected."""
+    """Direction after the surface, whether light passes, and the shortfall of the radicand where it
+    is totally reflected."""
     import drjit as dr
 
     cosine = dr.dot(d, normal)
@@ -309,8 +314,8 @@ def _diffraction(arr, o, r2, terms):
 
 
 def _diffract(d, normal, gradient, before, after, alive):
-    """Local grating equation: the tangential part of n d gains the tangential gradient of the added path.
-    Returns as ``_refract``."""
+    """Local grating equation: the tangential part of n d gains the tangential gradient of the added
+    path. Returns as ``_refract``."""
     import drjit as dr
 
     across = before * d + gradient

@@ -1,5 +1,5 @@
-"""First-order optics by the y-u trace, differentiable. Surfaces enter by their power, so the r^2 asphere
-term, mirrors and diffraction count."""
+"""First-order optics by the y-u trace, differentiable. Surfaces enter by their power, so the r^2
+asphere term, mirrors and diffraction count."""
 
 import math
 from collections.abc import Sequence
@@ -15,7 +15,8 @@ from codesign.lens.glass import D_UM
 
 @dataclass(frozen=True)
 class FirstOrder:
-    """Paraxial figures of a lens with the object at infinity; scalar tensors in millimetres, light along +z.
+    """Paraxial figures of a lens with the object at infinity; scalar tensors in millimetres, light
+    along +z.
 
     efl_mm, bfl_mm: effective and back focal length. fno: efl / entrance pupil diameter.
     entrance_pupil_z_mm: from the first vertex. exit_pupil_z_mm: from the last vertex.
@@ -46,14 +47,16 @@ class ParaxialLens(Protocol):
 
 
 def bending(index: Tensor, mirrors: Sequence[bool]) -> Tensor:
-    """Change of surface power per vertex curvature, [S]: n' - n where light passes, -2 n where it is
-    reflected (unfolded axis).
+    """Change of surface power per vertex curvature, [S]: n' - n where light passes, -2 n where it
+    is reflected (unfolded axis).
 
     Args: index [S + 1]; mirrors: S booleans.
     """
     if not any(mirrors):
         return index[1:] - index[:-1]
-    return torch.where(torch.tensor(mirrors, device=index.device), -2 * index[:-1], index[1:] - index[:-1])
+    return torch.where(
+        torch.tensor(mirrors, device=index.device), -2 * index[:-1], index[1:] - index[:-1]
+    )
 
 
 def yu_trace(
@@ -65,10 +68,11 @@ def yu_trace(
     first: int = 0,
     last: int | None = None,
 ) -> tuple[list[Any], list[Any]]:
-    """Paraxial height and reduced angle (n u) just after each surface from ``first`` to before ``last``.
+    """Paraxial height and reduced angle (n u) just after each surface from ``first`` to before
+    ``last``.
 
-    Args: power [S] per mm, thickness_mm [S], index [S + 1]; y at surface ``first`` and nu before it. Tensors,
-      or plain numbers and lists of them.
+    Args: power [S] per mm, thickness_mm [S], index [S + 1]; y at surface ``first`` and nu before
+      it. Tensors, or plain numbers and lists of them.
     Returns: lists of y and nu per surface.
     """
     last = len(power) if last is None else last
@@ -89,8 +93,8 @@ def first_order(
     stop: int,
     entrance_pupil_diameter_mm: float | Tensor,
 ) -> FirstOrder:
-    """First-order figures. Gradient: to every tensor. Raises: DomainError for an afocal lens, numbers
-    that are not finite, or a stop that no ray images.
+    """First-order figures. Gradient: to every tensor. Raises: DomainError for an afocal lens,
+    numbers that are not finite, or a stop that no ray images.
 
     Source: Smith, Modern Optical Engineering, ch. 2 and 9.
     """
@@ -108,7 +112,8 @@ def first_order(
         )
     efl = index[-1] / total
     bfl = index[-1] * heights[-1] / total
-    # from the stop centre backwards to the object side: y and nu at the stop, undone surface by surface
+    # from the stop centre backwards to the object side: y and nu at the stop, undone surface by
+    # surface
     y = zero
     nu = one
     for i in range(stop - 1, -1, -1):
@@ -123,15 +128,17 @@ def first_order(
     nu = angles[-1]
     exit_z = -y * index[-1] / nu
     exit_diameter = 2 * semi_stop / nu.abs()
-    return FirstOrder(efl, bfl, efl / diameter, entrance_z, diameter, exit_z, exit_diameter, semi_stop)
+    return FirstOrder(
+        efl, bfl, efl / diameter, entrance_z, diameter, exit_z, exit_diameter, semi_stop
+    )
 
 
 def system_matrix(lens: ParaxialLens, wavelength_um: float = D_UM) -> Tensor:
-    """Matrix [[A, B], [C, D]] from the plane of the first vertex to that of the last, for columns (y in mm, n
-    u). Its determinant is 1.
+    """Matrix [[A, B], [C, D]] from the plane of the first vertex to that of the last, for columns
+    (y in mm, n u). Its determinant is 1.
 
-    C is minus the power per mm. Gradient: to every lens tensor that bends or moves light. Source: Gerrard and
-    Burch, Matrix Methods in Optics, ch. 2.
+    C is minus the power per mm. Gradient: to every lens tensor that bends or moves light. Source:
+    Gerrard and Burch, Matrix Methods in Optics, ch. 2.
     """
     power = lens.surface_power(wavelength_um)
     thickness_mm = lens.thickness_mm
@@ -149,8 +156,8 @@ def system_matrix(lens: ParaxialLens, wavelength_um: float = D_UM) -> Tensor:
 
 @dataclass(frozen=True)
 class CardinalPoints:
-    """Positions on the axis, scalar tensors in mm: those of object space from the first vertex, those of
-    image space from the last vertex, positive along +z."""
+    """Positions on the axis, scalar tensors in mm: those of object space from the first vertex,
+    those of image space from the last vertex, positive along +z."""
 
     front_focal_z_mm: Tensor
     front_principal_z_mm: Tensor
@@ -163,11 +170,11 @@ class CardinalPoints:
 
 
 def cardinal_points(lens: ParaxialLens, wavelength_um: float = D_UM) -> CardinalPoints:
-    """CardinalPoints of a lens. Focal lengths are n / power and n' / power, both positive for a converging
-    lens.
+    """CardinalPoints of a lens. Focal lengths are n / power and n' / power, both positive for a
+    converging lens.
 
-    Gradient: to every lens tensor that bends or moves light. Raises: DomainError for an afocal lens. Source:
-      Gerrard and Burch, ch. 2.
+    Gradient: to every lens tensor that bends or moves light. Raises: DomainError for an afocal
+      lens. Source: Gerrard and Burch, ch. 2.
     """
     (A, _), (C, D) = system_matrix(lens, wavelength_um)
     index = lens.index(wavelength_um)
@@ -193,12 +200,12 @@ def cardinal_points(lens: ParaxialLens, wavelength_um: float = D_UM) -> Cardinal
 
 @dataclass(frozen=True)
 class ParaxialRays:
-    """The marginal ray (from the axial object point to the rim of the pupil) and the chief ray (from the rim
-    of the field through the centre of the stop).
+    """The marginal ray (from the axial object point to the rim of the pupil) and the chief ray
+    (from the rim of the field through the centre of the stop).
 
-    marginal_height_mm, chief_height_mm: [S] on each surface. marginal_angle, chief_angle: [S + 1] slopes
-      before the first surface and behind each surface. invariant_mm: scalar n (chief slope x marginal height
-      - marginal slope x chief height), the same everywhere.
+    marginal_height_mm, chief_height_mm: [S] on each surface. marginal_angle, chief_angle: [S + 1]
+      slopes before the first surface and behind each surface. invariant_mm: scalar n (chief slope x
+      marginal height - marginal slope x chief height), the same everywhere.
     """
 
     marginal_height_mm: Tensor
@@ -217,13 +224,13 @@ def paraxial_rays(
     """ParaxialRays of an object plane.
 
     Args:
-      field_rad: half field, whose tangent is the slope of the d line's chief ray in object space; a number or
-        scalar tensor, below 90 degrees.
-      vergence_per_mm: 1 / distance of the object from the entrance pupil of the d line, a number or scalar
-        tensor (see ``distance.vergence_per_mm``); 0 is parallel light. The diameter of the entrance pupil is
-        the lens's at every distance.
-    Gradient: to every lens tensor that bends or moves light, and to the vergence. Raises: DomainError for a
-      field of 90 degrees and more, or an entrance pupil at infinity.
+      field_rad: half field, whose tangent is the slope of the d line's chief ray in object space; a
+        number or scalar tensor, below 90 degrees.
+      vergence_per_mm: 1 / distance of the object from the entrance pupil of the d line, a number or
+        scalar tensor (see ``distance.vergence_per_mm``); 0 is parallel light. The diameter of the
+        entrance pupil is the lens's at every distance.
+    Gradient: to every lens tensor that bends or moves light, and to the vergence. Raises:
+      DomainError for a field of 90 degrees and more, or an entrance pupil at infinity.
     """
     field = torch.as_tensor(field_rad, dtype=torch.float64)
     if not abs(float(field.detach())) < math.pi / 2:
@@ -255,19 +262,23 @@ def paraxial_rays(
     )
     angles = torch.cat([starts[0][1].reshape(1), nu]) / index
     chief_angles = torch.cat([starts[1][1].reshape(1), nu_bar]) / index
-    return ParaxialRays(y, angles, y_bar, chief_angles, slope * index[0] * (f.entrance_pupil_diameter_mm / 2))
+    return ParaxialRays(
+        y, angles, y_bar, chief_angles, slope * index[0] * (f.entrance_pupil_diameter_mm / 2)
+    )
 
 
 def focused_image(
     lens: ParaxialLens, vergence_per_mm: float | Tensor = 0.0, wavelength_um: float = D_UM
 ) -> tuple[Tensor, Tensor]:
-    """Height and reduced angle (n u) behind the last vertex of the ray of an axial point that crosses the
-    first vertex plane at height 1, so that its image lies -height n / angle behind the last vertex.
+    """Height and reduced angle (n u) behind the last vertex of the ray of an axial point that
+    crosses the first vertex plane at height 1, so that its image lies -height n / angle behind the
+    last vertex.
 
     Args:
-      vergence_per_mm: 1 / distance of the point from the entrance pupil of the d line, scalar or [D].
-    Returns: two tensors of the shape of the vergence. Gradient: to it, and to every lens tensor that bends or
-      moves light.
+      vergence_per_mm: 1 / distance of the point from the entrance pupil of the d line, scalar or
+        [D].
+    Returns: two tensors of the shape of the vergence. Gradient: to it, and to every lens tensor
+      that bends or moves light.
     """
     power = lens.surface_power(wavelength_um)
     index = lens.index(wavelength_um)
@@ -283,9 +294,9 @@ def focused_image(
 def image_place_mm(
     lens: ParaxialLens, vergence_per_mm: float | Tensor = 0.0, wavelength_um: float = D_UM
 ) -> Tensor:
-    """Distance from the last vertex to the paraxial image of an axial point, mm: the back focal length for
-    parallel light. Negative where the image lies in the lens or is virtual, infinite where the light leaves
-    parallel. Shape of the vergence; gradient as for ``focused_image``."""
+    """Distance from the last vertex to the paraxial image of an axial point, mm: the back focal
+    length for parallel light. Negative where the image lies in the lens or is virtual, infinite
+    where the light leaves parallel. Shape of the vergence; gradient as for ``focused_image``."""
     height, angle = focused_image(lens, vergence_per_mm, wavelength_um)
     return -height * lens.index(wavelength_um)[-1] / angle
 
@@ -293,9 +304,11 @@ def image_place_mm(
 def image_scale_mm(
     lens: ParaxialLens, vergence_per_mm: float | Tensor = 0.0, wavelength_um: float = D_UM
 ) -> Tensor:
-    """Height of the paraxial image per tangent of the field, mm: the focal length for parallel light, and
-    magnification x distance otherwise. Shape of the vergence; gradient as for ``focused_image``."""
+    """Height of the paraxial image per tangent of the field, mm: the focal length for parallel
+    light, and magnification x distance otherwise. Shape of the vergence; gradient as for
+    ``focused_image``."""
     pupil_z = lens.first_order().entrance_pupil_z_mm
     _, angle = focused_image(lens, vergence_per_mm, wavelength_um)
-    # Lagrange's invariant of the chief ray and of this one, whose height at the pupil is 1 / (1 - vergence z)
+    # Lagrange's invariant of the chief ray and of this one, whose height at the pupil is 1 / (1 -
+    # vergence z)
     return -lens.index(wavelength_um)[0] / ((1 - vergence_per_mm * pupil_z) * angle)

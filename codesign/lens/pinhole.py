@@ -1,5 +1,5 @@
-"""The cheap fidelity levels of a lens: a pinhole, and a thin lens with defocus. Same interface as the traced
-lens."""
+"""The cheap fidelity levels of a lens: a pinhole, and a thin lens with defocus. Same interface as
+the traced lens."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,8 @@ from codesign.types import Rays
 
 
 class ThinLens(Replaceable):
-    """Ideal lens of focal length efl_mm and pupil diameter, with the film image_distance_mm behind it.
+    """Ideal lens of focal length efl_mm and pupil diameter, with the film image_distance_mm behind
+    it.
 
     >>> from codesign import lens
     >>> thin = lens.ThinLens(50.0, 10.0)
@@ -26,9 +27,9 @@ class ThinLens(Replaceable):
     >>> optimiser = torch.optim.Adam(thin.variables("efl", "focus"), lr=0.1)
 
     Args:
-      efl_mm, image_distance_mm: numbers, or tensors that gradients flow to. A number becomes a Parameter that
-        asks for no gradient until ``requires_grad_()`` or ``variables``; a tensor with a gradient is kept as
-        given. image_distance_mm follows efl_mm when it is None.
+      efl_mm, image_distance_mm: numbers, or tensors that gradients flow to. A number becomes a
+        Parameter that asks for no gradient until ``requires_grad_()`` or ``variables``; a tensor
+        with a gradient is kept as given. image_distance_mm follows efl_mm when it is None.
     Raises: DomainError for lengths that are not positive, or a diameter below 0.
     """
 
@@ -47,7 +48,11 @@ class ThinLens(Replaceable):
         super().__init__()
         efl = torch.as_tensor(efl_mm, dtype=None if torch.is_tensor(efl_mm) else torch.float64)
         self._hold("efl_mm", efl)
-        image = None if image_distance_mm is None else torch.as_tensor(image_distance_mm, dtype=efl.dtype)
+        image = (
+            None
+            if image_distance_mm is None
+            else torch.as_tensor(image_distance_mm, dtype=efl.dtype)
+        )
         self._hold("image_distance_mm", image)
         self.entrance_pupil_diameter_mm = float(entrance_pupil_diameter_mm)
         focal_mm, image_mm = float(self.efl_mm.detach()), float(self.image_distance_mm.detach())
@@ -86,7 +91,8 @@ class ThinLens(Replaceable):
         """Make "efl", "focus" (the image distance) or both variables for torch.optim; see
         ``GeoLens.variables``.
 
-        The lengths stay positive. Where the image distance follows the focal length, "efl" alone moves both.
+        The lengths stay positive. Where the image distance follows the focal length, "efl" alone
+        moves both.
 
         >>> from codesign import lens
         >>> pinhole = lens.Pinhole(5.0)
@@ -96,7 +102,9 @@ class ThinLens(Replaceable):
         """
         return self._make_variables(
             names,
-            step_mm=checked_step(1e-3 * float(self.efl_mm.detach()) if step_mm is None else step_mm),
+            step_mm=checked_step(
+                1e-3 * float(self.efl_mm.detach()) if step_mm is None else step_mm
+            ),
             bounds=bounds or {},
             mask={},
             fields_rad=fields_rad,
@@ -105,8 +113,8 @@ class ThinLens(Replaceable):
         )
 
     def focus_at(self, distance_m: float | Tensor) -> "ThinLens":
-        """The lens with its film where a point at ``distance_m`` is imaged, 1 / s' = 1 / f - 1 / s; inf is
-        allowed. Gradient: to the focal length and the distance.
+        """The lens with its film where a point at ``distance_m`` is imaged, 1 / s' = 1 / f - 1 / s;
+        inf is allowed. Gradient: to the focal length and the distance.
 
         Raises: DomainError for a point that is not beyond the focal length.
         """
@@ -126,7 +134,10 @@ class ThinLens(Replaceable):
     def _kinds(self):
         at = torch.zeros(1, dtype=torch.int64, device=self.efl_mm.device)
         reach = 0.1 * self.efl_mm.detach().reshape(1)
-        return {"efl": Kind("efl_mm", at, reach, 0.0), "focus": Kind("image_distance_mm", at, reach, 0.0)}
+        return {
+            "efl": Kind("efl_mm", at, reach, 0.0),
+            "focus": Kind("image_distance_mm", at, reach, 0.0),
+        }
 
     def _landing(self, fields_rad, wavelength_um):
         q = pupil_grid(8).to(self.efl_mm.detach()) * (self.entrance_pupil_diameter_mm / 2)
@@ -138,12 +149,14 @@ class ThinLens(Replaceable):
     def camera_rays(
         self, film_mm: Tensor, pupil: Tensor, wavelength_um: float | None = None, aim: bool = False
     ) -> Rays:
-        """Rays towards the scene; see GeoLens.camera_rays (the pupil is ideal, so aiming changes nothing).
-        Paraxial refraction: slope out = slope in - q / f."""
+        """Rays towards the scene; see GeoLens.camera_rays (the pupil is ideal, so aiming changes
+        nothing). Paraxial refraction: slope out = slope in - q / f."""
         q = pupil * (self.entrance_pupil_diameter_mm / 2)
         inside = (q + film_mm) / self.image_distance_mm
         slope = inside - q / self.efl_mm
-        direction = torch.nn.functional.normalize(torch.cat([slope, torch.ones_like(slope[:, :1])], 1), dim=1)
+        direction = torch.nn.functional.normalize(
+            torch.cat([slope, torch.ones_like(slope[:, :1])], 1), dim=1
+        )
         origin = torch.cat([q, torch.zeros_like(q[:, :1])], 1) * 1e-3
         return Rays(
             origin + 0 * direction,
@@ -156,8 +169,8 @@ class ThinLens(Replaceable):
     def film_points(
         self, points_mm: Tensor, pupil: Tensor, wavelength_um: float | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Where light from points of space meets the film; see GeoLens.film_points (here the pupil points
-        stay as they are)."""
+        """Where light from points of space meets the film; see GeoLens.film_points (here the pupil
+        points stay as they are)."""
         q = pupil * (self.entrance_pupil_diameter_mm / 2)
         inside = (points_mm[:, :2] - q) / points_mm[:, 2:] + q / self.efl_mm
         return inside * self.image_distance_mm - q, pupil, points_mm.detach()[:, 2] > 0

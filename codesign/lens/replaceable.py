@@ -1,5 +1,5 @@
-"""What every lens is as a torch Module: tensors that can be replaced, driven by variables, converted, saved
-and copied without touching another lens."""
+"""What every lens is as a torch Module: tensors that can be replaced, driven by variables,
+converted, saved and copied without touching another lens."""
 
 import copy
 import functools
@@ -18,7 +18,8 @@ DRIVER = "from_variables"  # name of the child that makes tensors from variables
 
 
 def settled(method: Callable[Concatenate[Any, P], R]) -> Callable[Concatenate[Any, P], R]:
-    """A method that computes the tensors of a lens from its variables once, however often it reads them."""
+    """A method that computes the tensors of a lens from its variables once, however often it reads
+    them."""
 
     @functools.wraps(method)
     def once(self: Any, *args: P.args, **kwargs: P.kwargs) -> R:
@@ -28,16 +29,17 @@ def settled(method: Callable[Concatenate[Any, P], R]) -> Callable[Concatenate[An
 
 
 class Replaceable(nn.Module):
-    """Base of the lenses. A lens as it was built owns its numbers as Parameters; what ``replace`` returns
-    owns none: its tensors are buffers, shared or given, through which gradients reach where they came from.
+    """Base of the lenses. A lens as it was built owns its numbers as Parameters; what ``replace``
+    returns owns none: its tensors are buffers, shared or given, through which gradients reach where
+    they came from.
 
-    tensor_names: the tensors that ``replace`` takes. parameter_names: those of them that are Parameters of a
-      lens as it was built.
+    tensor_names: the tensors that ``replace`` takes. parameter_names: those of them that are
+      Parameters of a lens as it was built.
     A saved state also says what its tensors belong to (pupil, glasses, kinds of surfaces):
       ``load_state_dict`` refuses that of another lens before it copies anything.
-    Conversions (``to``, ``float``, ``double``) and ``load_state_dict`` make new tensors wherever a tensor
-      may be shared, so make optimisers after converting, as torch asks. ``copy.deepcopy`` gives a lens that
-      owns its numbers, whatever it is a copy of.
+    Conversions (``to``, ``float``, ``double``) and ``load_state_dict`` make new tensors wherever a
+      tensor may be shared, so make optimisers after converting, as torch asks. ``copy.deepcopy``
+      gives a lens that owns its numbers, whatever it is a copy of.
     """
 
     tensor_names: tuple[str, ...] = ()
@@ -56,29 +58,38 @@ class Replaceable(nn.Module):
         return self.__dict__.get("_modules", {}).get(DRIVER)
 
     def replace(self, **tensors: Tensor) -> Self:
-        """A lens that shares everything with this one except the named tensors, which may depend on other
-        tensors.
+        """A lens that shares everything with this one except the named tensors, which may depend on
+        other tensors.
 
-        The functional way to optimise: build curvatures and thicknesses from a design vector, put them in,
-        trace, and go backward. It has no Parameters and no variables of its own.
-        Raises: DomainError for a name that is not one of the lens's tensors; ShapeError for another shape.
+        The functional way to optimise: build curvatures and thicknesses from a design vector, put
+        them in, trace, and go backward. It has no Parameters and no variables of its own.
+        Raises: DomainError for a name that is not one of the lens's tensors; ShapeError for another
+          shape.
         """
         for name, value in tensors.items():
             self._known(name)
             shape = getattr(self, name).shape
-            if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != shape:
+            if (
+                not isinstance(value, Tensor)
+                or not value.is_floating_point()
+                or value.shape != shape
+            ):
                 given = tuple(value.shape) if isinstance(value, Tensor) else repr(value)[:60]
                 kind = getattr(value, "dtype", type(value).__name__)
-                raise ShapeError(f"{name} has shape {tuple(shape)}, got {given} ({kind}); give real numbers.")
+                raise ShapeError(
+                    f"{name} has shape {tuple(shape)}, got {given} ({kind}); give real numbers."
+                )
         return self._with(self._now() | tensors)
 
     def freeze(self, *names: str) -> Self:
-        """Stop the gradient to the named tensors (all Parameters and variables when none is named); returns
-        the lens."""
+        """Stop the gradient to the named tensors (all Parameters and variables when none is named);
+        returns the lens."""
         driver = self._driver
         if driver is not None and not names:
             driver.requires_grad_(False)
-        for name in names or [n for n in self.parameter_names if driver is None or not driver.makes(n)]:
+        for name in names or [
+            n for n in self.parameter_names if driver is None or not driver.makes(n)
+        ]:
             self._known(name)
             if driver is not None and driver.makes(name):
                 raise DomainError(
@@ -124,7 +135,8 @@ class Replaceable(nn.Module):
         return super()._apply(fn, recurse)
 
     def get_extra_state(self) -> Tensor:
-        """What the tensors of a saved state belong to, beside their shapes: the numbers of ``_identity``."""
+        """What the tensors of a saved state belong to, beside their shapes: the numbers of
+        ``_identity``."""
         return torch.tensor([*self._identity().values()], dtype=torch.float64)
 
     def set_extra_state(self, state: Tensor) -> None:
@@ -156,10 +168,15 @@ class Replaceable(nn.Module):
         key = f"{prefix}_extra_state"
         if key in state_dict:
             self._check_state(state_dict[key])
-        # values are copied in place, so the buffers, and a plate of another lens, must be this lens's own
+        # values are copied in place, so the buffers, and a plate of another lens, must be this
+        # lens's own
         self._buffers.update({name: _own(value) for name, value in self._buffers.items()})
         if self.borrows:
-            parts = {name: child for name, child in self._modules.items() if isinstance(child, Replaceable)}
+            parts = {
+                name: child
+                for name, child in self._modules.items()
+                if isinstance(child, Replaceable)
+            }
             self._modules.update(copy.deepcopy(parts))
             self.borrows = False
         super()._load_from_state_dict(state_dict, prefix, local_metadata, strict, missing, *rest)
@@ -196,7 +213,9 @@ class Replaceable(nn.Module):
     def _now(self):
         """All tensors as they are now, by name."""
         made = self._made(self._driver)
-        return {name: made[name] if name in made else getattr(self, name) for name in self.tensor_names}
+        return {
+            name: made[name] if name in made else getattr(self, name) for name in self.tensor_names
+        }
 
     def _made(self, driver):
         """The tensors that variables make, by name; none without variables."""

@@ -1,12 +1,13 @@
 """Third-order aberrations of each surface: the Seidel sums, and the first-order colour sums.
 
-Conventions: wavefront coefficients in mm, positive where the wavefront is ahead of its
-  reference sphere. With pupil and field coordinates rho and h that are 1 at the rims, the wavefront is
-    S_I rho^4 / 8 + S_II h rho^3 cos / 2 + S_III h^2 rho^2 cos^2 / 2 + (S_III + S_IV) h^2 rho^2 / 4 + S_V h^3
-    rho cos / 2. Undercorrected spherical aberration and the field curvature of a converging lens are
-    positive. Field angles enter by their tangent.
-Sources: Welford, Aberrations of Optical Systems, ch. 8 to 10 (spheres, aspheres, colour; S_V in the form
-  without a quotient); Sweatt, JOSA 67 (1977), for diffractive surfaces as thin layers of infinite index.
+Conventions: wavefront coefficients in mm, positive where the wavefront is ahead of its reference
+  sphere. With pupil and field coordinates rho and h that are 1 at the rims, the wavefront is
+    S_I rho^4 / 8 + S_II h rho^3 cos / 2 + S_III h^2 rho^2 cos^2 / 2 + (S_III + S_IV) h^2 rho^2 / 4
+    + S_V h^3 rho cos / 2. Undercorrected spherical aberration and the field curvature of a
+    converging lens are positive. Field angles enter by their tangent.
+Sources: Welford, Aberrations of Optical Systems, ch. 8 to 10 (spheres, aspheres, colour; S_V in the
+  form without a quotient); Sweatt, JOSA 67 (1977), for diffractive surfaces as thin layers of
+  infinite index.
 """
 
 from dataclasses import dataclass
@@ -24,8 +25,8 @@ NAMES = ("spherical", "coma", "astigmatism", "petzval", "distortion")
 
 @dataclass(frozen=True)
 class SeidelSums:
-    """Contributions per surface, [S] mm of wavefront each: S_I spherical, S_II coma, S_III astigmatism, S_IV
-    Petzval, S_V distortion, C_I axial and C_II lateral colour (between F and C).
+    """Contributions per surface, [S] mm of wavefront each: S_I spherical, S_II coma, S_III
+    astigmatism, S_IV Petzval, S_V distortion, C_I axial and C_II lateral colour (between F and C).
     ``invariant_mm``: Lagrange invariant.
     """
 
@@ -57,14 +58,14 @@ def seidel_sums(
 ) -> SeidelSums:
     """SeidelSums of a lens for an object plane.
 
-    Spheres, conics, the r^2 and r^4 asphere terms, mirrors, and the first two diffractive terms; decentres
-    and tilts do not count.
+    Spheres, conics, the r^2 and r^4 asphere terms, mirrors, and the first two diffractive terms;
+    decentres and tilts do not count.
 
     Args:
       field_rad: half field.
       wavelength_um: of the monochromatic sums; those of colour are between F and C.
-      at_m: metres from the entrance pupil to the object, inf for parallel light; the pupil's diameter is the
-        lens's at every distance.
+      at_m: metres from the entrance pupil to the object, inf for parallel light; the pupil's
+        diameter is the lens's at every distance.
     Gradient: to every lens tensor and to at_m. Raises: DomainError, see ``paraxial_rays`` and
       ``distance.vergence_per_mm``.
     """
@@ -76,9 +77,15 @@ def seidel_sums(
     layer = _thin_layer(rays, index[:-1], curvature, power, path[1])
     sphere = _refraction(rays, index, lens.mirrors, curvature, power)
     # r^4 beyond the osculating sphere
-    figure = (1 + lens.conic) * lens.curvature_per_mm**3 / 8 + _column(lens.asphere, 1) - curvature**3 / 8
+    figure = (
+        (1 + lens.conic) * lens.curvature_per_mm**3 / 8
+        + _column(lens.asphere, 1)
+        - curvature**3 / 8
+    )
     plate = _plate(rays, 8 * figure * bending(index, lens.mirrors))
-    monochromatic = {name: a + b + c for name, a, b, c in zip(NAMES, layer, sphere, plate, strict=True)}
+    monochromatic = {
+        name: a + b + c for name, a, b, c in zip(NAMES, layer, sphere, plate, strict=True)
+    }
     axial, lateral = _colour(lens, rays, index, curvature, power)
     return SeidelSums(
         **monochromatic, axial_colour=axial, lateral_colour=lateral, invariant_mm=rays.invariant_mm
@@ -91,8 +98,8 @@ def _column(table, i):
 
 
 def _invariants(rays, index, curvature, power):
-    """Refraction invariants A and A_bar of the marginal and chief ray between a layer of ``power`` and the
-    surface behind it, [S] each."""
+    """Refraction invariants A and A_bar of the marginal and chief ray between a layer of ``power``
+    and the surface behind it, [S] each."""
     reduced = [
         angle[:-1] * index[:-1] - y * power
         for angle, y in (
@@ -107,8 +114,8 @@ def _invariants(rays, index, curvature, power):
 
 
 def _refraction(rays: ParaxialRays, index, mirrors, curvature, power):
-    """S_I to S_V of spheres. Behind a mirror n u keeps its value and n turns its sign, so that u / n = n u /
-    n^2 is the unfolded one."""
+    """S_I to S_V of spheres. Behind a mirror n u keeps its value and n turns its sign, so that u /
+    n = n u / n^2 is the unfolded one."""
     y = rays.marginal_height_mm
     y_bar = rays.chief_height_mm
     H = rays.invariant_mm
@@ -129,8 +136,8 @@ def _refraction(rays: ParaxialRays, index, mirrors, curvature, power):
 
 
 def _thin_layer(rays: ParaxialRays, n, curvature, power, path_r4):
-    """S_I to S_V of a diffractive layer in a medium n: two surfaces around an infinite index, and the phase
-    that differs from theirs in r^4."""
+    """S_I to S_V of a diffractive layer in a medium n: two surfaces around an infinite index, and
+    the phase that differs from theirs in r^4."""
     y = rays.marginal_height_mm
     y_bar = rays.chief_height_mm
     H = rays.invariant_mm
@@ -150,8 +157,8 @@ def _thin_layer(rays: ParaxialRays, n, curvature, power, path_r4):
     distortion = scale * (A_bar**3 - B_bar**3) + y_bar * curvature / n * (
         B_bar * (B_bar * y + H) - A_bar * (A_bar * y + H)
     )
-    # two spheres have the path -power (r^2 / 2 + curvature^2 r^4 / 8); the phase has no such r^4 term of its
-    # own
+    # two spheres have the path -power (r^2 / 2 + curvature^2 r^4 / 8); the phase has no such r^4
+    # term of its own
     plate = _plate(rays, -8 * path_r4 - power * curvature.square())
     return [s + p for s, p in zip([*sums, torch.zeros_like(y), distortion], plate, strict=True)]
 
@@ -170,8 +177,8 @@ def _plate(rays, strength):
 
 
 def _colour(lens, rays, index, curvature, power):
-    """C_I and C_II, [S] each: A y jump(dn / n) of the refraction, and y^2 times the spread of the diffractive
-    power."""
+    """C_I and C_II, [S] each: A y jump(dn / n) of the refraction, and y^2 times the spread of the
+    diffractive power."""
     (A, A_bar), _ = _invariants(rays, index, curvature, power)
     y = rays.marginal_height_mm
     y_bar = rays.chief_height_mm

@@ -22,13 +22,14 @@ NO_POWER = 1e-9  # index step, or ray height in mm, below which a curvature cann
 
 
 def holding_surface(lens: TracedLens) -> int:
-    """Index of the surface whose curvature holds the focal length: the last that bends light and is not the
-    face of a plane-parallel plate.
+    """Index of the surface whose curvature holds the focal length: the last that bends light and is
+    not the face of a plane-parallel plate.
 
-    A stop in air and a cover glass behind the lens are passed over; the plane side of a plano-convex lens is
-    not. When all are plane (a design from scratch) it is the last that bends light. It goes by today's
-    curvatures: where those of a cover glass vary, name the surface instead. Raises: DomainError when none
-    does.
+    A stop in air and a cover glass behind the lens are passed over; the plane side of a
+    plano-convex lens is not. When all are plane (a design from scratch) it is the last that bends
+    light. It goes by today's
+    curvatures: where those of a cover glass vary, name the surface instead. Raises: DomainError
+    when none does.
     """
     step = bending(lens.index(), lens.mirrors).detach().abs().tolist()
     curved = [abs(c) > FLAT for c in lens.curvature_per_mm.tolist()]
@@ -43,7 +44,9 @@ def holding_surface(lens: TracedLens) -> int:
 
     def has_shape(i):
         neighbours = [
-            j for j, n in ((i - 1, index[i]), (i + 1, index[i + 1])) if 0 <= j < len(curved) and n > 1 + 1e-3
+            j
+            for j, n in ((i - 1, index[i]), (i + 1, index[i + 1]))
+            if 0 <= j < len(curved) and n > 1 + 1e-3
         ]
         return curved[i] or any(curved[j] for j in neighbours)
 
@@ -56,11 +59,11 @@ def hold_efl(lens: L, efl_mm: float | Tensor, surface: int | None = None) -> L:
     Args:
       efl_mm: not 0, at the d line.
       surface: index of the curvature to solve; ``holding_surface(lens)`` when left out.
-    Gradient: the solved curvature carries that of all others, of thicknesses and of indices; efl_mm too when
-      it is a tensor.
+    Gradient: the solved curvature carries that of all others, of thicknesses and of indices; efl_mm
+      too when it is a tensor.
     Raises: DomainError when that curvature cannot do it.
-    Source: the y-u trace, whose last angle is linear in the power of each surface (Smith, Modern Optical
-      Engineering, ch. 2).
+    Source: the y-u trace, whose last angle is linear in the power of each surface (Smith, Modern
+      Optical Engineering, ch. 2).
     """
     c, t, n, power = lens.curvature_per_mm, lens.thickness_mm, lens.index(), lens.surface_power()
     at = holding_surface(lens) if surface is None else range(c.numel())[surface]
@@ -98,18 +101,19 @@ def focus_at(lens: L, distance_m: float | Tensor, wavelength_um: float, spot_gri
 
 
 def least_spot_shift(position: Tensor, slope: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """How far behind their plane rays of several spots have the least mean square distance from their spot's
-    mean, scalar mm; and the mean square slope that says how sharp that place is.
+    """How far behind their plane rays of several spots have the least mean square distance from
+    their spot's mean, scalar mm; and the mean square slope that says how sharp that place is.
 
-    Straight rays make the squared spot a parabola in z: with d the distance of a ray from its spot's mean
-    and s the same of its slope, the least of sum |d + z s|^2 lies at z = -sum(d.s) / sum(s.s).
-    Args:
+    Straight rays make the squared spot a parabola in z: with d the distance of a ray from its
+    spot's mean and s the same of its slope, the least of sum |d + z s|^2 lies at z = -sum(d.s) /
+    sum(s.s). Args:
       position, slope: [spots, M, 2].
       weight: [spots, M, 1] >= 0, with a positive sum for every spot.
     """
     total = weight.sum(1, keepdim=True)
     position, slope = (
-        (v - (v * weight).sum(1, keepdim=True) / total) * (weight / total.sqrt()) for v in (position, slope)
+        (v - (v * weight).sum(1, keepdim=True) / total) * (weight / total.sqrt())
+        for v in (position, slope)
     )
     sharpness = slope.square().sum()
     return -(position * slope).sum() / sharpness, sharpness
@@ -119,19 +123,21 @@ def _remedy(lens):
     power = -float(paraxial.system_matrix(lens)[1][0].detach())
     if power <= 0:
         return "no distance helps, as the lens diverges; change a curvature"
-    nearest = lens.first_order().entrance_pupil_z_mm - paraxial.cardinal_points(lens).front_focal_z_mm
+    nearest = (
+        lens.first_order().entrance_pupil_z_mm - paraxial.cardinal_points(lens).front_focal_z_mm
+    )
     return f"it needs more than {float(nearest.detach()) * 1e-3:.6g} m"
 
 
 def focus_paraxial(lens: L, defocus_mm: float | Tensor = 0.0, at_m: float | Tensor = PARALLEL) -> L:
-    """The lens with its image plane at the paraxial image of an axial point, or ``defocus_mm`` (number or
-    scalar tensor) behind it. Differentiable.
+    """The lens with its image plane at the paraxial image of an axial point, or ``defocus_mm``
+    (number or scalar tensor) behind it. Differentiable.
 
     Args:
-      at_m: metres from the entrance pupil to the point, inf for parallel light. ``GeoLens.focus_at`` does the
-        same and refuses images that are not real.
-    Raises: DomainError for light that leaves the lens parallel, or a distance inside the lens. A focus
-      inside the lens gives a negative last thickness, which constraints must push back.
+      at_m: metres from the entrance pupil to the point, inf for parallel light.
+        ``GeoLens.focus_at`` does the same and refuses images that are not real.
+    Raises: DomainError for light that leaves the lens parallel, or a distance inside the lens. A
+      focus inside the lens gives a negative last thickness, which constraints must push back.
     """
     height, angle = focused_image(lens, vergence_per_mm(lens, one_distance(at_m)))
     if abs(float(angle.detach())) < 1e-12:
@@ -150,18 +156,18 @@ def focus_rays(
     grid: int = 16,
     at_m: Distances = PARALLEL,
 ) -> L:
-    """The lens with its image plane where the mean square spot over fields, distances and wavelengths is
-    least.
+    """The lens with its image plane where the mean square spot over fields, distances and
+    wavelengths is least.
 
     Spots of one object point share their mean over the wavelengths; see ``focus.least_spot_shift``.
 
     Args:
       fields_rad: angles; wavelengths_um.
       grid: pupil samples across, without clipping by apertures. Failed rays are left out.
-      at_m: metres from the entrance pupil to the object plane, or several that share the image plane; inf for
-        parallel light.
-    Gradient: through the rays to every lens tensor and to at_m. Raises: DomainError when no ray of a field
-      arrives, none converges, or a distance lies inside the lens.
+      at_m: metres from the entrance pupil to the object plane, or several that share the image
+        plane; inf for parallel light.
+    Gradient: through the rays to every lens tensor and to at_m. Raises: DomainError when no ray of
+      a field arrives, none converges, or a distance lies inside the lens.
 
     Example:
     >>> from codesign import lens

@@ -1,4 +1,5 @@
-"""Wavelengths and their shares of the signal: spectral lines, and what a sensor sees of an illuminant."""
+"""Wavelengths and their shares of the signal: spectral lines, and what a sensor sees of an
+illuminant."""
 
 import math
 from collections.abc import Iterable
@@ -32,8 +33,8 @@ MOST_WAVELENGTHS = 1000
 ROUNDING = 4 * np.finfo(float).eps  # to which the ends of strata are found
 SECOND_RADIATION_UM_K = 14387.768775  # h c / k, exact in the SI of 2019
 
-# CIE standard illuminant D65, 300 to 830 nm in steps of 10 nm, linear between them by definition. Source: CIE
-# S 014-2 / ISO 11664-2
+# CIE standard illuminant D65, 300 to 830 nm in steps of 10 nm, linear between them by definition.
+# Source: CIE S 014-2 / ISO 11664-2
 _D65 = """
 0.0341 3.2945 20.236 37.0535 39.9488 44.9117 46.6383 52.0891 49.9755 54.6482 82.7549 91.486 93.4318
 86.6823 104.865 117.008 117.812 114.861 115.923 108.811 109.354 107.802 104.79 107.689 104.405
@@ -41,8 +42,8 @@ _D65 = """
 78.2842 69.7213 71.6091 74.349 61.604 69.8856 75.087 63.5927 46.4182 66.8054 63.3828 64.304 59.4519
 51.959 57.4406 60.3125
 """
-# extinction coefficient of silicon at 300 K, 360 to 1100 nm in steps of 20 nm. Source: Green, Sol. Energ.
-# Mat. Sol. Cells 92, 1305 (2008)
+# extinction coefficient of silicon at 300 K, 360 to 1100 nm in steps of 20 nm. Source: Green, Sol.
+# Energ. Mat. Sol. Cells 92, 1305 (2008)
 _SILICON_K = """
 2.966 0.946 0.296 0.176 0.107 0.071381 0.055004 0.044165 0.036415 0.030295 0.025758 0.022524
 0.019934 0.017367 0.015432 0.013498 0.011905 0.010528 0.0096257 0.008362 0.007197 0.0063933
@@ -53,7 +54,8 @@ _SILICON_K = """
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Wavelengths (um) and weights (shares of the signal, at least 0, sum 1); both become tuples of floats.
+    """Wavelengths (um) and weights (shares of the signal, at least 0, sum 1); both become tuples of
+    floats.
 
     Raises: ShapeError when the two differ in number; DomainError for what cannot be.
 
@@ -113,8 +115,8 @@ class Spectrum:
 
     @staticmethod
     def visible_FdC(weights: Iterable[float] = (1.0, 1.0, 1.0)) -> "Spectrum":
-        """The F, d and C lines, the classical visible spectrum of lens design, equally weighted unless
-        ``weights`` says otherwise."""
+        """The F, d and C lines, the classical visible spectrum of lens design, equally weighted
+        unless ``weights`` says otherwise."""
         return Spectrum.weighted(tuple(LINE_UM[letter] for letter in "FdC"), weights)
 
     @staticmethod
@@ -123,12 +125,12 @@ class Spectrum:
     ) -> "Spectrum":
         """``count`` wavelengths of equal weight for what a sensor sees of an illuminant.
 
-        The product of the curves (linear between their points, over the range they share) is cut into
-        ``count`` strata of equal signal; each is represented by its signal-weighted mean wavelength, so the
-        mean wavelength of the whole is exact.
-        Args:
-          response, illuminant: pairs (wavelength_um [N], value [N]), increasing wavelengths, values >= 0 of
-            any scale; the response per unit of radiant energy (A/W) when the illuminant is in energy.
+        The product of the curves (linear between their points, over the range they share) is cut
+        into ``count`` strata of equal signal; each is represented by its signal-weighted mean
+        wavelength, so the mean wavelength of the whole is exact. Args:
+          response, illuminant: pairs (wavelength_um [N], value [N]), increasing wavelengths, values
+            >= 0 of any scale; the response per unit of radiant energy (A/W) when the illuminant is
+            in energy.
           count: 1 to 1000.
         Raises: ShapeError, DomainError.
         """
@@ -162,7 +164,13 @@ class Spectrum:
                 "that overlap."
             )
         inner = [
-            brentq(lambda w, k=k: energy(w) - whole * k / count, first, last, xtol=1e-300, rtol=ROUNDING)
+            brentq(
+                lambda w, k=k: energy(w) - whole * k / count,
+                first,
+                last,
+                xtol=1e-300,
+                rtol=ROUNDING,
+            )
             for k in range(1, count)
         ]
         bounds = np.array([first, *inner, last])
@@ -192,22 +200,28 @@ def _curve(curve, name):
         raise ShapeError(
             f"{name} must be a pair (wavelength_um [N], value [N]) of numbers ({str(error)[:80]})."
         ) from error
-    if wavelength_um.ndim != 1 or wavelength_um.shape != value.shape or not 2 <= len(value) <= 10_000:
+    if (
+        wavelength_um.ndim != 1
+        or wavelength_um.shape != value.shape
+        or not 2 <= len(value) <= 10_000
+    ):
         raise ShapeError(
             f"{name} must be a pair (wavelength_um [N], value [N]) with 2 <= N <= 10000, got "
             f"{wavelength_um.shape} and {value.shape}."
         )
     increase = (np.diff(wavelength_um) > 0).all()
     if not (increase and wavelength_um[0] >= 0.1 and wavelength_um[-1] <= 100):
-        raise DomainError(f"{name}: wavelengths must increase and lie in 0.1 to 100; give micrometres.")
+        raise DomainError(
+            f"{name}: wavelengths must increase and lie in 0.1 to 100; give micrometres."
+        )
     if not (value >= 0).all() or not 0 < value.max() < math.inf:
         raise DomainError(f"{name}: values must be finite, at least 0 and not all 0.")
     return wavelength_um, value
 
 
 def blackbody(temperature_k: float) -> Curve:
-    """Planck's radiance per wavelength, 0.30 to 1.20 um in steps of 5 nm, largest value 1: (wavelength_um,
-    value).
+    """Planck's radiance per wavelength, 0.30 to 1.20 um in steps of 5 nm, largest value 1:
+    (wavelength_um, value).
 
     Args: temperature_k from 500 to 100000.
     Raises: DomainError.
@@ -232,12 +246,12 @@ def daylight_d65() -> Curve:
 
 
 def silicon_response(depth_um: float = 5.0) -> Curve:
-    """Response of a generic monochrome silicon sensor per unit of radiant energy, 0.36 to 1.10 um, largest
-    value 1: (wavelength_um, value).
+    """Response of a generic monochrome silicon sensor per unit of radiant energy, 0.36 to 1.10 um,
+    largest value 1: (wavelength_um, value).
 
-    An approximation: every photon absorbed within ``depth_um`` counts, w (1 - exp(-4 pi k depth / w));
-    reflection, the cover glass and losses at the surface are left out, so a real sensor falls faster in the
-    blue. Five micrometres is a usual epitaxial layer.
+    An approximation: every photon absorbed within ``depth_um`` counts, w (1 -
+    exp(-4 pi k depth / w)); reflection, the cover glass and losses at the surface are left out, so
+    a real sensor falls faster in the blue. Five micrometres is a usual epitaxial layer.
     Args: depth_um from 0.01 to 1000.
     Raises: DomainError.
     Source: Beer and Lambert's law with the extinction coefficient of Green, 2008.

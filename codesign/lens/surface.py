@@ -1,5 +1,5 @@
-"""One surface of a sequential lens: shape, what it does to light, the gap behind it, and the medium in that
-gap, which can be exchanged."""
+"""One surface of a sequential lens: shape, what it does to light, the gap behind it, and the medium
+in that gap, which can be exchanged."""
 
 import dataclasses
 import itertools
@@ -16,13 +16,15 @@ from codesign.lens.glass import AIR, D_UM, WAVELENGTH_UM, Glass
 
 @dataclass(frozen=True)
 class Phase:
-    """A diffractive phase on a surface: phi(r) = sum of coefficients[i] r^(2i + 2), in radians and mm, used
-    in one order.
+    """A diffractive phase on a surface: phi(r) = sum of coefficients[i] r^(2i + 2), in radians and
+    mm, used in one order.
 
-    The ray gains the path m w phi / (2 pi), so a negative first coefficient converges light. blaze_um:
-    wavelength at which the grating is blazed for its order; it sets ``efficiency``, None leaves that at 1.
-    Source: Buralli, Morris and Rogers, Optical performance of holographic kinoforms, Applied Optics 28
-      (1989).
+    The ray gains the path m w phi / (2 pi), so a negative first coefficient converges light.
+    blaze_um:
+    wavelength at which the grating is blazed for its order; it sets ``efficiency``, None leaves
+    that at 1.
+    Source: Buralli, Morris and Rogers, Optical performance of holographic kinoforms, Applied Optics
+      28 (1989).
     """
 
     coefficients: tuple[float, ...]
@@ -44,8 +46,8 @@ class Phase:
             check_positive(self.blaze_um, f"{label}: blaze_um")
 
     def efficiency(self, wavelength_um: float) -> float:
-        """Scalar efficiency of the order at a wavelength: sinc^2(m (blaze / w) - m) for a surface blazed for
-        order m, without the dispersion of its material."""
+        """Scalar efficiency of the order at a wavelength: sinc^2(m (blaze / w) - m) for a surface
+        blazed for order m, without the dispersion of its material."""
         if self.blaze_um is None:
             return 1.0
         x = math.pi * self.order * (self.blaze_um / wavelength_um - 1)
@@ -56,19 +58,20 @@ class Phase:
 class Surface:
     """A rotationally symmetric surface, centred on the axis unless it is decentred or tilted.
 
-    radius_mm: vertex radius of curvature, positive when the centre lies towards the image; inf is a plane.
+    radius_mm: vertex radius of curvature, positive when the centre lies towards the image; inf is a
+      plane.
     thickness_mm: axial distance to the next surface (or to the image plane), >= 0.
     medium: glass that follows the surface; None is air (n = 1).
     semi_aperture_mm: half of the clear diameter.
     conic: conic constant k (0 sphere, -1 paraboloid).
     asphere: coefficients of r^2, r^4, r^6, ... in mm^-1, mm^-3, mm^-5, ...
     is_stop: whether this surface is the aperture stop.
-    mirror: whether it reflects. The axis is unfolded at a mirror: light travels along +z behind it too, so
-      lengths and curvatures that follow count along the light (a file's signs are turned by its reader); its
-      medium is the one in front of it.
+    mirror: whether it reflects. The axis is unfolded at a mirror: light travels along +z behind it
+      too, so lengths and curvatures that follow count along the light (a file's signs are turned by
+      its reader); its medium is the one in front of it.
     phase: a diffractive phase, or None.
-    decentre_mm: (x, y) of the vertex; tilt_deg: about x, then about y, around that vertex. Later surfaces
-      stay where they were.
+    decentre_mm: (x, y) of the vertex; tilt_deg: about x, then about y, around that vertex. Later
+      surfaces stay where they were.
     inner_semi_aperture_mm: half the diameter of a central obstruction, 0 for none.
 
     Example:
@@ -124,7 +127,9 @@ class Surface:
                 "the distance to the next surface as 0 or more."
             )
         if self.semi_aperture_mm <= 0:
-            raise DomainError(f"{label}: semi-aperture {self.semi_aperture_mm} mm must be positive.")
+            raise DomainError(
+                f"{label}: semi-aperture {self.semi_aperture_mm} mm must be positive."
+            )
         if not 0 <= self.inner_semi_aperture_mm < self.semi_aperture_mm:
             raise DomainError(
                 f"{label}: central obstruction of {self.inner_semi_aperture_mm} mm must be at least 0 and "
@@ -151,24 +156,30 @@ class Surface:
 
 
 def checked(name: str, surfaces: Iterable[Surface]) -> tuple[tuple[Surface, ...], int]:
-    """Surfaces that can be a lens of that name, and which of them is the stop; the first where none is marked.
+    """Surfaces that can be a lens of that name, and which of them is the stop; the first where none
+    is marked.
 
     Raises: DomainError for none, for what is no Surface or cannot exist, and for two stops.
     """
     surfaces = tuple(surfaces)
     if not surfaces or not all(isinstance(surface, Surface) for surface in surfaces):
         kinds = ", ".join(sorted({type(surface).__name__ for surface in surfaces})) or "none"
-        raise DomainError(f"{name}: a lens needs at least one surface, each a Surface; given: {kinds}.")
+        raise DomainError(
+            f"{name}: a lens needs at least one surface, each a Surface; given: {kinds}."
+        )
     for i, surface in enumerate(surfaces):
         surface.check(f"{name}, surface {i + 1}")
     stops = [i for i, s in enumerate(surfaces) if s.is_stop]
     if len(stops) > 1:
-        raise DomainError(f"{name}: surfaces {[i + 1 for i in stops]} are all marked as the stop; mark one.")
+        raise DomainError(
+            f"{name}: surfaces {[i + 1 for i in stops]} are all marked as the stop; mark one."
+        )
     return surfaces, stops[0] if stops else 0
 
 
 def described(surfaces: Iterable[Surface]) -> dict[str, float]:
-    """What surfaces are beside the tensors of a lens, {what: number}: media, mirrors, obstructions and gratings."""
+    """What surfaces are beside the tensors of a lens, {what: number}: media, mirrors, obstructions
+    and gratings."""
     found = {}
     for i, s in enumerate(surfaces, 1):
         medium = s.medium or AIR
@@ -193,7 +204,8 @@ def scaled_phase(phase: Phase | None, factor: float) -> Phase | None:
     if phase is None:
         return None
     return replace(
-        phase, coefficients=tuple(a * factor ** (-2 - 2 * i) for i, a in enumerate(phase.coefficients))
+        phase,
+        coefficients=tuple(a * factor ** (-2 - 2 * i) for i, a in enumerate(phase.coefficients)),
     )
 
 
@@ -220,10 +232,10 @@ def sag_mm(
 ) -> Tensor:
     """Depth of a surface at heights [...] from the axis, mm.
 
-    Args: curvature_per_mm, conic, and each coefficient of r^2, r^4, ... in ``asphere``: numbers, or tensors
-      that broadcast with the heights.
-    Gradient: everything given as a tensor. Beyond the reach of the conic its root is held at 1e-3, so that
-      the gradient stays finite.
+    Args: curvature_per_mm, conic, and each coefficient of r^2, r^4, ... in ``asphere``: numbers, or
+      tensors that broadcast with the heights.
+    Gradient: everything given as a tensor. Beyond the reach of the conic its root is held at 1e-3,
+      so that the gradient stays finite.
     """
     r2 = height_mm.square()
     root = (1 - (1 + conic) * curvature_per_mm**2 * r2).clamp_min(1e-6).sqrt()
@@ -245,8 +257,8 @@ def with_medium(
       name: the lens's, for errors.
       surface: counted from 0, from the last when negative.
       glass: a Glass, a name or code as ``Glass.named`` takes, None for air.
-    Raises: DomainError for a surface that is not there or a mirror, glass passed twice, and a name the
-      catalogue does not know.
+    Raises: DomainError for a surface that is not there or a mirror, glass passed twice, and a name
+      the catalogue does not know.
     """
     count = len(surfaces)
     if isinstance(surface, bool) or not isinstance(surface, int) or not -count <= surface < count:
@@ -281,9 +293,9 @@ def with_medium(
 
 
 def passes_of(surfaces: Sequence[Surface], gap: int) -> list[int]:
-    """Other gaps of the same glass that take the same room on the axis, folded at the mirrors: further
-    passes through one piece. A gap behind a mirror is left out, as it takes its medium from the one in
-    front."""
+    """Other gaps of the same glass that take the same room on the axis, folded at the mirrors:
+    further passes through one piece. A gap behind a mirror is left out, as it takes its medium from
+    the one in front."""
     places = [0.0]
     along = 1.0
     for surface in surfaces:

@@ -19,10 +19,10 @@ from codesign.lens.kernel import FORWARD, GRAZING, Kernel, Status, Works
 class PlateAt:
     """A phase plate on a plane of a lens, for one wavelength; ``trace`` sends rays through it.
 
-    look: points [N, 2] mm -> phase [N] rad, its slope [N, 2] rad/mm, whether the plate reaches there [N]
-      bool.
-    gap: the surface it follows, -1 before the first. after_mm: from that surface's vertex (from the first
-      where gap is -1). mm_per_rad: optical path of a radian.
+    look: points [N, 2] mm -> phase [N] rad, its slope [N, 2] rad/mm, whether the plate reaches
+      there [N] bool.
+    gap: the surface it follows, -1 before the first. after_mm: from that surface's vertex (from the
+      first where gap is -1). mm_per_rad: optical path of a radian.
     """
 
     look: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
@@ -43,22 +43,25 @@ SEGMENT = 8
 
 @dataclass(frozen=True)
 class Prescription:
-    """Numbers the kernel needs, for one wavelength. Tensors of one dtype and device; gradients flow to all of
-    them.
+    """Numbers the kernel needs, for one wavelength. Tensors of one dtype and device; gradients flow
+    to all of them.
 
-    curvature_per_mm, thickness_mm, conic, semi_aperture_mm: [S]. asphere: [S, A], coefficients of r^2, r^4,
-      ...
-    index: [S + 1], the first before the first surface. soft_edge_mm: full width of the smooth edge of the
-      apertures.
-    path_mm: [S, P], optical path added by a diffractive phase, coefficients of r^2, r^4, ...; efficiency:
-      product of its efficiencies.
-    decentre_mm, tilt_rad: [S, 2] each. mirrors: S booleans; the axis is unfolded behind a mirror (see
-      Surface).
+    curvature_per_mm, thickness_mm, conic, semi_aperture_mm: [S]. asphere: [S, A], coefficients of
+      r^2, r^4, ...
+    index: [S + 1], the first before the first surface. soft_edge_mm: full width of the smooth edge
+      of the apertures.
+    path_mm: [S, P], optical path added by a diffractive phase, coefficients of r^2, r^4, ...;
+      efficiency: product of its efficiencies.
+    decentre_mm, tilt_rad: [S, 2] each. mirrors: S booleans; the axis is unfolded behind a mirror
+      (see Surface).
     inner_semi_aperture_mm: S numbers, radii of central obstructions (0: none).
-    borders_glass: S booleans, surfaces whose index step may change: where the step is 0 today, a derivative
-      to ``index`` still needs the refraction. False for a surface in air, whose step stays 0.
-    to_plane: whether rays go on to the plane behind the last thickness, or end on the last surface itself.
-    plate: a phase plate between the surfaces, or None; of no concern to ``trace_surfaces``, see ``trace``.
+    borders_glass: S booleans, surfaces whose index step may change: where the step is 0 today, a
+      derivative to ``index`` still needs the refraction. False for a surface in air, whose step
+      stays 0.
+    to_plane: whether rays go on to the plane behind the last thickness, or end on the last surface
+      itself.
+    plate: a phase plate between the surfaces, or None; of no concern to ``trace_surfaces``, see
+      ``trace``.
     """
 
     curvature_per_mm: Tensor
@@ -79,12 +82,14 @@ class Prescription:
     plate: PlateAt | None = None
 
     def reversed(self, last_gap_mm: Tensor) -> "Prescription":
-        """The same lens seen from the image side; ``last_gap_mm`` is the distance of the plane where the rays
-        end."""
+        """The same lens seen from the image side; ``last_gap_mm`` is the distance of the plane
+        where the rays end."""
         gaps = torch.cat([self.thickness_mm[:-1].flip(0), last_gap_mm.reshape(1)])
         # a mirror faces the light from either way
         turn = torch.tensor(
-            [1.0 if mirror else -1.0 for mirror in self.mirrors], dtype=gaps.dtype, device=gaps.device
+            [1.0 if mirror else -1.0 for mirror in self.mirrors],
+            dtype=gaps.dtype,
+            device=gaps.device,
         )
         shapes = {
             "curvature_per_mm": (turn * self.curvature_per_mm).flip(0),
@@ -123,12 +128,14 @@ class Prescription:
     def part(self, first: int, stop: int) -> "Prescription":
         """The surfaces from ``first`` to before ``stop``, without a plate."""
         whole = ("index", "soft_edge_mm", "efficiency", "to_plane", "plate")
-        rows = {f.name: getattr(self, f.name)[first:stop] for f in fields(self) if f.name not in whole}
+        rows = {
+            f.name: getattr(self, f.name)[first:stop] for f in fields(self) if f.name not in whole
+        }
         return replace(self, **rows, index=self.index[first : stop + 1], plate=None)
 
     def opened(self, surface: int) -> "Prescription":
-        """The same lens with one aperture that clips nothing: rays that are placed on the stop are not to be
-        weighed by its edge."""
+        """The same lens with one aperture that clips nothing: rays that are placed on the stop are
+        not to be weighed by its edge."""
         apertures = self.semi_aperture_mm.clone()
         apertures[surface] = 1e6
         return replace(self, semi_aperture_mm=apertures)
@@ -156,8 +163,10 @@ class Prescription:
 class TraceResult:
     """Rays on the plane behind the last thickness.
 
-    position_mm: [N, 3] relative to the plane's centre (z = 0). direction: [N, 3] unit. optical_path_mm: [N].
-    weight: [N] product of the soft aperture edges; 0 for failed rays. deficit: [N] >= 0, dimensionless.
+    position_mm: [N, 3] relative to the plane's centre (z = 0). direction: [N, 3] unit.
+      optical_path_mm: [N].
+    weight: [N] product of the soft aperture edges; 0 for failed rays. deficit: [N] >= 0,
+      dimensionless.
     packed_status: [N] int, status, hard mask and failed surface packed into one number; read
       them by their names.
     """
@@ -176,14 +185,14 @@ class TraceResult:
 
     @property
     def inside(self) -> Tensor:
-        """The hard mask: whether each ray lies within every clear aperture it reached and outside every
-        obstruction, [N] bool."""
+        """The hard mask: whether each ray lies within every clear aperture it reached and outside
+        every obstruction, [N] bool."""
         return (self.packed_status & 4) != 0
 
     @property
     def failed_surface(self) -> Tensor:
-        """First surface (from 0) where each ray failed, S where it failed to leave forwards, -1 if nowhere,
-        [N] int."""
+        """First surface (from 0) where each ray failed, S where it failed to leave forwards, -1 if
+        nowhere, [N] int."""
         return self.packed_status >> 3
 
 
@@ -210,9 +219,11 @@ def check_rays(origin_mm: Tensor, direction: Tensor) -> None:
 
 
 def _range(rows, function):
-    """Least and largest value of a function of rows [N, 3], in blocks that stay in the cache; NaN where there
-    is one."""
-    found = torch.stack([torch.stack(torch.aminmax(function(part))) for part in rows.detach().split(65_536)])
+    """Least and largest value of a function of rows [N, 3], in blocks that stay in the cache; NaN
+    where there is one."""
+    found = torch.stack(
+        [torch.stack(torch.aminmax(function(part))) for part in rows.detach().split(65_536)]
+    )
     return found[:, 0].min().item(), found[:, 1].max().item()
 
 
@@ -221,10 +232,10 @@ def trace_surfaces(prescription: Prescription, origin_mm: Tensor, direction: Ten
 
     Args: origin_mm [N, 3], direction [N, 3] unit, both of the prescription's dtype.
     Returns: TraceResult.
-    Gradient: position, direction, optical path, weight and deficit, to rays and to every tensor of the
-      prescription.
-    Lenses of more than LONGEST surfaces are traced in segments, each a kernel of its own: the time to
-      compile one grows with the square of its length, and segments alike share one.
+    Gradient: position, direction, optical path, weight and deficit, to rays and to every tensor of
+      the prescription.
+    Lenses of more than LONGEST surfaces are traced in segments, each a kernel of its own: the time
+      to compile one grows with the square of its length, and segments alike share one.
     """
     p = prescription
     count = origin_mm.shape[0]
@@ -290,7 +301,9 @@ def _in_segments(p, origin_mm, direction):
     def segment(first):
         stop = min(first + SEGMENT, count)
         efficiency = 1.0 if first else p.efficiency
-        return replace(p.part(first, stop), to_plane=p.to_plane or stop < count, efficiency=efficiency)
+        return replace(
+            p.part(first, stop), to_plane=p.to_plane or stop < count, efficiency=efficiency
+        )
 
     found = trace_surfaces(segment(0), origin_mm, direction)
     for first in range(SEGMENT, count, SEGMENT):
@@ -309,9 +322,12 @@ def onward(rays: TraceResult) -> tuple[Tensor, Tensor]:
 
 
 def joined(front: TraceResult, rest: TraceResult, surfaces: int) -> TraceResult:
-    """Rays through the first ``surfaces`` of a lens and then through the rest, as one TraceResult."""
+    """Rays through the first ``surfaces`` of a lens and then through the rest, as one
+    TraceResult."""
     alive = front.packed_status < 0  # no surface where they failed
-    packed = torch.where(rest.packed_status < 0, rest.packed_status, rest.packed_status + 8 * surfaces)
+    packed = torch.where(
+        rest.packed_status < 0, rest.packed_status, rest.packed_status + 8 * surfaces
+    )
     packed = packed & (front.packed_status | ~4)  # inside both
     if bool(alive.all()):  # the same as below, in a third of the time
         return replace(
@@ -331,12 +347,12 @@ def joined(front: TraceResult, rest: TraceResult, surfaces: int) -> TraceResult:
 
 
 def trace(prescription: Prescription, origin_mm: Tensor, direction: Tensor) -> TraceResult:
-    """Trace rays through a lens that may hold a plate, see ``trace_surfaces``. At the plate a ray gains its
-    phase as optical path, and its direction across the axis, times index, gains the slope of that path: the
-    local grating equation.
+    """Trace rays through a lens that may hold a plate, see ``trace_surfaces``. At the plate a ray
+    gains its phase as optical path, and its direction across the axis, times index, gains the slope
+    of that path: the local grating equation.
 
-    Gradient: also to the plate. Rays that leave a plate beyond its rim MISS; those it turns beyond a right
-      angle are TOTAL_REFLECTION.
+    Gradient: also to the plate. Rays that leave a plate beyond its rim MISS; those it turns beyond
+      a right angle are TOTAL_REFLECTION.
     """
     p = prescription
     placed = p.plate
@@ -370,7 +386,8 @@ def at_surfaces(
 def to_plate(
     prescription: Prescription, placed: PlateAt, origin_mm: Tensor, direction: Tensor
 ) -> TraceResult:
-    """Rays on the plane of a lens's plate, before it turns them; positions relative to the plate's centre."""
+    """Rays on the plane of a lens's plate, before it turns them; positions relative to the plate's
+    centre."""
     p = prescription
     after = torch.as_tensor(placed.after_mm).to(p.thickness_mm)
     if placed.gap < 0:
@@ -381,7 +398,8 @@ def to_plate(
 
 
 def straight(origin_mm: Tensor, direction: Tensor, to_mm: Tensor, index: Tensor) -> TraceResult:
-    """Rays on the plane z = ``to_mm``, without a surface on the way; positions relative to its centre."""
+    """Rays on the plane z = ``to_mm``, without a surface on the way; positions relative to its
+    centre."""
     forward = direction[:, 2] > FORWARD
     length = (to_mm - origin_mm[:, 2]) / torch.where(forward, direction[:, 2], 1)
     flat = pad(origin_mm[:, :2] + direction[:, :2] * length[:, None], (0, 1))
@@ -391,7 +409,8 @@ def straight(origin_mm: Tensor, direction: Tensor, to_mm: Tensor, index: Tensor)
 
 
 def _plate_turns(rays, placed, index, surface):
-    """Rays on the plate's plane as they leave it; what it stops failed at ``surface``, the one before."""
+    """Rays on the plate's plane as they leave it; what it stops failed at ``surface``, the one
+    before."""
     phase, slope, reaches = placed.look(rays.position_mm[:, :2])
     across = rays.direction[:, :2] + slope * (placed.mm_per_rad / index)
     radicand = 1 - across.square().sum(1)
@@ -404,7 +423,9 @@ def _plate_turns(rays, placed, index, surface):
     packed = torch.where(alive & ~good, failed, rays.packed_status)
     return replace(
         rays,
-        direction=torch.where(good[:, None], torch.cat([across, axial[:, None]], 1), rays.direction),
+        direction=torch.where(
+            good[:, None], torch.cat([across, axial[:, None]], 1), rays.direction
+        ),
         optical_path_mm=torch.where(
             good, rays.optical_path_mm + phase * placed.mm_per_rad, rays.optical_path_mm
         ),
@@ -415,11 +436,11 @@ def _plate_turns(rays, placed, index, surface):
 
 
 def sum_over_chunks(function: Callable[..., Tensor], *rays: Tensor, rows: int = 262_144) -> Tensor:
-    """Sum of ``function(*chunk)`` over chunks of rays, in bounded memory: a chunk is traced again when its
-    gradient is due.
+    """Sum of ``function(*chunk)`` over chunks of rays, in bounded memory: a chunk is traced again
+    when its gradient is due.
 
-    Args: function of tensors [n, ...] -> tensor, such as a merit of traced rays; rays: tensors [N, ...] split
-      together into ``rows`` at a time.
+    Args: function of tensors [n, ...] -> tensor, such as a merit of traced rays; rays: tensors
+      [N, ...] split together into ``rows`` at a time.
     Returns: the sum over chunks. Gradient: as if all were traced at once.
     Raises: ShapeError unless every tensor holds the same number of rays, at least one.
     """

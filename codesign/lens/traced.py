@@ -12,8 +12,8 @@ from codesign.lens.trace import Prescription, TraceResult
 
 
 class TracedLens(ParaxialLens, Protocol):
-    """A lens whose rays can be traced and whose tensors can be replaced; see GeoLens for what each name
-    holds."""
+    """A lens whose rays can be traced and whose tensors can be replaced; see GeoLens for what each
+    name holds."""
 
     tensor_names: tuple[str, ...]
     surfaces: tuple[Surface, ...]
@@ -44,8 +44,8 @@ L = TypeVar("L", bound=TracedLens)
 
 
 def in_float64(lens: L) -> L:
-    """The lens with its numbers in float64, for figures that float32 would drown in rounding; the lens
-    itself where they are that already. Gradient: to every tensor of the lens."""
+    """The lens with its numbers in float64, for figures that float32 would drown in rounding; the
+    lens itself where they are that already. Gradient: to every tensor of the lens."""
     if lens.dtype == torch.float64:
         return lens
     lens = lens.replace()

@@ -1,5 +1,5 @@
-"""Numbers of a lens as dimensionless variables whose unit is a natural step: one that moves the rays on the
-film by a set distance."""
+"""Numbers of a lens as dimensionless variables whose unit is a natural step: one that moves the
+rays on the film by a set distance."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -27,8 +27,9 @@ Bound = float | Sequence[float] | Tensor | None
 class Kind:
     """Numbers of a lens that go by one name.
 
-    tensor: name of the tensor they are in. places: [K] their places in it, flattened. reach: [K] the largest
-    change that a unit of a variable may make, for numbers that hardly move a ray. low: least value where no
+    tensor: name of the tensor they are in. places: [K] their places in it, flattened. reach: [K]
+    the largest change that a unit of a variable may make, for numbers that hardly move a ray. low:
+    least value where no
       other bound is given.
     """
 
@@ -52,9 +53,10 @@ class Chosen:
 class Variables(nn.Module):
     """Tensors of a lens as functions of variables: value = bound(start + unit u).
 
-    For every kind a Parameter [K] of its name, zero at the values that ``tensors`` hold. Where bounds are
-    given on both sides the value is middle + half tanh(.), where on one side it is bound ± width log(1 +
-    exp(.)); their slope at the start is in the unit, so that a step means the same with bounds and without.
+    For every kind a Parameter [K] of its name, zero at the values that ``tensors`` hold. Where
+    bounds are given on both sides the value is middle + half tanh(.), where on one side it is bound
+    ± width log(1 + exp(.)); their slope at the start is in the unit, so that a step means the same
+    with bounds and without.
     Raises: DomainError for a start that does not lie strictly inside its bounds.
     """
 
@@ -92,7 +94,9 @@ class Variables(nn.Module):
         """The tensors at the variables as they are, by name. Gradient: exact, to the variables."""
         made = self._labelled("start_")
         for name, tensor in self.tensor_of.items():
-            low, high, width, places, start, unit = (getattr(self, f"{name}_{label}") for label in LABELS)
+            low, high, width, places, start, unit = (
+                getattr(self, f"{name}_{label}") for label in LABELS
+            )
             values = _bounded(start + unit * getattr(self, name), low, high, width)
             flat = made[tensor].reshape(-1).index_put((places,), values)
             made[tensor] = flat.reshape(made[tensor].shape)
@@ -110,8 +114,8 @@ def ray_motion(
     ahead: tuple[Tensor, Tensor],
     behind: tuple[Tensor, Tensor],
 ) -> tuple[Tensor, Tensor]:
-    """How rays move on the film between two states of a lens: [fields, M, 2] mm, and [fields, M] 1 for rays
-    that arrive in both, else 0.
+    """How rays move on the film between two states of a lens: [fields, M, 2] mm, and [fields, M] 1
+    for rays that arrive in both, else 0.
 
     Args:
       ahead, behind: positions [fields, M, 2] and weights [fields, M], as from ``spots``.
@@ -149,7 +153,8 @@ def checked_step(step_mm: float) -> float:
 def checked_bounds(
     name: str, kind: Kind, value: Tensor, given: tuple[Bound, Bound] | None, rows: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Lower and upper bounds [R] of the numbers at ``rows`` of one kind; infinite where there is none.
+    """Lower and upper bounds [R] of the numbers at ``rows`` of one kind; infinite where there is
+    none.
 
     Raises: ShapeError; DomainError for a number that does not lie strictly inside.
     """
@@ -160,9 +165,13 @@ def checked_bounds(
         )
     sides = []
     for side, free in zip(given, (-math.inf, math.inf), strict=True):
-        side = torch.as_tensor(free if side is None else side, dtype=value.dtype, device=value.device)
+        side = torch.as_tensor(
+            free if side is None else side, dtype=value.dtype, device=value.device
+        )
         if side.numel() not in (1, value.numel()):
-            raise ShapeError(f"a bound of {name} is a number or {value.numel()} of them, got {side.numel()}.")
+            raise ShapeError(
+                f"a bound of {name} is a number or {value.numel()} of them, got {side.numel()}."
+            )
         sides.append(side.reshape(-1).expand_as(value)[rows])
     low, high = sides
     wrong = torch.nonzero(~((low < value[rows]) & (value[rows] < high)))[:, 0].tolist()
@@ -182,7 +191,8 @@ def _width(value, low, high):
 
 
 def _sides(low, high):
-    """Masks of bounds on both sides, below only, above only; and the bounds, 0 where there is none."""
+    """Masks of bounds on both sides, below only, above only; and the bounds, 0 where there is
+    none."""
     below = low.isfinite()
     above = high.isfinite()
     return (
@@ -231,8 +241,8 @@ def make_variables(
     """Variables of the named kinds around a lens as it is now; see ``GeoLens.variables``.
 
     The lens says what it has: ``_kinds()`` -> {name: Kind}, ``_solved(tensors, held)`` -> tensors,
-    ``_landing(fields_rad, wavelength_um)`` -> positions and weights of a bundle of rays on the film,
-    ``solved_tensors``: which tensor a solve makes.
+    ``_landing(fields_rad, wavelength_um)`` -> positions and weights of a bundle of rays on the
+    film, ``solved_tensors``: which tensor a solve makes.
     """
     exact = lens._fixed().double()
     kinds = exact._kinds()
@@ -258,7 +268,9 @@ def make_variables(
         rows = torch.nonzero(_kept(name, kind, value, bounds, mask))[:, 0]
 
         def land(numbers, tensor=kind.tensor, at=kind.places[rows]):
-            moved = tensors[tensor].reshape(-1).index_put((at,), numbers).reshape(tensors[tensor].shape)
+            moved = (
+                tensors[tensor].reshape(-1).index_put((at,), numbers).reshape(tensors[tensor].shape)
+            )
             given = {name: tensors[name] for name in solved} | {tensor: moved}
             return exact._with(exact._solved(given, held))._landing(fields_rad, wavelength_um)
 
@@ -281,7 +293,9 @@ def _kept(name, kind, value, bounds, mask):
     if name in mask:
         asked = torch.as_tensor(mask[name], dtype=torch.bool, device=value.device)
         if asked.shape != value.shape:
-            raise ShapeError(f"the mask of {name} needs {value.numel()} entries, got {tuple(asked.shape)}.")
+            raise ShapeError(
+                f"the mask of {name} needs {value.numel()} entries, got {tuple(asked.shape)}."
+            )
         keep = keep & asked
     return keep
 

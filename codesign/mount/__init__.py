@@ -1,7 +1,8 @@
 """A camera on a robot's body, and what the body reads off event flow from there.
 
-Where it sits and what it has to keep: ``Mount``, ``MountRanges``, the requirements. What flow tells of the
-body's velocity: ``body_flow``, ``Surroundings``, ``sight_table``. Reading it, as a stage of a system:
+Where it sits and what it has to keep: ``Mount``, ``MountRanges``, the requirements. What flow tells
+of the body's velocity: ``body_flow``, ``Surroundings``, ``sight_table``. Reading it, as a stage of
+a system:
   ``EgoVelocity``.
 Read first: pose.py, then ego_velocity.py.
 """
@@ -10,7 +11,13 @@ from codesign.doors import explain
 from codesign.mount.body import Body, Housing
 from codesign.mount.depth import ground_depth, scene_depth
 from codesign.mount.ego_velocity import EgoVelocity, Motion, Readings
-from codesign.mount.errors import Expected, FlowErrors, VelocityErrors, expected_errors, velocity_errors
+from codesign.mount.errors import (
+    Expected,
+    FlowErrors,
+    VelocityErrors,
+    expected_errors,
+    velocity_errors,
+)
 from codesign.mount.head import Evidence, VelocityHead, window_optics
 from codesign.mount.observability import FREE, PLANAR, body_flow, flow_precision
 from codesign.mount.pose import Mount, MountRanges, yaw_pitch_roll_rad

@@ -12,14 +12,20 @@ from torch import Tensor
 
 from codesign.checks import check_finite, check_number, check_positive
 from codesign.errors import DomainError, ShapeError
-from codesign.mount.triangles import closest_points, first_crossings, nearest_to_edges, winding_numbers
+from codesign.mount.triangles import (
+    closest_points,
+    first_crossings,
+    nearest_to_edges,
+    winding_numbers,
+)
 
 DEPTHS = 17  # points of a capsule's axis at which its depth inside a solid is looked for
 ON_SURFACE_M = 1e-9  # nearer than this the face's normal stands for the direction to the surface
 
 
 class Part(Protocol):
-    """A mesh of a robot, as ``scenes.robots`` has them: name, vertices_m [V, 3] and faces [F, 3]."""
+    """A mesh of a robot, as ``scenes.robots`` has them: name, vertices_m [V, 3] and faces
+    [F, 3]."""
 
     @property
     def name(self) -> str: ...
@@ -35,7 +41,8 @@ class Part(Protocol):
 class Housing:
     """What holds a camera, as a ball or a capsule about its axis.
 
-    radius_m: > 0. behind_m: how far the axis of the capsule goes behind the camera's origin; 0 is a ball.
+    radius_m: > 0. behind_m: how far the axis of the capsule goes behind the camera's origin; 0 is a
+      ball.
     Raises: DomainError for other numbers.
     """
 
@@ -50,8 +57,8 @@ class Housing:
 class Body:
     """Triangles of a robot in its own axes, metres.
 
-    Each closed surface is a solid, whichever way its faces turn; solids may overlap. What is not closed has
-    two sides and is a solid where it winds more than half around a point.
+    Each closed surface is a solid, whichever way its faces turn; solids may overlap. What is not
+    closed has two sides and is a solid where it winds more than half around a point.
 
     >>> corners = [[x, y, z] for x in (-0.2, 0.2) for y in (-0.1, 0.1) for z in (0.0, 0.1)]
     >>> sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -63,21 +70,23 @@ class Body:
     Args:
       meshes: pairs of vertices [V, 3] in metres and faces [F, 3] of their indices.
     solids: tuple of triangles [F, 3, 3] float64, those of one solid together.
-    Raises: DomainError where there is no triangle, a vertex is not finite, or a face names one that is not
-      there; ShapeError.
+    Raises: DomainError where there is no triangle, a vertex is not finite, or a face names one that
+      is not there; ShapeError.
     """
 
     solids: tuple[Tensor, ...]
 
     def __init__(self, meshes: Iterable[tuple[Any, Any]]) -> None:
-        self.solids = tuple(solid for vertices, faces in meshes for solid in solids_of(vertices, faces))
+        self.solids = tuple(
+            solid for vertices, faces in meshes for solid in solids_of(vertices, faces)
+        )
         if not self.solids:
             raise DomainError("body: there are no triangles; give at least one mesh with a face.")
 
     @classmethod
     def of(cls, parts: Sequence[Part], without: Sequence[str] = ()) -> "Body":
-        """The body of a robot's parts (``scenes.robots.from_urdf(...).parts``), less the links named in
-        ``without``: those that carry the camera and move with it.
+        """The body of a robot's parts (``scenes.robots.from_urdf(...).parts``), less the links
+        named in ``without``: those that carry the camera and move with it.
 
         Raises: DomainError for a link that has no part.
         """
@@ -100,24 +109,24 @@ class Body:
         Args:
           points_m: [..., 3], axes of the body.
         Returns: [..., solids] float64.
-        Gradient: to the points, the exact one of the distance; at a surface the normal of its face. It jumps
-          where two parts of a solid are equally near.
+        Gradient: to the points, the exact one of the distance; at a surface the normal of its face.
+          It jumps where two parts of a solid are equally near.
         """
         points = points_m.double().reshape(-1, 3)
         found = [_signed(points, solid) for solid in self.solids]
         return torch.stack(found, -1).reshape(*points_m.shape[:-1], len(found))
 
     def distance_m(self, points_m: Tensor) -> Tensor:
-        """Signed distance [...] of points [..., 3] to the body: exact outside, and inside the depth in the
-        solid that is deepest."""
+        """Signed distance [...] of points [..., 3] to the body: exact outside, and inside the depth
+        in the solid that is deepest."""
         return self.distances_m(points_m).amin(-1)
 
     def clearances_m(self, T_body_cam: Tensor, housing: Housing) -> Tensor:
-        """Free space between the housing of a camera and every solid, [..., solids] for mounts [..., 4, 4];
-        negative where they overlap.
+        """Free space between the housing of a camera and every solid, [..., solids] for mounts
+        [..., 4, 4]; negative where they overlap.
 
-        Exact where they do not; the depth of a capsule inside is that of the deepest of DEPTHS points of its
-        axis.
+        Exact where they do not; the depth of a capsule inside is that of the deepest of DEPTHS
+        points of its axis.
         Gradient: to the mount.
         """
         pose = T_body_cam.double().reshape(-1, 4, 4)
@@ -148,8 +157,8 @@ def _signed(points, triangles):
 
 
 def _of_segments(start, end, triangles):
-    """Smallest signed distance [N] along segments to one solid: outside it lies at an end, at an edge or
-    where the segment crosses a triangle."""
+    """Smallest signed distance [N] along segments to one solid: outside it lies at an end, at an
+    edge or where the segment crosses a triangle."""
     crossing = first_crossings(start, end - start, triangles).clamp_max(1.0)
     edges = nearest_to_edges(start, end, triangles)
     fixed = torch.linspace(0, 1, DEPTHS).to(start).expand(len(start), DEPTHS)
@@ -165,12 +174,15 @@ def solids_of(vertices_m: Any, faces: Any) -> list[Tensor]:
 
     Args:
       vertices_m: [V, 3].
-      faces: [F, 3] indices of them. Vertices at one place count as one: seams of a texture are no holes.
+      faces: [F, 3] indices of them. Vertices at one place count as one: seams of a texture are no
+        holes.
     Returns: list of [F', 3, 3] float64, turned outward where they are closed.
-    Raises: ShapeError; DomainError for vertices that are not finite, faces of vertices that are not there,
-      and closed surfaces whose faces turn different ways.
+    Raises: ShapeError; DomainError for vertices that are not finite, faces of vertices that are not
+      there, and closed surfaces whose faces turn different ways.
     """
-    vertices = check_finite(torch.tensor(np.asarray(vertices_m, dtype=np.float64)), "body: vertices")
+    vertices = check_finite(
+        torch.tensor(np.asarray(vertices_m, dtype=np.float64)), "body: vertices"
+    )
     faces = np.array(faces, dtype=np.int64) if len(faces) else np.zeros((0, 3), dtype=np.int64)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         raise ShapeError(
@@ -184,7 +196,9 @@ def solids_of(vertices_m: Any, faces: Any) -> list[Tensor]:
     if not len(faces):
         return []
     triangles = vertices[torch.from_numpy(faces)]
-    component, closed = _components(np.unique(vertices.numpy(), axis=0, return_inverse=True)[1][faces])
+    component, closed = _components(
+        np.unique(vertices.numpy(), axis=0, return_inverse=True)[1][faces]
+    )
     found = [_outward(triangles[torch.from_numpy(component == k)]) for k in np.flatnonzero(closed)]
     loose = torch.from_numpy(~closed[component])
     return [*found, triangles[loose]] if bool(loose.any()) else found

@@ -1,6 +1,6 @@
-"""How far the surfaces under pixels are: over flat ground, or as a map of the world tells it. What moves
-through the world by itself, such as the robot's own body, has no depth: its image says nothing of the way the
-body goes."""
+"""How far the surfaces under pixels are: over flat ground, or as a map of the world tells it. What
+moves through the world by itself, such as the robot's own body, has no depth: its image says
+nothing of the way the body goes."""
 
 from typing import Any
 
@@ -26,9 +26,10 @@ def ground_depth(
       camera: with ``chief_rays``.
       pixels: [N, P, 2] px.
       T_world_cam: [N, 4, 4].
-      scene: as for ``scene_depth``; only the objects of a MovingScene are looked at, which hide the ground.
-    Returns: [N, P] m along the camera's z axis, float64; infinite where a ray goes up or along the ground, or
-      meets an object that moves.
+      scene: as for ``scene_depth``; only the objects of a MovingScene are looked at, which hide the
+        ground.
+    Returns: [N, P] m along the camera's z axis, float64; infinite where a ray goes up or along the
+      ground, or meets an object that moves.
     Gradient: pose, and the lens behind the chief rays.
     """
     rays = camera.chief_rays(pixels.reshape(-1, 2))
@@ -59,8 +60,9 @@ def _over_ground(rays, pixels, T_world_cam, hidden):
 def scene_depth(camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, scene: Any) -> Tensor:
     """Depth of what a scene has under the pixels, as a perfect map would know it.
 
-    Args and Returns: as for ``ground_depth``; scene: one, or a tuple of as many for equal shares of the N
-      poses. Of a MovingScene the objects stand where they are in the middle of its frames, and have no depth.
+    Args and Returns: as for ``ground_depth``; scene: one, or a tuple of as many for equal shares of
+      the N poses. Of a MovingScene the objects stand where they are in the middle of its frames,
+      and have no depth.
     Gradient: pose and lens, the surface taken as its tangent plane.
     """
     return _on_surfaces(camera.chief_rays(pixels.reshape(-1, 2)), pixels, T_world_cam, scene)[1]
@@ -84,7 +86,8 @@ def _hidden(rays, pixels, T_world_cam, scene):
 
 
 def _on_surfaces(rays, pixels, T_world_cam, scene):
-    """First surfaces along rays through pixels [N, P, 2], and their depth [N, P], infinite for objects and for none."""
+    """First surfaces along rays through pixels [N, P, 2], and their depth [N, P], infinite for
+    objects and for none."""
     shape = pixels.shape[:2]
     origin = rays.origin_m.double().reshape(*shape, 3)
     direction = rays.direction.double().reshape(*shape, 3)
@@ -99,8 +102,12 @@ def _on_surfaces(rays, pixels, T_world_cam, scene):
             middle = world.T_world_object[0].shape[-3] // 2
             world, poses = world.during([middle]), poses[:, None]
         views = views_of(world, poses)
-        found.append(first_hits(origin[mine], direction[mine], lit[mine], views.scene, views.cameras))
-    hits = Hits(*(torch.cat([getattr(each, name) for each in found]) for name in Hits.__dataclass_fields__))
+        found.append(
+            first_hits(origin[mine], direction[mine], lit[mine], views.scene, views.cameras)
+        )
+    hits = Hits(
+        *(torch.cat([getattr(each, name) for each in found]) for name in Hits.__dataclass_fields__)
+    )
     ahead = origin[..., 2] + direction[..., 2] * hits.distance_m
     return hits, torch.where(hits.part == 0, ahead, torch.inf)
 

@@ -1,11 +1,12 @@
-"""The velocity of a body from event flow: weighted least squares on points of the flow, with the covariance
-that the flow's own estimator gives.
+"""The velocity of a body from event flow: weighted least squares on points of the flow, with the
+covariance that the flow's own estimator gives.
 
-What an estimator with a prior returns is drawn towards zero where it saw little: with precision S^-1 after it
-saw the events and S0^-1 before, the flow is (1 - S S0^-1) times what the events alone say. Taken as a
-measurement of precision S^-1 - S0^-1, about confidence x S^-1, each point counts by what the events said of
-it, and one that saw nothing counts nothing. Points of one window err alike: an affine field has three numbers
-per component, so a window counts as three points however many are read.
+What an estimator with a prior returns is drawn towards zero where it saw little: with precision
+S^-1 after it saw the events and S0^-1 before, the flow is (1 - S S0^-1) times what the events alone
+say. Taken as a measurement of precision S^-1 - S0^-1, about confidence x S^-1, each point counts by
+what the events said of it, and one that saw nothing counts nothing. Points of one window err alike:
+an affine field has three numbers per component, so a window counts as three points however many are
+read.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,9 +34,9 @@ DEPTHS = {"ground": ground_depth, "scene": scene_depth}
 
 @dataclass(frozen=True)
 class Motion:
-    """velocity: [N, K] m/s and rad/s. covariance: [N, K, K] of it, as least squares expects. kept: [N, P] in
-    0..1, by how much each point was believed. depth_m: [N, P] of the points, as estimated where it was not
-    known."""
+    """velocity: [N, K] m/s and rad/s. covariance: [N, K, K] of it, as least squares expects. kept:
+    [N, P] in 0..1, by how much each point was believed. depth_m: [N, P] of the points, as estimated
+    where it was not known."""
 
     velocity: Tensor
     covariance: Tensor
@@ -47,13 +48,14 @@ class Motion:
 class Readings:
     """Flow at P points of each of N bodies, and what each of K velocities would show there.
 
-    pixels: [N, P, 2] of the points at mid-interval, window after window. flow_px: [N, P, 2] over the
-      interval.
-    precision: [N, P, 2, 2] px^-2. confidence: [N, P] in 0..1, the share of it that the events said; the flow
-    is drawn towards zero by as much. depth_m: [N, P], infinite without a surface. rows: [N, P, 2, K] px of
-    flow per m/s and rad/s. share: [N, P] of an independent point that each counts as, 0 without a surface.
-    windows: in P. parallax: [N, P, 2, K] that each 1 / m of nearness adds to the rows, where depth is not
-      known; then depth_m is that of ``rows``.
+    pixels: [N, P, 2] of the points at mid-interval, window after window. flow_px: [N, P, 2] over
+      the interval.
+    precision: [N, P, 2, 2] px^-2. confidence: [N, P] in 0..1, the share of it that the events said;
+    the flow is drawn towards zero by as much. depth_m: [N, P], infinite without a surface. rows:
+    [N, P, 2, K] px of flow per m/s and rad/s. share: [N, P] of an independent point that each
+    counts as, 0 without a surface.
+    windows: in P. parallax: [N, P, 2, K] that each 1 / m of nearness adds to the rows, where depth
+      is not known; then depth_m is that of ``rows``.
     """
 
     pixels: Tensor
@@ -68,15 +70,19 @@ class Readings:
 
     def missed_px(self, velocity: Tensor) -> Tensor:
         """Flow [N, P, 2] that velocities [N, K] leave unexplained."""
-        return self.flow_px - self.confidence[..., None] * (self.rows @ velocity[:, None, :, None])[..., 0]
+        return (
+            self.flow_px
+            - self.confidence[..., None] * (self.rows @ velocity[:, None, :, None])[..., 0]
+        )
 
     def of_windows(self, values: Tensor) -> Tensor:
-        """[N, P, ...]: values [N, windows, ...] of windows at each of their points. Gradient: values."""
+        """[N, P, ...]: values [N, windows, ...] of windows at each of their points. Gradient:
+        values."""
         return values.repeat_interleave(self.share.shape[1] // self.windows, 1)
 
     def squared(self, velocity: Tensor) -> Tensor:
-        """What velocities leave unexplained, [N, P], as a sum of two squares in units of its standard
-        deviation."""
+        """What velocities leave unexplained, [N, P], as a sum of two squares in units of its
+        standard deviation."""
         miss = self.missed_px(velocity)
         return (miss[..., None, :] @ self.precision @ miss[..., :, None])[..., 0, 0]
 
@@ -87,13 +93,13 @@ class EgoVelocity:
     Args:
       axes: which of the six velocities the body has: ``mount.PLANAR`` or ``mount.FREE``.
       prior: [K] standard deviations expected of them around zero, m/s and rad/s.
-      depth: "ground" (the plane z = 0 of the world under a body that knows its height and attitude),
-        "scene" (a perfect map), a function (camera, pixels [N, P, 2], T_world_cam [N, 4, 4], scene) -> [N,
-        P] m, or ``mount.UnknownDepth``: estimated with the velocity.
+      depth: "ground" (the plane z = 0 of the world under a body that knows its height and
+        attitude), "scene" (a perfect map), a function (camera, pixels [N, P, 2], T_world_cam
+        [N, 4, 4], scene) -> [N, P] m, or ``mount.UnknownDepth``: estimated with the velocity.
       every_px: spacing of the points read.
       floor_px: standard deviation of flow errors that no covariance knows of.
-      outlier: errors of that many standard deviations count a quarter (Geman and McClure, 1987); None: all
-        count.
+      outlier: errors of that many standard deviations count a quarter (Geman and McClure, 1987);
+        None: all count.
       steps: of reweighting, for outliers.
     Gradient: flow, covariance, mount, poses, lens.
 
@@ -113,7 +119,9 @@ class EgoVelocity:
         steps: int = 4,
     ) -> None:
         if isinstance(depth, str) and depth not in DEPTHS:
-            raise DomainError(f"depth is {depth!r}; choose one of {', '.join(DEPTHS)}, or give a function.")
+            raise DomainError(
+                f"depth is {depth!r}; choose one of {', '.join(DEPTHS)}, or give a function."
+            )
         if len(prior) != len(axes) or not all(value > 0 for value in prior):
             raise DomainError(
                 f"prior is {tuple(prior)}; give one standard deviation > 0 for each of the {len(axes)} velocities."
@@ -135,12 +143,13 @@ class EgoVelocity:
         T_world_cam: Tensor,
         t_s: Tensor | None = None,
     ) -> Motion:
-        """Motion of N bodies from fields [N x windows, 2, H, W] behind poses T_world_cam [..., T, 4, 4].
+        """Motion of N bodies from fields [N x windows, 2, H, W] behind poses T_world_cam
+        [..., T, 4, 4].
 
         Raises: DomainError for NaN where the field says that it is valid.
 
-        t_s: [T] of the poses; the flow's interval ends with them and may begin later. None: it is all of
-          them.
+        t_s: [T] of the poses; the flow's interval ends with them and may begin later. None: it is
+          all of them.
         """
         return self.solve(self.read(field, camera, scene, T_body_cam, T_world_cam, t_s))
 
@@ -154,7 +163,8 @@ class EgoVelocity:
         t_s: Tensor | None = None,
         depth: Callable[..., Tensor] | None = None,
     ) -> Readings:
-        """What the fields say, and what each velocity would show. Arguments and gradient as of the call.
+        """What the fields say, and what each velocity would show. Arguments and gradient as of the
+        call.
 
         depth: other than the estimator believes in, such as ``mount.scene_depth`` for what is true.
         """
@@ -173,12 +183,16 @@ class EgoVelocity:
             parallax = (near - rows) / (1 / known.nearest_m - known.mean_per_m)
         windows = _windows(camera)
         share = INDEPENDENT * windows / flow.shape[1] * on_surface.to(flow)
-        return Readings(middle, flow, precision, confidence[..., 0], depth_m, rows, share, windows, parallax)
+        return Readings(
+            middle, flow, precision, confidence[..., 0], depth_m, rows, share, windows, parallax
+        )
 
     def read_beside_truth(self, *given: Any) -> tuple[Readings, Readings]:
-        """``read`` by the depth that is believed, and the same points with the depths that they have in the scene.
+        """``read`` by the depth that is believed, and the same points with the depths that they
+        have in the scene.
 
-        given: arguments of ``read`` but the last. Over flat ground rays are cast once for both depths.
+        given: arguments of ``read`` but the last. Over flat ground rays are cast once for both
+          depths.
         """
         if self.depth is scene_depth:
             read = self.read(*given)
@@ -206,11 +220,13 @@ class EgoVelocity:
         return Motion(velocity, torch.linalg.inv(normal), kept, read.depth_m)
 
     def _believed(self, read, velocity):
-        """Weight [N, P] of each point beside what velocities leave unexplained (Geman and McClure)."""
+        """Weight [N, P] of each point beside what velocities leave unexplained
+        (Geman and McClure)."""
         return (1 + read.squared(velocity) / self.outlier**2) ** -2
 
     def points(self, read: Readings, kept: Tensor) -> unknown_depth.Points:
-        """Readings [N, P] of unknown depth, each believed by as much as ``kept`` [N, P]. Gradient: both.
+        """Readings [N, P] of unknown depth, each believed by as much as ``kept`` [N, P]. Gradient:
+        both.
 
         Raises: DomainError for readings that know their depth.
         """
@@ -244,8 +260,8 @@ class EgoVelocity:
         return Motion(velocity, unknown_depth.covariance(points, velocity), kept, depth_m)
 
     def _measured(self, field, camera, count):
-        """Points [N, P, 2] px, their flow [N, P, 2] px, its precision [N, P, 2, 2] and confidence [N, P,
-        1]."""
+        """Points [N, P, 2] px, their flow [N, P, 2] px, its precision [N, P, 2, 2] and confidence
+        [N, P, 1]."""
         height, width = camera.film.shape[-2:]
         first = min(self.every_px, height, width) // 2
         at = (..., slice(first, None, self.every_px), slice(first, None, self.every_px))
@@ -267,7 +283,9 @@ class EgoVelocity:
             unknown = flow.new_tensor([UNSEEN_PX**2, 0.0, UNSEEN_PX**2])
             xx, xy, yy = torch.where(known, per_body(field.covariance_px2[at]), unknown).unbind(-1)
         for name, values in (("flow", flow), ("covariance", xx + xy + yy)):
-            check_finite(values, f"the {name} of valid pixels", "mark what is not known as not valid")
+            check_finite(
+                values, f"the {name} of valid pixels", "mark what is not known as not valid"
+            )
         precision = flow_precision(torch.stack([xx, xy, yy], -1), floor=self.floor_px)
         points = per_body(pixels[None].expand(count, *pixels.shape).flatten(0, 1))
         return points, flow, precision, confidence
@@ -278,8 +296,8 @@ class EgoVelocity:
 
 
 def _middle(frames: int, t_s: Tensor | None, interval_s: float) -> tuple[int, float]:
-    """Number of the frame nearest to the middle of the flow's interval, and how much of the interval is over
-    then."""
+    """Number of the frame nearest to the middle of the flow's interval, and how much of the
+    interval is over then."""
     if t_s is None:
         return frames // 2, 0.5
     since_s = t_s - (t_s[-1] - interval_s)

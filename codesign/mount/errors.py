@@ -1,19 +1,19 @@
-"""The error of a velocity that its flow lets expect: an objective that points where the error of the hard
-sensor falls, without the noise of single draws.
+"""The error of a velocity that its flow lets expect: an objective that points where the error of
+the hard sensor falls, without the noise of single draws.
 
-Least squares makes of flow f = c J v + e the velocity M^-1 J^T W f with M = c J^T W J + L, L the prior's
-precision. Its error is M^-1 (J^T W (f - c J v) - L v), so with flow errors of mean b and covariance V per
-point it has
+Least squares makes of flow f = c J v + e the velocity M^-1 J^T W f with M = c J^T W J + L, L the
+prior's precision. Its error is M^-1 (J^T W (f - c J v) - L v), so with flow errors of mean b and
+covariance V per point it has
 
     mean  M^-1 (J^T W b - L v),   covariance  M^-1 (J^T W V W J) M^-1.
 
-V is what the flow's estimator claims, and what it does not know of: a share of the flow's length (windows are
-not affine, pictures change), and a flow of which nothing is left once it is beyond the estimator's reach;
-both are taken of J v rather than of the c J v that the estimator would read, and as independent from point to
-point, though flow that is lost is drawn to zero in whole windows. b is the flow that the
-estimator of the velocity expects wrongly, because it believes in another depth than there is. What only
-single draws know, in which way an error points, is not in it: of that the gradient would change its sign with
-every pixel by which the picture shifts.
+V is what the flow's estimator claims, and what it does not know of: a share of the flow's length
+(windows are not affine, pictures change), and a flow of which nothing is left once it is beyond the
+estimator's reach; both are taken of J v rather than of the c J v that the estimator would read, and
+as independent from point to point, though flow that is lost is drawn to zero in whole windows. b is
+the flow that the estimator of the velocity expects wrongly, because it believes in another depth
+than there is. What only single draws know, in which way an error points, is not in it: of that the
+gradient would change its sign with every pixel by which the picture shifts.
 """
 
 from collections.abc import Sequence
@@ -32,8 +32,10 @@ from codesign.mount.sight import LINEAR, NAMES
 class FlowErrors:
     """Errors of flow beyond the covariance that its estimator claims.
 
-    claimed: factor on the claimed deviation. share: deviation per component, of the flow's length. reach_px:
-    flow of this length is lost half of the time; width_px: by which the odds of that grow to e times.
+    claimed: factor on the claimed deviation. share: deviation per component, of the flow's length.
+      reach_px:
+    flow of this length is lost half of the time; width_px: by which the odds of that grow to e
+    times.
     """
 
     claimed: float = 1.0
@@ -48,19 +50,24 @@ class FlowErrors:
             check_positive(getattr(self, name), name)
 
     def covariance(self, read: Readings, flow_px: Tensor) -> Tensor:
-        """[N, P, 2, 2] px^2 of the errors at readings whose true flow is [N, P, 2] px. Gradient: both."""
+        """[N, P, 2, 2] px^2 of the errors at readings whose true flow is [N, P, 2] px. Gradient:
+        both."""
         squared = flow_px.square().sum(-1)
         length = (squared + 1e-12).sqrt()
         lost = torch.sigmoid((length - self.reach_px) / self.width_px)
         unknown = (self.share**2 + lost / 2) * squared
-        claimed = self.claimed**2 * read.confidence[..., None, None] * torch.linalg.inv(read.precision)
-        return claimed + unknown[..., None, None] * torch.eye(2, dtype=claimed.dtype, device=claimed.device)
+        claimed = (
+            self.claimed**2 * read.confidence[..., None, None] * torch.linalg.inv(read.precision)
+        )
+        return claimed + unknown[..., None, None] * torch.eye(
+            2, dtype=claimed.dtype, device=claimed.device
+        )
 
 
 @dataclass(frozen=True)
 class Expected:
-    """What flow lets expect of N estimates of K velocities: mean [N, K] and covariance [N, K, K] of their
-    errors, m/s and rad/s."""
+    """What flow lets expect of N estimates of K velocities: mean [N, K] and covariance [N, K, K] of
+    their errors, m/s and rad/s."""
 
     mean: Tensor
     covariance: Tensor
@@ -84,13 +91,13 @@ def expected_errors(
       estimator: whose prior, axes and outliers count.
       read: what it reads.
       twist: [N, 6] true, m/s and rad/s.
-      true_rows: [N, P, 2, K] px of flow per velocity at the true depth, where the estimator believes in
-        another one; None: ``read.rows``.
+      true_rows: [N, P, 2, K] px of flow per velocity at the true depth, where the estimator
+        believes in another one; None: ``read.rows``.
       errors: of the flow.
-    Outliers count less by the mean of the squared misfit to be expected of a component, where the estimator
-    goes by that of the draw.
-    Gradient: readings, twist, rows. Raises: DomainError for readings whose depth is estimated with the
-      velocity.
+    Outliers count less by the mean of the squared misfit to be expected of a component, where the
+    estimator goes by that of the draw.
+    Gradient: readings, twist, rows. Raises: DomainError for readings whose depth is estimated with
+      the velocity.
     """
     if read.parallax is not None:
         raise DomainError(
@@ -110,7 +117,9 @@ def expected_errors(
     normal = ((believed * read.confidence)[..., None, None] * (weighed @ read.rows)).sum(1) + prior
     inverse = torch.linalg.inv(normal)
     scatter = ((believed * kept)[..., None, None] * (weighed @ covariance @ weighed.mT)).sum(1)
-    pulled = (believed[..., None, None] * (weighed @ wrong[..., None])).sum(1) - prior @ velocity[:, 0]
+    pulled = (believed[..., None, None] * (weighed @ wrong[..., None])).sum(1) - prior @ velocity[
+        :, 0
+    ]
     return Expected((inverse @ pulled)[..., 0], inverse @ scatter @ inverse)
 
 
@@ -120,8 +129,8 @@ PERCENTILES = (5, 10, 25, 50, 75, 90, 95)
 
 @dataclass(frozen=True)
 class VelocityErrors:
-    """error: [N, K] estimate less truth, m/s and rad/s. speed_m_s: [N] of the body. axes: K of the six
-    velocities."""
+    """error: [N, K] estimate less truth, m/s and rad/s. speed_m_s: [N] of the body. axes: K of the
+    six velocities."""
 
     error: Tensor
     speed_m_s: Tensor
@@ -143,15 +152,20 @@ class VelocityErrors:
         return squared / (1 + squared)
 
     def table(self) -> dict[str, dict[str, float]]:
-        """Name of the velocity -> rms, bias, median, and percentiles of the size of its error; of linear ones
-        also the median over the speed."""
+        """Name of the velocity -> rms, bias, median, and percentiles of the size of its error; of
+        linear ones also the median over the speed."""
         found = {}
         for column, axis in zip(self.error.detach().T, self.axes, strict=True):
             size = column.abs()
             unit = "m_s" if axis < LINEAR else "rad_s"
-            row = {f"rms_{unit}": float(size.square().mean().sqrt()), f"bias_{unit}": float(column.mean())}
+            row = {
+                f"rms_{unit}": float(size.square().mean().sqrt()),
+                f"bias_{unit}": float(column.mean()),
+            }
             levels = torch.tensor(PERCENTILES, dtype=size.dtype) / 100
-            for percent, value in zip(PERCENTILES, torch.quantile(size, levels).tolist(), strict=True):
+            for percent, value in zip(
+                PERCENTILES, torch.quantile(size, levels).tolist(), strict=True
+            ):
                 row[f"p{percent}_{unit}"] = value
             if axis < LINEAR:
                 row["median_over_speed"] = float((size / self.speed_m_s.clamp_min(1e-12)).median())

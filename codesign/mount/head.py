@@ -1,10 +1,10 @@
 """A learnt head: least squares whose weights know the lens and the mount.
 
-Least squares counts every window by what its flow claims. A head learns what claims are worth: flow of a
-window that is blurred, or faster than the estimator reaches, or on something that is not where the map says,
-is read short or not at all, and which windows these are can be told from the design, the residuals and the
-other windows. It says, window by window, how much to count it and by how much its flow was read short, and
-solves again.
+Least squares counts every window by what its flow claims. A head learns what claims are worth: flow
+of a window that is blurred, or faster than the estimator reaches, or on something that is not where
+the map says, is read short or not at all, and which windows these are can be told from the design,
+the residuals and the other windows. It says, window by window, how much to count it and by how much
+its flow was read short, and solves again.
 """
 
 from collections.abc import Mapping
@@ -37,13 +37,13 @@ MOUNT = (1, -1, 1, 1, -1, 1, 1, -1, 1)
 class Evidence:
     """Windows W of N bodies, K velocities.
 
-    information: [N, W, K, K] of the velocities without prior, outliers weighted down. pull: [N, W, K], so
-    that a window alone says inverse(information) pull. energy: [N, W], the squared flow in units of its
-    deviation. rows: [N, W, 2, K] and flow_px: [N, W, 2], means over the window of what velocities make and of
-    what was read, px.
-    told: [N, W, 11], the window's surface, depth, confidence, claim, flow and residuals. lens: [N, W, 6], its
-    direction in body axes, focal length and blur. mount: [N, 9], position in metres, camera z and y in body
-    axes. prior: [N, K].
+    information: [N, W, K, K] of the velocities without prior, outliers weighted down. pull:
+    [N, W, K], so that a window alone says inverse(information) pull. energy: [N, W], the squared
+    flow in units of its deviation. rows: [N, W, 2, K] and flow_px: [N, W, 2], means over the window
+    of what velocities make and of what was read, px.
+    told: [N, W, 11], the window's surface, depth, confidence, claim, flow and residuals. lens:
+    [N, W, 6], its direction in body axes, focal length and blur. mount: [N, 9], position in metres,
+    camera z and y in body axes. prior: [N, K].
     """
 
     information: Tensor
@@ -63,7 +63,9 @@ class Evidence:
     @staticmethod
     def joined(parts: "list[Evidence]") -> "Evidence":
         """All bodies of several, for films with as many windows."""
-        return Evidence(*(torch.cat([getattr(each, f.name) for each in parts]) for f in fields(Evidence)))
+        return Evidence(
+            *(torch.cat([getattr(each, f.name) for each in parts]) for f in fields(Evidence))
+        )
 
 
 def evidence(
@@ -74,7 +76,8 @@ def evidence(
     prior: tuple[float, ...],
     volume: EventVolume | None = None,
 ) -> Evidence:
-    """Evidence of what was read, and of the plain solution of it (``EgoVelocity.read`` and ``solve``).
+    """Evidence of what was read, and of the plain solution of it (``EgoVelocity.read`` and
+    ``solve``).
 
     Args:
       camera: one with ``rays_through`` says how it blurs, another counts as sharp.
@@ -137,8 +140,8 @@ def _length(vectors):
 
 
 def window_optics(camera: ChiefRayCamera, read: Readings) -> Tensor:
-    """[N, W, 2] of the windows of readings: logarithm of the focal length there, in units of FOCAL_PX, and log1p of
-    the blur of what is seen in them, px. Gradient: lens and depth."""
+    """[N, W, 2] of the windows of readings: logarithm of the focal length there, in units of
+    FOCAL_PX, and log1p of the blur of what is seen in them, px. Gradient: lens and depth."""
     seen = read.share.detach() > 0
     near = torch.where(seen, 1 / read.depth_m, 0.0).unflatten(1, (read.windows, -1))
     count = seen.unflatten(1, (read.windows, -1)).sum(2).clamp_min(1)
@@ -147,8 +150,9 @@ def window_optics(camera: ChiefRayCamera, read: Readings) -> Tensor:
 
 
 def _lens(camera, windows, nearness, mounts):
-    """[N, W, 6]: direction of the windows in body axes, logarithm of the focal length there, blur in pixels
-    (root mean square radius) of what is as near as 1 / nearness [N, W] m, and of what is infinitely far."""
+    """[N, W, 6]: direction of the windows in body axes, logarithm of the focal length there, blur
+    in pixels (root mean square radius) of what is as near as 1 / nearness [N, W] m, and of what is
+    infinitely far."""
     pixels = camera.film.pixels().double().reshape(windows, -1, 2).mean(1)
     base, slope, base_step, slope_step = chief_lines(camera, pixels)
     ahead = torch.cat([slope, torch.ones_like(slope[:, :1])], 1)
@@ -196,14 +200,15 @@ DELIVERED = Path(__file__).with_name("head.safetensors")
 
 
 class VelocityHead(nn.Module):
-    """Stage ``estimate`` of a System, where EgoVelocity can stand, for any film, lens, mount and number of
-    windows.
+    """Stage ``estimate`` of a System, where EgoVelocity can stand, for any film, lens, mount and
+    number of windows.
 
-    Windows are read by one network each, whose answers are pooled (mean and maximum; Zaheer et al., Deep
-    Sets, 2017); a second one hears the pool, the mount and the solution so far, a third says of each window a
-    factor on its information, up to e^6, and one on its flow, up to e; and of the body, factors on prior and
-    covariance and a correction of at most one standard deviation. It hears everything also as a mirror shows
-    it, so that left and right are treated alike. Fresh weights give the velocity of ``plain`` as it is.
+    Windows are read by one network each, whose answers are pooled (mean and maximum; Zaheer et al.,
+    Deep Sets, 2017); a second one hears the pool, the mount and the solution so far, a third says
+    of each window a factor on its information, up to e^6, and one on its flow, up to e; and of the
+    body, factors on prior and covariance and a correction of at most one standard deviation. It
+    hears everything also as a mirror shows it, so that left and right are treated alike. Fresh
+    weights give the velocity of ``plain`` as it is.
 
     Args:
       plain: axes, prior, depth and how flow is read.
@@ -249,10 +254,11 @@ class VelocityHead(nn.Module):
         t_s: Tensor | None = None,
         volume: EventVolume | None = None,
     ) -> Motion:
-        """Motion of N bodies; arguments as of EgoVelocity, and the volume whose events are counted where
-        there is one.
+        """Motion of N bodies; arguments as of EgoVelocity, and the volume whose events are counted
+        where there is one.
 
-        ``kept``: by how much the plain solution believed each point, times its window's weight, at most 1.
+        ``kept``: by how much the plain solution believed each point, times its window's weight, at
+        most 1.
         Gradient: flow, covariance, mount, poses, lens, counts, weights.
         """
         seen, plain = self._read(field, camera, scene, T_body_cam, T_world_cam, t_s, volume)
@@ -281,8 +287,8 @@ class VelocityHead(nn.Module):
         return evidence(read, plain, camera, mounts, self.plain.prior, volume), plain
 
     def judged(self, seen: Evidence) -> tuple[Tensor, Tensor, Tensor]:
-        """Velocity [N, K], its covariance [N, K, K] and the weights [N, W] of the windows. Gradient: evidence
-        and weights of the network."""
+        """Velocity [N, K], its covariance [N, K, K] and the weights [N, W] of the windows.
+        Gradient: evidence and weights of the network."""
         even = torch.ones_like(seen.energy)
         weight = even
         velocity, covariance = _solved(seen, even, even, seen.prior)
@@ -292,7 +298,9 @@ class VelocityHead(nn.Module):
             claim = claim[..., list(self.plain.axes)]
             weight = _bounded(said[..., 0], WIDEST)
             prior = seen.prior * _bounded(claim[:, 0], WIDER)
-            velocity, covariance = _solved(seen, weight, weight * _bounded(said[..., 1], 1.0), prior)
+            velocity, covariance = _solved(
+                seen, weight, weight * _bounded(said[..., 1], 1.0), prior
+            )
         velocity = velocity + _deviation(covariance) * torch.tanh(claim[:, 1])
         factor = _bounded(claim[:, 2], WIDER)
         return velocity, factor[:, :, None] * covariance * factor[:, None, :], weight
@@ -336,7 +344,8 @@ class VelocityHead(nn.Module):
         return found
 
     def save(self, path: str | Path, metadata: Mapping[str, Any] | None = None) -> None:
-        """Write the weights as .safetensors, with plain JSON values about them. Raises: FileFormatError."""
+        """Write the weights as .safetensors, with plain JSON values about them. Raises:
+        FileFormatError."""
         content = {"kind": KIND, "config": self.config, "metadata": dict(metadata or {})}
         checkpoint.write_tensors(path, self.state_dict(), content)
 
@@ -361,10 +370,11 @@ class VelocityHead(nn.Module):
 
     @classmethod
     def pretrained(cls, plain: EgoVelocity) -> "VelocityHead":
-        """The delivered head, which studies.velocity_head trained on the three pairs of scenes.robots.pairs.
+        """The delivered head, which studies.velocity_head trained on the three pairs of
+        scenes.robots.pairs.
 
-        It knows their regime: nine windows of 32 x 32, the closed form of flow with a prior of 4 px, axes
-        ``mount.FREE``. Elsewhere it is a start for training.
+        It knows their regime: nine windows of 32 x 32, the closed form of flow with a prior of 4
+        px, axes ``mount.FREE``. Elsewhere it is a start for training.
         """
         return cls.load(plain, DELIVERED)
 

@@ -1,10 +1,11 @@
 """The flow in an image that each velocity of a body makes.
 
-A static point X in camera axes moves as X' = -(v + w x X) when the camera moves with velocity v and rotation
-rate w (Longuet-Higgins and Prazdny, 1980). The pixel that images it moves so that its chief ray goes on
-passing through the point, for any lens that has chief rays. The flow is linear in the twist of the body:
-velocity of its origin (forward, left, up; m/s) and rotation rate (about the same axes; rad/s). A body in the
-plane has three of these six: forward, lateral, yaw rate.
+A static point X in camera axes moves as X' = -(v + w x X) when the camera moves with velocity v and
+rotation rate w (Longuet-Higgins and Prazdny, 1980). The pixel that images it moves so that its
+chief ray goes on passing through the point, for any lens that has chief rays. The flow is linear in
+the twist of the body:
+velocity of its origin (forward, left, up; m/s) and rotation rate (about the same axes; rad/s). A
+body in the plane has three of these six: forward, lateral, yaw rate.
 """
 
 import torch
@@ -29,13 +30,14 @@ def body_flow(
     Args:
       camera: has ``chief_rays`` and ``film`` (see render.Camera).
       depth_m: [..., P] true depth along the camera's z axis per pixel, film order.
-      T_body_cam: [..., 4, 4]. Pixels without a surface carry a depth that is not finite or not positive.
+      T_body_cam: [..., 4, 4]. Pixels without a surface carry a depth that is not finite or not
+        positive.
       pixels: [P, 2] px to look at, or [..., P, 2]; all of the film when None.
-    Returns: flow [..., P, 2, 6] px/s per m/s forward, left, up of the body's origin and per rad/s about these
-      axes; 0 where there is no surface. seen [..., P] bool.
+    Returns: flow [..., P, 2, 6] px/s per m/s forward, left, up of the body's origin and per rad/s
+      about these axes; 0 where there is no surface. seen [..., P] bool.
     Gradient: depth, mount, and the lens behind the chief rays.
-    Raises: ShapeError when the depths are not one per pixel, or the mount is not [..., 4, 4]; DomainError
-      when the mount is not finite.
+    Raises: ShapeError when the depths are not one per pixel, or the mount is not [..., 4, 4];
+      DomainError when the mount is not finite.
 
     >>> from codesign import lens, render
     >>> from codesign.mount import Mount
@@ -68,7 +70,8 @@ def flow_precision(covariance: Tensor, floor: float = 0.0) -> Tensor:
     """Inverse covariance of flow as a measurement, out of what an estimator says of its flow.
 
     Args:
-      covariance: [..., 3] of the error (xx, xy, yy), px^2 as of FlowField.covariance_px2, or px^2/s^2.
+      covariance: [..., 3] of the error (xx, xy, yy), px^2 as of FlowField.covariance_px2, or
+        px^2/s^2.
       floor: standard deviation of errors that no covariance knows of, px.
     Returns: [..., 2, 2], (S + floor^2)^-1. Gradient: covariance.
     Raises: ShapeError; DomainError for what is no covariance.
@@ -77,7 +80,9 @@ def flow_precision(covariance: Tensor, floor: float = 0.0) -> Tensor:
     [[1.0, -1.0], [-1.0, 2.0]]
     """
     if covariance.shape[-1:] != (3,):
-        raise ShapeError(f"a covariance of flow is [..., 3] (xx, xy, yy), got {tuple(covariance.shape)}.")
+        raise ShapeError(
+            f"a covariance of flow is [..., 3] (xx, xy, yy), got {tuple(covariance.shape)}."
+        )
     check_finite(covariance, "covariance of flow")
     xx, xy, yy = covariance.unbind(-1)
     xx = xx + floor**2
@@ -92,10 +97,13 @@ def flow_precision(covariance: Tensor, floor: float = 0.0) -> Tensor:
 
 
 def chief_lines(camera: ChiefRayCamera, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Chief rays as lines x(z) = base + slope z, [P, 2] each, and their change per pixel, [P, 2, 2] (last
+    """Chief rays as lines x(z) = base + slope z, [P, 2] each, and their change per pixel, [P, 2, 2]
+    (last
     axis: pixel x, y)."""
     step = (
-        torch.tensor([[0.0, 0.0], [1, 0], [-1, 0], [0, 1], [0, -1]], dtype=pixels.dtype, device=pixels.device)
+        torch.tensor(
+            [[0.0, 0.0], [1, 0], [-1, 0], [0, 1], [0, -1]], dtype=pixels.dtype, device=pixels.device
+        )
         * _STEP_PX
     )
     # those of one pixel stand side by side
@@ -118,15 +126,16 @@ def flow_of_points(velocity: Tensor, slope: Tensor, step: Tensor) -> Tensor:
     Args:
       velocity: [..., P, 3, K] m of the points, in camera axes.
       slope: [..., P, 2] of the chief rays.
-      step: [..., P, 2, 2] m by which a pixel's ray moves sideways at the point, last axis: pixel x, y.
+      step: [..., P, 2, 2] m by which a pixel's ray moves sideways at the point, last axis: pixel x,
+        y.
     """
     sideways = velocity[..., :2, :] - slope[..., None] * velocity[..., 2:, :]
     return torch.linalg.solve(step, sideways)
 
 
 def _point_velocity(point, T_body_cam):
-    """Velocity in camera axes of static points [..., P, 3] per unit of the body's twist: [..., P, 3 (axis),
-    6]."""
+    """Velocity in camera axes of static points [..., P, 3] per unit of the body's twist:
+    [..., P, 3 (axis), 6]."""
     to_camera = T_body_cam[..., :3, :3].mT  # columns: the body's axes as the camera has them
     position = T_body_cam[..., :3, 3]
     units = torch.eye(3).to(position).expand_as(to_camera)

@@ -1,9 +1,9 @@
-"""A camera mount on a robot body: six unconstrained numbers to a pose with a limited position and a free
-rotation; and bounds of all six (``MountRanges``), mounts by their shares of them.
+"""A camera mount on a robot body: six unconstrained numbers to a pose with a limited position and a
+free rotation; and bounds of all six (``MountRanges``), mounts by their shares of them.
 
-Body axes: x forward, y left, z up. Camera axes: x right, y down, z forward. Yaw turns the view to the left,
-pitch tilts it down (90 degrees looks straight down), roll turns the image about the view; at zero the camera
-looks along the body's x axis with level rows.
+Body axes: x forward, y left, z up. Camera axes: x right, y down, z forward. Yaw turns the view to
+the left, pitch tilts it down (90 degrees looks straight down), roll turns the image about the view;
+at zero the camera looks along the body's x axis with level rows.
 """
 
 import math
@@ -32,7 +32,9 @@ PITCH = 4
 ROUNDING = 1e-9
 AXES = ("x forward", "y left", "z up")
 # of a level camera that looks forward
-AXES_BODY_CAM = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
+AXES_BODY_CAM = torch.tensor(
+    [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64
+)
 
 
 class Mount(nn.Module):
@@ -48,12 +50,13 @@ class Mount(nn.Module):
       half_range_m: half its size per axis, >= 0 (0 holds that axis).
       yaw_rad, pitch_rad, roll_rad: attitude where the rotation part of ``numbers`` is zero.
       position_m: where to start, strictly inside the box; None starts in the middle.
-    numbers: [6] float64, learnable, unconstrained; with x = unit numbers, position = nominal + half_range
-      tanh(x[:3]) and rotation = start attitude times exp(x[3:]), a rotation vector in camera axes (so looking
-      straight down, where yaw and roll turn about one axis, is a pose like any other).
+    numbers: [6] float64, learnable, unconstrained; with x = unit numbers, position = nominal +
+      half_range tanh(x[:3]) and rotation = start attitude times exp(x[3:]), a rotation vector in
+      camera axes (so looking straight down, where yaw and roll turn about one axis, is a pose like
+      any other).
     unit: [6], 1 until ``variables`` makes a unit of every number move the image by a natural step.
-    Raises: DomainError when a number is not finite, a range is negative, or the start lies outside the box;
-      ShapeError for other than three numbers.
+    Raises: DomainError when a number is not finite, a range is negative, or the start lies outside
+      the box; ShapeError for other than three numbers.
     """
 
     start_attitude: Tensor
@@ -85,7 +88,9 @@ class Mount(nn.Module):
         self.register_buffer("start_attitude", attitude(yaw_rad, pitch_rad, roll_rad))
         start = torch.zeros(6, dtype=torch.float64)
         start[:3] = self._unbounded(
-            nominal if position_m is None else _numbers(position_m, "mount: position_m", AXES, "metres")
+            nominal
+            if position_m is None
+            else _numbers(position_m, "mount: position_m", AXES, "metres")
         )
         self.numbers = nn.Parameter(start)
 
@@ -103,8 +108,8 @@ class Mount(nn.Module):
         return torch.atanh(torch.where(free, offset / torch.where(free, half, 1.0), 0.0))
 
     def forward(self, numbers: Tensor | None = None) -> Tensor:
-        """T_body_cam [..., 4, 4] of ``numbers`` [..., 6]; the mount's own when None. Gradient: exact, to the
-        numbers.
+        """T_body_cam [..., 4, 4] of ``numbers`` [..., 6]; the mount's own when None. Gradient:
+        exact, to the numbers.
 
         Raises: ShapeError when the last axis is not 6; DomainError when one is not finite.
         """
@@ -116,7 +121,9 @@ class Mount(nn.Module):
         check_finite(numbers, "mount numbers", "go back to the last finite ones")
         numbers = self.unit * numbers
         position = self.nominal_m + self.half_range_m * torch.tanh(numbers[..., :3])
-        turn = se3_exp(torch.cat([torch.zeros_like(numbers[..., 3:]), numbers[..., 3:]], -1))[..., :3, :3]
+        turn = se3_exp(torch.cat([torch.zeros_like(numbers[..., 3:]), numbers[..., 3:]], -1))[
+            ..., :3, :3
+        ]
         return _pose(self.start_attitude @ turn, position)
 
     def numbers_at(self, T_body_cam: Tensor) -> Tensor:
@@ -137,18 +144,20 @@ class Mount(nn.Module):
     def variables(
         self, camera: ChiefRayCamera, depth_m: float | Tensor, step_px: float = 1.0
     ) -> list[nn.Parameter]:
-        """Rescale ``numbers`` so that a unit of each moves the image of what the camera sees by ``step_px``
-        RMS; the pose stays. Then one learning rate suits the mount, the lens's variables and a network.
+        """Rescale ``numbers`` so that a unit of each moves the image of what the camera sees by
+        ``step_px`` RMS; the pose stays. Then one learning rate suits the mount, the lens's
+        variables and a network.
 
         Args:
           camera: has ``chief_rays`` and ``film`` (see render.Camera).
-          depth_m: depth of the scene along the view, one number or one per pixel [P]; pixels without a
-            surface carry one that is not finite or not positive.
+          depth_m: depth of the scene along the view, one number or one per pixel [P]; pixels
+            without a surface carry one that is not finite or not positive.
           step_px: the natural step.
-        A number that hardly moves the image (a narrow box far from the scene) keeps 1 of its map's argument
-        as unit, as does one that is held.
+        A number that hardly moves the image (a narrow box far from the scene) keeps 1 of its map's
+        argument as unit, as does one that is held.
         Returns: [numbers], the mount's one Parameter, for torch.optim.
-        Raises: DomainError when no pixel sees a surface, or the step is not positive and finite; ShapeError.
+        Raises: DomainError when no pixel sees a surface, or the step is not positive and finite;
+          ShapeError.
         """
         check_positive(step_px, "mount: step_px")
         numbers = self.numbers.detach()
@@ -167,7 +176,9 @@ class Mount(nn.Module):
             raise ShapeError(
                 f"mount: depth_m is one number or [{pixels.shape[0]}] (one per pixel), got {tuple(depth.shape)}."
             )
-        at = torch.linspace(0, pixels.shape[0] - 1, min(MOST_PIXELS, pixels.shape[0])).round().long()
+        at = (
+            torch.linspace(0, pixels.shape[0] - 1, min(MOST_PIXELS, pixels.shape[0])).round().long()
+        )
         depth = depth.expand(pixels.shape[0])[at]
         seen = depth.isfinite() & (depth > NEAREST_M) & (camera.chief_rays(pixels[at]).weight > 0)
         if not bool(seen.any()):
@@ -193,8 +204,8 @@ def attitude(
     pitch_rad: float | Tensor,
     roll_rad: float | Tensor,
 ) -> Tensor:
-    """Rotations [..., 3, 3] float64 from camera to body axes: Rz(yaw) Ry(pitch) Rx(roll) after the axes of a
-    level camera.
+    """Rotations [..., 3, 3] float64 from camera to body axes: Rz(yaw) Ry(pitch) Rx(roll) after the
+    axes of a level camera.
 
     Args: numbers or tensors [...] that broadcast.
     Gradient: exact, to the angles.
@@ -216,13 +227,13 @@ def attitude(
 
 
 def yaw_pitch_roll_rad(T_body_cam: Tensor) -> Tensor:
-    """Angles [..., 3] of a mount, the inverse of ``attitude``: yaw and roll in (-pi, pi], pitch in [-pi/2,
-    pi/2].
+    """Angles [..., 3] of a mount, the inverse of ``attitude``: yaw and roll in (-pi, pi], pitch in
+    [-pi/2, pi/2].
 
-    Yaw and pitch are where the camera's axis points. Looking straight up or down only yaw and roll together
-    mean something: yaw is then both, and roll 0.
-    Gradient: the matrix; straight up or down, where pitch has its largest or smallest value, 0 for pitch and
-      roll.
+    Yaw and pitch are where the camera's axis points. Looking straight up or down only yaw and roll
+    together mean something: yaw is then both, and roll 0.
+    Gradient: the matrix; straight up or down, where pitch has its largest or smallest value, 0 for
+      pitch and roll.
     """
     turn = T_body_cam[..., :3, :3] @ AXES_BODY_CAM.to(T_body_cam).mT
     upright = turn[..., :2, 0].detach().square().sum(-1) < UPRIGHT**2
@@ -230,7 +241,9 @@ def yaw_pitch_roll_rad(T_body_cam: Tensor) -> Tensor:
     safe = torch.where(upright, 1.0, turn[..., 0, 0])
     aside = torch.where(upright, 0.0, turn[..., 1, 0])
     level = torch.where(upright, 0.0, torch.hypot(safe, aside))
-    yaw = torch.where(upright, torch.atan2(-turn[..., 0, 1], turn[..., 1, 1]), torch.atan2(aside, safe))
+    yaw = torch.where(
+        upright, torch.atan2(-turn[..., 0, 1], turn[..., 1, 1]), torch.atan2(aside, safe)
+    )
     pitch = torch.atan2(-turn[..., 2, 0], level)
     below = torch.where(upright, 1.0, turn[..., 2, 2])
     roll = torch.where(upright, 0.0, torch.atan2(torch.where(upright, 0.0, turn[..., 2, 1]), below))
@@ -238,7 +251,8 @@ def yaw_pitch_roll_rad(T_body_cam: Tensor) -> Tensor:
 
 
 class MountRanges:
-    """Bounds of position, yaw to the left, pitch downwards and roll in body axes (x forward, y left, z up).
+    """Bounds of position, yaw to the left, pitch downwards and roll in body axes
+    (x forward, y left, z up).
 
     A mount is six shares from 0 (low) to 1 (high): a cube in which any search can look.
 
@@ -250,9 +264,9 @@ class MountRanges:
     [0.5, 0.5, 0.5, 0.5, 0.5, 0.5]
 
     Args:
-      low, high: six finite numbers each, in the order of NAMES, metres and radians. Equal bounds hold a
-        number; its share means nothing and is given as 0.5. Pitch is strictly between straight up and down,
-        where yaw and roll would be one; yaw and roll have a turn at most.
+      low, high: six finite numbers each, in the order of NAMES, metres and radians. Equal bounds
+        hold a number; its share means nothing and is given as 0.5. Pitch is strictly between
+        straight up and down, where yaw and roll would be one; yaw and roll have a turn at most.
     low, high: [6] float64. held: [6] bool.
     Raises: DomainError for bounds that are not finite, in the wrong order, or too wide; ShapeError.
     """
@@ -263,7 +277,9 @@ class MountRanges:
 
     def __init__(self, low: Sequence[float] | Tensor, high: Sequence[float] | Tensor) -> None:
         self.low = _numbers(low, "mount ranges: low", NAMES, "metres and radians").detach().clone()
-        self.high = _numbers(high, "mount ranges: high", NAMES, "metres and radians").detach().clone()
+        self.high = (
+            _numbers(high, "mount ranges: high", NAMES, "metres and radians").detach().clone()
+        )
         self.held = self.low == self.high
         for name, least, most in zip(NAMES, self.low.tolist(), self.high.tolist(), strict=True):
             said = f"mount ranges: {name} goes from {least:g} to {most:g}"
@@ -274,21 +290,24 @@ class MountRanges:
                     f"{said}; straight up and down (pi / 2) yaw and roll are one, so stay strictly between them."
                 )
             if name in (NAMES[k] for k in TURNS) and most - least > 2 * math.pi:
-                raise DomainError(f"{said}, more than a turn; give 2 pi at most, as from -pi to pi.")
+                raise DomainError(
+                    f"{said}, more than a turn; give 2 pi at most, as from -pi to pi."
+                )
 
     def numbers(self, share: Tensor) -> Tensor:
-        """Position in metres and angles in radians [..., 6] of shares [..., 6]; exactly the bounds at 0 and
-        1.
+        """Position in metres and angles in radians [..., 6] of shares [..., 6]; exactly the bounds
+        at 0 and 1.
 
         Shares beyond these go on beyond the bounds, as differences at a wall need; see ``clamped``.
-        Gradient: exact, to the shares, none to what is held. Raises: ShapeError; DomainError for shares that
-          are not finite.
+        Gradient: exact, to the shares, none to what is held. Raises: ShapeError; DomainError for
+          shares that are not finite.
         """
         share = _shares(share)
         return torch.where(self.held, self.low, torch.lerp(self.low, self.high, share))
 
     def pose(self, share: Tensor) -> Tensor:
-        """T_body_cam [..., 4, 4] float64 of shares [..., 6], as ``numbers``; gradient and errors too."""
+        """T_body_cam [..., 4, 4] float64 of shares [..., 6], as ``numbers``; gradient and errors
+        too."""
         numbers = self.numbers(share)
         return _pose(attitude(*numbers[..., 3:].unbind(-1)), numbers[..., :3])
 
@@ -316,7 +335,8 @@ class MountRanges:
         return self.clamped((numbers - self.low) / width)
 
     def clamped(self, share: Tensor) -> Tensor:
-        """The nearest shares [..., 6] within 0..1, those of held numbers 0.5. Gradient: as of torch.clamp.
+        """The nearest shares [..., 6] within 0..1, those of held numbers 0.5. Gradient: as of
+        torch.clamp.
 
         Raises: ShapeError; DomainError for shares that are not finite.
         """
@@ -343,5 +363,7 @@ def _numbers(values, name, names, unit):
 
 def _shares(share):
     if share.shape[-1:] != (6,):
-        raise ShapeError(f"mount ranges: shares are [..., 6] ({', '.join(NAMES)}), got {tuple(share.shape)}.")
+        raise ShapeError(
+            f"mount ranges: shares are [..., 6] ({', '.join(NAMES)}), got {tuple(share.shape)}."
+        )
     return check_finite(share.double(), "mount ranges: shares", "go back to the last finite ones")

@@ -1,9 +1,9 @@
 """What a mount has to keep: distance to the robot, a free way for its cable, a view ahead.
 
-Each requirement has a ``slack`` in metres or radians with a gradient to the mount (and to the lens where it
-looks through it), and an ``exact`` one that is at least 0 where it is kept; they have the same sign but where
-a count of pixels decides. ``penalty`` makes one smooth number of the slacks, to add to an objective;
-``judge`` says yes or no.
+Each requirement has a ``slack`` in metres or radians with a gradient to the mount (and to the lens
+where it looks through it), and an ``exact`` one that is at least 0 where it is kept; they have the
+same sign but where a count of pixels decides. ``penalty`` makes one smooth number of the slacks, to
+add to an objective; ``judge`` says yes or no.
 """
 
 import math
@@ -98,9 +98,12 @@ class CableSide:
         check_positive(self.step, "cable side: step")
 
     def slack(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
-        """[..., 1]: (cos a - cos b) / sin a with a the half angle and b the angle between back and axis; near
-        the rim of the cone that is b - a in radians, and it is smooth everywhere. Gradient: mount."""
-        return (math.cos(self.half_angle_rad) - self._cosine(T_body_cam)) / math.sin(self.half_angle_rad)
+        """[..., 1]: (cos a - cos b) / sin a with a the half angle and b the angle between back and
+        axis; near the rim of the cone that is b - a in radians, and it is smooth everywhere.
+        Gradient: mount."""
+        return (math.cos(self.half_angle_rad) - self._cosine(T_body_cam)) / math.sin(
+            self.half_angle_rad
+        )
 
     def exact(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
         """[..., 1]: b - a, radians."""
@@ -115,8 +118,8 @@ class CableSide:
 class LookAhead:
     """A share of the picture sees farther than ``distance_m``.
 
-    A pixel sees beyond the distance when its chief ray goes ahead and meets the ground, if at all, beyond the
-    line across at that distance.
+    A pixel sees beyond the distance when its chief ray goes ahead and meets the ground, if at all,
+    beyond the line across at that distance.
 
     Args:
       distance_m: from the body's origin, forward, > 0.
@@ -142,13 +145,16 @@ class LookAhead:
             check_number(getattr(self, label), f"look-ahead: {label}", above=0.0, most=1.0)
 
     def slack(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
-        """[..., 1]: the mean of ``angles`` at the ranks around the one that ``exact`` looks at, so that a row
-        of pixels decides and not its last one. Gradient: mount, and the lens behind the chief rays."""
+        """[..., 1]: the mean of ``angles`` at the ranks around the one that ``exact`` looks at, so
+        that a row of pixels decides and not its last one. Gradient: mount, and the lens behind the
+        chief rays."""
         angles = self.angles(T_body_cam, camera)
         rank = torch.arange(angles.shape[-1]).to(angles)
         reach = max(1.0, self.smooth * len(rank))
         weight = (1 - (rank - self._rank(angles)).abs() / reach).clamp_min(0)
-        return (angles.sort(-1, descending=True).values * weight).sum(-1, keepdim=True) / weight.sum()
+        return (angles.sort(-1, descending=True).values * weight).sum(
+            -1, keepdim=True
+        ) / weight.sum()
 
     def exact(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
         """[..., 1]: the angle that just ``share`` of the pixels reach."""
@@ -160,9 +166,9 @@ class LookAhead:
         return max(math.ceil(self.share * angles.shape[-1] - 1e-9) - 1, 0)
 
     def angles(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
-        """By how much each pixel [..., P] looks beyond the distance: the sine of the angle between its ray and
-        the plane through the line at that distance and the camera, or the vertical plane across, whichever is
-        smaller."""
+        """By how much each pixel [..., P] looks beyond the distance: the sine of the angle between
+        its ray and the plane through the line at that distance and the camera, or the vertical
+        plane across, whichever is smaller."""
         if not hasattr(camera, "chief_rays"):
             raise DomainError(
                 "look-ahead: it looks through the camera; give one with chief rays, as render.Camera."
@@ -187,8 +193,8 @@ def penalty(
     T_body_cam: Tensor,
     camera: ChiefRayCamera,
 ) -> Tensor:
-    """What to add to an objective so that a search keeps to its requirements: sum of max(0, 1 - slack /
-    step)^2.
+    """What to add to an objective so that a search keeps to its requirements: sum of
+    max(0, 1 - slack / step)^2.
 
     Args:
       T_body_cam: [..., 4, 4].
@@ -197,7 +203,9 @@ def penalty(
     """
     total = T_body_cam.new_zeros(T_body_cam.shape[:-2], dtype=torch.float64)
     for each in requirements:
-        total = total + (1 - each.slack(T_body_cam, camera) / each.step).clamp_min(0).square().sum(-1)
+        total = total + (1 - each.slack(T_body_cam, camera) / each.step).clamp_min(0).square().sum(
+            -1
+        )
     return total
 
 
@@ -223,7 +231,9 @@ def judge(
 ) -> list[Verdict]:
     """The hard answer for one mount [4, 4], one Verdict for each requirement."""
     if T_body_cam.shape != (4, 4):
-        raise ShapeError(f"judge: one mount [4, 4] is judged at a time, got {tuple(T_body_cam.shape)}.")
+        raise ShapeError(
+            f"judge: one mount [4, 4] is judged at a time, got {tuple(T_body_cam.shape)}."
+        )
     found = []
     for each in requirements:
         slack = float(each.exact(T_body_cam, camera).min())
@@ -237,7 +247,8 @@ def first_missed(
     T_body_cam: Tensor,
     camera: Any,
 ) -> Requirement | None:
-    """The first requirement that one mount [4, 4] does not keep, by the hard answer; None where all are kept."""
+    """The first requirement that one mount [4, 4] does not keep, by the hard answer; None where all
+    are kept."""
     for each in requirements:
         if float(each.exact(T_body_cam, camera).min()) < 0:
             return each
@@ -253,12 +264,12 @@ def _direction(vector, name):
 
 @dataclass(frozen=True)
 class OwnBody:
-    """The body covers at most ``largest_share`` of the picture, one of the requirements of a mount (see
-    codesign.mount).
+    """The body covers at most ``largest_share`` of the picture, one of the requirements of a mount
+    (see codesign.mount).
 
-    The slack's gradient is that of a rendered picture in which the body glows and nothing else does, with the
-    motion of its silhouettes: it is 0 where nothing of the body is in view. The exact answer counts chief
-    rays.
+    The slack's gradient is that of a rendered picture in which the body glows and nothing else
+    does, with the motion of its silhouettes: it is 0 where nothing of the body is in view. The
+    exact answer counts chief rays.
 
     >>> from codesign import lens, render
     >>> from codesign.mount import Body, Mount, OwnBody
@@ -272,8 +283,8 @@ class OwnBody:
       body: in the axes of the mount.
       largest_share: 0 to 1.
       step: share below it from which on nothing pushes.
-      per_px: points of silhouettes per pixel length, for the gradient (before a rover, in 16 x 12 pixels,
-        it is good to 2 %).
+      per_px: points of silhouettes per pixel length, for the gradient (before a rover, in 16 x 12
+        pixels, it is good to 2 %).
     Raises: DomainError for shares out of range.
     """
 
@@ -298,7 +309,8 @@ class OwnBody:
         return self.largest_share - self.covered(T_body_cam, camera).mean(-1, keepdim=True)
 
     def covered(self, T_body_cam: Tensor, camera: Camera) -> Tensor:
-        """[..., windows] share of every window of the film that the body covers. Gradient: mount and lens."""
+        """[..., windows] share of every window of the film that the body covers. Gradient: mount
+        and lens."""
         # of which the pictures are the same
         way = "boundary" if torch.is_grad_enabled() else "interior"
         found = frames(camera, self.scene, T_body_cam.reshape(-1, 4, 4), way, self.per_px).double()
@@ -311,8 +323,8 @@ class OwnBody:
 
     @torch.no_grad()
     def met(self, T_body_cam: Tensor, camera: Camera, every_px: int = 1) -> Tensor:
-        """[..., windows] share of the pixels of every window of the film, or of every so many in both directions, whose
-        chief ray meets the body. No gradient."""
+        """[..., windows] share of the pixels of every window of the film, or of every so many in
+        both directions, whose chief ray meets the body. No gradient."""
         size = camera.film.shape[-2:]
         first = every_px // 2
         pixels = camera.film.pixels().reshape(-1, *size, 2)[:, first::every_px, first::every_px]

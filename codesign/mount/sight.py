@@ -1,4 +1,5 @@
-"""What cameras are blind to: a table over attitudes, and a map over all directions a camera may look in."""
+"""What cameras are blind to: a table over attitudes, and a map over all directions a camera may
+look in."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -24,14 +25,15 @@ NOTHING = 1e-12
 def expected_error(
     information: Tensor, unit: Sequence[float] | Tensor, prior: Sequence[float] | Tensor
 ) -> Tensor:
-    """Root mean square error of K velocities, in units of ``unit``, that the best unbiased use of the flow
-    leaves.
+    """Root mean square error of K velocities, in units of ``unit``, that the best unbiased use of
+    the flow leaves.
 
     Args:
-      information: [..., K, K] as of ``Surroundings.information``, or of an estimator: the inverse of
-        ``mount.Motion.covariance`` less the prior's.
+      information: [..., K, K] as of ``Surroundings.information``, or of an estimator: the inverse
+        of ``mount.Motion.covariance`` less the prior's.
       unit: [K] errors that count 1.
-      prior: [K] standard deviations of the velocities around zero, by which what no flow shows counts.
+      prior: [K] standard deviations of the velocities around zero, by which what no flow shows
+        counts.
     Returns: [...]. Gradient: information.
     Raises: ShapeError; DomainError for units or priors that are not positive.
     Source: Cramer-Rao bound with a prior (Van Trees, 1968).
@@ -49,10 +51,10 @@ def expected_error(
 class Sight:
     """What flow tells of K velocities.
 
-    axes: which of the six. deviation: [K] standard deviation of each where none is known, m/s and rad/s,
-    infinite for what leaves no trace in the flow; alone: [K] where all others are known. weakest: [K] motion
-    that shows least, of length 1 in units of ``unit``; weakest_deviation: its standard deviation in these
-    units. unit: [K].
+    axes: which of the six. deviation: [K] standard deviation of each where none is known, m/s and
+    rad/s, infinite for what leaves no trace in the flow; alone: [K] where all others are known.
+    weakest: [K] motion that shows least, of length 1 in units of ``unit``; weakest_deviation: its
+    standard deviation in these units. unit: [K].
     """
 
     axes: tuple[int, ...]
@@ -71,8 +73,8 @@ class Sight:
         ]
 
     def weakest_named(self, least: float = 0.2) -> str:
-        """The weakest motion in words and shares of its units, such as "+0.71 left -0.70 roll"; parts below
-        ``least`` are left out."""
+        """The weakest motion in words and shares of its units, such as "+0.71 left -0.70 roll";
+        parts below ``least`` are left out."""
         parts = [
             f"{share:+.2f} {NAMES[axis]}"
             for axis, share in zip(self.axes, self.weakest.tolist(), strict=True)
@@ -125,7 +127,9 @@ def _scales(values, information, name):
             f"{name} has {len(given)} numbers for an information {tuple(information.shape)}; give one per velocity."
         )
     if not bool(((given > 0) & given.isfinite()).all()):
-        raise DomainError(f"{name} is {given.tolist()}; finite numbers > 0 are needed (m/s, rad/s).")
+        raise DomainError(
+            f"{name} is {given.tolist()}; finite numbers > 0 are needed (m/s, rad/s)."
+        )
     return given
 
 
@@ -139,7 +143,9 @@ ATTITUDES = {
 }
 UNIT = 0.1  # m/s and rad/s that count 1
 PRIOR = 1.0
-VELOCITIES = tuple(f"{name}_{'m_s' if axis < LINEAR else 'rad_s'}" for axis, name in enumerate(NAMES))
+VELOCITIES = tuple(
+    f"{name}_{'m_s' if axis < LINEAR else 'rad_s'}" for axis, name in enumerate(NAMES)
+)
 MOST_PIXELS = 1024  # of a film, spread over it, that are looked at
 Depth = Callable[[ChiefRayCamera, Tensor, Tensor, Any], Tensor]
 
@@ -148,12 +154,12 @@ Depth = Callable[[ChiefRayCamera, Tensor, Tensor, Any], Tensor]
 class Surroundings:
     """Where and by what flow a body's velocity is read.
 
-    position_m: of the camera on the body. T_world_body: [4, 4], None: at the world's origin. depth: as of
-    EgoVelocity, ``mount.ground_depth`` or ``mount.scene_depth``; scene: handed to it. axes: the velocities
-    that the body has.
-    deviation_px_s: of the flow of one point; points: independent ones in the picture (a window read by an
-    affine flow counts as three). farthest_m: what lies farther counts as unseen: a pixel covers whole
-    patterns there.
+    position_m: of the camera on the body. T_world_body: [4, 4], None: at the world's origin. depth:
+    as of EgoVelocity, ``mount.ground_depth`` or ``mount.scene_depth``; scene: handed to it. axes:
+    the velocities that the body has.
+    deviation_px_s: of the flow of one point; points: independent ones in the picture (a window read
+    by an affine flow counts as three). farthest_m: what lies farther counts as unseen: a pixel
+    covers whole patterns there.
     """
 
     position_m: tuple[float, float, float]
@@ -170,8 +176,8 @@ class Surroundings:
             check_positive(getattr(self, name), name)
 
     def information(self, camera: ChiefRayCamera, T_body_cam: Tensor) -> tuple[Tensor, Tensor]:
-        """Information [..., K, K] without prior of mounts [..., 4, 4], and the share [...] of the picture
-        that sees something. Gradient: mount and lens."""
+        """Information [..., K, K] without prior of mounts [..., 4, 4], and the share [...] of the
+        picture that sees something. Gradient: mount and lens."""
         pixels = camera.film.pixels()
         count = min(MOST_PIXELS, len(pixels))
         pixels = pixels[torch.linspace(0, len(pixels) - 1, count).round().long()]
@@ -206,14 +212,15 @@ def sight_table(
     around: Surroundings,
     attitudes: Mapping[str, tuple[float, float]] = ATTITUDES,
 ) -> dict[str, dict[str, Any]]:
-    """What forward, downward, sideways and oblique cameras see of the body's motion, and what they are blind
-    to.
+    """What forward, downward, sideways and oblique cameras see of the body's motion, and what they
+    are blind to.
 
     Args:
       attitudes: name -> yaw and pitch in degrees.
-    Returns: name -> "seen" (share of the picture), "sight" (mount.Sight), a column for each velocity
-      (standard deviation in m/s or rad/s, all unknown), "blind" (names of velocities worse than one unit),
-      "weakest" (the motion that shows least, in words) and "weakest_units" (its deviation). No gradient.
+    Returns: name -> "seen" (share of the picture), "sight" (mount.Sight), a column for each
+      velocity (standard deviation in m/s or rad/s, all unknown), "blind" (names of velocities worse
+      than one unit), "weakest" (the motion that shows least, in words) and "weakest_units"
+      (its deviation). No gradient.
 
     >>> from codesign import lens, render
     >>> from codesign.mount import Surroundings
@@ -250,8 +257,8 @@ def sight_map(
     Args:
       rows: from straight up to straight down;
       columns: all around, both at least 2.
-    Returns: yaw [columns], pitch [rows] rad at the middle of the cells, and the error [rows, columns] in
-      units. For ``report.mount_sphere``. No gradient.
+    Returns: yaw [columns], pitch [rows] rad at the middle of the cells, and the error
+      [rows, columns] in units. For ``report.mount_sphere``. No gradient.
     """
     check_whole(rows, "rows", 2)
     check_whole(columns, "columns", 2)

@@ -1,5 +1,5 @@
-"""Where searches begin: mounts spread at random over what is allowed; and what makes a search hopeless, said
-before it."""
+"""Where searches begin: mounts spread at random over what is allowed; and what makes a search
+hopeless, said before it."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -32,15 +32,16 @@ def starts(
     *,
     seed: int = 0,
 ) -> Tensor:
-    """Mounts from which to search: at random within the bounds, as far as they keep the requirements.
+    """Mounts from which to search: at random within the bounds, as far as they keep the
+    requirements.
 
     Args:
       ranges: their bounds; mounts begin in the inner nine tenths of each.
       count: how many.
       requirements: looked at through ``camera``, in their order, so the cheap ones stand first.
     Returns: shares [count, 6] float64 of the bounds; no gradient. The same seed gives the same.
-    Raises: DomainError where too few of TRIES mounts keep the requirements; it names the one at which most
-      fail.
+    Raises: DomainError where too few of TRIES mounts keep the requirements; it names the one at
+      which most fail.
 
     >>> ranges = MountRanges((0.1, 0.0, 0.2, 0.0, 0.5, 0.0), (0.3, 0.0, 0.6, 0.0, 1.5, 0.0))
     >>> ranges.pose(starts(ranges, 5))[:, 1, 3].tolist()  # this axis is held
@@ -81,9 +82,9 @@ def check_mount(
 
     Args:
       reach_m: how far from the body a bracket may hold a camera.
-    Raises: DomainError, in a sentence that says what to change, for a box that is farther from the robot than
-      ``reach_m`` or has no room beside it, a start that does not keep a requirement, or a camera whose lens
-      has a smaller image circle than its film (where the camera has ``check``).
+    Raises: DomainError, in a sentence that says what to change, for a box that is farther from the
+      robot than ``reach_m`` or has no room beside it, a start that does not keep a requirement, or
+      a camera whose lens has a smaller image circle than its film (where the camera has ``check``).
     """
     for each in requirements:
         if isinstance(each, Clearance):

@@ -1,12 +1,13 @@
-"""How well flow is known where it is longer or nearer, in the mean over textures: the part of the gradient of
-its precision that is not the draw's.
+"""How well flow is known where it is longer or nearer, in the mean over textures: the part of the
+gradient of its precision that is not the draw's.
 
-The precision that an estimator gives a window jumps with the texture under it: moved by a pixel, the picture
-has other edges. Its derivative to a pose is that jump times hundreds of pixels per radian, and has no mean.
-What goes on when the jumps are averaged is that flow is told better where there is more of it, until it is
-too fast, where the surface and its texture are near, and where the robot's own body, whose image stands
-still, does not reach into the window. That trend is fitted over all points seen so far, and is followed
-instead; or, over steps that no slope describes, what was told from one place is carried to another by it.
+The precision that an estimator gives a window jumps with the texture under it: moved by a pixel,
+the picture has other edges. Its derivative to a pose is that jump times hundreds of pixels per
+radian, and has no mean. What goes on when the jumps are averaged is that flow is told better where
+there is more of it, until it is too fast, where the surface and its texture are near, and where the
+robot's own body, whose image stands still, does not reach into the window. That trend is fitted
+over all points seen so far, and is followed instead; or, over steps that no slope describes, what
+was told from one place is carried to another by it.
 """
 
 from dataclasses import replace
@@ -24,11 +25,13 @@ SURE = 1e-4  # of a confidence from 0 and 1
 
 
 class PrecisionTrend:
-    """Regression of the logarithm of precision, and of the log odds of confidence, on flow length (third
-    order), nearness, and the share of the window that the body covers (second).
+    """Regression of the logarithm of precision, and of the log odds of confidence, on flow length
+    (third order), nearness, and the share of the window that the body covers (second).
 
-    Where lenses differ too, every call is given ``optics`` [N, windows, 2] of its readings (``window_optics``):
-    nearness then counts in pixels per metre, and blur is a term (second order, and with the length).
+    Where lenses differ too, every call is given ``optics`` [N, windows, 2] of its readings
+    (``window_optics``):
+    nearness then counts in pixels per metre, and blur is a term (second order, and with the
+    length).
 
     >>> trend = PrecisionTrend()
     """
@@ -47,8 +50,8 @@ class PrecisionTrend:
     ) -> "PrecisionTrend":
         """Take in readings whose true flow is [N, P, 2] px; points without a surface are left out.
 
-        covered: share of each window that the robot's own body covers, [windows] (``OwnBody.covered``) or [N,
-          windows].
+        covered: share of each window that the robot's own body covers, [windows]
+          (``OwnBody.covered``) or [N, windows].
         """
         seen = read.share > 0
         terms = _terms(read, flow_px, covered, optics)[seen]
@@ -59,8 +62,8 @@ class PrecisionTrend:
         return self
 
     def followed(self, read: Readings, flow_px: Tensor, covered: Tensor | None = None) -> Readings:
-        """The same readings, whose precision and confidence have the gradient of the trend to flow, depth and
-        cover.
+        """The same readings, whose precision and confidence have the gradient of the trend to flow,
+        depth and cover.
 
         Raises: DomainError where nothing has been added.
         """
@@ -77,8 +80,8 @@ class PrecisionTrend:
         covered: Tensor | None = None,
         optics: Tensor | None = None,
     ) -> Tensor:
-        """[N, P, 2]: logarithm of precision and log odds of confidence by the trend alone. Arguments and
-        errors as ``followed``."""
+        """[N, P, 2]: logarithm of precision and log odds of confidence by the trend alone.
+        Arguments and errors as ``followed``."""
         return _terms(read, flow_px, covered, optics) @ self._coefficients()
 
     def carried(
@@ -88,30 +91,38 @@ class PrecisionTrend:
         there: Readings,
         told_there: Tensor,
     ) -> Readings:
-        """Readings of the same points and textures as if they had been made from another place, no picture of
-        which there is.
+        """Readings of the same points and textures as if they had been made from another place, no
+        picture of which there is.
 
         Args:
           here: what was read.
           told_here, told_there: what the trend tells of either place (``told``).
           there: depth, rows and share from the other place; its estimates are not looked at.
-        Precision and confidence are those of here, changed as the trend tells. A point that shows a surface
-        only from there takes what the nearest window with surfaces had beside the trend: a mean would be too
-        good, since a window in three without texture says less than all of them with a little. Gradient:
+        Precision and confidence are those of here, changed as the trend tells. A point that shows a
+        surface only from there takes what the nearest window with surfaces had beside the trend: a
+        mean would be too good, since a window in three without texture says less than all of them
+        with a little. Gradient:
         readings of here, what is told.
         """
         seen = here.share > 0
         own = torch.stack([_log_precision(here), _log_odds(here.confidence)], -1)
         beside = own - told_here
-        told = torch.where(seen[..., None], beside, _of_nearest_window(here, beside, seen)) + told_there
+        told = (
+            torch.where(seen[..., None], beside, _of_nearest_window(here, beside, seen))
+            + told_there
+        )
         grown = (told - own)[..., 0].exp()[..., None, None] * here.precision
-        alone = told[..., 0].exp()[..., None, None] * torch.eye(2, dtype=told.dtype, device=told.device)
+        alone = told[..., 0].exp()[..., None, None] * torch.eye(
+            2, dtype=told.dtype, device=told.device
+        )
         precision = torch.where(seen[..., None, None], grown, alone)
         return replace(there, precision=precision, confidence=torch.sigmoid(told[..., 1]))
 
     def _coefficients(self):
         if self._normal is None:
-            raise DomainError("the trend of precision has seen no readings; add some before it is followed.")
+            raise DomainError(
+                "the trend of precision has seen no readings; add some before it is followed."
+            )
         weight = self._normal[0, 0].clamp_min(1)  # the number of points: the first term is 1
         ridge = RIDGE * weight * torch.eye(len(self._normal), dtype=self._normal.dtype)
         return torch.linalg.solve(self._normal + ridge, self._right)
@@ -132,7 +143,9 @@ def _terms(read, flow_px, covered, optics=None):
     hidden = torch.zeros_like(length)
     if covered is not None:
         hidden = read.of_windows(covered.to(length).expand(len(length), read.windows))
-    return torch.stack([*terms, length * nearness, length**2 * nearness, hidden, hidden**2, *soft], -1)
+    return torch.stack(
+        [*terms, length * nearness, length**2 * nearness, hidden, hidden**2, *soft], -1
+    )
 
 
 def _of_nearest_window(read, values, seen):

@@ -1,5 +1,5 @@
-"""Points, segments and rays against triangles [F, 3, 3], exactly and without gradient; float64, many against
-many."""
+"""Points, segments and rays against triangles [F, 3, 3], exactly and without gradient; float64,
+many against many."""
 
 import math
 
@@ -16,8 +16,8 @@ def closest_points(points: Tensor, triangles: Tensor) -> tuple[Tensor, Tensor]:
       points: [N, 3].
       triangles: [F, 3, 3], F >= 1; ones without area count as their edges.
     Returns: closest [N, 3], and the triangle that it lies on [N]. Gradient: none.
-    Source: Ericson, Real-Time Collision Detection, 2005, 5.1.5: inside the prism over a triangle its plane is
-      nearest, elsewhere one of its edges.
+    Source: Ericson, Real-Time Collision Detection, 2005, 5.1.5: inside the prism over a triangle
+      its plane is nearest, elsewhere one of its edges.
     """
     chunks = points.detach().split(max(1, PAIRS // len(triangles)))
     found = [_closest(chunk, triangles.detach()) for chunk in chunks]
@@ -45,14 +45,15 @@ def _closest(points, triangles):
 
 
 def winding_numbers(points: Tensor, triangles: Tensor) -> Tensor:
-    """How often triangles wind around points: 1 inside a closed surface that faces outward, 0 outside of it.
+    """How often triangles wind around points: 1 inside a closed surface that faces outward, 0
+    outside of it.
 
     Args:
       points: [N, 3].
       triangles: [F, 3, 3].
     Returns: [N]. Gradient: none.
-    Source: solid angle of a triangle of van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 30, 1983; as a
-      test of what is inside Jacobson, Kavan and Sorkine-Hornung, SIGGRAPH 2013.
+    Source: solid angle of a triangle of van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 30,
+      1983; as a test of what is inside Jacobson, Kavan and Sorkine-Hornung, SIGGRAPH 2013.
     """
     found = []
     for chunk in points.detach().split(max(1, PAIRS // len(triangles))):
@@ -115,7 +116,8 @@ def nearest_to_edges(start: Tensor, end: Tensor, triangles: Tensor) -> Tensor:
         beside = (edge * gap).sum(-1)
         both = (axis * edge).sum(-1)
         spread = squared * long - both.square()
-        # nearest points of the two lines, then each kept on its segment (of parallel lines any point serves)
+        # nearest points of the two lines, then each kept on its segment (of parallel lines any
+        # point serves)
         t = ((both * beside - ahead * long) / torch.where(spread > 0, spread, 1.0)).clamp(0, 1)
         t = torch.where(spread > 1e-14 * squared * long, t, 0.0)
         s = ((both * t + beside) / long).clamp(0, 1)

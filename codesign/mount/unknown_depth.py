@@ -1,15 +1,16 @@
 """The velocity of a body when nobody knows how far the surfaces are.
 
-The flow of a point is (R0 + rho R1) v with rho = 1 / depth. With rho anywhere between two bounds, everywhere
-as likely, the likelihood of v takes in all depths,
+The flow of a point is (R0 + rho R1) v with rho = 1 / depth. With rho anywhere between two bounds,
+everywhere as likely, the likelihood of v takes in all depths,
 
     p(flow | v) = 1 / (hi - lo)  integral over rho of  N(flow; (R0 + rho R1) v, precision),
 
-whose integrand is a Gaussian in rho, cut off at the bounds: nodes laid over where it is not nothing give it
-and its moments. Slope and curvature in v follow from the moments (Fisher's and Louis' identities: the mean of
-the slope at known depth; the mean of its curvature less the covariance of that slope). The likelihood has
-other maxima, where points stand at a bound: flow is believed a thousandth at first, and the maximum is
-followed while the belief grows (Rose, Deterministic annealing, 1998).
+whose integrand is a Gaussian in rho, cut off at the bounds: nodes laid over where it is not nothing
+give it and its moments. Slope and curvature in v follow from the moments (Fisher's and Louis'
+identities: the mean of the slope at known depth; the mean of its curvature less the covariance of
+that slope). The likelihood has other maxima, where points stand at a bound: flow is believed a
+thousandth at first, and the maximum is followed while the belief grows (Rose, Deterministic
+annealing, 1998).
 """
 
 import math
@@ -32,8 +33,8 @@ LEAST = 1e-12
 
 @dataclass(frozen=True)
 class UnknownDepth:
-    """No map: surfaces anywhere from ``nearest_m`` to ``farthest_m``, evenly in 1 / depth. ``depth`` of an
-    EgoVelocity.
+    """No map: surfaces anywhere from ``nearest_m`` to ``farthest_m``, evenly in 1 / depth.
+    ``depth`` of an EgoVelocity.
 
     Raises: DomainError unless 0 < nearest_m < farthest_m; the farthest may be infinite.
     """
@@ -60,7 +61,8 @@ class UnknownDepth:
     def __call__(
         self, camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, scene: Any = None
     ) -> Tensor:
-        """The depth of mean nearness [N, P] m, infinite where an object of a MovingScene is seen."""
+        """The depth of mean nearness [N, P] m, infinite where an object of a MovingScene is
+        seen."""
         depth = pixels.new_full(pixels.shape[:-1], 1 / self.mean_per_m, dtype=torch.float64)
         return depth.masked_fill(hidden_by_objects(camera, pixels, T_world_cam, scene), torch.inf)
 
@@ -69,9 +71,9 @@ class UnknownDepth:
 class Points:
     """What the flow of N bodies says at P points, for any depths.
 
-    precision: [N, P, 2, 2] px^-2. told: [N, P, 2], precision times flow. far, near: rows [N, P, 2, K] px at
-    infinite depth, and what each 1 / m adds. weight: [N, P] of a point's logarithmic likelihood. prior: [K,
-    K] precision of the velocities. bounds: of nearness, 1 / m.
+    precision: [N, P, 2, 2] px^-2. told: [N, P, 2], precision times flow. far, near: rows
+    [N, P, 2, K] px at infinite depth, and what each 1 / m adds. weight: [N, P] of a point's
+    logarithmic likelihood. prior: [K, K] precision of the velocities. bounds: of nearness, 1 / m.
     """
 
     precision: Tensor
@@ -84,8 +86,8 @@ class Points:
 
 
 class Look(NamedTuple):
-    """At velocities [N, K]: value [N], less by a constant than minus the logarithm of the posterior density;
-    its slope [N, K] and curvature [N, K, K]; mean of nearness [N, P] 1/m."""
+    """At velocities [N, K]: value [N], less by a constant than minus the logarithm of the posterior
+    density; its slope [N, K] and curvature [N, K, K]; mean of nearness [N, P] 1/m."""
 
     value: Tensor
     slope: Tensor
@@ -162,7 +164,8 @@ def settled(points: Points, velocity: Tensor) -> Tensor:
 
 
 def covariance(points: Points, velocity: Tensor) -> Tensor:
-    """[N, K, K]: the inverse of the curvature, taken for positive where it is not. Gradient: both."""
+    """[N, K, K]: the inverse of the curvature, taken for positive where it is not. Gradient:
+    both."""
     curvature = look(points, velocity).curvature
     # detached: eigenvectors have no gradient where two values are alike
     values, vectors = torch.linalg.eigh(curvature.detach())
@@ -178,8 +181,8 @@ def _solve(curvature, slope, damping):
 
 
 def _moments(tilt, bend, low, high):
-    """Of exp(tilt rho - bend rho^2 / 2) over bounds: logarithm of its mean, mean of rho, central moments 2 to
-    4."""
+    """Of exp(tilt rho - bend rho^2 / 2) over bounds: logarithm of its mean, mean of rho, central
+    moments 2 to 4."""
     with torch.no_grad():
         peak = (tilt / bend.clamp_min(LEAST)).clamp(low, high)
         fall = (tilt - bend * peak).abs()

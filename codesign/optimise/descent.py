@@ -8,17 +8,17 @@ import torch
 
 from codesign.checks import check_number, check_positive
 
-# parameters stay on a grid of 1/GRAIN: parallel sums in a backward pass differ in their last bits, and a run
-# must repeat to the same numbers
+# parameters stay on a grid of 1/GRAIN: parallel sums in a backward pass differ in their last bits,
+# and a run must repeat to the same numbers
 GRAIN = 256
 
 
 class Descent(torch.optim.Optimizer):
     """Steps along a running mean of the gradient, on a grid, with a weak pull towards 0.
 
-    For parameters in natural units, where 0 is the start and a unit is a sensible step. The pull keeps those
-    that the objective does not see from wandering. velocity <- momentum velocity + (1 - momentum)(gradient +
-    pull parameter); parameter <- parameter - lr velocity.
+    For parameters in natural units, where 0 is the start and a unit is a sensible step. The pull
+    keeps those that the objective does not see from wandering. velocity <- momentum velocity +
+    (1 - momentum)(gradient + pull parameter); parameter <- parameter - lr velocity.
 
     Args:
       params: as for any torch optimiser.
@@ -26,7 +26,8 @@ class Descent(torch.optim.Optimizer):
       momentum: 0 to below 1.
       pull: >= 0.
       normalised: every gradient counts by its direction alone, and every step has length lr.
-      grain: 1 over the spacing of the grid, on which steps below half its spacing do nothing; 0 for none.
+      grain: 1 over the spacing of the grid, on which steps below half its spacing do nothing; 0 for
+        none.
     Raises: DomainError for numbers outside these ranges.
 
     >>> import torch
@@ -50,18 +51,27 @@ class Descent(torch.optim.Optimizer):
         check_number(pull, "descent: pull", 0.0)
         check_number(grain, "descent: grain", 0.0)
         super().__init__(
-            params, {"lr": lr, "momentum": momentum, "pull": pull, "normalised": normalised, "grain": grain}
+            params,
+            {
+                "lr": lr,
+                "momentum": momentum,
+                "pull": pull,
+                "normalised": normalised,
+                "grain": grain,
+            },
         )
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> Any:
-        """One step from the gradients in ``.grad``; parameters without one only feel pull and momentum."""
+        """One step from the gradients in ``.grad``; parameters without one only feel pull and
+        momentum."""
         value = None if closure is None else closure()
         for group in self.param_groups:
             slopes = [torch.zeros_like(p) if p.grad is None else p.grad for p in group["params"]]
             share = 1 / _length(slopes) if group["normalised"] else 1.0
             velocities = [
-                self._velocity(p, share * g, group) for p, g in zip(group["params"], slopes, strict=True)
+                self._velocity(p, share * g, group)
+                for p, g in zip(group["params"], slopes, strict=True)
             ]
             reach = group["lr"] / _length(velocities) if group["normalised"] else group["lr"]
             for parameter, velocity in zip(group["params"], velocities, strict=True):

@@ -1,5 +1,5 @@
-"""Gradients of samples, one by one: clipped before they are averaged, because a few are tens of times too
-long."""
+"""Gradients of samples, one by one: clipped before they are averaged, because a few are tens of
+times too long."""
 
 from collections.abc import Iterable, Sequence
 
@@ -13,15 +13,15 @@ def sample_gradients(
     losses: Iterable[Tensor],
     parameters: Sequence[Tensor],
 ) -> tuple[Tensor, Tensor]:
-    """Values and gradients of sample losses, each taken as soon as it is made, so that one graph lives at a
-    time.
+    """Values and gradients of sample losses, each taken as soon as it is made, so that one graph
+    lives at a time.
 
     Args:
       losses: scalars, S of them; a generator makes each when it is needed.
       parameters: leaves that ask for gradients, of any shapes.
     Returns: values [S] and gradients [S, V] to the parameters' numbers in order, float64.
-    Raises: GradientError when a loss does not depend on any of the parameters, or shares its graph with
-      another; DomainError, ShapeError for samples that are no scalar tensors, or none.
+    Raises: GradientError when a loss does not depend on any of the parameters, or shares its graph
+      with another; DomainError, ShapeError for samples that are no scalar tensors, or none.
     """
     if isinstance(losses, Tensor) or not isinstance(losses, Iterable):
         raise DomainError(
@@ -32,9 +32,13 @@ def sample_gradients(
     for loss in losses:
         if not isinstance(loss, Tensor) or loss.numel() != 1:
             given = tuple(loss.shape) if isinstance(loss, Tensor) else type(loss).__name__
-            raise ShapeError(f"a sample's loss is {given}; give one number as a tensor, such as a mean.")
+            raise ShapeError(
+                f"a sample's loss is {given}; give one number as a tensor, such as a mean."
+            )
         if not loss.requires_grad:
-            raise GradientError("a sample's loss has no gradient; the graph is cut before the objective.")
+            raise GradientError(
+                "a sample's loss has no gradient; the graph is cut before the objective."
+            )
         try:
             grads = torch.autograd.grad(loss, list(parameters), allow_unused=True)
         except RuntimeError as error:
@@ -45,7 +49,9 @@ def sample_gradients(
                 "generator), or add them up to one loss."
             ) from error
         if all(g is None for g in grads):
-            raise GradientError("a sample's loss does not depend on any parameter that is optimised.")
+            raise GradientError(
+                "a sample's loss does not depend on any parameter that is optimised."
+            )
         values.append(float(loss.detach()))
         rows.append(torch.cat([_flat(g, p) for g, p in zip(grads, parameters, strict=True)]))
     if not rows:
@@ -54,7 +60,8 @@ def sample_gradients(
 
 
 def clipped_mean(gradients: Tensor, limit: float | None) -> Tensor:
-    """Mean [V] of gradients [S, V], those longer than ``limit`` cut to it; None cuts to the median length."""
+    """Mean [V] of gradients [S, V], those longer than ``limit`` cut to it; None cuts to the median
+    length."""
     lengths = gradients.norm(dim=1)
     felt = lengths[lengths > 0]
     longest = limit if limit is not None else float(felt.median()) if felt.numel() else 1.0

@@ -1,18 +1,20 @@
-"""Damped least squares (Levenberg-Marquardt) on any function of variables to residuals, resumable, with
-bounds.
+"""Damped least squares (Levenberg-Marquardt) on any function of variables to residuals, resumable,
+with bounds.
 
-Each step solves (J^T J + damping D^2) step = -J^T r with D the largest column norms of J seen so far, so the
-units of the variables do not matter. The gain ratio (what the sum of squares lost over what the linear model
-promised) multiplies the damping down after a good step and up after a bad one. Constraints beyond bounds are
-residual rows of their own, such as weight *
-max(0, shortfall).
+Each step solves (J^T J + damping D^2) step = -J^T r with D the largest column norms of J seen so
+far, so the units of the variables do not matter. The gain ratio (what the sum of squares lost over
+what the linear model promised) multiplies the damping down after a good step and up after a bad
+one. Constraints beyond bounds are residual rows of their own, such as weight * max(0, shortfall).
 
-A variable the residuals hardly see (a null mode) has a column about 0, hence a D about 0 and a step of any
-length: the linear model holds nowhere along it, and the damping that would hold it also holds all others. Its
-own column cannot tell it from a variable in small units, so D follows Marquardt as long as steps succeed.
-After ``REJECTED`` failures in a row, when some D lies below ``FLOOR`` of the largest, D is raised to that
-floor for the rest of the run, and the damping goes back to what it was before them. Problems whose steps
-succeed keep their independence of units to the last bit; the others keep it within 1 / FLOOR.
+A variable the residuals hardly see (a null mode) has a column about 0, hence a D about 0 and a step
+of any
+length: the linear model holds nowhere along it, and the damping that would hold it also holds all
+others. Its own column cannot tell it from a variable in small units, so D follows Marquardt as long
+as steps succeed.
+After ``REJECTED`` failures in a row, when some D lies below ``FLOOR`` of the largest, D is raised
+to that floor for the rest of the run, and the damping goes back to what it was before them.
+Problems whose steps succeed keep their independence of units to the last bit; the others keep it
+within 1 / FLOOR.
 Source: Marquardt, SIAM J. Appl. Math. 11 (1963); Nielsen, Damping parameter in Marquardt's method,
   IMM-REP-1999-05 (update of the damping);
 More, The Levenberg-Marquardt algorithm, LNM 630 (1978) (scaling).
@@ -42,11 +44,13 @@ REJECTED = 3
 class StopRules:
     """When a run ends by itself; each is checked after every step.
 
-    steps: most steps of a run. gradient: largest cosine between a column of J and r (0 at a minimum).
-    step: length of a step over that of the variables, both in units of D. loss: relative decrease by an
-      accepted step.
-    damping: largest damping, reached when no step of any size helps. stall: share that the last ``trials``
-      steps together gained of what the linear model promised for them, below which they lead nowhere.
+    steps: most steps of a run. gradient: largest cosine between a column of J and r
+      (0 at a minimum).
+    step: length of a step over that of the variables, both in units of D. loss: relative decrease
+      by an accepted step.
+    damping: largest damping, reached when no step of any size helps. stall: share that the last
+      ``trials`` steps together gained of what the linear model promised for them, below which they
+      lead nowhere.
     """
 
     steps: int = 100
@@ -60,8 +64,8 @@ class StopRules:
 
 @dataclass(frozen=True)
 class Entry:
-    """One step: the loss before it, the norm of its gradient, the length of the trial step, damping, whether it was
-    accepted."""
+    """One step: the loss before it, the norm of its gradient, the length of the trial step,
+    damping, whether it was accepted."""
 
     loss: float
     gradient: float
@@ -76,15 +80,15 @@ class DampedLeastSquares:
     Args:
       residuals: pure function; a value that is not finite counts as a failed step.
       start: [V], a point where the residuals are finite.
-      jacobian: function of (residuals, variables, value there) to [M, V]: ``by_autograd`` (the default),
-        ``by_differences(...)`` or your own.
-      lower, upper: [V] bounds, or None. A variable on a bound that wants to leave is held; steps are cut at
-        bounds.
+      jacobian: function of (residuals, variables, value there) to [M, V]: ``by_autograd``
+        (the default), ``by_differences(...)`` or your own.
+      lower, upper: [V] bounds, or None. A variable on a bound that wants to leave is held; steps
+        are cut at bounds.
       damping: first damping, relative to D^2.
-    variables, loss: where it stands. history: list of Entry. stopped: why the last run ended: a name of StopRules
-      ("stall": it did not converge), "" while it has not.
-    Raises: ShapeError, DomainError for a start that is not finite, outside its bounds, or has residuals that
-      are not finite.
+    variables, loss: where it stands. history: list of Entry. stopped: why the last run ended: a
+      name of StopRules ("stall": it did not converge), "" while it has not.
+    Raises: ShapeError, DomainError for a start that is not finite, outside its bounds, or has
+      residuals that are not finite.
 
     >>> start = torch.tensor([-1.2, 1.0], dtype=torch.float64)
     >>> solver = DampedLeastSquares(lambda x: torch.stack([10 * (x[1] - x[0] ** 2), 1 - x[0]]), start)
@@ -126,15 +130,17 @@ class DampedLeastSquares:
         return float(self._value.square().sum()) / 2
 
     def step(self) -> Entry:
-        """One trial step, accepted or not. Returns its Entry; ``stopped`` says whether a rule ended the
-        run."""
+        """One trial step, accepted or not. Returns its Entry; ``stopped`` says whether a rule ended
+        the run."""
         J = self._slopes = self._jacobian() if self._slopes is None else self._slopes
         r = self._value
         x = self.variables
         gradient = J.T @ r
         free = ~(((x <= self.lower) & (gradient > 0)) | ((x >= self.upper) & (gradient < 0)))
         self.scale = torch.maximum(self.scale, torch.linalg.vector_norm(J, dim=0))
-        D = torch.where(self.scale > 0, self.scale, 1.0).clamp_min(self.floor * float(self.scale.max()))
+        D = torch.where(self.scale > 0, self.scale, 1.0).clamp_min(
+            self.floor * float(self.scale.max())
+        )
         step = torch.zeros_like(x)
         step[free] = _solve(J[:, free], r, self.damping**0.5 * D[free])
         trial = torch.minimum(torch.maximum(x + step, self.lower), self.upper)
@@ -142,8 +148,8 @@ class DampedLeastSquares:
         value = self._residuals(trial)
         before = self.loss
         after = float(value.square().sum()) / 2
-        # the model's decrease, as a product: the difference of two sums of squares drowns in rounding near a
-        # minimum
+        # the model's decrease, as a product: the difference of two sums of squares drowns in
+        # rounding near a minimum
         promised = -float(gradient @ step) - float((J @ step).square().sum()) / 2
         accepted = finite(value) and after < before and promised > 0
         gain = (before - after) / promised if accepted else 0.0
@@ -179,8 +185,8 @@ class DampedLeastSquares:
         steps: int | None = None,
         progress: Callable[[Entry], object] | None = None,
     ) -> Tensor:
-        """Step until a rule ends it, or for ``steps`` more. ``progress`` is called after each step. Returns
-        the variables."""
+        """Step until a rule ends it, or for ``steps`` more. ``progress`` is called after each step.
+        Returns the variables."""
         self.stopped = ""
         for _ in range(steps if steps is not None else self.stop.steps):
             entry = self.step()
@@ -192,7 +198,8 @@ class DampedLeastSquares:
         return self.variables
 
     def state(self) -> dict[str, Any]:
-        """Everything needed to go on, as numbers and lists that JSON and torch.save keep to the last bit."""
+        """Everything needed to go on, as numbers and lists that JSON and torch.save keep to the
+        last bit."""
         return {
             "variables": self.variables.tolist(),
             "scale": self.scale.tolist(),
@@ -204,9 +211,11 @@ class DampedLeastSquares:
         }
 
     def resume(self, state: dict[str, Any]) -> Self:
-        """Go on from ``state``; the same steps follow as without the break. Raises: ShapeError when it
-        belongs to other variables."""
-        found = torch.tensor(state["variables"], dtype=self.variables.dtype, device=self.variables.device)
+        """Go on from ``state``; the same steps follow as without the break. Raises: ShapeError when
+        it belongs to other variables."""
+        found = torch.tensor(
+            state["variables"], dtype=self.variables.dtype, device=self.variables.device
+        )
         if found.shape != self.variables.shape:
             raise ShapeError(
                 f"the state has {found.numel()} variables, this problem has {self.variables.numel()}; give "
@@ -245,11 +254,14 @@ class DampedLeastSquares:
         if self.damping > stop.damping:
             return "damping"
         gained, promised = map(sum, zip(*self.promises, strict=True))
-        return "stall" if len(self.promises) == stop.trials and gained < stop.stall * promised else ""
+        return (
+            "stall" if len(self.promises) == stop.trials and gained < stop.stall * promised else ""
+        )
 
 
 def _solve(J, r, damping):
-    """Step of the damped linear problem, by QR of the stacked rows: squaring J would lose half the digits."""
+    """Step of the damped linear problem, by QR of the stacked rows: squaring J would lose half the
+    digits."""
     if not J.shape[1]:
         return J.new_zeros(0)
     Q, R = torch.linalg.qr(torch.cat([J, torch.diag(damping)]))
@@ -258,7 +270,9 @@ def _solve(J, r, damping):
 
 def _cosine(J, r, gradient, free):
     norms = torch.linalg.vector_norm(J, dim=0) * r.norm()
-    return float(torch.where(free & (norms > 0), gradient.abs() / norms.clamp_min(1e-300), 0.0).max())
+    return float(
+        torch.where(free & (norms > 0), gradient.abs() / norms.clamp_min(1e-300), 0.0).max()
+    )
 
 
 def _bounds(start, lower, upper):

@@ -9,7 +9,8 @@ neighbours.
     shorter = remove_element(geo, 1, residuals)
     better = exchange_glasses(shorter.lens, residuals)
 
-All run damped least squares over the numbers named; the focal length is held by a curvature throughout.
+All run damped least squares over the numbers named; the focal length is held by a curvature
+throughout.
 """
 
 import copy
@@ -43,8 +44,8 @@ STEP = 1e-3  # of the unit of a variable, which moves the rays by a thousandth o
 
 @dataclass(frozen=True)
 class Redesign:
-    """A lens of its own after a move, the merit (sum of squared residuals) of the lens given and of this one,
-    why the last run of least squares stopped, and what was done in words, a line each."""
+    """A lens of its own after a move, the merit (sum of squared residuals) of the lens given and of
+    this one, why the last run of least squares stopped, and what was done in words, a line each."""
 
     lens: GeoLens
     before: float
@@ -64,19 +65,21 @@ def reoptimise(
     """Damped least squares on the residuals of a lens, its focal length held by a curvature.
 
     Args:
-      residuals: lens -> [M]; limits enter as rows, see ``constraints.rows``. Values that are not finite,
-        and a DomainError, make a failed step.
+      residuals: lens -> [M]; limits enter as rows, see ``constraints.rows``. Values that are not
+        finite, and a DomainError, make a failed step.
       names, bounds: as in ``GeoLens.variables``; thicknesses stay above 0.
       held: surfaces (from 0, from the last when negative) whose curvature is not to change.
       steps: most steps.
     Returns: Redesign; the lens given stays as it is.
-    Raises: DomainError when the residuals of the lens given are not finite, a held surface is not there, or
-      nothing can vary.
+    Raises: DomainError when the residuals of the lens given are not finite, a held surface is not
+      there, or nothing can vary.
     """
     count = len(lens.surfaces)
     missing = [i for i in held if not -count <= i < count]
     if missing:
-        raise DomainError(f"{lens.name}: there is no surface {missing[0]} to hold; it has 0 to {count - 1}.")
+        raise DomainError(
+            f"{lens.name}: there is no surface {missing[0]} to hold; it has 0 to {count - 1}."
+        )
     held = [i % count for i in held]
     work = copy.deepcopy(lens)
     efl = float(work.first_order().efl_mm.detach())
@@ -97,7 +100,9 @@ def reoptimise(
                 return torch.full_like(at_start, torch.nan)
 
     at_start = residuals(hold_efl(work.replace(), efl, at)).detach()
-    solver = DampedLeastSquares(guarded, parameters_to_vector(parameters).detach(), by_differences(STEP))
+    solver = DampedLeastSquares(
+        guarded, parameters_to_vector(parameters).detach(), by_differences(STEP)
+    )
     before = 2 * solver.loss
     with torch.no_grad():
         found = copy.deepcopy(build(solver.run(steps)))
@@ -113,9 +118,9 @@ def remove_element(
     steps: int = 40,
     bounds: Bounds | None = None,
 ) -> Redesign:
-    """The lens without an element, re-optimised: its curvatures are first led to a plate (see
-    ``moves.flattened``) in ``path`` equal parts, each followed by a quarter of the ``steps``, so that the
-    others take over its work.
+    """The lens without an element, re-optimised: its curvatures are first led to a plate
+    (see ``moves.flattened``) in ``path`` equal parts, each followed by a quarter of the ``steps``,
+    so that the others take over its work.
 
     Args:
       element: its number in ``elements(lens)``.
@@ -146,14 +151,14 @@ def exchange_glasses(
     bounds: Bounds | None = None,
     among: Sequence[str] | None = None,
 ) -> Redesign:
-    """The lens with the glass of one element after another exchanged for the best of its nearest catalogue
-    neighbours, where that is better after re-optimisation.
+    """The lens with the glass of one element after another exchanged for the best of its nearest
+    catalogue neighbours, where that is better after re-optimisation.
 
     Args:
       count, among: neighbours tried per glass and the names they are chosen from, see
         ``neighbour_glasses``.
-      steps: most steps per trial, and for the lens given first, so that a neighbour wins by its glass and
-        not by its steps. The rest as for ``reoptimise``.
+      steps: most steps per trial, and for the lens given first, so that a neighbour wins by its
+        glass and not by its steps. The rest as for ``reoptimise``.
     Returns: Redesign; its log has a line per trial.
     Raises: DomainError for a lens without glass, or as ``reoptimise`` for the lens given.
     """
@@ -188,13 +193,15 @@ def _as_before(lens, like, held):
 
 
 def _holder(lens, held):
-    """The surface that holds the focal length: ``holding_surface``, or the last that bends light and may
-    change."""
+    """The surface that holds the focal length: ``holding_surface``, or the last that bends light
+    and may change."""
     at = holding_surface(lens)
     if at not in held:
         return at
     index = lens.index().tolist()
     others = [i for i in range(len(lens.surfaces)) if index[i] != index[i + 1] and i not in held]
     if not others:
-        raise DomainError(f"{lens.name}: no surface is left to hold the focal length; hold fewer curvatures.")
+        raise DomainError(
+            f"{lens.name}: no surface is left to hold the focal length; hold fewer curvatures."
+        )
     return others[-1]

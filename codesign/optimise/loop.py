@@ -1,4 +1,5 @@
-"""The loop around an optimiser: draw samples, clip, step, judge now and then, keep the best, save, resume."""
+"""The loop around an optimiser: draw samples, clip, step, judge now and then, keep the best, save,
+resume."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -17,7 +18,8 @@ SHRINK = 0.5  # of the step sizes, after a judgement that is worse than the best
 
 @dataclass
 class Record:
-    """What happened: loss and gradient length by step; step, score and whether it was kept by judgement."""
+    """What happened: loss and gradient length by step; step, score and whether it was kept by
+    judgement."""
 
     loss: list[float] = field(default_factory=list)
     gradient: list[float] = field(default_factory=list)
@@ -27,18 +29,21 @@ class Record:
 
 
 class Loop:
-    """Steps of any torch optimiser on clipped sample gradients; the best point by judgement is kept.
+    """Steps of any torch optimiser on clipped sample gradients; the best point by judgement is
+    kept.
 
-    Straight-through gradients are noisy: single samples point anywhere, and some are tens of times too long.
-    So samples are clipped one by one, and what counts is a score on fixed cases, such as the hard sensor's.
+    Straight-through gradients are noisy: single samples point anywhere, and some are tens of times
+    too long. So samples are clipped one by one, and what counts is a score on fixed cases, such as
+    the hard sensor's.
 
     Args:
       optimiser: torch.optim.Optimizer over what is optimised.
       samples: step number -> the samples' scalar losses, best as a generator.
-      clip: longest gradient of a sample within a parameter group; None clips to the median length of the
-        samples.
-      judge: () -> score, the lower the better, at the parameters as they are; where it is worse than the best, the loop
-        goes back to that point with half the step sizes. Without one the last point is the best.
+      clip: longest gradient of a sample within a parameter group; None clips to the median length
+        of the samples.
+      judge: () -> score, the lower the better, at the parameters as they are; where it is worse
+        than the best, the loop goes back to that point with half the step sizes. Without one the
+        last point is the best.
       judge_every: steps between judgements; the start and the end are judged too.
     record: Record. best, best_score: clones of the parameters at the best judgement, and its score.
     Raises: DomainError for numbers that make no sense; GradientError for a frozen parameter.
@@ -100,8 +105,8 @@ class Loop:
           advance: called after every step with loss= and score=; may raise to stop.
           save: called after every judgement.
         Returns: the best point, one tensor per parameter.
-        Raises: NonFiniteError when a loss or gradient is not finite; the parameters are then at the best
-          point.
+        Raises: NonFiniteError when a loss or gradient is not finite; the parameters are then at the
+          best point.
         """
         try:
             while self.step_number < steps:
@@ -137,7 +142,8 @@ class Loop:
         self.record.gradient.append(float(gradients.norm(dim=1).mean()))
 
     def _clipped(self, gradients: Tensor) -> Tensor:
-        """Mean of the samples' gradients, clipped group by group: weights and lenses have no common unit."""
+        """Mean of the samples' gradients, clipped group by group: weights and lenses have no common
+        unit."""
         sizes = [sum(p.numel() for p in group["params"]) for group in self.optimiser.param_groups]
         return torch.cat([clipped_mean(part, self.clip) for part in gradients.split(sizes, 1)])
 
@@ -196,10 +202,13 @@ class Loop:
     def resume(self, tensors: dict[str, Tensor], numbers: dict[str, Any]) -> "Loop":
         """Go on from ``state()``; the same steps follow as without the break.
 
-        Raises: ShapeError when the state is of other parameters; DomainError when it is of another optimiser.
+        Raises: ShapeError when the state is of other parameters; DomainError when it is of another
+          optimiser.
         """
         shapes = [
-            tuple(tensors[f"now_{i}"].shape) for i in range(len(self.parameters)) if f"now_{i}" in tensors
+            tuple(tensors[f"now_{i}"].shape)
+            for i in range(len(self.parameters))
+            if f"now_{i}" in tensors
         ]
         if shapes != [tuple(p.shape) for p in self.parameters]:
             raise ShapeError(
@@ -221,14 +230,16 @@ class Loop:
             if name.startswith("optimiser_"):
                 _, index, entry = name.split("_", 2)
                 parameter = self.parameters[int(index)]
-                # numbers such as NAdam's product of momenta have a dtype of their own, and stay on the CPU
+                # numbers such as NAdam's product of momenta have a dtype of their own, and stay on
+                # the CPU
                 own = value.clone() if value.ndim == 0 else value.to(parameter)
                 self.optimiser.state[parameter][entry] = own
         return self
 
 
 def check_parameters(parameters: Sequence[Tensor]) -> None:
-    """Raise GradientError for parameters that cannot be optimised: none at all, frozen, or not leaves."""
+    """Raise GradientError for parameters that cannot be optimised: none at all, frozen, or not
+    leaves."""
     if not parameters:
         raise GradientError(
             "the optimiser has no parameters; give it those of lens, mount, sensor or network."

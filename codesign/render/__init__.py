@@ -1,4 +1,5 @@
-"""Cameras, scenes and frames: one wavefront for all frames, ground truth through the current lens."""
+"""Cameras, scenes and frames: one wavefront for all frames, ground truth through the current
+lens."""
 
 from codesign.doors import explain
 from codesign.render import sequence, truth

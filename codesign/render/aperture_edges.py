@@ -1,10 +1,11 @@
 """The gradient of the light that the rims of apertures take away, sampled where it is.
 
-Within the pupil the share of light W that passes falls from one to nothing over the soft edge of an aperture,
-and only there does it change with the lens. Samples spread over the whole pupil meet that edge now and then,
-each with a large derivative: most of the noise of a gradient to the lens. Points of the edge alone, weighted
-by its width, have the same mean: d/dp of the mean of W L over the disc is the mean over angles of 2 (b - a) r
-dW/dp L with r uniform in [a, b], where b - a is the edge at that angle and field point.
+Within the pupil the share of light W that passes falls from one to nothing over the soft edge of an
+aperture, and only there does it change with the lens. Samples spread over the whole pupil meet that
+edge now and then, each with a large derivative: most of the noise of a gradient to the lens. Points
+of the edge alone, weighted by its width, have the same mean: d/dp of the mean of W L over the disc
+is the mean over angles of 2 (b - a) r dW/dp L with r uniform in [a, b], where b - a is the edge at
+that angle and field point.
 """
 
 import math
@@ -26,8 +27,8 @@ WHOLE = 1 - 1e-9  # share of light from which nothing is taken away
 
 
 def aperture_edge_term(camera: Camera, views: Views, samples: int) -> Tensor | None:
-    """Zero-valued image [..., T, *film.shape] whose gradient is that of the light which apertures take away;
-    None where the edge cannot be found so (an obstruction in the pupil's middle).
+    """Zero-valued image [..., T, *film.shape] whose gradient is that of the light which apertures
+    take away; None where the edge cannot be found so (an obstruction in the pupil's middle).
 
     Args:
       camera: as for ``frames``.
@@ -52,13 +53,15 @@ def aperture_edge_term(camera: Camera, views: Views, samples: int) -> Tensor | N
         light, _ = look(views.scene, views.cameras, frame, origin, direction)
         light = light.reshape(count, -1) * (size / samples)
     taken = light * camera.light(replace(rays, weight=rays.weight - rays.weight.detach()), colour)
-    image = torch.zeros(count, math.prod(camera.film.shape), dtype=taken.dtype).index_add(1, pixel, taken)
+    image = torch.zeros(count, math.prod(camera.film.shape), dtype=taken.dtype).index_add(
+        1, pixel, taken
+    )
     return image.reshape(shape).to(dtype)
 
 
 def _edge_points(camera, samples):
-    """Film positions [n, 2] px, pupil points [n, 2], colours and pixels [n], and what share of its pixel's
-    disc each point stands for [n]; None where the edge is no single one."""
+    """Film positions [n, 2] px, pupil points [n, 2], colours and pixels [n], and what share of its
+    pixel's disc each point stands for [n]; None where the edge is no single one."""
     edge = _edge(camera)
     if edge is None:
         return None
@@ -76,8 +79,8 @@ def _edge_points(camera, samples):
     spoke = torch.stack([angle.cos(), angle.sin()], 1)
     colour = rows % len(camera.colours)
 
-    # the edge lies between the largest radius at which all light passes and the smallest at which none does;
-    # both at once
+    # the edge lies between the largest radius at which all light passes and the smallest at which
+    # none does; both at once
     inner, outer = (v[rows].repeat(2, 1) for v in (first, last))
     least = torch.tensor([[WHOLE], [DARK]], dtype=torch.float64)
     for _ in range(HALVINGS):
@@ -88,12 +91,19 @@ def _edge_points(camera, samples):
         inner, outer = torch.where(passes, middle, inner), torch.where(passes, outer, middle)
     begin, end = inner[0], outer[1]
     radius = begin + at[rows, 3] * (end - begin)
-    return film_px[rows], radius[:, None] * spoke, colour, rows // samples, 2 * (end - begin) * radius
+    return (
+        film_px[rows],
+        radius[:, None] * spoke,
+        colour,
+        rows // samples,
+        2 * (end - begin) * radius,
+    )
 
 
 def _edge(camera):
-    """Least and largest radius [FIELDS, FIELDS, ANGLES] of the edge within each cell of the sensor and each
-    sector of the pupil, and the size [2] px of a cell; None where light falls and rises again on the way out."""
+    """Least and largest radius [FIELDS, FIELDS, ANGLES] of the edge within each cell of the sensor
+    and each sector of the pupil, and the size [2] px of a cell; None where light falls and rises
+    again on the way out."""
     film = camera.film
     k = torch.arange(FIELDS + 1, dtype=torch.float64) / FIELDS
     fields = torch.cartesian_prod(k, k).flip(1) * film.sensor_px - 0.5
@@ -110,7 +120,9 @@ def _edge(camera):
     whole = ((least >= WHOLE).sum(2) - 2).clamp(0, RADII)
     some = ((most > 0).sum(2) + 1).clamp(0, RADII)
     whole = torch.where((least >= WHOLE).all(2), RADII, whole)
-    low, high = (_over_cells(v, f) / RADII for v, f in ((whole, torch.minimum), (some, torch.maximum)))
+    low, high = (
+        _over_cells(v, f) / RADII for v, f in ((whole, torch.minimum), (some, torch.maximum))
+    )
     return low, high, film.sensor_px / FIELDS
 
 

@@ -1,6 +1,7 @@
-"""Triangle meshes cut into cells, parallelograms where two triangles make one, laid side by side in one
-texture: a texture for any mesh, whatever texture coordinates it has. Meshes finer than the texels get
-  radiance at vertices.
+"""Triangle meshes cut into cells, parallelograms where two triangles make one, laid side by side in
+one
+texture: a texture for any mesh, whatever texture coordinates it has. Meshes finer than the texels
+  get radiance at vertices.
 """
 
 from dataclasses import dataclass
@@ -21,8 +22,8 @@ NEAR = 0.4  # of a face, from a vertex: where light counts as that of the vertex
 
 @dataclass(frozen=True)
 class Cells:
-    """Flat pieces of a mesh. origin, along_u, along_v, normal: [C, 3]; triangle: [C] bool, whether a cell is
-    only the half of its parallelogram next to its origin."""
+    """Flat pieces of a mesh. origin, along_u, along_v, normal: [C, 3]; triangle: [C] bool, whether
+    a cell is only the half of its parallelogram next to its origin."""
 
     origin: np.ndarray
     along_u: np.ndarray
@@ -48,7 +49,8 @@ def cells_of(vertices: np.ndarray, faces: np.ndarray) -> Cells:
     face, _, k, far = pairs.T
     start, end, apex = (corners[face, (k + j) % 3] for j in range(3))
     other = corners[pairs[:, 1], far]
-    # the diagonal runs from start to end, so seen from where the normal points to: start, other, end, apex
+    # the diagonal runs from start to end, so seen from where the normal points to: start, other,
+    # end, apex
     return Cells(
         np.concatenate([start, o]),
         np.concatenate([other - start, a - o]),
@@ -66,8 +68,8 @@ def places(vertices: np.ndarray) -> np.ndarray:
 
 
 def shared_edges(place: np.ndarray) -> np.ndarray:
-    """Edges between two faces of places [F, 3]: [E, 4] of face, other face, and the corner where the edge
-    starts in each, running one way in the first and the other way in the second."""
+    """Edges between two faces of places [F, 3]: [E, 4] of face, other face, and the corner where
+    the edge starts in each, running one way in the first and the other way in the second."""
     one, other, count, rises = edge_pairs(place)
     apart = (one // 3 != other // 3) & (count == 2) & (rises[one] != rises[other])
     one, other = one[apart], other[apart]
@@ -76,8 +78,8 @@ def shared_edges(place: np.ndarray) -> np.ndarray:
 
 
 def _parallelograms(place, corners, normal):
-    """Pairs of faces that make one: [P, 4] of face, other face, corner where their common edge starts in the
-    first, corner opposite to it in the second. No face twice, longest edges first."""
+    """Pairs of faces that make one: [P, 4] of face, other face, corner where their common edge
+    starts in the first, corner opposite to it in the second. No face twice, longest edges first."""
     edges = shared_edges(place)
     face, other, k, j = edges.T
     start, end, apex = (corners[face, (k + i) % 3] for i in range(3))
@@ -96,10 +98,10 @@ def _parallelograms(place, corners, normal):
 
 @dataclass(frozen=True)
 class Atlas:
-    """Cells in one texture. left, bottom: [C] first texel of each cell behind its gap; wide, high: [C] its
-    texels;
-    texels: (rows, columns) of the whole; cell: [rows, columns] number of the cell of each texel, -1 for
-      none."""
+    """Cells in one texture. left, bottom: [C] first texel of each cell behind its gap; wide, high:
+    [C] its texels;
+    texels: (rows, columns) of the whole; cell: [rows, columns] number of the cell of each texel, -1
+      for none."""
 
     cells: Cells
     left: np.ndarray
@@ -110,8 +112,8 @@ class Atlas:
     cell: np.ndarray
 
     def at(self, u, v):
-        """Points [N, 3], normals [N, 3] and whether they are on the surface [N], of texture coordinates
-        [N]."""
+        """Points [N, 3], normals [N, 3] and whether they are on the surface [N], of texture
+        coordinates [N]."""
         rows, columns = self.texels
         x = u * columns
         y = v * rows
@@ -121,21 +123,32 @@ class Atlas:
         inside = (k >= 0) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
         inside &= ~self.cells.triangle[k] | (s + t <= 1)
         points = (
-            self.cells.origin[k] + s[:, None] * self.cells.along_u[k] + t[:, None] * self.cells.along_v[k]
+            self.cells.origin[k]
+            + s[:, None] * self.cells.along_u[k]
+            + t[:, None] * self.cells.along_v[k]
         )
         return points, self.cells.normal[k], inside
 
     def mesh(self):
-        """Vertices [V, 3], faces [F, 3] and texture coordinates [V, 2] of the mesh that shows the texture."""
+        """Vertices [V, 3], faces [F, 3] and texture coordinates [V, 2] of the mesh that shows the
+        texture."""
         c = self.cells
         corners = np.stack(
-            [c.origin, c.origin + c.along_u, c.origin + c.along_u + c.along_v, c.origin + c.along_v], 1
+            [
+                c.origin,
+                c.origin + c.along_u,
+                c.origin + c.along_u + c.along_v,
+                c.origin + c.along_v,
+            ],
+            1,
         )
         at = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
         size = np.stack([self.wide, self.high], 1)[:, None]
         uv = (np.stack([self.left, self.bottom], 1)[:, None] + at * size) / self.texels[::-1]
         number = 4 * np.arange(len(c.origin))
-        both = np.stack([number, number + 1, number + 2, number, number + 2, number + 3], 1).reshape(-1, 2, 3)
+        both = np.stack(
+            [number, number + 1, number + 2, number, number + 2, number + 3], 1
+        ).reshape(-1, 2, 3)
         half = np.stack([number, number + 1, number + 3], 1)
         faces = np.concatenate([both[~c.triangle].reshape(-1, 3), half[c.triangle]])
         used, faces = np.unique(faces, return_inverse=True)
@@ -144,7 +157,9 @@ class Atlas:
 
 def atlas_of(cells: Cells, texel: float) -> Atlas:
     """Cells laid out with texels of this size, or larger ones where they would be too many."""
-    lengths = np.stack([np.linalg.norm(cells.along_u, axis=1), np.linalg.norm(cells.along_v, axis=1)], 1)
+    lengths = np.stack(
+        [np.linalg.norm(cells.along_u, axis=1), np.linalg.norm(cells.along_v, axis=1)], 1
+    )
     while True:
         size = np.maximum(np.ceil(lengths / texel), 1).astype(np.int64)
         total = int((size + 2 * GAP).prod(1).sum())
@@ -171,9 +186,10 @@ def atlas_of(cells: Cells, texel: float) -> Atlas:
 
 @dataclass(frozen=True)
 class Nodes:
-    """Vertices of a fine mesh, one per place and smooth surface. vertices: [N, 3]; faces: [F, 3] of them;
-    normal: [F, 3]; corner: [3 F] corners 3 face + k in order of their nodes; first: [N + 1] where each node
-      starts there."""
+    """Vertices of a fine mesh, one per place and smooth surface. vertices: [N, 3]; faces: [F, 3] of
+    them;
+    normal: [F, 3]; corner: [3 F] corners 3 face + k in order of their nodes; first: [N + 1] where
+      each node starts there."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -193,7 +209,8 @@ class Nodes:
 
 
 def nodes_of(vertices: np.ndarray, faces: np.ndarray) -> Nodes:
-    """Nodes of a mesh of vertices [V, 3] and faces [F, 3]: where faces meet at a crease each has its own."""
+    """Nodes of a mesh of vertices [V, 3] and faces [F, 3]: where faces meet at a crease each has
+    its own."""
     corners = vertices[faces]
     normal = normals_of(corners)
     face, other, k, j = shared_edges(places(vertices)[faces]).T
@@ -206,4 +223,6 @@ def nodes_of(vertices: np.ndarray, faces: np.ndarray) -> Nodes:
     )
     corner = np.argsort(label, kind="stable")
     first = np.searchsorted(label[corner], np.arange(count + 1))
-    return Nodes(corners.reshape(-1, 3)[corner[first[:-1]]], label.reshape(-1, 3), normal, corner, first)
+    return Nodes(
+        corners.reshape(-1, 3)[corner[first[:-1]]], label.reshape(-1, 3), normal, corner, first
+    )

@@ -1,10 +1,11 @@
 """Light of a scene, computed once by path tracing and kept as emissive textures.
 
-Outgoing radiance of a Lambertian surface is emission + albedo x irradiance / pi, the same from every side.
-Irradiance is smooth, so it is estimated on a coarse light map; albedo and emission are read at their own
-resolution; the product is the texture of a ``MitsubaScene``. Of surfaces that shine, whose radiance depends
-on where they are seen from, it is the mean over directions (weighted by their cosine, so that the energy is
-right), or the radiance towards one point. Surfaces that reflect on both sides have a texture for each.
+Outgoing radiance of a Lambertian surface is emission + albedo x irradiance / pi, the same from
+every side. Irradiance is smooth, so it is estimated on a coarse light map; albedo and emission are
+read at their own resolution; the product is the texture of a ``MitsubaScene``. Of surfaces that
+shine, whose radiance depends on where they are seen from, it is the mean over directions (weighted
+by their cosine, so that the energy is right), or the radiance towards one point. Surfaces that
+reflect on both sides have a texture for each.
 """
 
 import itertools
@@ -24,8 +25,8 @@ from codesign.render.charts import FINE, Chart, Surface, placed, surfaces_of
 from codesign.render.placed import Placement, SidedScene
 from codesign.render.world import MitsubaScene
 
-# of (1 m + distance from the origin): height over the surface from which a texel is looked at; about half of
-# Mitsuba's own ray offset
+# of (1 m + distance from the origin): height over the surface from which a texel is looked at;
+# about half of Mitsuba's own ray offset
 LIFT = 5e-5
 # of launches: a new size is a new kernel, so points are padded to one of these
 SIZES = (
@@ -58,22 +59,26 @@ def bake(
     """A MitsubaScene whose emissive textures are the outgoing radiance of a scene.
 
     Args:
-      description: Mitsuba scene dictionary, or an mi.Scene, of rectangles, disks, spheres, cylinders and
-        meshes, area emitters where they glow, and lamps of any kind. Environment maps stay in the scene, seen
-        and lighting.
-      texel_m: size of light-map texels, from LEAST_SIDE to MOST_SIDE along each side of a shape; larger on a
-        mesh that would need more than two million. samples: paths per texel; seed: of all of them.
+      description: Mitsuba scene dictionary, or an mi.Scene, of rectangles, disks, spheres,
+        cylinders and meshes, area emitters where they glow, and lamps of any kind. Environment maps
+        stay in the scene, seen and lighting.
+      texel_m: size of light-map texels, from LEAST_SIDE to MOST_SIDE along each side of a shape;
+        larger on a mesh that would need more than two million. samples: paths per texel; seed: of
+        all of them.
       max_depth: longest path. integrator: a Mitsuba SamplingIntegrator instead.
-      towards_m: place from which shiny surfaces look as they are; None shows the mean over directions.
-      matte: whether mirrors, glass and masks are shown as if they were matte, in their mean radiance.
-      lit: whether there is light at all; without it what glows shows its emission, anything else its albedo.
+      towards_m: place from which shiny surfaces look as they are; None shows the mean over
+        directions.
+      matte: whether mirrors, glass and masks are shown as if they were matte, in their mean
+        radiance.
+      lit: whether there is light at all; without it what glows shows its emission, anything else
+        its albedo.
       placement: of the scene in the world; texel_m and towards_m are the world's.
-    Returns: MitsubaScene. Meshes have textures of their own, whatever texture coordinates they come with;
-      those finer than their texels have radiance at vertices.
-    Error: noise of about 1 / sqrt(samples) of what arrives indirectly, light smeared over a texel at contact
-      shadows, pictures read bilinearly, gloss from one direction; see light.level_error.
-    Raises: DomainError for mirrors, glass and masks unless ``matte``; media; shapes without known charts; of
-      a dictionary, shapes of which nothing can be seen from their front.
+    Returns: MitsubaScene. Meshes have textures of their own, whatever texture coordinates they come
+      with; those finer than their texels have radiance at vertices.
+    Error: noise of about 1 / sqrt(samples) of what arrives indirectly, light smeared over a texel
+      at contact shadows, pictures read bilinearly, gloss from one direction; see light.level_error.
+    Raises: DomainError for mirrors, glass and masks unless ``matte``; media; shapes without known
+      charts; of a dictionary, shapes of which nothing can be seen from their front.
     """
     check_positive(texel_m, "bake: texel_m")
     check_whole(samples, "bake: samples")
@@ -90,7 +95,9 @@ def bake(
         np.random.default_rng(seed),
         int(samples),
         texel_m / place.unit_m,
-        None if towards_m is None else (np.array(towards_m) @ place.R_world_scene.numpy()) / place.unit_m,
+        None
+        if towards_m is None
+        else (np.array(towards_m) @ place.R_world_scene.numpy()) / place.unit_m,
     )
     surfaces = surfaces_of(mi, world.scene, work.texel, matte)
     light = work.radiance(surfaces, strict=isinstance(description, Mapping))
@@ -100,8 +107,8 @@ def bake(
 def shown(
     world: MitsubaScene, surfaces: Sequence[Surface], light: Any, place: Placement, device: str
 ) -> MitsubaScene:
-    """The scene of these surfaces with their light, a list per surface of one array per side, as emission,
-    and the sky of the scene they come from."""
+    """The scene of these surfaces with their light, a list per surface of one array per side, as
+    emission, and the sky of the scene they come from."""
     mi = world.mi
     to_world = np.eye(4)
     to_world[:3, :3] = place.unit_m * place.R_world_scene.numpy()
@@ -117,13 +124,17 @@ def shown(
             backs[surface.name] = back
     upright = sky is None or bool((place.R_world_scene == torch.eye(3)).all())
     plain = not backs and place.gain == 1 and upright
-    return MitsubaScene(description, device) if plain else SidedScene(description, backs, place, device)
+    return (
+        MitsubaScene(description, device)
+        if plain
+        else SidedScene(description, backs, place, device)
+    )
 
 
 @dataclass(frozen=True)
 class Bake:
-    """The estimates. texel, towards: in the scene's unit and axes; integrator None takes light to be 1
-    everywhere, which leaves albedo and emission."""
+    """The estimates. texel, towards: in the scene's unit and axes; integrator None takes light to
+    be 1 everywhere, which leaves albedo and emission."""
 
     mi: Any
     scene: Any
@@ -134,7 +145,8 @@ class Bake:
     towards: np.ndarray | None = None
 
     def radiance(self, surfaces: Sequence[Surface], strict: bool) -> list[list[np.ndarray]]:
-        """Outgoing radiance of every side of every surface: textures [H, W], or values [N] of nodes. strict:
+        """Outgoing radiance of every side of every surface: textures [H, W], or values [N] of
+        nodes. strict:
         whether a surface that nothing can be seen of from its front is an error."""
         jobs = [(surface, side) for surface in surfaces for side in (1, -1)[: surface.sides]]
         found = {}
@@ -178,7 +190,8 @@ class Bake:
             values[:, texel[seen]] = np.stack([albedo, emission, seen])[:, seen]
             if last:
                 light = _filled(
-                    (total[k] / np.maximum(count[k], 1)).reshape(coarse[k]), (count[k] > 0).reshape(coarse[k])
+                    (total[k] / np.maximum(count[k], 1)).reshape(coarse[k]),
+                    (count[k] > 0).reshape(coarse[k]),
                 )
                 albedo, emission, known = values.reshape(3, *fine[k])
                 albedo, emission = (_filled(part, known > 0) for part in (albedo, emission))
@@ -186,8 +199,8 @@ class Bake:
                 values = None
 
     def _texels(self, jobs, sizes, samples):
-        """Random points within texels, ``samples`` each, or their centres for 0: points, normals, shiny,
-        (job, texel, whether the last), in blocks."""
+        """Random points within texels, ``samples`` each, or their centres for 0: points, normals,
+        shiny, (job, texel, whether the last), in blocks."""
         block = max(1, SIZES[-1] // max(samples, 1))
         for k, ((surface, side), (rows, columns)) in enumerate(zip(jobs, sizes, strict=True)):
             for start in range(0, rows * columns, block):
@@ -197,20 +210,29 @@ class Bake:
                 at = (texel % columns + x) / columns, (texel // columns + y) / rows
                 points, normals, inside = surface.chart.at(*at)
                 last = end == rows * columns
-                yield points[inside], side * normals[inside], surface.shiny, (k, texel[inside], last)
+                yield (
+                    points[inside],
+                    side * normals[inside],
+                    surface.shiny,
+                    (k, texel[inside], last),
+                )
 
     def _stream(self, requests, paths):
-        """Answers of ``_look`` to (points, normals, shiny, tag), as (tag, *answers) in order; small requests
-        share a launch, since setting one up costs a tenth of a second."""
+        """Answers of ``_look`` to (points, normals, shiny, tag), as (tag, *answers) in order; small
+        requests share a launch, since setting one up costs a tenth of a second."""
         waiting = []
         lanes = 0
         for request in itertools.chain(requests, [None]):
             if waiting and (request is None or lanes + len(request[0]) > SIZES[-1]):
-                points, normals = (np.concatenate([np.float32(row[k]) for row in waiting]) for k in (0, 1))
+                points, normals = (
+                    np.concatenate([np.float32(row[k]) for row in waiting]) for k in (0, 1)
+                )
                 shiny = np.repeat([row[2] for row in waiting], [len(row[0]) for row in waiting])
                 ends = np.cumsum([len(row[0]) for row in waiting])[:-1]
                 answers = self._look(points, normals, shiny, paths)
-                for row, *parts in zip(waiting, *(np.split(part, ends) for part in answers), strict=True):
+                for row, *parts in zip(
+                    waiting, *(np.split(part, ends) for part in answers), strict=True
+                ):
                     yield row[3], *parts
                 waiting = []
                 lanes = 0
@@ -219,13 +241,17 @@ class Bake:
                 lanes += len(request[0])
 
     def _values(self, jobs):
-        """Outgoing radiance [N] of each (surface, side) with nodes: the mean near each; where nothing is seen
-        that of the others."""
+        """Outgoing radiance [N] of each (surface, side) with nodes: the mean near each; where
+        nothing is seen that of the others."""
         jobs = [job for job in jobs if isinstance(job[0].chart, Nodes)]
-        total, count = ([np.zeros(len(surface.chart.vertices)) for surface, _ in jobs] for _ in range(2))
+        total, count = (
+            [np.zeros(len(surface.chart.vertices)) for surface, _ in jobs] for _ in range(2)
+        )
         lit = self.integrator is not None
         for (k, node), light, albedo, emission, seen in self._stream(self._node_points(jobs), lit):
-            out = emission + albedo * (np.where(albedo > DARK, light, 0) if lit else _unlit(jobs[k]))
+            out = emission + albedo * (
+                np.where(albedo > DARK, light, 0) if lit else _unlit(jobs[k])
+            )
             total[k] += np.bincount(node, np.where(seen, out, 0), len(total[k]))
             count[k] += np.bincount(node, seen, len(total[k]))
         for sums, times in zip(total, count, strict=True):
@@ -237,7 +263,9 @@ class Bake:
         block = max(1, SIZES[1] // self.samples)
         for k, (surface, side) in enumerate(jobs):
             for start in range(0, len(surface.chart.vertices), block):
-                node = np.arange(start, min(start + block, len(surface.chart.vertices))).repeat(self.samples)
+                node = np.arange(start, min(start + block, len(surface.chart.vertices))).repeat(
+                    self.samples
+                )
                 points, normals = surface.chart.points(self.random, node)
                 yield points, side * normals, surface.shiny, (k, node)
 
@@ -249,8 +277,8 @@ class Bake:
         return tuple(int(n) for n in np.clip(wanted, LEAST_SIDE, MOST_SIDE))
 
     def _fine(self, surface):
-        """Texels (rows, columns) of the finished texture: those of the pictures on the shape, but no more
-        than FINE per light-map texel."""
+        """Texels (rows, columns) of the finished texture: those of the pictures on the shape, but
+        no more than FINE per light-map texel."""
         chart = surface.chart
         coarse = np.array(self._coarse(chart))
         pictures = np.array(surface.texels_per_uv)
@@ -258,7 +286,9 @@ class Bake:
         if chart.atlas is not None:
             per_uv = float(np.sqrt(pictures.prod()))
             per_texel = (
-                per_uv * chart.uv_per_unit * chart.size[0] / coarse[1] if np.isfinite(per_uv) else per_uv
+                per_uv * chart.uv_per_unit * chart.size[0] / coarse[1]
+                if np.isfinite(per_uv)
+                else per_uv
             )
             wanted = max(1, np.ceil(min(per_texel, FINE))) * coarse
         else:
@@ -267,9 +297,9 @@ class Bake:
         return tuple(int(n) for n in np.maximum(coarse, wanted * min(1.0, most)))
 
     def _look(self, points, normals, shiny, paths):
-        """Light (irradiance / pi), albedo, emission and whether the surface is there, for points on a
-        surface; numpy [N]. Where it is ``shiny`` light comes towards one direction, and albedo is no less
-        than SHINE."""
+        """Light (irradiance / pi), albedo, emission and whether the surface is there, for points on
+        a surface; numpy [N]. Where it is ``shiny`` light comes towards one direction, and albedo is
+        no less than SHINE."""
         import drjit as dr
 
         mi = self.mi
@@ -286,7 +316,8 @@ class Bake:
                 for part in (p, out, reach, loose)
             )
             ray = mi.RayDifferential3f(
-                mi.Point3f(*_columns(mi, p + reach[:, None] * out)), mi.Vector3f(*_columns(mi, -out))
+                mi.Point3f(*_columns(mi, p + reach[:, None] * out)),
+                mi.Vector3f(*_columns(mi, -out)),
             )
             si = self.scene.ray_intersect(mi.Ray3f(ray.o, ray.d))
             albedo = si.bsdf().eval_diffuse_reflectance(si)[0]
@@ -305,14 +336,19 @@ class Bake:
             parts.append(
                 [
                     np.broadcast_to(np.array(part), (width,))[:count].astype(kind)
-                    for part, kind in ((light, float), (albedo, float), (emission, float), (seen, bool))
+                    for part, kind in (
+                        (light, float),
+                        (albedo, float),
+                        (emission, float),
+                        (seen, bool),
+                    )
                 ]
             )
         return [np.concatenate(column) for column in zip(*parts, strict=True)]
 
     def _directions(self, points, normals, shiny):
-        """Where each point is looked at from: along its normal, or where it shines from ``towards``, or from
-        anywhere with the density of the cosine."""
+        """Where each point is looked at from: along its normal, or where it shines from
+        ``towards``, or from anywhere with the density of the cosine."""
         if not shiny.any():
             return normals
         cosine = np.sqrt(self.random.uniform(GRAZING**2, 1, len(points)))[:, None]

@@ -22,9 +22,9 @@ CHECKED_RAYS = 16
 
 
 class Lens(Protocol):
-    """camera_rays(film_mm [N, 2], pupil [N, 2], aim=...) -> Rays [N], as GeoLens has it; ``dtype`` where it
-    is not float64, ``film_points`` for a first guess where gradients of silhouettes are asked for,
-    ``entrance_pupil_diameter_mm`` where there is an aperture."""
+    """camera_rays(film_mm [N, 2], pupil [N, 2], aim=...) -> Rays [N], as GeoLens has it; ``dtype``
+    where it is not float64, ``film_points`` for a first guess where gradients of silhouettes are
+    asked for, ``entrance_pupil_diameter_mm`` where there is an aperture."""
 
     @property
     def camera_rays(self) -> Callable[..., Rays]: ...
@@ -38,14 +38,14 @@ class Camera:
     >>> camera.check().rays().weight.shape  # 8 x 8 pixels x 4 samples
     torch.Size([256])
 
-    The same seed gives the same film and pupil samples in every frame and for every lens state (common random
-    numbers).
-    spectrum: anything with wavelengths_um and weights (sum 1), such as lens.Spectrum: each takes an equal
-      share of the samples; None is the d line.
-    falloff: whether the natural illumination falloff (cos^4 and pupil growth) darkens the image; without it
-      the image is as after flat-field correction.
-    aim: whether pupil samples lie on the real stop instead of the paraxial exit pupil; several traces more
-      per frame.
+    The same seed gives the same film and pupil samples in every frame and for every lens state
+    (common random numbers).
+    spectrum: anything with wavelengths_um and weights (sum 1), such as lens.Spectrum: each takes an
+      equal share of the samples; None is the d line.
+    falloff: whether the natural illumination falloff (cos^4 and pupil growth) darkens the image;
+      without it the image is as after flat-field correction.
+    aim: whether pupil samples lie on the real stop instead of the paraxial exit pupil; several
+      traces more per frame.
     """
 
     def __init__(
@@ -114,8 +114,8 @@ class Camera:
 
     @property
     def colours(self) -> list[tuple[dict[str, float], float]]:
-        """Of each colour what ``camera_rays`` has to be told, and how its light counts beside an equal
-        share."""
+        """Of each colour what ``camera_rays`` has to be told, and how its light counts beside an
+        equal share."""
         if self.spectrum is None:
             return [({}, 1.0)]
         lines = self.spectrum.wavelengths_um
@@ -130,12 +130,15 @@ class Camera:
         return getattr(self.lens, "entrance_pupil_diameter_mm", 0.0) * 1e-3 / 2
 
     def light(self, rays: Rays, colour: Tensor) -> Tensor:
-        """Light [N] that rays in the colours of their numbers ([N], or one of all) bring, less what falls off towards the
-        corners.
+        """Light [N] that rays in the colours of their numbers ([N], or one of all) bring, less what
+        falls off towards the corners.
         Raises: DomainError for a lens that does not say how it does."""
         light = rays.weight
         if self.spectrum is not None:
-            light = light * torch.tensor([share for _, share in self.colours], dtype=light.dtype)[colour]
+            light = (
+                light
+                * torch.tensor([share for _, share in self.colours], dtype=light.dtype)[colour]
+            )
         if not self.falloff:
             return light
         if rays.irradiance is None:
@@ -145,17 +148,19 @@ class Camera:
         return light * rays.irradiance
 
     def check(self) -> "Camera":
-        """Raise DomainError when some pixels of the film get no light at all through the lens; returns the
-        camera.
+        """Raise DomainError when some pixels of the film get no light at all through the lens;
+        returns the camera.
 
-        Pixels on a grid of about CHECKED_ACROSS across the film are looked at, by CHECKED_RAYS rays each; no
-        gradient. To be asked once per lens, before the first step of a design.
+        Pixels on a grid of about CHECKED_ACROSS across the film are looked at, by CHECKED_RAYS rays
+        each; no gradient. To be asked once per lens, before the first step of a design.
         """
         every_px = max(1, math.ceil(max(self.film.width_px, self.film.height_px) / CHECKED_ACROSS))
         pixels = coarse_pixels(self.film, every_px)
         _, pupil = film_pupil_pattern(CHECKED_RAYS, self.seed)
         with torch.no_grad():
-            rays = self.rays_through(pixels.repeat_interleave(CHECKED_RAYS, 0), pupil.repeat(len(pixels), 1))
+            rays = self.rays_through(
+                pixels.repeat_interleave(CHECKED_RAYS, 0), pupil.repeat(len(pixels), 1)
+            )
         dark = (rays.weight.reshape(-1, CHECKED_RAYS) > 0).logical_not().all(1).cpu()
         if bool(dark.any()):
             radius_mm = self.film_mm(pixels).norm(dim=1)
@@ -173,8 +178,8 @@ class Camera:
         return (pixels - self.film.middle_px.to(pixels)) * self.film.pixel_pitch_mm
 
     def given(self, rays: Rays | None) -> Rays:
-        """The same rays, or newly traced ones for None. Raises: ShapeError unless they are as many as this
-        camera has."""
+        """The same rays, or newly traced ones for None. Raises: ShapeError unless they are as many
+        as this camera has."""
         if rays is None:
             return self.rays()
         count = math.prod(self.film.shape) * self.samples_per_pixel
@@ -187,8 +192,8 @@ class Camera:
         return rays
 
     def rays(self) -> Rays:
-        """All rays of one frame, pixel after pixel, samples_per_pixel each: Rays with N = pixels x samples,
-        in the lens's dtype. Gradient: to the lens."""
+        """All rays of one frame, pixel after pixel, samples_per_pixel each: Rays with N = pixels x
+        samples, in the lens's dtype. Gradient: to the lens."""
         offset, pupil = film_pupil_pattern(self.samples_per_pixel, self.seed)
         pixels = self.film.pixels()
         points = pixels[:, None] + offset
@@ -200,16 +205,21 @@ class Camera:
             return parts[0]
 
         def joined(*column):
-            return torch.cat([part.unflatten(0, (len(pixels), -1)) for part in column], 1).flatten(0, 1)
+            return torch.cat([part.unflatten(0, (len(pixels), -1)) for part in column], 1).flatten(
+                0, 1
+            )
 
         return _columns(joined, *parts)
 
     def _rays(self, number, points, pupil):
-        """Rays of one colour from points [P, n, 2] of the film, through the same points [n, 2] of the pupil."""
+        """Rays of one colour from points [P, n, 2] of the film, through the same points [n, 2] of
+        the pupil."""
         dtype = getattr(self.lens, "dtype", torch.float64)
         film_mm = self.film_mm(points).reshape(-1, 2).to(dtype)
         line, _ = self.colours[number]
-        rays = self.lens.camera_rays(film_mm, pupil.repeat(len(points), 1).to(dtype), aim=self.aim, **line)
+        rays = self.lens.camera_rays(
+            film_mm, pupil.repeat(len(points), 1).to(dtype), aim=self.aim, **line
+        )
         return replace(rays, weight=self.light(rays, torch.tensor(number)))
 
     def coloured_rays(self, pixels: Tensor, pupil: Tensor, colour: Tensor) -> Rays:
@@ -241,9 +251,9 @@ class Camera:
         pupil: Tensor,
         wavelength_um: float | None = None,
     ) -> Rays:
-        """Rays of pixel coordinates [N, 2] through points [N, 2] of the pupil, of one colour (the d line when
-        none is given): Rays, float64. The axial ray goes along: only a lens that passes nothing at all is an
-        error."""
+        """Rays of pixel coordinates [N, 2] through points [N, 2] of the pupil, of one colour (the d
+        line when none is given): Rays, float64. The axial ray goes along: only a lens that passes
+        nothing at all is an error."""
         line = {} if wavelength_um is None else {"wavelength_um": wavelength_um}
         at = torch.cat([self.film.middle_px[None].to(pixels), pixels])
         through = torch.cat([pupil.new_zeros(1, 2), pupil])
@@ -252,28 +262,31 @@ class Camera:
 
 
 def _columns(of, *rays):
-    """Rays of which every column is ``of`` those of the given ones; None where one of them does not say."""
+    """Rays of which every column is ``of`` those of the given ones; None where one of them does not
+    say."""
     columns = zip(*((r.origin_m, r.direction, r.weight, r.irradiance) for r in rays), strict=True)
-    found: list[Any] = [None if any(v is None for v in column) else of(*column) for column in columns]
+    found: list[Any] = [
+        None if any(v is None for v in column) else of(*column) for column in columns
+    ]
     return Rays(*found)
 
 
 def lines(rays: Rays) -> tuple[Tensor, Tensor]:
-    """Rays as places on the entrance pupil's plane [N, 2] metres and slopes [N, 2]; those that run aside have
-    slopes of the length of their directions."""
+    """Rays as places on the entrance pupil's plane [N, 2] metres and slopes [N, 2]; those that run
+    aside have slopes of the length of their directions."""
     ahead = rays.direction[:, 2:]
     slope = rays.direction[:, :2] / torch.where(ahead.detach() > 1e-6, ahead, 1)
     return rays.origin_m[:, :2] - rays.origin_m[:, 2:] * slope, slope
 
 
 def project(camera: Camera, points_cam_m: Tensor, pupil: Tensor | None = None) -> Tensor:
-    """Pixel coordinates whose ray through a point of the pupil (the centre when none is given) passes through
-    points of space.
+    """Pixel coordinates whose ray through a point of the pupil (the centre when none is given)
+    passes through points of space.
 
-    Args: points_cam_m [..., N, 3], camera axes, metres, in front of the camera. pupil: [..., N, 2] on the
-      unit disc, or None for chief rays.
-    Returns: [..., N, 2] px (the centre of the first pixel is 0, 0), float64; NaN for points that no such ray
-      reaches (outside the lens's field).
+    Args: points_cam_m [..., N, 3], camera axes, metres, in front of the camera. pupil: [..., N, 2]
+      on the unit disc, or None for chief rays.
+    Returns: [..., N, 2] px (the centre of the first pixel is 0, 0), float64; NaN for points that no
+      such ray reaches (outside the lens's field).
 
     >>> from codesign import lens, render
     >>> camera = render.Camera(lens.Pinhole(8.0), 8, 8, pixel_pitch_mm=0.5)
@@ -281,8 +294,8 @@ def project(camera: Camera, points_cam_m: Tensor, pupil: Tensor | None = None) -
     >>> render.project(camera, points).tolist()
     [[3.5, 3.5], [4.5, 3.5]]
 
-    Gradient: to the points and to the lens, by the implicit function theorem (one Newton step with gradients
-      at the solution); 0 to NaN points.
+    Gradient: to the points and to the lens, by the implicit function theorem (one Newton step with
+      gradients at the solution); 0 to NaN points.
     Raises: DomainError when a point is not finite or not in front of the camera; ShapeError.
     """
     points_cam_m = torch.as_tensor(points_cam_m)
@@ -321,9 +334,9 @@ def project(camera: Camera, points_cam_m: Tensor, pupil: Tensor | None = None) -
 
 @dataclass(frozen=True)
 class Images:
-    """Where N points are seen: at_px [N, 2]; m_per_px [N, 2, 2], change of the place at that depth per pixel;
-    slope [N, 2] of the ray there; step_px [N], the last step of Newton's method, infinite where no light
-    passes."""
+    """Where N points are seen: at_px [N, 2]; m_per_px [N, 2, 2], change of the place at that depth
+    per pixel; slope [N, 2] of the ray there; step_px [N], the last step of Newton's method,
+    infinite where no light passes."""
 
     at_px: Tensor
     m_per_px: Tensor
@@ -341,12 +354,12 @@ def images(
     within_px: float,
     shrink: float = 0.0,
 ) -> Images:
-    """Images of points [N, 3] in camera axes through points [N, 2] of the pupil, in the colours of their
-    numbers [N].
+    """Images of points [N, 3] in camera axes through points [N, 2] of the pupil, in the colours of
+    their numbers [N].
 
-    By Newton's method from a guess [N, 2] on the rays of the camera, their derivatives by differences over
-    ``apart_px``, until a step is below ``within_px``. What gets no light is drawn towards the axis by
-    ``shrink`` and tried again; 0 gives it up.
+    By Newton's method from a guess [N, 2] on the rays of the camera, their derivatives by
+    differences over ``apart_px``, until a step is below ``within_px``. What gets no light is drawn
+    towards the axis by ``shrink`` and tried again; 0 gives it up.
     """
     at = guess_px.clone()
     m_per_px = torch.eye(2, dtype=at.dtype).repeat(len(at), 1, 1)
@@ -380,13 +393,13 @@ def images(
 
 
 def angular_miss_rad(camera: Camera, pixels: Tensor, points_cam_m: Tensor) -> Tensor:
-    """Angle by which the chief rays of pixel coordinates [N, 2] miss points [N, 3] given in camera axes: [N]
-    rad.
+    """Angle by which the chief rays of pixel coordinates [N, 2] miss points [N, 3] given in camera
+    axes: [N] rad.
 
     A flow error in task units: zero when the pixel images the point, whatever the focal length and
     distortion.
-    Gradient: to the pixels, the points and the lens; smooth at zero, where the value is 1e-6 rad instead of
-      0.
+    Gradient: to the pixels, the points and the lens; smooth at zero, where the value is 1e-6 rad
+      instead of 0.
     """
     rays = camera.chief_rays(pixels)
     towards = torch.nn.functional.normalize(points_cam_m - rays.origin_m, dim=1)

@@ -1,5 +1,5 @@
-"""Surfaces whose light is baked: where their texels lie (charts from texture coordinates to points and
-normals), their sides, whether they shine, their pictures; and meshes that glow."""
+"""Surfaces whose light is baked: where their texels lie (charts from texture coordinates to points
+and normals), their sides, whether they shine, their pictures; and meshes that glow."""
 
 import itertools
 from collections.abc import Callable
@@ -17,7 +17,8 @@ from codesign.render.mitsuba_shapes import checked_mesh, front_faces, is_mirrore
 from codesign.render.triangles import across
 from codesign.render.world import MitsubaScene
 
-# texels of a finished texture per light-map texel along each side, unless its picture is coarser than that
+# texels of a finished texture per light-map texel along each side, unless its picture is coarser
+# than that
 FINE = 10
 # of a texel: meshes whose pieces are smaller on the average have their light at vertices
 FINE_MESH = 0.5
@@ -27,9 +28,10 @@ LAMBERTIAN = ("DiffuseReflection", "FrontSide", "BackSide", "SpatiallyVarying")
 
 @dataclass(frozen=True)
 class Chart:
-    """A map from the unit square to a surface: ``at`` takes u, v [N] (v up) and gives points [N, 3], normals
-    [N, 3], on the surface [N]. size: its extent along u and v, in the scene's unit. matrix, kind, flip: of
-    the Mitsuba shape that it is; atlas: the layout of a mesh, whose texture coordinates are its own;
+    """A map from the unit square to a surface: ``at`` takes u, v [N] (v up) and gives points
+    [N, 3], normals [N, 3], on the surface [N]. size: its extent along u and v, in the scene's unit.
+    matrix, kind, flip: of the Mitsuba shape that it is; atlas: the layout of a mesh, whose texture
+    coordinates are its own;
     uv_per_unit: lengths of that mesh's former ones on its surface."""
 
     size: tuple[float, float]
@@ -83,9 +85,9 @@ def placed(
     to_world: np.ndarray,
     light: list[np.ndarray],
 ) -> tuple[Any, Any]:
-    """The shape moved by a similarity [4, 4], with its light as emission: textures [H, W] of a Chart, values
-    [N] of Nodes, of its front and, where there are two, of its back. Returns the shape and the emitter of its
-    back or None."""
+    """The shape moved by a similarity [4, 4], with its light as emission: textures [H, W] of a
+    Chart, values [N] of Nodes, of its front and, where there are two, of its back. Returns the
+    shape and the emitter of its back or None."""
     if isinstance(chart, Nodes):
         back = {"type": "area", "radiance": {"type": "mesh_attribute", "name": "vertex_back"}}
         shape = emissive_mesh(
@@ -122,8 +124,9 @@ def emitter(mi, texture):
 
 @exclusive
 def emissive_mesh(mi, vertices, faces, light, uv=None, bsdf=None, attribute="face_radiance"):
-    """A Mitsuba mesh of flat faces: ``light`` is an emitter dictionary, an array of radiance, [F] per face
-    or, for an ``attribute`` that begins with vertex_, [V] per vertex, or None; ``bsdf`` a dictionary or None.
+    """A Mitsuba mesh of flat faces: ``light`` is an emitter dictionary, an array of radiance, [F]
+    per face or, for an ``attribute`` that begins with vertex_, [V] per vertex, or None; ``bsdf`` a
+    dictionary or None.
     Raises: DomainError and ShapeError for a mesh that cannot be."""
     vertices, faces = checked_mesh("mesh", vertices, faces)
     per = "vertex" if attribute.startswith("vertex_") else "face"
@@ -136,7 +139,9 @@ def emissive_mesh(mi, vertices, faces, light, uv=None, bsdf=None, attribute="fac
         ("texture coordinates", uv, len(vertices)),
     ):
         if values is not None and len(values) != count:  # Mitsuba would read beyond their end
-            raise ShapeError(f"mesh: {len(values)} values of {label} for {count}; give one for each.")
+            raise ShapeError(
+                f"mesh: {len(values)} values of {label} for {count}; give one for each."
+            )
     properties = mi.Properties()
     if light is not None:
         source = (
@@ -147,28 +152,38 @@ def emissive_mesh(mi, vertices, faces, light, uv=None, bsdf=None, attribute="fac
         properties["mesh_emitter"] = mi.load_dict(source)
     if bsdf is not None:
         properties["mesh_bsdf"] = mi.load_dict(bsdf)
-    mesh = mi.Mesh("mesh", len(vertices), len(faces), props=properties, has_vertex_texcoords=uv is not None)
+    mesh = mi.Mesh(
+        "mesh", len(vertices), len(faces), props=properties, has_vertex_texcoords=uv is not None
+    )
     if light is not None and not isinstance(light, dict):
         mesh.add_attribute(attribute, 1, np.asarray(light, dtype=np.float32).reshape(-1))
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices, dtype=np.float32).reshape(-1))
+    parameters["vertex_positions"] = mi.Float(
+        np.ascontiguousarray(vertices, dtype=np.float32).reshape(-1)
+    )
     parameters["faces"] = mi.UInt32(np.ascontiguousarray(faces, dtype=np.uint32).reshape(-1))
     if uv is not None:
-        parameters["vertex_texcoords"] = mi.Float(np.ascontiguousarray(uv, dtype=np.float32).reshape(-1))
+        parameters["vertex_texcoords"] = mi.Float(
+            np.ascontiguousarray(uv, dtype=np.float32).reshape(-1)
+        )
     parameters.update()
     return mesh
 
 
 def mesh_arrays(parameters):
-    """Vertices [V, 3] float64, faces [F, 3] and texture coordinates [V, 2] of a mesh, None where it has
-    none."""
+    """Vertices [V, 3] float64, faces [F, 3] and texture coordinates [V, 2] of a mesh, None where it
+    has none."""
     vertices = np.array(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
     uv = (
         np.array(parameters["vertex_texcoords"], dtype=np.float64)
         if "vertex_texcoords" in parameters
         else np.empty(0)
     )
-    return vertices, np.array(parameters["faces"]).reshape(-1, 3), uv.reshape(-1, 2) if uv.size else None
+    return (
+        vertices,
+        np.array(parameters["faces"]).reshape(-1, 3),
+        uv.reshape(-1, 2) if uv.size else None,
+    )
 
 
 def _to_world(matrix, local):
@@ -176,8 +191,8 @@ def _to_world(matrix, local):
 
 
 def _unmirrored(mi, shape, matrix):
-    """A to_world [4, 4] of the same surface that does not mirror, and whether its normals are then flipped
-    (-1)."""
+    """A to_world [4, 4] of the same surface that does not mirror, and whether its normals are then
+    flipped (-1)."""
     flip = -1.0 if shape.has_flipped_normals() else 1.0
     if is_mirrored(matrix):
         matrix = matrix @ np.diag([1.0, -1, 1, 1])
@@ -201,14 +216,16 @@ def _chart(kind, matrix, flip):
     def at(u, v):
         local, out = local_of(u, v)
         points = _to_world(matrix, local)
-        normals = np.broadcast_to(up, points.shape) if out is None else flip * out @ matrix[:3, :3].T / x
+        normals = (
+            np.broadcast_to(up, points.shape) if out is None else flip * out @ matrix[:3, :3].T / x
+        )
         return points, normals, np.ones(len(points), dtype=bool)
 
     return Chart(size, at, kind.lower(), matrix, flip)
 
 
-# points [N, 3] of shapes of unit size at texture coordinates [N] as Mitsuba has them, and normals, None where
-# they are +z
+# points [N, 3] of shapes of unit size at texture coordinates [N] as Mitsuba has them, and normals,
+# None where they are +z
 
 
 def _rectangle(u, v):
@@ -235,11 +252,11 @@ def _cylinder(u, v):
 
 @dataclass(frozen=True)
 class Surface:
-    """name, shape: of the Mitsuba scene. chart: of its points. sides: 1, or 2 where it reflects from behind
-    too.
-    shiny: whether its radiance depends on the direction. texels_per_uv: rows and columns of its finest
-    picture per unit of its texture coordinates, (0, 0) without pictures, infinite where patterns have no
-    resolution."""
+    """name, shape: of the Mitsuba scene. chart: of its points. sides: 1, or 2 where it reflects
+    from behind too.
+    shiny: whether its radiance depends on the direction. texels_per_uv: rows and columns of its
+    finest picture per unit of its texture coordinates, (0, 0) without pictures, infinite where
+    patterns have no resolution."""
 
     name: str
     shape: Any
@@ -250,10 +267,11 @@ class Surface:
 
 
 def surfaces_of(mi: Any, scene: Any, texel: float, matte: bool) -> list[Surface]:
-    """The surfaces of a Mitsuba scene whose light is kept in texels of this size, and pictures in finer ones.
+    """The surfaces of a Mitsuba scene whose light is kept in texels of this size, and pictures in
+    finer ones.
 
-    Raises: DomainError for surfaces that no texture can stand for: mirrors, glass and masks unless ``matte``,
-      media, shapes without charts.
+    Raises: DomainError for surfaces that no texture can stand for: mirrors, glass and masks unless
+      ``matte``, media, shapes without charts.
     """
     found = {}
     for shape in scene.shapes():
@@ -300,14 +318,18 @@ def _pictures(parameters):
         if key.endswith(".data") and len(parameters[key].shape) == 3:
             rows, columns, _ = parameters[key].shape
             to_uv = parameters.get(key.removesuffix("data") + "to_uv")
-            scale = np.eye(3) if to_uv is None else np.array(to_uv.matrix, dtype=float).reshape(3, 3)
-            found.append((rows * np.linalg.norm(scale[1, :2]), columns * np.linalg.norm(scale[0, :2])))
+            scale = (
+                np.eye(3) if to_uv is None else np.array(to_uv.matrix, dtype=float).reshape(3, 3)
+            )
+            found.append(
+                (rows * np.linalg.norm(scale[1, :2]), columns * np.linalg.norm(scale[0, :2]))
+            )
     return found
 
 
 def glowing(triangles_m: Tensor) -> MitsubaScene:
-    """Scene of triangles [F, 3, 3] with radiance 1 on both sides, and 0 elsewhere. Raises: DomainError for a
-    mesh that cannot be."""
+    """Scene of triangles [F, 3, 3] with radiance 1 on both sides, and 0 elsewhere. Raises:
+    DomainError for a mesh that cannot be."""
     corners = triangles_m.detach().cpu().reshape(-1, 3).numpy()
     faces = np.arange(len(corners)).reshape(-1, 3)
     mesh = emissive_mesh(backend.mitsuba("cpu"), corners, faces, np.ones(len(faces)))

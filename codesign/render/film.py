@@ -1,5 +1,5 @@
-"""Pixels of a sensor, windows on it, and the one low-discrepancy pattern over film and pupil that all pixels,
-all frames and both sides of a difference share."""
+"""Pixels of a sensor, windows on it, and the one low-discrepancy pattern over film and pupil that
+all pixels, all frames and both sides of a difference share."""
 
 import math
 from dataclasses import dataclass
@@ -11,7 +11,8 @@ from codesign.backend import memory_bytes
 from codesign.checks import check_number, check_positive, check_whole
 from codesign.errors import DomainError
 
-# origin, direction and weight of a ray in float64, and its film and pupil position; tracing takes more
+# origin, direction and weight of a ray in float64, and its film and pupil position; tracing takes
+# more
 BYTES_PER_RAY = 88
 
 
@@ -20,8 +21,8 @@ class Film:
     """Pixels of a sensor, or of rectangular windows on it.
 
     windows_px: tuple of (left, top); each window has height_px rows and width_px columns. A pixel's
-    coordinate is that of its centre: column 0 of the full sensor is x = 0, and the lens axis is at the
-    sensor's middle.
+    coordinate is that of its centre: column 0 of the full sensor is x = 0, and the lens axis is at
+    the sensor's middle.
     """
 
     sensor_width_px: int
@@ -32,7 +33,8 @@ class Film:
     windows_px: tuple[tuple[int, int], ...] | None = None
 
     def check(self) -> "Film":
-        """Raise DomainError unless there are pixels and every window lies on the sensor; returns the film."""
+        """Raise DomainError unless there are pixels and every window lies on the sensor; returns
+        the film."""
         for label in ("sensor_width_px", "sensor_height_px", "width_px", "height_px"):
             check_whole(getattr(self, label), f"camera: {label}")
         check_positive(self.pixel_pitch_mm, "camera: pixel_pitch_mm")
@@ -61,7 +63,8 @@ class Film:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of one image: (H, W) for the whole sensor, (windows, H, W) for windows (one window too)."""
+        """Shape of one image: (H, W) for the whole sensor, (windows, H, W) for windows
+        (one window too)."""
         return (
             (self.height_px, self.width_px)
             if self.windows_px is None
@@ -79,24 +82,30 @@ class Film:
         return (self.sensor_px - 1) / 2
 
     def pixels(self) -> Tensor:
-        """Coordinates (x, y) of all pixel centres on the full sensor, [P, 2] float64, in image order."""
-        rows, columns = (torch.arange(n, dtype=torch.float64) for n in (self.height_px, self.width_px))
+        """Coordinates (x, y) of all pixel centres on the full sensor, [P, 2] float64, in image
+        order."""
+        rows, columns = (
+            torch.arange(n, dtype=torch.float64) for n in (self.height_px, self.width_px)
+        )
         return self.in_windows(rows, columns)
 
     @property
     def corners_px(self) -> Tensor:
-        """First pixel (x, y) of every window, [W, 2] float64; that of the sensor without windows."""
+        """First pixel (x, y) of every window, [W, 2] float64; that of the sensor without
+        windows."""
         return torch.tensor(self.windows_px or ((0, 0),), dtype=torch.float64)
 
     def in_windows(self, rows: Tensor, columns: Tensor) -> Tensor:
-        """Coordinates (x, y) of these rows and columns of every window, [W x rows x columns, 2], in image
-        order."""
-        return (self.corners_px[:, None] + torch.cartesian_prod(rows, columns).flip(1)).reshape(-1, 2)
+        """Coordinates (x, y) of these rows and columns of every window, [W x rows x columns, 2], in
+        image order."""
+        return (self.corners_px[:, None] + torch.cartesian_prod(rows, columns).flip(1)).reshape(
+            -1, 2
+        )
 
 
 def border_px(first_px: Tensor, size_px: Tensor, count: int) -> Tensor:
-    """Coordinates [4 count, 2] along the border of a window of ``size_px`` [2] behind its ``first_px`` [2],
-    half a pixel outside the outermost centres."""
+    """Coordinates [4 count, 2] along the border of a window of ``size_px`` [2] behind its
+    ``first_px`` [2], half a pixel outside the outermost centres."""
     share = torch.linspace(0, 1, count, dtype=torch.float64)
     ends = [torch.full_like(share, end) for end in (0.0, 1.0)]
     sides = [torch.stack(pair, 1) for end in ends for pair in ((share, end), (end, share))]
@@ -104,7 +113,8 @@ def border_px(first_px: Tensor, size_px: Tensor, count: int) -> Tensor:
 
 
 def check_memory(film: Film, samples_per_pixel: int) -> None:
-    """Raise DomainError when the rays of one frame cannot be in this machine's memory, BYTES_PER_RAY each."""
+    """Raise DomainError when the rays of one frame cannot be in this machine's memory,
+    BYTES_PER_RAY each."""
     count = math.prod(film.shape) * samples_per_pixel
     needed = count * BYTES_PER_RAY
     if needed > memory_bytes():
@@ -131,14 +141,16 @@ def film_pupil_pattern(samples, seed):
     """Scrambled Sobol points over pixel x pupil.
 
     Args: samples per pixel, seed.
-    Returns: offset [samples, 2] in pixels, within [-1/2, 1/2); pupil [samples, 2] on the unit disc; float64.
-      The same pattern in every pixel makes the sampled point spread the same everywhere: a static scene gives
-      equal frames and a moving one no sampling flicker. A single sample is the pixel centre through the pupil
-      centre.
+    Returns: offset [samples, 2] in pixels, within [-1/2, 1/2); pupil [samples, 2] on the unit disc;
+      float64. The same pattern in every pixel makes the sampled point spread the same everywhere: a
+      static scene gives equal frames and a moving one no sampling flicker. A single sample is the
+      pixel centre through the pupil centre.
     """
     if samples == 1:
         return torch.zeros(1, 2, dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64)
-    points = torch.quasirandom.SobolEngine(4, scramble=True, seed=seed).draw(samples, dtype=torch.float64)
+    points = torch.quasirandom.SobolEngine(4, scramble=True, seed=seed).draw(
+        samples, dtype=torch.float64
+    )
     return points[:, :2] - 0.5, concentric_disc(points[:, 2:])
 
 

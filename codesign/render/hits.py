@@ -12,8 +12,8 @@ from codesign.render.rows import Rows
 
 @dataclass(frozen=True)
 class Hits(Rows):
-    """First surfaces along rays of F frames: local_m, normal [F, P, 3] in the axes of the part [F, P] that is
-    met (-1 for none), distance_m [F, P] (infinite for none)."""
+    """First surfaces along rays of F frames: local_m, normal [F, P, 3] in the axes of the part
+    [F, P] that is met (-1 for none), distance_m [F, P] (infinite for none)."""
 
     local_m: Tensor
     normal: Tensor
@@ -43,7 +43,9 @@ def first_hits(
     nearest = torch.full(shape, torch.inf, dtype=torch.float64)
     local = normal = torch.zeros(*shape, 3, dtype=torch.float64)
     part = torch.full(shape, -1)
-    for number, (surface, pose) in enumerate(zip(parts(scene), cameras.double()[:, :, None], strict=True)):
+    for number, (surface, pose) in enumerate(
+        zip(parts(scene), cameras.double()[:, :, None], strict=True)
+    ):
         origin = (turned(pose, origin_cam_m) + pose[..., :3, 3]).expand(*shape, 3)
         direction = turned(pose, direction_cam).expand(*shape, 3)
         point, across, valid = (
@@ -64,14 +66,15 @@ def first_hits(
 
 
 def carried(hits: Hits, transforms: Tensor) -> Tensor:
-    """Points [F, P, 3] that were hit, from the axes of their part by transforms [parts, F, 4, 4]."""
+    """Points [F, P, 3] that were hit, from the axes of their part by transforms
+    [parts, F, 4, 4]."""
     own = of_part(hits, transforms)
     return turned(own, hits.local_m) + own[..., :3, 3]
 
 
 def of_part(hits: Hits, transforms: Tensor) -> Tensor:
-    """Of transforms [parts, F, 4, 4] those of the part that each ray meets: [F, P, 4, 4], or [F, 1, 4, 4]
-    where there is one part only."""
+    """Of transforms [parts, F, 4, 4] those of the part that each ray meets: [F, P, 4, 4], or
+    [F, 1, 4, 4] where there is one part only."""
     if len(transforms) == 1:
         return transforms[0][:, None]
     return transforms[hits.part.clamp_min(0), torch.arange(len(hits.part))[:, None]]

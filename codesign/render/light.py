@@ -1,9 +1,10 @@
-"""How much light transport a scene gets: emissive lookup, light baked once into textures, or Mitsuba's path
-integrator on the same camera rays.
+"""How much light transport a scene gets: emissive lookup, light baked once into textures, or
+Mitsuba's path integrator on the same camera rays.
 
-The cheap level is ``MitsubaScene``: every surface shows its own radiance. ``bake`` (codesign.render.bake)
-computes the light of a Lambertian scene once and returns such a ``MitsubaScene``. ``PathScene`` traces paths
-for every camera ray: the reference. All three have ``radiance``, ``hit`` and ``dtype``.
+The cheap level is ``MitsubaScene``: every surface shows its own radiance. ``bake``
+(codesign.render.bake) computes the light of a Lambertian scene once and returns such a
+``MitsubaScene``. ``PathScene`` traces paths for every camera ray: the reference. All three have
+``radiance``, ``hit`` and ``dtype``.
 """
 
 import copy
@@ -26,7 +27,8 @@ from codesign.render.world import MitsubaScene
 
 __all__ = ["Choice", "LevelError", "PathScene", "bake", "choose", "level_error"]
 
-# share of a frame's mean radiance below which errors are relative to this share instead of to the pixel
+# share of a frame's mean radiance below which errors are relative to this share instead of to the
+# pixel
 FLOOR = 0.05
 
 
@@ -34,14 +36,15 @@ class PathScene(MitsubaScene):
     """A Mitsuba scene of any surfaces and lights, seen by path tracing along the camera's own rays.
 
     Args:
-      description: a Mitsuba scene dictionary, or an mi.Scene. samples: paths per camera ray, on top of the
-        camera's samples per pixel.
-      max_depth: longest path; 1 sees emitters only, 2 one reflection, -1 any length. seed: of the random
-        numbers; equal calls give equal frames. Noise is independent from ray to ray, so a camera at rest sees
-        frames that differ by it: raise samples until events of noise are rare. integrator: a Mitsuba
-        SamplingIntegrator instead of path tracing to max_depth.
-    Gradient: none. A path's light behind a moved ray jumps wherever the path changes, and differentiating the
-      numbers one by one is not the gradient of their mean; asking for it raises GradientError.
+      description: a Mitsuba scene dictionary, or an mi.Scene. samples: paths per camera ray, on top
+        of the camera's samples per pixel.
+      max_depth: longest path; 1 sees emitters only, 2 one reflection, -1 any length. seed: of the
+        random numbers; equal calls give equal frames. Noise is independent from ray to ray, so a
+        camera at rest sees frames that differ by it: raise samples until events of noise are rare.
+        integrator: a Mitsuba SamplingIntegrator instead of path tracing to max_depth.
+    Gradient: none. A path's light behind a moved ray jumps wherever the path changes, and
+      differentiating the numbers one by one is not the gradient of their mean; asking for it raises
+      GradientError.
     """
 
     @exclusive
@@ -72,8 +75,8 @@ class PathScene(MitsubaScene):
         return twin
 
     def radiance(self, arr: Any, origin: Any, direction: Any) -> Any:
-        """Mean radiance of ``samples`` paths along each world ray. Raises: GradientError when a gradient is
-        asked for."""
+        """Mean radiance of ``samples`` paths along each world ray. Raises: GradientError when a
+        gradient is asked for."""
         import drjit as dr
 
         if dr.grad_enabled(origin, direction):
@@ -94,11 +97,14 @@ class PathScene(MitsubaScene):
         sampler = mi.load_dict({"type": "independent"})
         # opaque: another seed needs no new kernel
         sampler.seed(dr.opaque(mi.UInt32, self.seed), count * self.samples)
-        light, _, _ = self.integrator.sample(self.scene, sampler, mi.RayDifferential3f(o, mi.Vector3f(d)))
+        light, _, _ = self.integrator.sample(
+            self.scene, sampler, mi.RayDifferential3f(o, mi.Vector3f(d))
+        )
         return dr.block_sum(light[0], self.samples) / self.samples
 
     def radiance_and_distance(self, arr: Any, origin: Any, direction: Any) -> Any:
-        """Radiance as above, and the distance to the first surface (infinite where there is none)."""
+        """Radiance as above, and the distance to the first surface (infinite where there is
+        none)."""
         mi = self.mi
         light = self.radiance(arr, origin, direction)
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
@@ -111,13 +117,15 @@ def _path_seed(seed):
 
 @dataclass(frozen=True)
 class LevelError:
-    """Error of one light level against another, per frame: [T] tensors, shares of the reference's radiance.
+    """Error of one light level against another, per frame: [T] tensors, shares of the reference's
+    radiance.
 
-    mean, percentile_95, maximum: of |cheap - reference| over the pixels, the reference's noise included.
-    rms: root mean square with the noise taken out (products of errors against two independent references), 0
-      where noise hides it.
-    rms_after_gain: the same after the best single factor for the frame: what is left for a sensor of log
-      intensity.
+    mean, percentile_95, maximum: of |cheap - reference| over the pixels, the reference's noise
+      included.
+    rms: root mean square with the noise taken out (products of errors against two independent
+      references), 0 where noise hides it.
+    rms_after_gain: the same after the best single factor for the frame: what is left for a sensor
+      of log intensity.
     noise: standard deviation of a pixel of the reference, root mean square.
     """
 
@@ -135,11 +143,12 @@ def level_error(
     camera: Camera,
     T_world_cam: Tensor,
 ) -> LevelError:
-    """Relative radiance error of a cheap scene against a reference, seen by a camera along poses [T, 4, 4].
+    """Relative radiance error of a cheap scene against a reference, seen by a camera along poses
+    [T, 4, 4].
 
-    The error of a pixel is relative to the reference there, or to FLOOR of the frame's mean where that is
-    more. A reference with ``with_seed`` (PathScene) is rendered twice with independent numbers; any other
-    counts as free of noise. No gradient. Returns: LevelError.
+    The error of a pixel is relative to the reference there, or to FLOOR of the frame's mean where
+    that is more. A reference with ``with_seed`` (PathScene) is rendered twice with independent
+    numbers; any other counts as free of noise. No gradient. Returns: LevelError.
     Raises: DomainError when a frame of the reference is black.
     """
     with torch.no_grad():
@@ -188,8 +197,8 @@ def _compare(cheap, first, second):
 
 @dataclass(frozen=True)
 class Choice:
-    """The level chosen: its name and scene, the reason in one sentence, errors and CPU seconds of every level
-    by name."""
+    """The level chosen: its name and scene, the reason in one sentence, errors and CPU seconds of
+    every level by name."""
 
     name: str
     scene: Any
@@ -205,13 +214,14 @@ def choose(
     tolerance: float,
     after_gain: bool = False,
 ) -> Choice:
-    """The cheapest light level whose RMS radiance error against the last one stays within a tolerance in
-    every frame.
+    """The cheapest light level whose RMS radiance error against the last one stays within a
+    tolerance in every frame.
 
     Args:
       levels: dictionary name -> scene, the last of them the reference.
       tolerance: share of the radiance.
-      after_gain: whether one brightness factor per frame is forgiven, as by a sensor of log intensity.
+      after_gain: whether one brightness factor per frame is forgiven, as by a sensor of log
+        intensity.
     Returns: Choice. Costs are CPU seconds of rendering these frames once, kernels compiled before.
     Raises: DomainError without levels or for a tolerance that is not positive.
     """

@@ -1,10 +1,11 @@
-"""What the shapes of Mitsuba do not tell by themselves: which side is the front, radiance between vertices,
-numbers, the box around them; and scenes that cannot be, refused where they are built, before Mitsuba renders
-them wrong or black, or ends the process.
+"""What the shapes of Mitsuba do not tell by themselves: which side is the front, radiance between
+vertices, numbers, the box around them; and scenes that cannot be, refused where they are built,
+before Mitsuba renders them wrong or black, or ends the process.
 
-Mitsuba takes the front from the normals that a shape stores, and a mirrored ``to_world`` turns its faces
-inside out, but not those normals. At vertices it weighs corners in float32 by the square of a face's area,
-which is noise on faces more than a thousand times as long as wide; here that is float64.
+Mitsuba takes the front from the normals that a shape stores, and a mirrored ``to_world`` turns its
+faces inside out, but not those normals. At vertices it weighs corners in float32 by the square of a
+face's area, which is noise on faces more than a thousand times as long as wide; here that is
+float64.
 """
 
 import re
@@ -31,13 +32,16 @@ ROOM = 1e-3  # of a box's diagonal, around it
 
 
 def checked_mesh(name: str, vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] and faces [F, 3] of a mesh as arrays; ShapeError and DomainError, by its name, for a
-    mesh without faces, vertices that are not finite and faces of vertices that are not there."""
+    """Vertices [V, 3] and faces [F, 3] of a mesh as arrays; ShapeError and DomainError, by its
+    name, for a mesh without faces, vertices that are not finite and faces of vertices that are not
+    there."""
     vertices = np.asarray(vertices)
     faces = np.asarray(faces)
     for label, array in (("vertices", vertices), ("faces", faces)):
         if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0:
-            raise ShapeError(f"mesh '{name}': its {label} are {array.shape}; give at least one, [N, 3].")
+            raise ShapeError(
+                f"mesh '{name}': its {label} are {array.shape}; give at least one, [N, 3]."
+            )
     finite = np.isfinite(vertices).all(1)
     if not finite.all():
         raise DomainError(
@@ -54,8 +58,8 @@ def checked_mesh(name: str, vertices: Any, faces: Any) -> tuple[np.ndarray, np.n
 
 
 def check_description(mi: Any, description: Any) -> None:
-    """Raise DomainError or ShapeError for a description that is none, or that holds a mesh which would end
-    the process when Mitsuba builds the scene."""
+    """Raise DomainError or ShapeError for a description that is none, or that holds a mesh which
+    would end the process when Mitsuba builds the scene."""
     if not isinstance(description, Mapping):
         raise DomainError(
             "a scene is described by a dictionary of shapes as Mitsuba has it, got a "
@@ -78,8 +82,9 @@ def check_description(mi: Any, description: Any) -> None:
 
 
 def check_scene(mi: Any, scene: Any, emissive: bool) -> None:
-    """Raise DomainError or ShapeError when a shape of a built scene is not finite, has no faces, or, where it
-    must be ``emissive``, has no emitter; or when an emitter's radiance is negative or not finite."""
+    """Raise DomainError or ShapeError when a shape of a built scene is not finite, has no faces,
+    or, where it must be ``emissive``, has no emitter; or when an emitter's radiance is negative or
+    not finite."""
     black = []
     for number, shape in enumerate(scene.shapes()):
         name = shape.id() or f"number {number}"
@@ -96,7 +101,9 @@ def check_scene(mi: Any, scene: Any, emissive: bool) -> None:
     for emitter in scene.emitters():
         shape = emitter.get_shape()
         parameters = mi.traverse(emitter)
-        values = ((key, parameters[key]) for key, _ in parameters if key.rsplit(".", 1)[-1] in RADIANCE)
+        values = (
+            (key, parameters[key]) for key, _ in parameters if key.rsplit(".", 1)[-1] in RADIANCE
+        )
         _check_radiance(emitter.id() if shape is None else shape.id(), values)
         if shape is not None:
             _check_attributes(shape, emitter)
@@ -112,7 +119,9 @@ def _check_attributes(shape, emitter):
 
 
 def _file_of(entry):
-    return {key: value for key, value in entry.items() if key in ("type", "filename", "shape_index")}
+    return {
+        key: value for key, value in entry.items() if key in ("type", "filename", "shape_index")
+    }
 
 
 def _check_shape(mi, name, shape):
@@ -120,27 +129,38 @@ def _check_shape(mi, name, shape):
     _check_lookup(name, parameters)
     if shape.is_mesh() and "vertex_positions" in parameters:
         vertices, faces = checked_mesh(
-            name, *(np.array(parameters[key]).reshape(-1, 3) for key in ("vertex_positions", "faces"))
+            name,
+            *(np.array(parameters[key]).reshape(-1, 3) for key in ("vertex_positions", "faces")),
         )
         if vertex_attribute(shape.bsdf()):
             _check_thick(name, vertices[faces])
         attributes = (
-            key for key, _ in parameters if key.startswith(("vertex_", "face_")) and not key.endswith(OWN)
+            key
+            for key, _ in parameters
+            if key.startswith(("vertex_", "face_")) and not key.endswith(OWN)
         )
         _check_radiance(name, ((key, parameters[key]) for key in attributes))
         return
     box = shape.bbox()
     if not np.isfinite(np.array([box.min, box.max], dtype=float)).all():
-        raise DomainError(f"shape '{name}': its place or size is NaN or infinite; repair its to_world.")
+        raise DomainError(
+            f"shape '{name}': its place or size is NaN or infinite; repair its to_world."
+        )
 
 
 def _check_lookup(name, parameters):
     """Texture coordinates times texels stay below what float32 can tell apart."""
-    uv = np.array(parameters["vertex_texcoords"]) if "vertex_texcoords" in parameters else np.ones(1)
+    uv = (
+        np.array(parameters["vertex_texcoords"]) if "vertex_texcoords" in parameters else np.ones(1)
+    )
     for key in [key for key, _ in parameters if key.endswith(".data")]:
         size = max(np.shape(parameters[key]))
         to_uv = key.removesuffix("data") + "to_uv"
-        scale = np.abs(np.array(parameters[to_uv].matrix, dtype=float)).max() if to_uv in parameters else 1.0
+        scale = (
+            np.abs(np.array(parameters[to_uv].matrix, dtype=float)).max()
+            if to_uv in parameters
+            else 1.0
+        )
         reach = float(np.abs(uv).max(initial=0)) * scale * size
         if not reach <= MOST_TEXELS:
             raise DomainError(
@@ -187,12 +207,15 @@ def matrix_of(parameters: Any) -> np.ndarray:
 def front_faces(shape: Any, parameters: Any) -> np.ndarray:
     """Faces [F, 3] of a Mitsuba mesh, wound so that their normals point to the side that shines."""
     faces = np.array(parameters["faces"], dtype=np.int64).reshape(-1, 3)
-    turned = np.full(len(faces), shape.has_flipped_normals()) ^ _against_normals(shape, parameters, faces)
+    turned = np.full(len(faces), shape.has_flipped_normals()) ^ _against_normals(
+        shape, parameters, faces
+    )
     return np.where(turned[:, None], faces[:, ::-1], faces)
 
 
 def are_geometric(mi: Any, shape: Any) -> bool:
-    """Whether the geometric normal of a Mitsuba shape points to the side that shines, everywhere."""
+    """Whether the geometric normal of a Mitsuba shape points to the side that shines,
+    everywhere."""
     parameters = mi.traverse(shape)
     if shape.shape_type() == int(mi.ShapeType.Rectangle):
         return not is_mirrored(matrix_of(parameters))
@@ -214,20 +237,24 @@ def _against_normals(shape, parameters, faces):
 
 
 def vertex_attribute(surface: Any) -> str | None:
-    """Name of the attribute at vertices that an emitter or material of Mitsuba shows, None where it shows
-    none."""
+    """Name of the attribute at vertices that an emitter or material of Mitsuba shows, None where it
+    shows none."""
     found = re.search(r'MeshAttribute\[\s*name = "(vertex_\w+)"', str(surface))
     return found[1] if found else None
 
 
 def interpolated(mi: Any, shape: Any, name: str, si: Any) -> Any:
-    """An attribute at vertices of a mesh where it is met (drjit arrays), between the values of the corners.
+    """An attribute at vertices of a mesh where it is met (drjit arrays), between the values of the
+    corners.
     Gradient: to the place."""
     import drjit as dr
 
     parameters = mi.traverse(shape)
     corner = [dr.gather(mi.UInt32, parameters["faces"], 3 * si.prim_index + k) for k in range(3)]
-    at = [mi.Point3d(dr.gather(mi.Point3f, parameters["vertex_positions"], vertex)) for vertex in corner]
+    at = [
+        mi.Point3d(dr.gather(mi.Point3f, parameters["vertex_positions"], vertex))
+        for vertex in corner
+    ]
     value = [dr.gather(mi.Float, parameters[name], vertex) for vertex in corner]
     u = at[1] - at[0]
     v = at[2] - at[0]
@@ -237,11 +264,16 @@ def interpolated(mi: Any, shape: Any, name: str, si: Any) -> Any:
     along_u, along_v = dr.dot(u, towards), dr.dot(v, towards)
     share_u = dr.clip((vv * along_u - uv * along_v) / area, 0, 1)
     share_v = dr.clip((uu * along_v - uv * along_u) / area, 0, 1 - share_u)
-    return value[0] + mi.Float(share_u) * (value[1] - value[0]) + mi.Float(share_v) * (value[2] - value[0])
+    return (
+        value[0]
+        + mi.Float(share_u) * (value[1] - value[0])
+        + mi.Float(share_v) * (value[2] - value[0])
+    )
 
 
 def repeats(mi: Any, scene: Any) -> dict[Any, Any]:
-    """Emitter -> how often its picture is repeated (an opaque drjit transform), where it has one picture that is."""
+    """Emitter -> how often its picture is repeated (an opaque drjit transform), where it has one
+    picture that is."""
     import drjit as dr
 
     found = {}
@@ -254,8 +286,9 @@ def repeats(mi: Any, scene: Any) -> dict[Any, Any]:
 
 
 def eval_repeated(mi: Any, emitter: Any, si: Any, repeat: Any) -> Any:
-    """What an emitter shows (drjit arrays), its repeat taken from memory. Mitsuba writes it into the kernel, so that
-    every other world would need a new one, of as many pieces as it has pictures."""
+    """What an emitter shows (drjit arrays), its repeat taken from memory. Mitsuba writes it into
+    the kernel, so that every other world would need a new one, of as many pieces as it has
+    pictures."""
     if repeat is None:
         return emitter.eval(si)
     parameters = mi.traverse(emitter)
@@ -270,8 +303,8 @@ def eval_repeated(mi: Any, emitter: Any, si: Any, repeat: Any) -> Any:
 
 
 def shape_numbers(mi: Any, scene: Any) -> Any:
-    """Numbers of the shapes of a Mitsuba scene in its own list, behind what their pointers hold (drjit
-    array)."""
+    """Numbers of the shapes of a Mitsuba scene in its own list, behind what their pointers hold
+    (drjit array)."""
     import drjit as dr
 
     held = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in scene.shapes()]
@@ -282,8 +315,8 @@ def shape_numbers(mi: Any, scene: Any) -> Any:
 
 
 def box_around(mi: Any, scene: Any) -> Any:
-    """Box (drjit arrays) with room for rounding around all shapes of a Mitsuba scene; None under a sky, where
-    rays start inside."""
+    """Box (drjit arrays) with room for rounding around all shapes of a Mitsuba scene; None under a
+    sky, where rays start inside."""
     import drjit as dr
 
     box = scene.bbox()

@@ -1,5 +1,5 @@
-"""A world with objects that move: every object is a scene in its own frame, with a pose per frame of the
-sequence."""
+"""A world with objects that move: every object is a scene in its own frame, with a pose per frame
+of the sequence."""
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +15,8 @@ from codesign.types import Rays
 
 
 class Scene(Protocol):
-    """Radiance along world rays, in drjit arrays of one dtype; ``hit`` as MitsubaScene has it for truth."""
+    """Radiance along world rays, in drjit arrays of one dtype; ``hit`` as MitsubaScene has it for
+    truth."""
 
     @property
     def dtype(self) -> torch.dtype: ...
@@ -25,7 +26,8 @@ class Scene(Protocol):
 
 
 def check_kind(scene: Any) -> None:
-    """Raise DomainError for what is no scene: neither ``radiance`` nor ``hit`` can be asked of it."""
+    """Raise DomainError for what is no scene: neither ``radiance`` nor ``hit`` can be asked of
+    it."""
     if (hasattr(scene, "radiance") or hasattr(scene, "hit")) and not isinstance(scene, type):
         return
     kind = type(scene).__name__
@@ -37,22 +39,25 @@ def check_kind(scene: Any) -> None:
         cure = "worlds.from_mitsuba(scene) makes one of it"
     else:
         cure = "give a MitsubaScene, TexturedPlane or MovingScene, or a list of them"
-    raise DomainError(f"the scene is a {kind}, which has no radiance that could be rendered; {cure}.")
+    raise DomainError(
+        f"the scene is a {kind}, which has no radiance that could be rendered; {cure}."
+    )
 
 
 class MovingScene:
     """A static scene and rigid objects that move through it; what is nearest along a ray is seen.
 
     Args:
-      static: a scene in world axes (MitsubaScene, TexturedPlane). Where a ray meets nothing at all, the
-        background of this scene is seen.
-      objects: {name: (scene in the object's own axes, T_world_object [T, 4, 4])}, the same T for all; frame t
-        of a sequence has its objects at pose t. Before cameras on several trajectories [..., T, 4, 4] objects
-        move the same way for each, or, with poses [..., T, 4, 4] too, their own way.
+      static: a scene in world axes (MitsubaScene, TexturedPlane). Where a ray meets nothing at all,
+        the background of this scene is seen.
+      objects: {name: (scene in the object's own axes, T_world_object [T, 4, 4])}, the same T for
+        all; frame t of a sequence has its objects at pose t. Before cameras on several trajectories
+        [..., T, 4, 4] objects move the same way for each, or, with poses [..., T, 4, 4] too, their
+        own way.
     Computes in float32 when one of the scenes does, otherwise in float64.
     Gradient: to T_world_object, as to the camera's poses; silhouettes with gradient "boundary".
-    Raises: DomainError when poses are not rigid or a scene cannot say how far away it is; ShapeError when the
-      numbers of poses differ.
+    Raises: DomainError when poses are not rigid or a scene cannot say how far away it is;
+      ShapeError when the numbers of poses differ.
     """
 
     def __init__(self, static: Scene, objects: Mapping[str, tuple[Scene, Poses]]):
@@ -79,11 +84,18 @@ class MovingScene:
                     "light comes from; give a MitsubaScene or a TexturedPlane."
                 )
         self.T_world_object = tuple(_checked(name, poses) for name, (_, poses) in objects.items())
-        lengths = {name: poses.shape[-3] for name, poses in zip(self.names, self.T_world_object, strict=True)}
+        lengths = {
+            name: poses.shape[-3]
+            for name, poses in zip(self.names, self.T_world_object, strict=True)
+        }
         if len(set(lengths.values())) > 1:
-            raise ShapeError(f"moving scene: the objects have {lengths} poses; give each one pose per frame.")
+            raise ShapeError(
+                f"moving scene: the objects have {lengths} poses; give each one pose per frame."
+            )
         self.dtype = (
-            torch.float32 if any(scene.dtype == torch.float32 for scene in self.scenes) else torch.float64
+            torch.float32
+            if any(scene.dtype == torch.float32 for scene in self.scenes)
+            else torch.float64
         )
 
     def during(self, frames: slice | Sequence[int]) -> "MovingScene":
@@ -105,7 +117,8 @@ class MovingScene:
                 )
 
     def in_one_row(self, batch: Sequence[int]) -> "MovingScene":
-        """The same scene for the frames of all trajectories of a batch of shape (..., T), one after the
+        """The same scene for the frames of all trajectories of a batch of shape (..., T), one after
+        the
         other: every object has as many poses as there are frames in all."""
         self.check_length(batch[-1])
         for name, poses in zip(self.names, self.T_world_object, strict=True):
@@ -117,7 +130,9 @@ class MovingScene:
                     f"moving scene: object '{name}' has poses for a batch {tuple(own)} of trajectories, the "
                     f"camera for {tuple(batch[:-1])}; give one trajectory for all, or one for each."
                 )
-        return self._with(poses.expand(*batch, 4, 4).reshape(-1, 4, 4) for poses in self.T_world_object)
+        return self._with(
+            poses.expand(*batch, 4, 4).reshape(-1, 4, 4) for poses in self.T_world_object
+        )
 
 
 def parts(scene: Any) -> tuple[Any, ...]:
@@ -126,8 +141,8 @@ def parts(scene: Any) -> tuple[Any, ...]:
 
 
 def scenes_and_poses(scene: Any, T_world_cam: Poses) -> list[tuple[Any, Tensor]] | None:
-    """Pairs of a scene and the poses it is seen from, along the first axis of T_world_cam [W, ..., T, 4, 4],
-    where ``scene`` is a list or tuple of W scenes; None for a single scene."""
+    """Pairs of a scene and the poses it is seen from, along the first axis of T_world_cam
+    [W, ..., T, 4, 4], where ``scene`` is a list or tuple of W scenes; None for a single scene."""
     if not isinstance(scene, list | tuple):
         return None
     T_world_cam = as_poses(T_world_cam)
@@ -143,8 +158,9 @@ def scenes_and_poses(scene: Any, T_world_cam: Poses) -> list[tuple[Any, Tensor]]
 class Views:
     """A scene as all frames of all trajectories see it, N frames one after the other.
 
-    scene: with the poses of its objects in these frames. T_world_part: [parts, N, 4, 4], the identity for the
-    static part. cameras: [parts, N, 4, 4], poses of the camera in the axes of every part. batch: (..., T).
+    scene: with the poses of its objects in these frames. T_world_part: [parts, N, 4, 4], the
+    identity for the static part. cameras: [parts, N, 4, 4], poses of the camera in the axes of
+    every part. batch: (..., T).
     float64.
     """
 
@@ -164,11 +180,11 @@ class Views:
 
 
 def views_of(scene: Any, T_world_cam: Poses, rays: Rays | None = None) -> Views:
-    """Views of a scene from trajectories [..., T, 4, 4]: the one place where poses are checked and brought
-    into the axes of every part. rays: of the camera, which must be on one device with them.
+    """Views of a scene from trajectories [..., T, 4, 4]: the one place where poses are checked and
+    brought into the axes of every part. rays: of the camera, which must be on one device with them.
 
-    Raises: DomainError for what is no scene or no poses; ShapeError unless every object has a pose for every
-      frame.
+    Raises: DomainError for what is no scene or no poses; ShapeError unless every object has a pose
+      for every frame.
     """
     for part in parts(scene):
         check_kind(part)
@@ -191,7 +207,8 @@ def views_of(scene: Any, T_world_cam: Poses, rays: Rays | None = None) -> Views:
 
 
 def _product(a, b):
-    """a b [..., 4, 4] written out by element: a matrix product may round differently in another batch."""
+    """a b [..., 4, 4] written out by element: a matrix product may round differently in another
+    batch."""
     x, y, z, w = (a[..., :, k : k + 1] * b[..., k : k + 1, :] for k in range(4))
     return x + y + z + w
 
@@ -202,8 +219,8 @@ def at_frames(scene: Any, frames: slice | Sequence[int]) -> Any:
 
 
 def says_distance(kind):
-    """Whether a class has a ``radiance_and_distance`` beside its ``radiance``: one inherited from further up
-    would tell of other light."""
+    """Whether a class has a ``radiance_and_distance`` beside its ``radiance``: one inherited from
+    further up would tell of other light."""
     owner = next((base for base in kind.__mro__ if "radiance" in vars(base)), None)
     return owner is not None and "radiance_and_distance" in vars(owner)
 

@@ -1,8 +1,9 @@
 """Pixel means of a wavefront in torch's graph, and their gradients.
 
-Forward one launch, a lane per ray and frame. The light of a ray depends on six numbers, its origin and
-direction in the axes of the part that it meets. Their slopes are known when the light is, at little more
-cost; with them, gradients to poses, lens and weights are sums over rays, for which nothing is traced again.
+Forward one launch, a lane per ray and frame. The light of a ray depends on six numbers, its origin
+and direction in the axes of the part that it meets. Their slopes are known when the light is, at
+little more cost; with them, gradients to poses, lens and weights are sums over rays, for which
+nothing is traced again.
 """
 
 import weakref
@@ -24,10 +25,11 @@ NUMBERS = 7  # kept of every ray, at most
 
 
 def with_slopes(shown: Callable[..., Any]) -> Callable[..., Any]:
-    """A function (origin, direction, *others) -> (light, normal) of drjit arrays as one that returns light,
-    normal, and the slopes of light to origin and direction, all without a graph.
+    """A function (origin, direction, *others) -> (light, normal) of drjit arrays as one that
+    returns light, normal, and the slopes of light to origin and direction, all without a graph.
 
-    Differentiating through a call would visit the surface once more; here that ends inside the call.
+    Differentiating through a call would visit the surface once more; here that ends inside the
+    call.
     """
 
     def sloped(origin, direction, *others):
@@ -41,19 +43,25 @@ def with_slopes(shown: Callable[..., Any]) -> Callable[..., Any]:
             if dr.grad_enabled(light):
                 dr.backward(light)
             slopes = dr.grad(origin), dr.grad(direction)
-            # a ray that touches a round shape, or meets a pole of its picture, has no slope: one in some
-            # millions
-            told = dr.all(dr.isfinite(slopes[0])) & dr.all(dr.isfinite(slopes[1])) | ~dr.isfinite(light)
-            return dr.detach(light), dr.detach(normal), *(dr.select(told, slope, 0) for slope in slopes)
+            # a ray that touches a round shape, or meets a pole of its picture, has no slope: one in
+            # some millions
+            told = dr.all(dr.isfinite(slopes[0])) & dr.all(dr.isfinite(slopes[1])) | ~dr.isfinite(
+                light
+            )
+            return (
+                dr.detach(light),
+                dr.detach(normal),
+                *(dr.select(told, slope, 0) for slope in slopes),
+            )
 
     return sloped
 
 
 @dataclass(frozen=True, eq=False)
 class Slopes:
-    """Of F x N rays, one frame after the other (drjit arrays): slopes [6] to origin and direction in the axes
-    of the part that is met, number of that part (None: there is one only), light (None where nobody asks for
-    weights)."""
+    """Of F x N rays, one frame after the other (drjit arrays): slopes [6] to origin and direction
+    in the axes of the part that is met, number of that part (None: there is one only), light (None
+    where nobody asks for weights)."""
 
     slopes: Sequence[Any]
     part: Any
@@ -86,7 +94,8 @@ ROOM = Room()
 def ray_gradients(
     arr: Any, kept: Slopes, seed: Any, weight: Any, poses: Any, frames: int, samples: int
 ) -> tuple[Any, ...]:
-    """Gradients of origin (3), direction (3) and weight of N rays before the camera: drjit arrays [N].
+    """Gradients of origin (3), direction (3) and weight of N rays before the camera: drjit arrays
+    [N].
 
     Args:
       arr: drjit types.
@@ -113,9 +122,13 @@ def ray_gradients(
         slope = [dr.gather(arr.Float, each, at) * (mean * scale) for each in kept.slopes]
         light = 0 if kept.light is None else mean * dr.gather(arr.Float, kept.light, at)
         turned = [
-            sum(m[4 * row + k] * slope[first + row] for row in range(3)) for first in (0, 3) for k in range(3)
+            sum(m[4 * row + k] * slope[first + row] for row in range(3))
+            for first in (0, 3)
+            for k in range(3)
         ]
-        return frame + 1, *(total + more for total, more in zip(sums, (*turned, light), strict=True))
+        return frame + 1, *(
+            total + more for total, more in zip(sums, (*turned, light), strict=True)
+        )
 
     zero = dr.zeros(arr.Float, count)
     begun = (dr.zeros(arr.UInt32, count), *[zero] * 7)
@@ -126,7 +139,8 @@ def ray_gradients(
 def pose_gradients(
     arr: Any, kept: Slopes, seed: Any, rays: Sequence[Any], parts: int, frames: int, samples: int
 ) -> list[Any]:
-    """Gradients of the 12 numbers of the camera's pose in every part, part after part: drjit arrays [F] each.
+    """Gradients of the 12 numbers of the camera's pose in every part, part after part: drjit arrays
+    [F] each.
 
     Args:
       as for ``ray_gradients``.
@@ -173,8 +187,8 @@ class Wavefront:
     dtype: torch.dtype
 
     def image(self, arr: Any, rays: Sequence[Any], poses: Sequence[Any]) -> Any:
-        """Pixel means [F x pixels] of rays: origin (3), direction (3) and weight [N], from poses [F x 12] in
-        each part (drjit arrays)."""
+        """Pixel means [F x pixels] of rays: origin (3), direction (3) and weight [N], from poses
+        [F x 12] in each part (drjit arrays)."""
         import drjit as dr
 
         *line, weight = rays
@@ -208,7 +222,8 @@ class Wavefront:
         return dr.block_sum(carried, self.samples) / self.samples, kept
 
     def _seen(self, arr, placed):
-        """Light of every lane, and the number of the part that it comes from (None: there is one only)."""
+        """Light of every lane, and the number of the part that it comes from
+        (None: there is one only)."""
         if len(placed) == 1:
             return self.scenes[0].radiance(arr, *placed[0]), None
         light, _, part = nearest(arr, self.scenes, placed)
@@ -218,8 +233,8 @@ class Wavefront:
 def pixel_means(
     wavefront: Wavefront, origin: Tensor, direction: Tensor, weight: Tensor, poses: Tensor
 ) -> Tensor:
-    """Pixel means [F, pixels] of rays given in camera space, origin and direction [3, N], weight [N], seen
-    from poses [parts, F, 3, 4] of the camera; all of the wavefront's dtype.
+    """Pixel means [F, pixels] of rays given in camera space, origin and direction [3, N], weight
+    [N], seen from poses [parts, F, 3, 4] of the camera; all of the wavefront's dtype.
 
     Gradient: to all four, silhouettes at rest.
     """
@@ -311,8 +326,8 @@ def lanes(arr: Any, line: Sequence[Any], poses: Sequence[Any]) -> tuple[Any, Any
     Args:
       line: origin (3) and direction (3) before the camera, [N] each.
       poses: of the camera in every part, rows [F x 12] each.
-    Returns: number of the ray of every lane, its origin and direction before the camera, and those in each
-      part.
+    Returns: number of the ray of every lane, its origin and direction before the camera, and those
+      in each part.
     """
     import drjit as dr
 
@@ -320,24 +335,29 @@ def lanes(arr: Any, line: Sequence[Any], poses: Sequence[Any]) -> tuple[Any, Any
     lane = dr.arange(arr.UInt32, count * (dr.width(poses[0]) // 12))
     frame = lane // count
     ray = lane - frame * count
-    o, d = (arr.Array3(*[dr.gather(arr.Float, v, ray) for v in part]) for part in (line[:3], line[3:]))
+    o, d = (
+        arr.Array3(*[dr.gather(arr.Float, v, ray) for v in part]) for part in (line[:3], line[3:])
+    )
     return ray, o, d, [placed(arr, o, d, pose, frame) for pose in poses]
 
 
 def placed(arr: Any, o: Any, d: Any, pose: Any, frame: Any) -> tuple[Any, Any]:
-    """Origins and directions in the frame of a part, by the pose of the camera in it at each lane's frame."""
+    """Origins and directions in the frame of a part, by the pose of the camera in it at each lane's
+    frame."""
     import drjit as dr
 
     m = [dr.gather(arr.Float, pose, frame * 12 + k) for k in range(12)]
     origin = arr.Array3(
         *[m[4 * r] * o.x + m[4 * r + 1] * o.y + m[4 * r + 2] * o.z + m[4 * r + 3] for r in range(3)]
     )
-    return origin, arr.Array3(*[m[4 * r] * d.x + m[4 * r + 1] * d.y + m[4 * r + 2] * d.z for r in range(3)])
+    return origin, arr.Array3(
+        *[m[4 * r] * d.x + m[4 * r + 1] * d.y + m[4 * r + 2] * d.z for r in range(3)]
+    )
 
 
 def nearest(arr: Any, scenes: Sequence[Any], placed: Sequence[Any]) -> tuple[Any, Any, Any]:
-    """Radiance of the part met first, its distance and its number; where nothing is met, what the first part
-    says."""
+    """Radiance of the part met first, its distance and its number; where nothing is met, what the
+    first part says."""
     import drjit as dr
 
     light, least = scenes[0].radiance_and_distance(arr, *placed[0])

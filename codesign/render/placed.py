@@ -1,5 +1,6 @@
-"""Scenes in axes and a unit of their own, placed in the world: the rays go to the scene; and emissive scenes
-that are placed already, whose surfaces may show one radiance from their front and another from behind."""
+"""Scenes in axes and a unit of their own, placed in the world: the rays go to the scene; and
+emissive scenes that are placed already, whose surfaces may show one radiance from their front and
+another from behind."""
 
 import copy
 from collections.abc import Mapping
@@ -16,8 +17,8 @@ from codesign.render.world import MitsubaScene
 
 @dataclass(frozen=True)
 class Placement:
-    """How a scene of its own axes and unit stands in the world. R_world_scene: [3, 3] rotation from its axes
-    to the world's; unit_m: metres per unit of its lengths; gain: factor on its radiance.
+    """How a scene of its own axes and unit stands in the world. R_world_scene: [3, 3] rotation from
+    its axes to the world's; unit_m: metres per unit of its lengths; gain: factor on its radiance.
 
     Raises: DomainError for a matrix that is no rotation, or a unit or gain that is not positive.
     """
@@ -33,14 +34,18 @@ class Placement:
             or float((R @ R.mT - torch.eye(3)).abs().max()) > 1e-6
             or torch.linalg.det(R) < 0
         ):
-            raise DomainError(f"placement: R_world_scene must be a rotation [3, 3], got {R.tolist()}.")
+            raise DomainError(
+                f"placement: R_world_scene must be a rotation [3, 3], got {R.tolist()}."
+            )
         for name in ("unit_m", "gain"):
             check_positive(getattr(self, name), f"placement: {name}")
 
     def in_scene(self, direction: Any) -> Any:
         """World directions (drjit arrays) in the scene's axes."""
         rows = self.R_world_scene.mT.tolist()
-        return type(direction)(*[r[0] * direction.x + r[1] * direction.y + r[2] * direction.z for r in rows])
+        return type(direction)(
+            *[r[0] * direction.x + r[1] * direction.y + r[2] * direction.z for r in rows]
+        )
 
 
 class PlacedScene:
@@ -48,7 +53,8 @@ class PlacedScene:
 
     Args:
       scene: with ``radiance``, ``radiance_and_distance`` and ``hit``, such as a PathScene.
-      placement: of it. Nothing of the scene is changed, so what depends on its size (media, bumps, point
+      placement: of it. Nothing of the scene is changed, so what depends on its size (media, bumps,
+        point
     lamps) looks as in itself.
     Gradient: that of the scene.
     """
@@ -83,8 +89,8 @@ class PlacedScene:
         return place.in_scene(origin) / place.unit_m, place.in_scene(direction)
 
     def hit(self, origin_m: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """First surface met by world rays [N, 3]: point [N, 3], normal [N, 3], valid [N], as MitsubaScene has
-        it."""
+        """First surface met by world rays [N, 3]: point [N, 3], normal [N, 3], valid [N], as
+        MitsubaScene has it."""
         R = self.placement.R_world_scene.to(origin_m)
         unit_m = self.placement.unit_m
         point, normal, valid = self.scene.hit((origin_m @ R) / unit_m, direction @ R.to(direction))
@@ -104,8 +110,8 @@ class SidedScene(MitsubaScene):
     Args:
       description: as for MitsubaScene.
       backs: area emitter of the back of each shape that has one, by its name.
-      placement: turn of the scene's sky and factor on all its radiance; its shapes stand in the world
-        already.
+      placement: turn of the scene's sky and factor on all its radiance; its shapes stand in the
+        world already.
     """
 
     both_sides = True

@@ -1,4 +1,5 @@
-"""A textured plane in closed form: band-limited texture, float32 or float64, for checks and smooth scenes."""
+"""A textured plane in closed form: band-limited texture, float32 or float64, for checks and smooth
+scenes."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,12 +13,14 @@ from codesign.pose import Poses, check_pose
 
 
 class TexturedPlane:
-    """The plane z = 0 of its own frame, with radiance mean * exp(sum of cosines), seen from both sides.
+    """The plane z = 0 of its own frame, with radiance mean * exp(sum of cosines), seen from both
+    sides.
 
     Args:
-      frequency_per_m: [K, 2] spatial frequencies, cycles per metre; the texture has no detail finer than the
-        largest.
-      amplitude: [K] of the log radiance; phase_rad: [K]. mean: radiance where the sum is zero (0..255 scale).
+      frequency_per_m: [K, 2] spatial frequencies, cycles per metre; the texture has no detail finer
+        than the largest.
+      amplitude: [K] of the log radiance; phase_rad: [K]. mean: radiance where the sum is zero
+        (0..255 scale).
       T_world_plane: [4, 4]; identity when None. dtype: precision of intersection and shading.
     Rays that do not meet the plane see ``mean``.
     """
@@ -39,10 +42,16 @@ class TexturedPlane:
             try:
                 found = torch.as_tensor(value, dtype=torch.float64)
             except (TypeError, ValueError, RuntimeError):
-                raise DomainError(f"textured plane: {label} holds no numbers; give one per wave.") from None
+                raise DomainError(
+                    f"textured plane: {label} holds no numbers; give one per wave."
+                ) from None
             if not bool(found.isfinite().all()):
-                raise DomainError(f"textured plane: {label} holds NaN or infinite entries; remove them.")
-        check_number(mean, "textured plane: mean", 0.0, remedy="give a radiance on the 0..255 scale")
+                raise DomainError(
+                    f"textured plane: {label} holds NaN or infinite entries; remove them."
+                )
+        check_number(
+            mean, "textured plane: mean", 0.0, remedy="give a radiance on the 0..255 scale"
+        )
         self.dtype = dtype
         self.mean = float(mean)
         self.frequency = torch.as_tensor(frequency_per_m, dtype=torch.float64).reshape(-1, 2)
@@ -55,7 +64,9 @@ class TexturedPlane:
                 "given; give one of each per wave."
             )
         self.T_world_plane = (
-            torch.eye(4, dtype=torch.float64) if T_world_plane is None else check_pose(T_world_plane).double()
+            torch.eye(4, dtype=torch.float64)
+            if T_world_plane is None
+            else check_pose(T_world_plane).double()
         )
 
     def _constants(self, arr):
@@ -83,8 +94,8 @@ class TexturedPlane:
         return self.radiance_and_distance(arr, origin, direction)[0]
 
     def radiance_and_distance(self, arr: Any, origin: Any, direction: Any) -> Any:
-        """Radiance as above, and the distance to the plane (infinite where it is not met). Gradient: to the
-        rays."""
+        """Radiance as above, and the distance to the plane (infinite where it is not met).
+        Gradient: to the rays."""
         import drjit as dr
 
         m, waves, mean = self._constants(arr)
@@ -111,4 +122,8 @@ class TexturedPlane:
         falling = (direction.detach() * normal).sum(-1)
         valid = (height * falling < 0) & (falling.abs() > 1e-9)
         t = torch.where(valid, -height / torch.where(valid, falling, 1.0), 1.0)
-        return origin_m.detach() + direction.detach() * t[:, None], normal.expand_as(origin_m), valid
+        return (
+            origin_m.detach() + direction.detach() * t[:, None],
+            normal.expand_as(origin_m),
+            valid,
+        )

@@ -1,10 +1,11 @@
-"""A camera's chief rays as polynomials, so that points of space are projected in a few multiplications
-instead of ray traces.
+"""A camera's chief rays as polynomials, so that points of space are projected in a few
+multiplications instead of ray traces.
 
-A chief ray that leaves with slope s (dx/dz, dy/dz) starts at base B(s) on the plane of the entrance pupil and
-comes from the pixel U(s). The image of a point (X, Y, z) is U(s) with s = (X, Y)/z - B(s)/z, an equation that
-fixed-point steps solve, since B is a part of a millimetre and z is metres. U and B are Chebyshev series in
-both components of s, interpolated at their nodes and checked against traced rays.
+A chief ray that leaves with slope s (dx/dz, dy/dz) starts at base B(s) on the plane of the entrance
+pupil and comes from the pixel U(s). The image of a point (X, Y, z) is U(s) with s = (X, Y)/z -
+B(s)/z, an equation that fixed-point steps solve, since B is a part of a millimetre and z is metres.
+U and B are Chebyshev series in both components of s, interpolated at their nodes and checked
+against traced rays.
 """
 
 import torch
@@ -24,8 +25,8 @@ BLOCK = 2048  # points at a time: their series stay in the cache
 class ProjectionTable:
     """``project`` for one camera, from a table; also gives the chief ray that leads to the point.
 
-    Where the lens has no such polynomials to 1e-6 px, and for points outside the table, rays are traced as in
-    codesign.render.project.
+    Where the lens has no such polynomials to 1e-6 px, and for points outside the table, rays are
+    traced as in codesign.render.project.
     """
 
     @torch.no_grad()
@@ -56,8 +57,8 @@ class ProjectionTable:
     def __call__(self, points_cam_m: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Image and chief ray of points [N, 3] in camera axes with z > 0.
 
-        Returns: pixels [N, 2] (NaN where there is no image), base [N, 2] metres and slope [N, 2] of the chief
-          ray, all float64. No gradient.
+        Returns: pixels [N, 2] (NaN where there is no image), base [N, 2] metres and slope [N, 2] of
+          the chief ray, all float64. No gradient.
         """
         pixels, base, slope, inside = self._from_series(points_cam_m)
         if not bool(inside.all()):
@@ -101,8 +102,8 @@ class ProjectionTable:
         ).T
 
     def _fitted(self, degree):
-        """Coefficients [degree + 1, degree + 1, 4] of pixel and base; None when a node lies outside the
-        lens's field."""
+        """Coefficients [degree + 1, degree + 1, 4] of pixel and base; None when a node lies outside
+        the lens's field."""
         count = degree + 1
         nodes = torch.cos(torch.pi * (torch.arange(count, dtype=torch.float64) + 0.5) / count)
         x, y = torch.meshgrid(nodes, nodes, indexing="ij")
@@ -118,7 +119,8 @@ class ProjectionTable:
         return torch.einsum("ik,jl,ijc->klc", basis, basis, values).contiguous()
 
     def _error_px(self):
-        """Largest error against traced rays, at points of a spiral over the table and three depths."""
+        """Largest error against traced rays, at points of a spiral over the table and three
+        depths."""
         k = torch.arange(96, dtype=torch.float64)
         radius = ((k + 0.5) / 96).sqrt() * 1.3
         angle = k * 2.399963

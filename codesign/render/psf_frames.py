@@ -1,9 +1,9 @@
 """Frames by their point spread functions: one sharp picture with depth, convolved layer by layer.
 
-The fidelity level between the thin and the traced lens. A picture of the chief rays (distortion in it, no
-blur) is split into layers of depth, by hats over 1 / distance that sum to 1; each is convolved with the point
-spread functions of its depth, interpolated over the film; layers are put on each other front to back. What a
-nearer layer hides of a farther one is filled in from around it.
+The fidelity level between the thin and the traced lens. A picture of the chief rays (distortion in
+it, no blur) is split into layers of depth, by hats over 1 / distance that sum to 1; each is
+convolved with the point spread functions of its depth, interpolated over the film; layers are put
+on each other front to back. What a nearer layer hides of a farther one is filled in from around it.
 """
 
 import itertools
@@ -45,15 +45,18 @@ def psf_frames(
     (torch.Size([3, 16, 16]), True)
 
     Args:
-      camera, scene, T_world_cam: as for ``render.frames``; the camera's samples and seed do not count.
-      psf: ``psf_map(camera)``, made once for many calls while the lens stays as it is; None makes one.
+      camera, scene, T_world_cam: as for ``render.frames``; the camera's samples and seed do not
+        count.
+      psf: ``psf_map(camera)``, made once for many calls while the lens stays as it is; None makes
+        one.
     Returns: [..., T, *film.shape].
-    Gradient: to lens, poses and poses of objects, through the sharp picture, its depth and the point spread
-      functions; "interior" as in ``render.frames``: the motion of silhouettes is left out.
-    Raises: DomainError for surfaces nearer than the map is made for, and scenes without distances; ShapeError
-      for a map of another film.
-    True where blur changes slowly; not within a blur's radius of depth edges, where light that a chief ray
-    does not see is guessed (docs/worlds.md has figures).
+    Gradient: to lens, poses and poses of objects, through the sharp picture, its depth and the
+      point spread functions; "interior" as in ``render.frames``: the motion of silhouettes is left
+      out.
+    Raises: DomainError for surfaces nearer than the map is made for, and scenes without distances;
+      ShapeError for a map of another film.
+    True where blur changes slowly; not within a blur's radius of depth edges, where light that a
+    chief ray does not see is guessed (docs/worlds.md has figures).
     """
     if psf is None:
         psf = psf_map(camera)
@@ -73,9 +76,9 @@ def psf_frames(
 
 
 def _layers(psf, per_m, lit):
-    """Layers of depth for what is seen, as numbers (near to far) of a step in 1 / distance: the map's, halved
-    while there are few. Raises: DomainError for surfaces nearer than the map's, or a film without chief
-    rays."""
+    """Layers of depth for what is seen, as numbers (near to far) of a step in 1 / distance: the
+    map's, halved while there are few. Raises: DomainError for surfaces nearer than the map's, or a
+    film without chief rays."""
     if not bool(lit.any()):
         raise DomainError(
             "psf frames: no chief ray passes the lens; open its apertures or make the film smaller."
@@ -118,7 +121,8 @@ def _frame(psf, light, per_m, lit, numbers, step):
 
 
 def _filled(layers, width):
-    """Layers of light and coverage [J, 2, S, W, H, W], near to far, with what nearer ones hide taken from
+    """Layers of light and coverage [J, 2, S, W, H, W], near to far, with what nearer ones hide
+    taken from
     around: the mean of the layer's light within ``width`` pixels, where there is any."""
     around = layers.mean(2).flatten(0, 1)
     for size in ((width, 1), (1, width)):
@@ -135,8 +139,8 @@ def _filled(layers, width):
 def _convolved(psf, layers, depths_per_m):
     """Layers [J, 2, S, W, H + 2 R, W + 2 R] at these 1 / distance convolved: [J, 2, W, H, W].
 
-    Cell after cell, by Fourier transforms: with the weights of its four corners, which are then interpolated
-    (so a constant stays constant).
+    Cell after cell, by Fourier transforms: with the weights of its four corners, which are then
+    interpolated (so a constant stays constant).
     """
     film = psf.camera.film
     rows, columns = (n - 1 for n in psf.grid[1:])
@@ -158,14 +162,17 @@ def _convolved(psf, layers, depths_per_m):
             found = spectrum[:, :, 0] * corner[:, :, 0]
             for part in range(1, SIDE * SIDE):
                 found = torch.addcmul(found, spectrum[:, :, part], corner[:, :, part])
-            found = torch.fft.irfft2(found, s=size)[..., margin : margin + high, margin : margin + wide]
+            found = torch.fft.irfft2(found, s=size)[
+                ..., margin : margin + high, margin : margin + wide
+            ]
             strip = strip + found * (down[i, row][:, None] * right[j][:, None, :])
         strips.append(strip.transpose(-3, -2).flatten(-2))  # cells of a row, side by side
     return torch.cat(strips, -2)[..., : film.height_px, : film.width_px]
 
 
 def _transfer(psf, per_m, like, size):
-    """Fourier transform of the weights of a layer, [S, windows, rows, columns, ...]; kept by the map."""
+    """Fourier transform of the weights of a layer, [S, windows, rows, columns, ...]; kept by the
+    map."""
     key = (per_m, like.dtype, torch.is_grad_enabled())
     if key not in psf.transfers:
         weights = psf.weights(torch.tensor([per_m], dtype=like.dtype))[0].flatten(1, 2)
@@ -174,7 +181,8 @@ def _transfer(psf, per_m, like, size):
 
 
 def _between(length, cell, count):
-    """Weights [2, count, cell] of the node before and the node behind each pixel of a row of cells."""
+    """Weights [2, count, cell] of the node before and the node behind each pixel of a row of
+    cells."""
     node = (torch.arange(count + 1.0) * cell).clamp_max(length - 1)
     at = (torch.arange(count * cell, dtype=node.dtype)).reshape(count, cell)
     share = ((at - node[:-1, None]) / (node[1:] - node[:-1]).clamp_min(1)[:, None]).clamp(0, 1)

@@ -1,10 +1,10 @@
 """Point spread functions of a camera over field and depth, as tensors with gradients.
 
-The rays of a pixel through the pupil do not depend on what they meet. So one trace, of pupil points for the
-nodes of a grid over the film, says for every distance which places of the sharp picture (that of the chief
-rays) the pixel gathers light from: where the ray meets the plane at that distance, in pixels of the chief
-rays around it. That is the point spread function mirrored, exact for a plane across the axis, whatever the
-lens (vignetting, decentred elements, colour).
+The rays of a pixel through the pupil do not depend on what they meet. So one trace, of pupil points
+for the nodes of a grid over the film, says for every distance which places of the sharp picture
+(that of the chief rays) the pixel gathers light from: where the ray meets the plane at that
+distance, in pixels of the chief rays around it. That is the point spread function mirrored, exact
+for a plane across the axis, whatever the lens (vignetting, decentred elements, colour).
 """
 
 import math
@@ -28,8 +28,8 @@ PUPIL_PX = 1.0  # spacing of the pupil's points in the widest blur, about
 ACROSS = 32  # film points across the sensor whose light is traced
 APART_PX = 0.5  # of the chief rays that give the scale of the picture, on either side
 SIDE = 2  # values of the sharp picture per side of a pixel
-# a pixel's weights reach beyond the blur by the quartic splines and, until it has fallen below 0.5 %, the
-# ringing of the interpolation, in spacings of the sharp picture
+# a pixel's weights reach beyond the blur by the quartic splines and, until it has fallen below 0.5
+# %, the ringing of the interpolation, in spacings of the sharp picture
 TAIL_PX = math.ceil((2.5 + (SIDE - 1) / 2 + 4) / SIDE)
 
 
@@ -37,17 +37,18 @@ TAIL_PX = math.ceil((2.5 + (SIDE - 1) / 2 + 4) / SIDE)
 class PsfMap:
     """Rays of a camera from which its point spread functions follow, made by ``psf_map``.
 
-    camera: Camera. nearest_m: least distance it is made for. nodes_px: [N, 2] film points, pixel coordinates;
-      ``grid`` = (windows, rows, columns) of them, N in all, cells of ``cell_px`` (rows, columns) pixels
-      between.
-    transmission: [windows, H, W] share of the light that passes, as in the traced frames. radius_px: how far
-      the light of a pixel comes from. step_per_m: of 1 / distance, over which blur grows by LAYER_PX at most.
-      sharp: chief rays of the film's pixels and a margin of radius_px around them, window after window, SIDE
-      x SIDE values a pixel of ``fine`` x ``fine`` rays each.
+    camera: Camera. nearest_m: least distance it is made for. nodes_px: [N, 2] film points, pixel
+      coordinates; ``grid`` = (windows, rows, columns) of them, N in all, cells of ``cell_px``
+      (rows, columns) pixels between.
+    transmission: [windows, H, W] share of the light that passes, as in the traced frames.
+      radius_px: how far the light of a pixel comes from. step_per_m: of 1 / distance, over which
+      blur grows by LAYER_PX at most.
+      sharp: chief rays of the film's pixels and a margin of radius_px around them, window after
+      window, SIDE x SIDE values a pixel of ``fine`` x ``fine`` rays each.
       transfers: what ``psf_frames`` keeps for its next call.
-    base_m, slope: [N, M, 2] where rays through pupil points meet the entrance pupil's plane, and their
-      slopes, both relative to the chief ray; share: [N, M] of the light, sum 1. base_m_per_px, slope_per_px:
-      [N, 2, 2] the same of neighbouring chief rays, per pixel.
+    base_m, slope: [N, M, 2] where rays through pupil points meet the entrance pupil's plane, and
+      their slopes, both relative to the chief ray; share: [N, M] of the light, sum 1.
+      base_m_per_px, slope_per_px: [N, 2, 2] the same of neighbouring chief rays, per pixel.
     """
 
     camera: Camera
@@ -65,17 +66,22 @@ class PsfMap:
     step_per_m: float
     sharp: Rays
     fine: int
-    transfers: dict[tuple[Any, ...], Tensor] = field(default_factory=dict, repr=False, compare=False)
+    transfers: dict[tuple[Any, ...], Tensor] = field(
+        default_factory=dict, repr=False, compare=False
+    )
 
     def offsets_px(self, per_m: Tensor) -> Tensor:
-        """Where the light of a point ends up, relative to its chief ray: [D, N, M, 2] px, for 1 / distance
-        [D].
+        """Where the light of a point ends up, relative to its chief ray: [D, N, M, 2] px, for 1 /
+        distance [D].
 
-        Gradient: to the lens and to per_m. Raises: DomainError for distances nearer than ``nearest_m``.
+        Gradient: to the lens and to per_m. Raises: DomainError for distances nearer than
+          ``nearest_m``.
         """
         per_m = torch.as_tensor(per_m, dtype=torch.float64)
         if per_m.ndim != 1:
-            raise ShapeError(f"psf map: distances must be a list [D], got shape {tuple(per_m.shape)}.")
+            raise ShapeError(
+                f"psf map: distances must be a list [D], got shape {tuple(per_m.shape)}."
+            )
         known = (per_m.detach() >= 0) & (per_m.detach() <= (1 + ROUNDING) / self.nearest_m)
         if not bool(known.all()):
             raise DomainError(
@@ -90,8 +96,8 @@ class PsfMap:
         return -_solved(self.slope_per_px + v * self.base_m_per_px, self.slope + v * self.base_m)
 
     def energy(self, distance_m: Tensor, size_px: int | None = None) -> Tensor:
-        """The point spread functions, [D, N, K, K]: share of a point's light per pixel, rows along +y (down),
-        columns along +x, the chief ray on the middle pixel; the sum is 1.
+        """The point spread functions, [D, N, K, K]: share of a point's light per pixel, rows along
+        +y (down), columns along +x, the chief ray on the middle pixel; the sum is 1.
 
         >>> from codesign import lens, render
         >>> camera = render.Camera(lens.ThinLens(10.0, 4.0).focus_at(1.0), 96, 64, pixel_pitch_mm=0.005)
@@ -104,10 +110,12 @@ class PsfMap:
 
         Args:
           distance_m: [D] along the camera's axis from the entrance pupil, inf allowed.
-          size_px: rows and columns, odd; None is as many as the widest blur needs. A ray is shared bilinearly
-            among four pixels.
-        Gradient: to every tensor of the lens and to the distances, piecewise linear in the rays' positions.
-        Raises: DomainError for distances nearer than ``nearest_m``, or a size that does not hold the blur.
+          size_px: rows and columns, odd; None is as many as the widest blur needs. A ray is shared
+            bilinearly among four pixels.
+        Gradient: to every tensor of the lens and to the distances, piecewise linear in the rays'
+          positions.
+        Raises: DomainError for distances nearer than ``nearest_m``, or a size that does not hold
+          the blur.
         """
         offsets_px = self.offsets_px(1 / torch.as_tensor(distance_m, dtype=torch.float64))
         needed = 2 * (self.radius_px - TAIL_PX) + 3
@@ -121,12 +129,13 @@ class PsfMap:
         return _shared((1 - at.abs()).clamp_min(0), self.share)
 
     def weights(self, per_m: Tensor) -> Tensor:
-        """What pixels gather from the sharp picture at 1 / distance [J]: [J, N, S, S, K, K], by which the
-        picture of each of a pixel's S x S values is convolved; K = 2 radius_px + 1, all of a node sum to 1.
+        """What pixels gather from the sharp picture at 1 / distance [J]: [J, N, S, S, K, K], by
+        which the picture of each of a pixel's S x S values is convolved; K = 2 radius_px + 1, all
+        of a node sum to 1.
 
-        The sharp picture is taken as the cubic spline through its values. Values of one ray each are
-        integrated over the pixel in closed form (quartic splines); those of several are means over their part
-        of it already.
+        The sharp picture is taken as the cubic spline through its values. Values of one ray each
+        are integrated over the pixel in closed form (quartic splines); those of several are means
+        over their part of it already.
         Source: Unser, IEEE Signal Processing Magazine 16, 1999.
         """
         dtype = per_m.dtype
@@ -139,7 +148,9 @@ class PsfMap:
         inverse = torch.linalg.inv(_cubic(spacings[:, None] - spacings))
         found = inverse @ _shared(splines, share) @ inverse
         found = (
-            (found / found.sum((-2, -1), keepdim=True)).unflatten(-1, (-1, SIDE)).unflatten(-3, (-1, SIDE))
+            (found / found.sum((-2, -1), keepdim=True))
+            .unflatten(-1, (-1, SIDE))
+            .unflatten(-3, (-1, SIDE))
         )
         return found.permute(0, 1, 3, 5, 2, 4).flip((-2, -1))
 
@@ -150,12 +161,15 @@ def psf_map(
     cell_px: int = 64,
     rays_per_px: int = 4,
 ) -> PsfMap:
-    """Trace what the point spread functions of a camera at all distances from ``nearest_m`` on follow from.
+    """Trace what the point spread functions of a camera at all distances from ``nearest_m`` on
+    follow from.
 
     Args:
-      camera: before any lens with ``camera_rays``; its spectrum, falloff and aim count, its samples do not.
+      camera: before any lens with ``camera_rays``; its spectrum, falloff and aim count, its samples
+        do not.
       nearest_m: metres from the entrance pupil.
-      cell_px: largest spacing of the film points between which point spread functions are interpolated.
+      cell_px: largest spacing of the film points between which point spread functions are
+        interpolated.
       rays_per_px: 4, or for scenes full of hard edges 16, 36, 64, ...
     Gradient: to the lens. To be made anew for every state of the lens.
     Raises: DomainError when the blur is wider than LARGEST_PX, or no light reaches the film.
@@ -208,44 +222,59 @@ def psf_map(
 
 
 def _nodes(camera, cell_px):
-    """Film points at the corners of equal cells over every window: [N, 2] px, how many, and pixels of a
-    cell."""
+    """Film points at the corners of equal cells over every window: [N, 2] px, how many, and pixels
+    of a cell."""
     film = camera.film
     nodes = []
     cell = []
     for length in (film.height_px, film.width_px):
         count = math.ceil(length / cell_px)
         cell.append(math.ceil(length / count))
-        nodes.append((torch.arange(count + 1.0, dtype=torch.float64) * cell[-1]).clamp_max(length - 1))
-    return film.in_windows(*nodes), (len(film.corners_px), len(nodes[0]), len(nodes[1])), tuple(cell)
+        nodes.append(
+            (torch.arange(count + 1.0, dtype=torch.float64) * cell[-1]).clamp_max(length - 1)
+        )
+    return (
+        film.in_windows(*nodes),
+        (len(film.corners_px), len(nodes[0]), len(nodes[1])),
+        tuple(cell),
+    )
 
 
 def _around(nodes):
     """Every node and its neighbours in +x, -x, +y, -y: [5 N, 2] px."""
-    steps = torch.tensor([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=nodes.dtype)
+    steps = torch.tensor(
+        [[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=nodes.dtype
+    )
     return (nodes[:, None] + APART_PX * steps).reshape(-1, 2)
 
 
 def _through_pupil(camera, places, across):
-    """Rays of film points [P, 2] px through ``across`` x ``across`` equal parts of the pupil, colour after
-    colour: at the entrance pupil's plane and slopes [P, M, 2], and their light [P, M], 1 in all where nothing
-      stops it."""
+    """Rays of film points [P, 2] px through ``across`` x ``across`` equal parts of the pupil,
+    colour after
+    colour: at the entrance pupil's plane and slopes [P, M, 2], and their light [P, M], 1 in all
+      where nothing stops it."""
     line = (torch.arange(across, dtype=torch.float64) + 0.5) / across
     pupil = concentric_disc(torch.cartesian_prod(line, line)).repeat(len(camera.colours), 1)
     colour = torch.arange(len(camera.colours)).repeat_interleave(across**2).repeat(len(places))
-    rays = camera.coloured_rays(places.repeat_interleave(len(pupil), 0), pupil.repeat(len(places), 1), colour)
+    rays = camera.coloured_rays(
+        places.repeat_interleave(len(pupil), 0), pupil.repeat(len(places), 1), colour
+    )
     light = camera.light(rays, colour) / len(pupil)
     return [v.unflatten(0, (len(places), -1)) for v in (*lines(rays), light)]
 
 
 def _gathered(camera, nodes, across, base, slope, scale):
-    """Rays through the pupil relative to the chief rays: base and slope [N, M, 2], and shares of the light
-    [N, M]."""
+    """Rays through the pupil relative to the chief rays: base and slope [N, M, 2], and shares of
+    the light [N, M]."""
     meets, leans, light = _through_pupil(camera, nodes, across)
     total = light.sum(1, keepdim=True)
     if not bool((total.detach() > 0).any()):
-        raise DomainError("psf map: no light reaches the film; open the apertures or make the film smaller.")
-    usable = (light.detach() > 0)[..., None] & (torch.linalg.det(scale[1].detach()) != 0)[:, None, None]
+        raise DomainError(
+            "psf map: no light reaches the film; open the apertures or make the film smaller."
+        )
+    usable = (light.detach() > 0)[..., None] & (torch.linalg.det(scale[1].detach()) != 0)[
+        :, None, None
+    ]
     share = torch.where(total > 0, light / torch.where(total > 0, total, 1), 1 / light.shape[1])
     return (
         torch.where(usable, meets - base[:, :1], 0),
@@ -265,14 +294,16 @@ def _transmission(camera):
 
 
 def _reach(base, slope, scale, nearest_per_m):
-    """Radius of the widest blur at infinity and at the nearest distance, px; between them it is smaller."""
+    """Radius of the widest blur at infinity and at the nearest distance, px; between them it is
+    smaller."""
     with torch.no_grad():
         ends = [_solved(scale[1] + v * scale[0], slope + v * base) for v in (0.0, nearest_per_m)]
         return float(torch.stack(ends).abs().max())
 
 
 def _solved(matrix, vectors):
-    """matrix^-1 [..., N, 2, 2] times vectors [..., N, M, 2], written out; nodes without chief rays give 0."""
+    """matrix^-1 [..., N, 2, 2] times vectors [..., N, M, 2], written out; nodes without chief rays
+    give 0."""
     (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
     determinant = a * d - b * c
     regular = determinant != 0
@@ -283,9 +314,12 @@ def _solved(matrix, vectors):
 
 
 def _places(film, margin, fine):
-    """Pixel coordinates of ``fine`` x ``fine`` points in each of SIDE x SIDE equal parts of every pixel of
-    the windows and a margin around them."""
-    around = [torch.arange(-margin, n + margin, dtype=torch.float64) for n in (film.height_px, film.width_px)]
+    """Pixel coordinates of ``fine`` x ``fine`` points in each of SIDE x SIDE equal parts of every
+    pixel of the windows and a margin around them."""
+    around = [
+        torch.arange(-margin, n + margin, dtype=torch.float64)
+        for n in (film.height_px, film.width_px)
+    ]
     count = SIDE * fine
     inside = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5).reshape(SIDE, fine)
     y, x = torch.broadcast_tensors(inside[:, None, :, None], inside[None, :, None, :])

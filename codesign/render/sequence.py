@@ -2,8 +2,8 @@
 
 interior: what moves inside surfaces (plain automatic differentiation).
 boundary: with the motion of silhouettes and edges.
-difference: central differences with common random numbers, twelve renders for the poses and two per lens
-  number.
+difference: central differences with common random numbers, twelve renders for the poses and two per
+  lens number.
 auto: the cheapest of the three that is right for the frames at hand.
 """
 
@@ -66,19 +66,22 @@ def frames(
 
     Args:
       camera: Camera, before any lens with ``camera_rays``.
-      scene: anything with ``radiance`` and ``dtype`` (MitsubaScene, TexturedPlane, MovingScene), or a list of
-        scenes, one for each entry of the first axis of T_world_cam.
-      T_world_cam: [..., T, 4, 4], several trajectories in one batch as if each were rendered by itself.
-      gradient: "interior", "boundary", "difference" or "auto", see the top of this file; the frames are the
-        same.
+      scene: anything with ``radiance`` and ``dtype`` (MitsubaScene, TexturedPlane, MovingScene), or
+        a list of scenes, one for each entry of the first axis of T_world_cam.
+      T_world_cam: [..., T, 4, 4], several trajectories in one batch as if each were rendered by
+        itself.
+      gradient: "interior", "boundary", "difference" or "auto", see the top of this file; the frames
+        are the same.
       per_px: samples per pixel length of silhouettes and edges for "boundary".
-      rays: ``camera.rays()`` where they are traced already (one trace for many calls) or recorded, for
-        "interior" and "boundary"; the boundary term traces its own points through the camera's lens.
-    Returns: [..., T, H, W] (or [..., T, windows, H, W] behind a Film with windows) linear irradiance in the
-      scene's units, box-filtered over each pixel.
+      rays: ``camera.rays()`` where they are traced already (one trace for many calls) or recorded,
+        for "interior" and "boundary"; the boundary term traces its own points through the camera's
+        lens.
+    Returns: [..., T, H, W] (or [..., T, windows, H, W] behind a Film with windows) linear
+      irradiance in the scene's units, box-filtered over each pixel.
     Gradient: lens and poses; "interior" leaves out the motion of silhouettes.
-    Raises: DomainError for an unknown way, rays that it cannot use, or a scene whose silhouettes are not
-      known; ShapeError for rays of another camera, or numbers of scenes and poses that differ.
+    Raises: DomainError for an unknown way, rays that it cannot use, or a scene whose silhouettes
+      are not known; ShapeError for rays of another camera, or numbers of scenes and poses that
+      differ.
     """
     check_choice(gradient, "gradient", WAYS)
     if rays is not None and gradient not in PROVEN:
@@ -90,7 +93,9 @@ def frames(
     check_kind(camera, Camera, "the camera", "a render.Camera has a lens and a film")
     if pairs := scenes_and_poses(scene, T_world_cam):
         rays = camera.given(rays) if gradient in PROVEN else None
-        return torch.stack([frames(camera, s, poses, gradient, per_px, rays=rays) for s, poses in pairs])
+        return torch.stack(
+            [frames(camera, s, poses, gradient, per_px, rays=rays) for s, poses in pairs]
+        )
     rays = camera.given(rays)
     views = views_of(scene, T_world_cam, rays)
     if gradient == "auto":
@@ -101,7 +106,9 @@ def frames(
         return image(rays, camera, views)
     taken = None
     if rays.weight.requires_grad:
-        taken = aperture_edge_term(camera, views, max(APERTURE_SAMPLES, camera.samples_per_pixel // 8))
+        taken = aperture_edge_term(
+            camera, views, max(APERTURE_SAMPLES, camera.samples_per_pixel // 8)
+        )
     if taken is not None:
         rays = _with_still_apertures(camera, rays)
     found = image(rays, camera, views) + boundary_term(camera, views, per_px)
@@ -122,8 +129,8 @@ def image(rays: Rays, camera: Camera, views: Views) -> Tensor:
 
 
 def by_differences(rays: Rays, camera: Camera, views: Views) -> Tensor:
-    """Frames whose gradient to poses and lens tensors is that of central differences with common random
-    numbers."""
+    """Frames whose gradient to poses and lens tensors is that of central differences with common
+    random numbers."""
     if _objects_ask(views.scene):
         raise DomainError(
             "gradient 'difference' goes to camera and lens only, but the pose of an object asks for one; "
@@ -145,16 +152,16 @@ def _objects_ask(scene):
 
 
 def _twist(T_world_cam):
-    """Zero-valued twists [T, 6] (translation first) whose gradient is that of small motions of the poses in
-    their own axes."""
+    """Zero-valued twists [T, 6] (translation first) whose gradient is that of small motions of the
+    poses in their own axes."""
     small = inverse(T_world_cam.detach().double()) @ T_world_cam.double()
     turn = (small[:, :3, :3] - small[:, :3, :3].mT) / 2
     return torch.stack([*small[:, :3, 3].unbind(1), turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], 1)
 
 
 def pose_steps(camera: Camera, views: Views) -> list[float]:
-    """Steps of differences to the six components of a twist, metres and radians: at most STEP_PX of motion on
-    the film, for translations at the median distance of what the first frame shows."""
+    """Steps of differences to the six components of a twist, metres and radians: at most STEP_PX of
+    motion on the film, for translations at the median distance of what the first frame shows."""
     with torch.no_grad():
         turn = STEP_PX * abs(camera.slope_per_px())
         move = turn * reach_m(camera, views.scene, views.cameras[:, :1])
@@ -162,8 +169,8 @@ def pose_steps(camera: Camera, views: Views) -> list[float]:
 
 
 def _pose_numbers(rays, camera, views):
-    """For every component of the twist of all poses: frames as a function of its change, the step, and the
-    zero-valued component of each frame."""
+    """For every component of the twist of all poses: frames as a function of its change, the step,
+    and the zero-valued component of each frame."""
     if not views.cameras.requires_grad:
         return
     twist = _twist(views.T_world_cam).reshape(*views.batch, *[1] * len(camera.film.shape), 6)
@@ -171,7 +178,9 @@ def _pose_numbers(rays, camera, views):
         way = torch.eye(6, dtype=torch.float64)[k : k + 1]
 
         def at(change, way=way):
-            return image(rays, camera, views_of(views.scene, views.T_world_cam @ se3_exp(change * way)))
+            return image(
+                rays, camera, views_of(views.scene, views.T_world_cam @ se3_exp(change * way))
+            )
 
         yield at, size, twist[..., k]
 
@@ -179,12 +188,14 @@ def _pose_numbers(rays, camera, views):
 def lens_tensors(lens: Any) -> dict[str, Tensor]:
     """Tensors of a lens that ask for gradients, by name."""
     found = {name: getattr(lens, name, None) for name in LENS_STEP}
-    return {name: t for name, t in found.items() if torch.is_tensor(t) and t.requires_grad and t.numel()}
+    return {
+        name: t for name, t in found.items() if torch.is_tensor(t) and t.requires_grad and t.numel()
+    }
 
 
 def _check_known(lens, known):
-    """Raise DomainError when a lens of the user's own asks for gradients to parameters, none of which
-    differences know."""
+    """Raise DomainError when a lens of the user's own asks for gradients to parameters, none of
+    which differences know."""
     if known or not isinstance(lens, torch.nn.Module):
         return
     for name, tensor in lens.named_parameters():
@@ -206,7 +217,12 @@ def _lens_numbers(camera, views):
             )
         held = tensor.detach()
         for i, number in enumerate(tensor.reshape(-1)):
-            way = torch.zeros_like(held).reshape(-1).index_fill(0, torch.tensor(i), 1.0).reshape(held.shape)
+            way = (
+                torch.zeros_like(held)
+                .reshape(-1)
+                .index_fill(0, torch.tensor(i), 1.0)
+                .reshape(held.shape)
+            )
 
             def at(change, name=name, held=held, way=way):
                 lens = camera.lens.replace(**{name: held + change * way})
@@ -216,11 +232,18 @@ def _lens_numbers(camera, views):
 
 
 def cheapest(camera: Camera, views: Views) -> Way:
-    """The cheapest way that is right for these very frames: "interior" where no edge or outline in them parts
-    two radiances, "boundary" where one does, "difference" where the scene does not list them."""
+    """The cheapest way that is right for these very frames: "interior" where no edge or outline in
+    them parts two radiances, "boundary" where one does, "difference" where the scene does not list
+    them."""
     middle = camera.film.middle_px[None]
     ray = camera.rays_through(middle, torch.zeros_like(middle))
-    asked = [views.cameras, ray.origin_m, ray.direction, ray.weight, *lens_tensors(camera.lens).values()]
+    asked = [
+        views.cameras,
+        ray.origin_m,
+        ray.direction,
+        ray.weight,
+        *lens_tensors(camera.lens).values(),
+    ]
     objects = _objects_ask(views.scene)
     if not (objects or any(tensor.requires_grad for tensor in asked)):
         return "interior"

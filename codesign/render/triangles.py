@@ -15,11 +15,12 @@ def normals_of(corners: np.ndarray) -> np.ndarray:
 
 
 def edge_pairs(place: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Edges of faces whose corners lie at places [F, 3], in order of their lower and their higher place.
+    """Edges of faces whose corners lie at places [F, 3], in order of their lower and their higher
+    place.
 
-    Returns: one, other: [E] sides of faces that lie there, numbered 3 face + corner at which a side begins;
-      the same where not just two do. count: [E] how many do. rises: [3 F] whether a side runs to a higher
-      place.
+    Returns: one, other: [E] sides of faces that lie there, numbered 3 face + corner at which a side
+      begins; the same where not just two do. count: [E] how many do. rises: [3 F] whether a side
+      runs to a higher place.
     """
     first = place.reshape(-1)
     second = np.roll(place, -1, axis=1).reshape(-1)

@@ -1,8 +1,8 @@
-"""Ground truth through the current lens: points, depth, objects, flow, occlusion and the velocity of the
-camera, in float64 with gradients; the rays of many frames meet the scene together.
+"""Ground truth through the current lens: points, depth, objects, flow, occlusion and the velocity
+of the camera, in float64 with gradients; the rays of many frames meet the scene together.
 
-A frame's truth is the same to the last bit whatever frames are beside it, on one machine with one number of
-threads, where images are read from a table; where they are traced, to 1e-10 px.
+A frame's truth is the same to the last bit whatever frames are beside it, on one machine with one
+number of threads, where images are read from a table; where they are traced, to 1e-10 px.
 """
 
 import math
@@ -22,8 +22,8 @@ from codesign.render.moving import MovingScene, Scene, Views, scenes_and_poses, 
 from codesign.render.projection import ProjectionTable
 from codesign.types import Rays
 
-# of lengths: 32 units in the last place of a float32, for a ray moved into an object's axes and met with its
-# surface
+# of lengths: 32 units in the last place of a float32, for a ray moved into an object's axes and met
+# with its surface
 ROUNDING = 2e-6
 GRAZING = 1e-3  # cosines of incidence below this count as this
 NEAREST_M = 1e-6  # points closer to the plane of the pupil have no image
@@ -34,9 +34,10 @@ TOGETHER = 2**17  # points that are followed at once
 class View:
     """What lies under the pixel centres of one frame; zero (object_id -1) where not valid.
 
-    points_world_m, normal: [..., *film.shape, 3] in world axes, the normal of unit length and as the surface
-      has it. depth_m: [..., *film.shape] along the camera's z axis. object_id: [..., *film.shape] int64, 0
-      for the static scene, then the moving objects in order. valid: [..., *film.shape] bool.
+    points_world_m, normal: [..., *film.shape, 3] in world axes, the normal of unit length and as
+      the surface has it. depth_m: [..., *film.shape] along the camera's z axis. object_id:
+      [..., *film.shape] int64, 0 for the static scene, then the moving objects in order. valid:
+      [..., *film.shape] bool.
     """
 
     points_world_m: Tensor
@@ -48,7 +49,8 @@ class View:
 
 @dataclass(frozen=True)
 class FlowTruth:
-    """flow_px: [..., T - stride, 2, *film.shape], +x right, +y down, 0 where not valid. valid, occluded:
+    """flow_px: [..., T - stride, 2, *film.shape], +x right, +y down, 0 where not valid. valid,
+    occluded:
     [..., T - stride, *film.shape] bool; occluded points are hidden later."""
 
     flow_px: Tensor
@@ -58,8 +60,9 @@ class FlowTruth:
 
 @dataclass(frozen=True)
 class FramesTruth(FlowTruth):
-    """Of F frames of one trajectory, the flow to the frame behind each; and depth_m [F, *film.shape], 0 where
-    nothing is seen, object_id [F, *film.shape] int64 (0 static, then moving objects, -1 nothing)."""
+    """Of F frames of one trajectory, the flow to the frame behind each; and depth_m
+    [F, *film.shape], 0 where nothing is seen, object_id [F, *film.shape] int64 (0 static, then
+    moving objects, -1 nothing)."""
 
     depth_m: Tensor
     object_id: Tensor
@@ -115,8 +118,8 @@ def true_flow(
     T_world_cam: Poses,
     stride: int = 1,
 ) -> tuple[Tensor, Tensor]:
-    """Flow of every pixel centre from each pose to the one ``stride`` later, through the camera's current
-    lens; points move with their object.
+    """Flow of every pixel centre from each pose to the one ``stride`` later, through the camera's
+    current lens; points move with their object.
 
     >>> from codesign import lens, pose, render
     >>> from scenes import worlds
@@ -127,13 +130,14 @@ def true_flow(
     >>> [round(float(component), 3) for component in flow_px[0, :, 4, 4]]
     [2.0, 0.0]
 
-    Args: camera with ``chief_rays`` and ``film``; scene with ``hit``, a MovingScene, or a list of scenes, one
-      for each entry of the first axis of the poses; T_world_cam [..., T, 4, 4], several trajectories in one
-      batch.
-    Returns: flow [..., T - stride, 2, *film.shape] px, +x right, +y down; valid [..., T - stride,
-      *film.shape], False where the ray meets nothing or the point leaves the field of the lens (the flow is 0
-      there).
-    Gradient: to lens, camera and object poses. Occlusion at the later time is left to ``flow_and_occlusion``.
+    Args: camera with ``chief_rays`` and ``film``; scene with ``hit``, a MovingScene, or a list of
+      scenes, one for each entry of the first axis of the poses; T_world_cam [..., T, 4, 4], several
+      trajectories in one batch.
+    Returns: flow [..., T - stride, 2, *film.shape] px, +x right, +y down; valid
+      [..., T - stride, *film.shape], False where the ray meets nothing or the point leaves the
+      field of the lens (the flow is 0 there).
+    Gradient: to lens, camera and object poses. Occlusion at the later time is left to
+      ``flow_and_occlusion``.
     Raises: ShapeError when there are not more poses than ``stride``.
     """
     found = _flow_truth(camera, scene, T_world_cam, stride, occlusion=False)
@@ -146,7 +150,8 @@ def flow_and_occlusion(
     T_world_cam: Poses,
     stride: int = 1,
 ) -> FlowTruth:
-    """As ``true_flow``, and which of the points are hidden at the later time by something nearer: FlowTruth.
+    """As ``true_flow``, and which of the points are hidden at the later time by something nearer:
+    FlowTruth.
 
     >>> from codesign import lens, pose, render
     >>> from scenes import worlds
@@ -157,9 +162,10 @@ def flow_and_occlusion(
     >>> bool(truth.occluded.any()), bool(truth.valid[truth.occluded].all())
     (True, True)
 
-    A point is hidden when the later chief ray through its image meets a surface before it by more than
-    rounding: 32 units in the last place of float32 geometry, divided by the cosine at which the ray meets the
-    point's own surface, since a ray aside by as much meets it earlier or later by that.
+    A point is hidden when the later chief ray through its image meets a surface before it by more
+    than
+    rounding: 32 units in the last place of float32 geometry, divided by the cosine at which the ray
+    meets the point's own surface, since a ray aside by as much meets it earlier or later by that.
     """
     return _flow_truth(camera, scene, T_world_cam, stride, occlusion=True)
 
@@ -172,14 +178,14 @@ def truth_of_frames(
     count: int,
     rays: Rays | None = None,
 ) -> FramesTruth:
-    """Truth of the first ``count`` frames of a long sequence, without gradients: images are read from a table
-    of the camera's lens (to 1e-6 px) instead of traced.
+    """Truth of the first ``count`` frames of a long sequence, without gradients: images are read
+    from a table of the camera's lens (to 1e-6 px) instead of traced.
 
     Args:
       table: ProjectionTable of the camera.
       scene: as for ``true_flow``.
-      T_world_cam: [T >= count, 4, 4]; flow where there is a frame behind (of ``count`` - 1 frames where T =
-        count).
+      T_world_cam: [T >= count, 4, 4]; flow where there is a frame behind (of ``count`` - 1 frames
+        where T = count).
       rays: the camera's chief rays through all pixel centres, where they are traced already.
     """
     camera = table.camera
@@ -208,12 +214,14 @@ def truth_of_frames(
 
 @dataclass(frozen=True)
 class Track:
-    """Points under pixels [P] of F frames, and where they are at a later frame each: hits of the first,
-    points_cam_m [F, P, 3] and to_px [F, P, 2] of the later (the pixel itself where not valid).
+    """Points under pixels [P] of F frames, and where they are at a later frame each: hits of the
+    first, points_cam_m [F, P, 3] and to_px [F, P, 2] of the later (the pixel itself where not
+    valid).
 
-    in_front: [F, P] bool, the point lies before the later camera (points_cam_m is (0, 0, 1) elsewhere).
-      valid: [F, P] bool, it is in the field of the lens too. chief: the later chief rays to the points, base
-      and slope [F, P, 2], where a table gave them.
+    in_front: [F, P] bool, the point lies before the later camera (points_cam_m is (0, 0, 1)
+      elsewhere).
+      valid: [F, P] bool, it is in the field of the lens too. chief: the later chief rays to the
+      points, base and slope [F, P, 2], where a table gave them.
     """
 
     hits: Hits
@@ -233,8 +241,8 @@ def track(
     pixels: Tensor,
     rays: Rays,
 ) -> Track:
-    """Track of the pixel coordinates [P, 2] and their chief rays from frames ``now`` to frames ``later``
-    (numbers [F]) of a sequence."""
+    """Track of the pixel coordinates [P, 2] and their chief rays from frames ``now`` to frames
+    ``later`` (numbers [F]) of a sequence."""
     hits = hits_of(rays, views.scene, views.cameras[:, now])
     return follow(camera, hits, views.cameras[:, later], pixels)
 
@@ -245,24 +253,28 @@ def follow(optics: Camera | ProjectionTable, hits: Hits, later: Tensor, pixels: 
     points, in_front = _before(hits, later)
     chief = None
     if isinstance(optics, ProjectionTable):
-        # a matrix product rounds by its shape: one frame per call keeps a frame's bits in any company
+        # a matrix product rounds by its shape: one frame per call keeps a frame's bits in any
+        # company
         to, base, slope = (torch.stack(v) for v in zip(*map(optics, points), strict=True))
         chief = (base, slope)
     else:
         to = project(optics, points)
     valid = in_front & ~to.detach().isnan().any(-1)
-    return Track(hits, points, pixels, torch.where(valid[..., None], to, pixels), in_front, valid, chief)
+    return Track(
+        hits, points, pixels, torch.where(valid[..., None], to, pixels), in_front, valid, chief
+    )
 
 
 def later_points(rays: Rays, scene: Any, T_world_cam: Poses) -> tuple[Tensor, Tensor]:
-    """Points under rays at the first pose of each trajectory, as they lie before the camera at its last.
+    """Points under rays at the first pose of each trajectory, as they lie before the camera at its
+    last.
 
     Args:
       rays: Rays [P] (chief rays).
       scene: as for ``true_flow``; points move with their object.
       T_world_cam: [..., T, 4, 4].
-    Returns: points [B, P, 3] metres in the axes of the last camera, B trajectories; seen [B, P] bool: it met
-      a surface, and lies before the last camera (the point is (0, 0, 1) elsewhere).
+    Returns: points [B, P, 3] metres in the axes of the last camera, B trajectories; seen [B, P]
+      bool: it met a surface, and lies before the last camera (the point is (0, 0, 1) elsewhere).
     Gradient: to rays, camera and object poses, the surface taken as its tangent plane at the hit.
     """
     views = views_of(scene, T_world_cam, rays)
@@ -272,8 +284,8 @@ def later_points(rays: Rays, scene: Any, T_world_cam: Poses) -> tuple[Tensor, Te
 
 
 def _before(hits, later):
-    """Points that were hit in the axes of cameras ``later`` [parts, F, 4, 4], and whether they lie before
-    them."""
+    """Points that were hit in the axes of cameras ``later`` [parts, F, 4, 4], and whether they lie
+    before them."""
     points = carried(hits, inverse(later))
     in_front = (hits.part >= 0) & (points.detach()[..., 2] > NEAREST_M)
     return torch.where(
@@ -283,12 +295,14 @@ def _before(hits, later):
 
 @torch.no_grad()
 def _hidden(camera, scene, later, found):
-    """Whether something is nearer than the tracked points at the later frames [parts, F, 4, 4]: [F, P]
-    bool."""
+    """Whether something is nearer than the tracked points at the later frames [parts, F, 4, 4]:
+    [F, P] bool."""
     if found.chief is None:
         at = torch.where(found.valid[..., None], found.to_px, camera.film.middle_px)
         rays = camera.chief_rays(at.reshape(-1, 2))
-        origin, direction = (v.double().reshape(*at.shape[:-1], 3) for v in (rays.origin_m, rays.direction))
+        origin, direction = (
+            v.double().reshape(*at.shape[:-1], 3) for v in (rays.origin_m, rays.direction)
+        )
     else:
         base, slope = found.chief
         origin = torch.cat([base, torch.zeros_like(base[..., :1])], -1)
@@ -296,7 +310,11 @@ def _hidden(camera, scene, later, found):
         direction = direction / dot(direction, direction).sqrt()[..., None]
     between = found.points_cam_m - origin
     reach = dot(between, between).sqrt()
-    cosine = dot(turned(of_part(found.hits, later), direction), found.hits.normal).abs().clamp_min(GRAZING)
+    cosine = (
+        dot(turned(of_part(found.hits, later), direction), found.hits.normal)
+        .abs()
+        .clamp_min(GRAZING)
+    )
     # float32 coordinates round by their own size
     size = reach + dot(found.hits.local_m, found.hits.local_m).sqrt()
     nearer = first_hits(origin, direction, found.valid, scene, later).distance_m
@@ -306,7 +324,9 @@ def _hidden(camera, scene, later, found):
 def _flow_truth(camera, scene, T_world_cam, stride, occlusion):
     if pairs := scenes_and_poses(scene, T_world_cam):
         found = [_flow_truth(camera, each, poses, stride, occlusion) for each, poses in pairs]
-        return FlowTruth(*(torch.stack([getattr(f, n.name) for f in found]) for n in fields(FlowTruth)))
+        return FlowTruth(
+            *(torch.stack([getattr(f, n.name) for f in found]) for n in fields(FlowTruth))
+        )
     pixels = camera.film.pixels()
     rays = camera.chief_rays(pixels)
     views = views_of(scene, T_world_cam, rays)
@@ -318,13 +338,17 @@ def _flow_truth(camera, scene, T_world_cam, stride, occlusion):
     for some in starts.split(max(1, TOGETHER // len(pixels))):
         later = cameras[:, some + stride]
         found = follow(camera, hits_of(rays, scene, cameras[:, some]), later, pixels)
-        hidden = _hidden(camera, scene, later, found) if occlusion else torch.zeros_like(found.valid)
+        hidden = (
+            _hidden(camera, scene, later, found) if occlusion else torch.zeros_like(found.valid)
+        )
         flows.append(((found.to_px - pixels).mT, found.valid, hidden))
     flow, valid, hidden = (torch.cat(column) for column in zip(*flows, strict=True))
     batch = (*batch, length - stride)
     shape = camera.film.shape
     return FlowTruth(
-        flow.reshape(*batch, 2, *shape), valid.reshape(*batch, *shape), hidden.reshape(*batch, *shape)
+        flow.reshape(*batch, 2, *shape),
+        valid.reshape(*batch, *shape),
+        hidden.reshape(*batch, *shape),
     )
 
 
@@ -343,17 +367,18 @@ SMALL = 1e-4  # squared angle below which series are used; their next term is 1e
 
 
 def camera_velocity(T_world_cam: Poses, t_s: Tensor | Sequence[float]) -> tuple[Tensor, Tensor]:
-    """Mean velocity of a camera between its poses: the constant twist that leads from each pose to the next.
+    """Mean velocity of a camera between its poses: the constant twist that leads from each pose to
+    the next.
 
     Args:
       T_world_cam: [..., T >= 2, 4, 4].
       t_s: [T] times, increasing, the same for all trajectories.
-    Returns: two twists [..., T - 1, 6], translation of the camera's origin (m/s) then rotation (rad/s): in
-      the camera's own axes, where it is the same all through the interval, and in world axes, as it is at the
-      middle of the interval.
+    Returns: two twists [..., T - 1, 6], translation of the camera's origin (m/s) then rotation
+      (rad/s): in the camera's own axes, where it is the same all through the interval, and in world
+      axes, as it is at the middle of the interval.
     Gradient: to the poses.
-    Raises: DomainError when times do not increase or the camera turns by more than 3 rad from one pose to the
-      next; ShapeError.
+    Raises: DomainError when times do not increase or the camera turns by more than 3 rad from one
+      pose to the next; ShapeError.
     """
     T_world_cam = check_poses(T_world_cam)
     t_s = check_finite(torch.as_tensor(t_s, dtype=torch.float64), "times of the poses")
@@ -370,7 +395,9 @@ def camera_velocity(T_world_cam: Poses, t_s: Tensor | Sequence[float]) -> tuple[
     start = poses[..., :-1, :, :]
     moves = inverse(start) @ poses[..., 1:, :, :]
     twist = se3_log(moves.reshape(-1, 4, 4)).reshape(*start.shape[:-2], 6)
-    half_turn = se3_exp(torch.cat([torch.zeros_like(twist[..., :3]), twist[..., 3:] / 2], -1))[..., :3, :3]
+    half_turn = se3_exp(torch.cat([torch.zeros_like(twist[..., :3]), twist[..., 3:] / 2], -1))[
+        ..., :3, :3
+    ]
     body = twist / t_s.diff()[:, None]
     turn = (start[..., :3, :3] @ half_turn)[..., None, :, :]
     world = turn @ body.reshape(*body.shape[:-1], 2, 3, 1)
@@ -378,17 +405,18 @@ def camera_velocity(T_world_cam: Poses, t_s: Tensor | Sequence[float]) -> tuple[
 
 
 def se3_log(transform: Tensor) -> Tensor:
-    """Twists [N, 6] of rigid transforms [N, 4, 4], the inverse of ``pose.se3_exp`` for turns of at most 3
-    rad.
+    """Twists [N, 6] of rigid transforms [N, 4, 4], the inverse of ``pose.se3_exp`` for turns of at
+    most 3 rad.
 
     Gradient: exact, also at the identity. Raises: DomainError for larger turns.
-    Source: Sola, Deray and Atchuthan, A micro Lie theory for state estimation in robotics, 2018, eq. 133, 146
-      and 173.
+    Source: Sola, Deray and Atchuthan, A micro Lie theory for state estimation in robotics, 2018,
+      eq. 133, 146 and 173.
     """
     R = transform[:, :3, :3]
     t = transform[:, :3, 3]
     sine_axis = (
-        torch.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], 1) / 2
+        torch.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], 1)
+        / 2
     )
     cosine = (R.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
     square = sine_axis.square().sum(1)

@@ -21,14 +21,15 @@ def shade(
     T_world_cam: Poses,
     samples_per_pixel: int,
 ) -> Tensor:
-    """Pixel means [..., T, P] of the radiance along rays given in camera space, seen from every pose.
+    """Pixel means [..., T, P] of the radiance along rays given in camera space, seen from every
+    pose.
 
     Args:
       rays: Rays with N = P x samples_per_pixel.
       scene: anything with ``radiance`` and ``dtype``, or a MovingScene with T poses per object.
       T_world_cam: [..., T, 4, 4]; all trajectories are one launch.
-    Gradient: to the rays (weights included), the poses and the poses of moving objects; the motion of
-      silhouettes is not in it.
+    Gradient: to the rays (weights included), the poses and the poses of moving objects; the motion
+      of silhouettes is not in it.
     """
     return shaded(rays, views_of(scene, T_world_cam, rays), samples_per_pixel)
 
@@ -68,12 +69,12 @@ def shaded(rays: Rays, views: Views, samples_per_pixel: int) -> Tensor:
 
 
 def light_and_nearness(rays: Rays, views: Views) -> tuple[Tensor, Tensor]:
-    """Radiance [T, N] along rays [N] given in camera space, seen in views of T frames, and 1 / depth [T, N]
-    per metre of what they meet, along the camera's axis; 0 where they meet nothing. The rays' weights do not
-    count.
+    """Radiance [T, N] along rays [N] given in camera space, seen in views of T frames, and 1 /
+    depth [T, N] per metre of what they meet, along the camera's axis; 0 where they meet nothing.
+    The rays' weights do not count.
 
-    Gradient: of both to the rays, the poses and the poses of moving objects, as ``shade``; depth through the
-    tangent plane of what is met.
+    Gradient: of both to the rays, the poses and the poses of moving objects, as ``shade``; depth
+    through the tangent plane of what is met.
     Raises: DomainError for a scene that does not say how far away its light comes from.
     """
     scene = views.scene
@@ -84,7 +85,9 @@ def light_and_nearness(rays: Rays, views: Views) -> tuple[Tensor, Tensor]:
                 "depth needs; give a MitsubaScene or a TexturedPlane, or render traced frames."
             )
     columns = [*rays.origin_m.unbind(1), *rays.direction.unbind(1)]
-    inputs = [c.to(scene.dtype) for c in columns] + [pose[:, :3].to(scene.dtype) for pose in views.cameras]
+    inputs = [c.to(scene.dtype) for c in columns] + [
+        pose[:, :3].to(scene.dtype) for pose in views.cameras
+    ]
     shape = views.cameras.shape[1], rays.weight.numel()
     light, nearness = run_kernel(_Depths(parts(scene)), inputs, [shape] * 2)
     return light, nearness
@@ -94,15 +97,17 @@ def light_and_nearness(rays: Rays, views: Views) -> tuple[Tensor, Tensor]:
 def look(
     scene: Any, cameras: Tensor, frame: Tensor, origin: Tensor, direction: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Radiance [n] and distance [n] along rays [n, 3] in camera axes, each seen in its frame [n] of cameras
-    [parts, F, 4, 4]; float64 without gradient."""
+    """Radiance [n] and distance [n] along rays [n, 3] in camera axes, each seen in its frame [n] of
+    cameras [parts, F, 4, 4]; float64 without gradient."""
     import drjit as dr
 
     arr, fine = (arrays(origin.device.type, dtype) for dtype in (scene.dtype, torch.float64))
     at = fine.UInt32(load(fine.Int32, frame.int()))
     o, d = (fine.Array3(*[load(fine.Float, c) for c in v.unbind(1)]) for v in (origin, direction))
     rays = [placed(fine, o, d, load(fine.Float, pose[:, :3]), at) for pose in cameras]
-    light, distance, _ = nearest(arr, parts(scene), [[arr.Array3(v) for v in pair] for pair in rays])
+    light, distance, _ = nearest(
+        arr, parts(scene), [[arr.Array3(v) for v in pair] for pair in rays]
+    )
     dr.eval(light, distance)
     light, distance = (torch.as_tensor(arr.Float(v).numpy()).double() for v in (light, distance))
     return light, distance

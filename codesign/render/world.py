@@ -33,14 +33,15 @@ class MitsubaScene:
     """A Mitsuba scene whose radiance is read directly from its emitters.
 
     Args:
-      description: a Mitsuba scene dictionary; every shape carries an area emitter (of radiance 0 where it is
-        black). Also an mi.Scene that is loaded already.
+      description: a Mitsuba scene dictionary; every shape carries an area emitter (of radiance 0
+        where it is black). Also an mi.Scene that is loaded already.
       device: "cpu" or "cuda".
       merge: whether Mitsuba may join meshes that look alike into one.
-      emissive: whether every shape must have an emitter; False for a scene whose geometry alone is asked for.
-    Computes in float32. Raises: DomainError when Mitsuba refuses the description, a shape has no emitter, a
-      mesh has no faces, vertices that are not finite or faces of vertices that are not there, a radiance is
-      negative or not finite.
+      emissive: whether every shape must have an emitter; False for a scene whose geometry alone is
+        asked for.
+    Computes in float32. Raises: DomainError when Mitsuba refuses the description, a shape has no
+      emitter, a mesh has no faces, vertices that are not finite or faces of vertices that are not
+      there, a radiance is negative or not finite.
     """
 
     dtype = torch.float32
@@ -73,31 +74,35 @@ class MitsubaScene:
         self._box = box_around(self.mi, self.scene)
 
     def _built(self, description, merge):
-        with reading("the scene's description", "Mitsuba cannot build the scene from it", DomainError):
+        with reading(
+            "the scene's description", "Mitsuba cannot build the scene from it", DomainError
+        ):
             return self.mi.load_dict({"type": "scene", **description}, optimize=merge)
 
     def two_sided(self) -> "MitsubaScene":
-        """The same scene with surfaces that show from behind what they show from in front, as sheets and
-        meshes of unknown winding need; otherwise they are black there."""
+        """The same scene with surfaces that show from behind what they show from in front, as
+        sheets and meshes of unknown winding need; otherwise they are black there."""
         twin = copy.copy(self)
         twin.both_sides = True
         twin._outline = None
         return twin
 
     def radiance(self, arr: Any, origin: Any, direction: Any) -> Any:
-        """Radiance along world rays (drjit arrays), 0 where nothing is hit. Gradient: to the rays, inside
-        surfaces."""
+        """Radiance along world rays (drjit arrays), 0 where nothing is hit. Gradient: to the rays,
+        inside surfaces."""
         return self.radiance_and_distance(arr, origin, direction)[0]
 
     def radiance_and_distance(self, arr: Any, origin: Any, direction: Any) -> Any:
-        """Radiance as above, and the distance to what is hit (infinite where nothing is). Gradient: to the
-        rays, the surface taken as its tangent plane."""
+        """Radiance as above, and the distance to what is hit (infinite where nothing is). Gradient:
+        to the rays, the surface taken as its tangent plane."""
         import drjit as dr
 
         mi = self.mi
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
         still = dr.detach(ray)
-        found = self.scene.ray_intersect_preliminary(still, coherent=True, active=self._ahead(still))
+        found = self.scene.ray_intersect_preliminary(
+            still, coherent=True, active=self._ahead(still)
+        )
         met = found.is_valid()
         number = self._number(found)
         shown = [self._shown(shape) for shape in self.scene.shapes()] + [self._beyond]
@@ -156,14 +161,14 @@ class MitsubaScene:
         emitter = shape.emitter()
         if emitter is None:
             return self.mi.Float(0)
-        # emission is one-sided by the face: vertex normals are stored to 1 % only and would blacken faces
-        # seen nearly edge-on
+        # emission is one-sided by the face: vertex normals are stored to 1 % only and would blacken
+        # faces seen nearly edge-on
         facing = -dr.dot(si.n, ray.d)
         return self.emitted(shape, emitter, si, dr.abs(facing) if self.both_sides else facing)
 
     def emitted(self, shape: Any, emitter: Any, si: Any, facing: Any) -> Any:
-        """Radiance that an emitter shows on a shape where it is met (drjit arrays); 0 where ``facing`` is
-        negative."""
+        """Radiance that an emitter shows on a shape where it is met (drjit arrays); 0 where
+        ``facing`` is negative."""
         import drjit as dr
 
         si.wi = self.mi.Vector3f(0, 0, facing)
@@ -174,7 +179,8 @@ class MitsubaScene:
         return dr.select(facing > 0, scale * interpolated(self.mi, shape, name, si), 0)
 
     def sky(self, direction: Any) -> Any:
-        """Radiance that comes against directions (drjit arrays) where nothing is met; 0 without a sky."""
+        """Radiance that comes against directions (drjit arrays) where nothing is met; 0 without a
+        sky."""
         import drjit as dr
 
         mi = self.mi
@@ -206,8 +212,8 @@ class MitsubaScene:
 
     @exclusive
     def hit(self, origin_m: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """First surface met by world rays [N, 3]: point [N, 3], normal [N, 3], valid [N]; no gradient,
-        float64 out of float32 geometry."""
+        """First surface met by world rays [N, 3]: point [N, 3], normal [N, 3], valid [N]; no
+        gradient, float64 out of float32 geometry."""
         import drjit as dr
 
         mi = self.mi
@@ -238,15 +244,17 @@ class MitsubaScene:
             return found.compute_surface_interaction(ray, mi.RayFlags.Minimal).n
 
         def of(shape):
-            return lambda ray, found: shape.compute_surface_interaction(ray, found, mi.RayFlags.Minimal).n
+            return lambda ray, found: (
+                shape.compute_surface_interaction(ray, found, mi.RayFlags.Minimal).n
+            )
 
         across = [*map(of, shapes), lambda ray, found: mi.Normal3f(0, 0, 0)]
         return dr.switch(self._number(found), across, ray, found)
 
 
 def _never_black(curve):
-    """Curves of surfaces that show on both sides: an edge that counts from every side counts also from that
-    which its faces turn away from."""
+    """Curves of surfaces that show on both sides: an edge that counts from every side counts also
+    from that which its faces turn away from."""
     if not isinstance(curve, Segments):
         return curve
     return replace(curve, normals=torch.where(curve.always[:, None, None], 0.0, curve.normals))

@@ -9,13 +9,13 @@ from matplotlib.figure import Figure
 
 
 def draw_image(axis: Any, image: Any, of_scale: Sequence[Any], signed: bool = False) -> None:
-    """Draw an image [H, W] into an axis: grey with a display's gamma, or ``signed`` in red (above 0) and
-    blue.
+    """Draw an image [H, W] into an axis: grey with a display's gamma, or ``signed`` in red
+    (above 0) and blue.
 
     Args:
       of_scale: the images that share its scale, itself among them.
-      signed: whether zero is in the middle of the scale. An image [H, W, 3] is shown in its own colours, 0
-        to 1.
+      signed: whether zero is in the middle of the scale. An image [H, W, 3] is shown in its own
+        colours, 0 to 1.
     """
     image = np.asarray(image)
     top = max(float(np.quantile(np.abs(np.asarray(other)), 0.99)) for other in of_scale) or 1.0

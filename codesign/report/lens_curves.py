@@ -1,7 +1,8 @@
-"""Pictures of lens errors over the field, over focus, and over the surfaces: distortion, field curvature,
-through focus, Seidel sums.
+"""Pictures of lens errors over the field, over focus, and over the surfaces: distortion, field
+curvature, through focus, Seidel sums.
 
-at_m, in all of them: metres to the object plane, inf for parallel light. The first wavelength is the reference.
+at_m, in all of them: metres to the object plane, inf for parallel light. The first wavelength is
+the reference.
 """
 
 import math
@@ -68,7 +69,8 @@ def through_focus(
     vignetting: bool = False,
     at_m: float = PARALLEL,
 ) -> Figure:
-    """Figure over the position of the image plane: RMS spot, and MTF of the rays at one frequency."""
+    """Figure over the position of the image plane: RMS spot, and MTF of the rays at one
+    frequency."""
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
     z = np.asarray(defocus_mm, dtype=float)
     sizes = analysis.through_focus_spot_mm(lens, fields_rad, z, light, 24, vignetting, at_m) * 1e3
@@ -87,9 +89,14 @@ def through_focus(
 
 
 def seidel_bars(sums: SeidelSums, wavelength_um: float = D_UM) -> Figure:
-    """Figure of Seidel sums (``SeidelSums``) per surface and, on a scale of its own, in total; in waves."""
-    values, total = (v.detach().numpy() / (wavelength_um * 1e-3) for v in (sums.per_surface, sums.total))
-    figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), width_ratios=[4, 1.2], layout="constrained")
+    """Figure of Seidel sums (``SeidelSums``) per surface and, on a scale of its own, in total; in
+    waves."""
+    values, total = (
+        v.detach().numpy() / (wavelength_um * 1e-3) for v in (sums.per_surface, sums.total)
+    )
+    figure, axes = plt.subplots(
+        1, 2, figsize=(10, 3.6), width_ratios=[4, 1.2], layout="constrained"
+    )
     place = np.arange(len(values))
     for k, (name, colour) in enumerate(zip(SEIDEL_NAMES, SEIDEL_COLOURS, strict=True)):
         axes[0].bar(place + 0.16 * (k - 2), values[:, k], 0.16, color=colour, label=name)
@@ -116,12 +123,16 @@ def encircled_curves(
     """Figure of encircled energy (rays, about their mean) over the radius, a curve per field."""
     figure, axis = plt.subplots(figsize=(7, 3.4), layout="constrained")
     options = {"light": light, "grid": 48, "vignetting": vignetting, "at_m": at_m}
-    largest = max(float(analysis.encircled_radius_mm(lens, field, 1.0, **options)) for field in fields_rad)
+    largest = max(
+        float(analysis.encircled_radius_mm(lens, field, 1.0, **options)) for field in fields_rad
+    )
     radii = torch.linspace(0, 1.02 * largest, 200, dtype=lens.dtype)
     for field, colour in coloured(fields_rad):
         energy = analysis.encircled_energy(lens, field, radii, **options)
         axis.plot(radii.numpy() * 1e3, energy.numpy(), color=colour, label=degrees(field))
-    finish(axis, xlabel="radius (µm)", ylabel="share of rays inside", ylim=(0, 1.02), xlim=(0, None))
+    finish(
+        axis, xlabel="radius (µm)", ylabel="share of rays inside", ylim=(0, 1.02), xlim=(0, None)
+    )
     return figure
 
 
@@ -134,8 +145,8 @@ def depth_curves(
     blur_mm: float,
     wavelength_um: float = D_UM,
 ) -> Figure:
-    """Figure over the distance of the object, even in 1 / distance: RMS spot of each field with the film where it is,
-    and the RMS radius of a disc ``blur_mm`` across as a dashed line."""
+    """Figure over the distance of the object, even in 1 / distance: RMS spot of each field with the
+    film where it is, and the RMS radius of a disc ``blur_mm`` across as a dashed line."""
     vergence = torch.linspace(1 / far_m, 1 / near_m, 129, dtype=lens.dtype)
     sizes = analysis.rms_spot_mm(lens, fields_rad, wavelength_um, 16, 1 / vergence) * 1e3
     figure, axis = plt.subplots(figsize=(7, 3.4), layout="constrained")

@@ -1,7 +1,8 @@
-"""Pictures of what a lens does to light: spots, ray fans, wavefront, point spread, MTF. Each function returns
-a matplotlib Figure.
+"""Pictures of what a lens does to light: spots, ray fans, wavefront, point spread, MTF. Each
+function returns a matplotlib Figure.
 
-at_m, in all of them: metres to the object plane, inf for parallel light. The first wavelength is the reference.
+at_m, in all of them: metres to the object plane, inf for parallel light. The first wavelength is
+the reference.
 """
 
 import math
@@ -38,8 +39,8 @@ def spot_diagrams(
     pixel_mm: float,
     at_m: float = PARALLEL,
 ) -> Figure:
-    """Figure of spot diagrams: a row per lens (dict title -> lens), a column per field, one scale, the pixel
-    drawn in."""
+    """Figure of spot diagrams: a row per lens (dict title -> lens), a column per field, one scale,
+    the pixel drawn in."""
     figure, axes = _grid(len(lenses), len(fields_rad), 3.0, 3.0, sharex=True, sharey=True)
     half = pixel_mm * 500
     for row, (title, lens) in zip(axes, lenses.items(), strict=True):
@@ -48,7 +49,10 @@ def spot_diagrams(
             p = (p - p[w > 0].mean(0))[w > 0] * 1e3
             axis.plot(*p.T.numpy(), ".", ms=2, color=COLOURS[0])
             axis.plot(
-                [-half, half, half, -half, -half], [-half, -half, half, half, -half], color="#c0392b", lw=1
+                [-half, half, half, -half, -half],
+                [-half, -half, half, half, -half],
+                color="#c0392b",
+                lw=1,
             )
             rms = float(p.square().sum(1).mean().sqrt())
             axis.set_title(f"{title}, {math.degrees(field):.1f}°\nRMS {rms:.1f} µm", fontsize=9)
@@ -67,16 +71,21 @@ def spots_by_wavelength(
     vignetting: bool = False,
     at_m: float = PARALLEL,
 ) -> Figure:
-    """Figure of spots of each field about the chief ray, a colour per wavelength, with the Airy disc."""
+    """Figure of spots of each field about the chief ray, a colour per wavelength, with the Airy
+    disc."""
     lines = list(_lines(light))
     first_um = lines[0][0]
     figure, axes = _grid(1, len(fields_rad), 3.1, 3.4, sharex=True, sharey=True)
     airy = 1.22 * first_um * float(lens.first_order(first_um).fno.abs())
     for axis, field in zip(axes[0], fields_rad, strict=True):
-        points, weight = analysis.polychromatic_spot(lens, field, light, grid, vignetting, at_m=at_m)
+        points, weight = analysis.polychromatic_spot(
+            lens, field, light, grid, vignetting, at_m=at_m
+        )
         centre = analysis.chief_ray(lens, field, first_um, at_m=at_m).position_mm[0]
         for p, w, (_, colour, label) in zip(points, weight, lines, strict=True):
-            axis.plot(*((p[w > 0] - centre) * 1e3).T.numpy(), ".", ms=1.8, color=colour, label=label)
+            axis.plot(
+                *((p[w > 0] - centre) * 1e3).T.numpy(), ".", ms=1.8, color=colour, label=label
+            )
         axis.add_patch(plt.Circle((0, 0), airy, fill=False, color="k", lw=0.9, zorder=5))  # pyright: ignore[reportPrivateImportUsage]
         rms = 1e3 * float(analysis.spot_radius_mm(points, weight))
         axis.set_title(f"{degrees(field)}, RMS {rms:.1f} µm", fontsize=9)
@@ -95,8 +104,8 @@ def ray_fans(
     vignetting: bool = False,
     at_m: float = PARALLEL,
 ) -> Figure:
-    """Figure of ray fans: transverse aberration (upper) and optical path difference (lower) over the pupil, a
-    pair of columns per field, relative to the chief ray."""
+    """Figure of ray fans: transverse aberration (upper) and optical path difference (lower) over
+    the pupil, a pair of columns per field, relative to the chief ray."""
     lines = list(_lines(light))
     figure, axes = _grid(2, 2 * len(fields_rad), 1.7, 2.3, sharey="row", sharex=True)
     for k, field in enumerate(fields_rad):
@@ -129,10 +138,13 @@ def opd_maps(
     vignetting: bool = False,
     at_m: float = PARALLEL,
 ) -> Figure:
-    """Figure of optical path difference maps over the pupil, piston and tilt removed, one scale in waves."""
+    """Figure of optical path difference maps over the pupil, piston and tilt removed, one scale in
+    waves."""
     column, row = ((analysis.pupil_grid(grid, lens.dtype) + 1) / 2 * grid).long().unbind(1)
     fronts = [
-        analysis.remove_fit(analysis.wavefront(lens, field, wavelength_um, grid, vignetting, at_m=at_m))
+        analysis.remove_fit(
+            analysis.wavefront(lens, field, wavelength_um, grid, vignetting, at_m=at_m)
+        )
         for field in fields_rad
     ]
     limit = max(float(f.waves[f.weight > 0].abs().max()) for f in fronts) or 1e-12
@@ -151,14 +163,16 @@ def opd_maps(
 
 
 def psf_pictures(psfs: Sequence[Psf], titles: Sequence[str]) -> Figure:
-    """Figure of point spreads (list of ``Psf``), each over its own peak on a logarithmic scale. Axes in µm
-    about the reference point."""
+    """Figure of point spreads (list of ``Psf``), each over its own peak on a logarithmic scale.
+    Axes in µm about the reference point."""
     figure, axes = _grid(1, len(psfs), 2.9, 3.0)
     for axis, psf, title in zip(axes[0], psfs, titles, strict=True):
         energy = psf.energy.detach().numpy()
         x, y = (energy.shape[0] / 2 * float(p) * 1e3 for p in psf.pitch_mm.detach())
         picture = np.maximum(energy / max(energy.max(), 1e-300), FLOOR)
-        axis.imshow(picture, origin="lower", extent=(-x, x, -y, y), cmap="magma", norm=LogNorm(FLOOR, 1))
+        axis.imshow(
+            picture, origin="lower", extent=(-x, x, -y, y), cmap="magma", norm=LogNorm(FLOOR, 1)
+        )
         axis.set(xlabel="x (µm)")
         axis.set_title(title, fontsize=9)
     axes[0, 0].set_ylabel("y (µm)")
@@ -225,5 +239,7 @@ def _lines(light: analysis.Light) -> Iterator[tuple[float, str, str]]:
 def _legend(figure, axes, **options):
     """The figure with the legend of its first axis above all."""
     handles = axes[0, 0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside upper center", ncols=5, frameon=False, fontsize=8, **options)
+    figure.legend(
+        *handles, loc="outside upper center", ncols=5, frameon=False, fontsize=8, **options
+    )
     return figure

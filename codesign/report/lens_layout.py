@@ -46,10 +46,13 @@ def lens_layout(
     """Figure of a lens's cross-section with meridional rays.
 
     Args:
-      fields_rad: angles; None takes 0, 0.7 and 1 of the lens's half field (10 degrees where none is known).
+      fields_rad: angles; None takes 0, 0.7 and 1 of the lens's half field (10 degrees where none is
+        known).
       path: where to save, .svg, .png or .pdf, or None.
-      at_m: metres from the entrance pupil to the object plane. Mirrors are drawn along the unfolded axis.
-    Returns: matplotlib Figure. Raises: FileFormatError for another ending or a place that is not writable.
+      at_m: metres from the entrance pupil to the object plane. Mirrors are drawn along the unfolded
+        axis.
+    Returns: matplotlib Figure. Raises: FileFormatError for another ending or a place that is not
+      writable.
     """
     if path is not None and Path(path).suffix.lower() not in ENDINGS:
         raise FileFormatError(
@@ -68,7 +71,9 @@ def lens_layout(
 
 def layouts(lenses: Mapping[str, GeoLens], fields_rad: Sequence[float]) -> Figure:
     """Figure of several lenses above one another: dict title -> lens."""
-    figure, axes = plt.subplots(len(lenses), 1, figsize=(9, 3.0 * len(lenses)), sharex=True, squeeze=False)
+    figure, axes = plt.subplots(
+        len(lenses), 1, figsize=(9, 3.0 * len(lenses)), sharex=True, squeeze=False
+    )
     for axis, (title, lens) in zip(axes[:, 0], lenses.items(), strict=True):
         draw_layout(axis, lens, fields_rad)
         axis.set_title(title, loc="left")
@@ -79,8 +84,8 @@ def layouts(lenses: Mapping[str, GeoLens], fields_rad: Sequence[float]) -> Figur
 def draw_layout(
     axis: Axes, lens: GeoLens, fields_rad: Sequence[float], rays: int = 5, at_m: float = PARALLEL
 ) -> None:
-    """Draw the cross-section of a lens with meridional rays of each field into a matplotlib axis. Lengths in
-    mm."""
+    """Draw the cross-section of a lens with meridional rays of each field into a matplotlib axis.
+    Lengths in mm."""
     surfaces = lens.to_surfaces()
     *vertices, film = np.cumsum([0.0, *(s.thickness_mm for s in surfaces)])
     outlines = [_outline(s, at) for s, at in zip(surfaces, vertices, strict=True)]
@@ -126,8 +131,8 @@ def draw_layout(
 def ray_paths(
     lens: GeoLens, field_rad: float, pupil: Tensor, start_z_mm: float, at_m: float = PARALLEL
 ) -> list[np.ndarray]:
-    """Polylines [points, 2] (z, y) in mm of the rays of a field that arrive, found by tracing them up to each
-    surface."""
+    """Polylines [points, 2] (z, y) in mm of the rays of a field that arrive, found by tracing them
+    up to each surface."""
     rays = field_rays(lens, field_rad, pupil, start_z_mm=start_z_mm, at_m=at_m)
     end = lens.trace(*rays)
     vertices = [0.0, *lens.thickness_mm.cumsum(0).tolist()]
@@ -144,11 +149,14 @@ def _outline(surface, vertex_mm, height_mm=None):
     """(z, y) of a surface out to its semi-aperture, in mm."""
     reach = surface.semi_aperture_mm if height_mm is None else height_mm
     y = torch.linspace(-reach, reach, 121, dtype=torch.float64)
-    return vertex_mm + sag_mm(y, surface.curvature_per_mm, surface.conic, surface.asphere).numpy(), y.numpy()
+    return vertex_mm + sag_mm(
+        y, surface.curvature_per_mm, surface.conic, surface.asphere
+    ).numpy(), y.numpy()
 
 
 def _draw_glass(axis, faces):
-    """A piece of glass between two outlines; the smaller face gets a flat rim out to the larger one's edge."""
+    """A piece of glass between two outlines; the smaller face gets a flat rim out to the larger
+    one's edge."""
     rim = max(y[-1] for _, y in faces)
     (za, ya), (zb, yb) = (
         (np.concatenate([z[:1], z, z[-1:]]), np.concatenate([[-rim], y, [rim]])) for z, y in faces

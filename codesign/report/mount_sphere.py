@@ -21,11 +21,12 @@ def mount_sphere(
     label: str,
     marked: Mapping[str, tuple[float, float]] | None = None,
 ) -> Figure:
-    """Figure of a sphere of directions in equal areas (Mollweide), as seen from the body: ahead is the middle, left is
-    left, down is below.
+    """Figure of a sphere of directions in equal areas (Mollweide), as seen from the body: ahead is
+    the middle, left is left, down is below.
 
     Args:
-      yaw_rad: [columns], pitch_rad: [rows] middles of cells of equal angles, as of ``mount.sight_map``.
+      yaw_rad: [columns], pitch_rad: [rows] middles of cells of equal angles, as of
+        ``mount.sight_map``.
       values: [rows, columns] > 0, on a logarithmic scale.
       label: of them.
       marked: name -> yaw and pitch of directions to mark.
@@ -38,7 +39,12 @@ def mount_sphere(
     # yaw grows to the left and pitch downwards
     shown = values.detach().numpy()[::-1, ::-1]
     mesh = axes.pcolormesh(
-        across, upwards, shown, norm=LogNorm(shown.min(), shown.max()), cmap="viridis_r", shading="flat"
+        across,
+        upwards,
+        shown,
+        norm=LogNorm(shown.min(), shown.max()),
+        cmap="viridis_r",
+        shading="flat",
     )
     axes.grid(color="white", lw=0.5, alpha=0.4)
     # as the body looks: yaw to the left
@@ -47,7 +53,21 @@ def mount_sphere(
     bar = figure.colorbar(mesh, shrink=0.8, label=label)
     bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     for k, (name, (yaw, pitch)) in enumerate((marked or {}).items()):
-        axes.plot([-yaw], [-pitch], "o", mfc="white", mec=COLOURS[k % len(COLOURS)], mew=2, ms=8, label=name)
+        axes.plot(
+            [-yaw],
+            [-pitch],
+            "o",
+            mfc="white",
+            mec=COLOURS[k % len(COLOURS)],
+            mew=2,
+            ms=8,
+            label=name,
+        )
     if marked:
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=min(len(marked), 5), frameon=False)
+        axes.legend(
+            loc="upper center",
+            bbox_to_anchor=(0.5, -0.02),
+            ncols=min(len(marked), 5),
+            frameon=False,
+        )
     return figure

@@ -48,8 +48,8 @@ class Table:
 
 @dataclass
 class Section:
-    """A heading and what stands below it, in order: ("prose", HTML), ("picture", Picture) or ("table",
-    Table)."""
+    """A heading and what stands below it, in order: ("prose", HTML), ("picture", Picture) or
+    ("table", Table)."""
 
     title: str
     blocks: list[tuple[str, Any]] = field(default_factory=list)
@@ -63,7 +63,9 @@ def picture(path: str | Path, caption: str) -> Picture:
     path = Path(path)
     media = MEDIA.get(path.suffix.lower())
     if media is None:
-        raise FileFormatError(f"'{path}' cannot be shown on the page; give one of {', '.join(MEDIA)}.")
+        raise FileFormatError(
+            f"'{path}' cannot be shown on the page; give one of {', '.join(MEDIA)}."
+        )
     try:
         return Picture(media, base64.b64encode(path.read_bytes()).decode(), caption)
     except OSError as error:
@@ -78,8 +80,8 @@ def table(
     rows: Iterable[Iterable[Any]],
     caption: str = "",
 ) -> Table:
-    """Table of numbers, text and None (shown as a dash). A column of numbers is right-aligned; floats show
-    four digits.
+    """Table of numbers, text and None (shown as a dash). A column of numbers is right-aligned;
+    floats show four digits.
 
     Raises: ShapeError when a row has not one cell per column.
     """
@@ -97,7 +99,8 @@ def table(
 
 
 def cell(value: Any) -> str:
-    """Text of a table cell: four digits of a float, all of an integer, yes or no, a dash for None."""
+    """Text of a table cell: four digits of a float, all of an integer, yes or no, a dash for
+    None."""
     if value is None:
         return "–"
     if isinstance(value, bool):
@@ -123,11 +126,12 @@ def render_page(
     """HTML text of the page.
 
     Args:
-      title: heading. lead: one paragraph that says what was done and what came out (see prose.to_html).
+      title: heading. lead: one paragraph that says what was done and what came out
+        (see prose.to_html).
       cards: list of Card, the headline figures.
       sections: list of Section.
-      facts: dictionary of folded tables at the end, heading -> {name: value} (configuration, versions,
-        hardware).
+      facts: dictionary of folded tables at the end, heading -> {name: value} (configuration,
+        versions, hardware).
     Returns: text of a self-contained HTML file.
     Raises: DomainError when the title is empty.
     """

@@ -1,5 +1,5 @@
-"""A small markdown for the page of a run: paragraphs, lists, **bold**, *emphasis*, `code`. Everything else is
-text."""
+"""A small markdown for the page of a run: paragraphs, lists, **bold**, *emphasis*, `code`.
+Everything else is text."""
 
 import re
 
@@ -13,10 +13,12 @@ _MARKS = (
 
 
 def to_html(text: str) -> Markup:
-    """HTML of ``text``; blank lines separate paragraphs, and a block whose lines all start with "- " is a
-    list. Markup in it is shown, not used."""
+    """HTML of ``text``; blank lines separate paragraphs, and a block whose lines all start with "-
+    " is a list. Markup in it is shown, not used."""
     return Markup(
-        "\n".join(_block(block.strip()) for block in re.split(r"\n\s*\n", text.strip()) if block.strip())
+        "\n".join(
+            _block(block.strip()) for block in re.split(r"\n\s*\n", text.strip()) if block.strip()
+        )
     )
 
 

@@ -16,13 +16,16 @@ SMALL = 0.08
 
 
 def draw_robot(axis: Any, triangles: np.ndarray, shade: np.ndarray, lines: np.ndarray) -> None:
-    """Draw triangles [F, 3, 3] m in greys [F] 0..1, and lines [L, 2, 3] m of a view, into a 3-D axis of matplotlib."""
+    """Draw triangles [F, 3, 3] m in greys [F] 0..1, and lines [L, 2, 3] m of a view, into a 3-D
+    axis of matplotlib."""
     across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     kept = np.argsort(-np.linalg.norm(across, axis=1))[:MOST_DRAWN]
     longest = SMALL * np.ptp(triangles.reshape(-1, 3), axis=0).max()
     drawn, grey = cut(triangles[kept], shade[kept], longest)
     colours = np.repeat(grey[:, None], 3, 1)
-    axis.add_collection3d(Poly3DCollection(drawn, facecolors=colours, edgecolors=colours, linewidths=0.2))
+    axis.add_collection3d(
+        Poly3DCollection(drawn, facecolors=colours, edgecolors=colours, linewidths=0.2)
+    )
     axis.add_collection3d(Line3DCollection(list(lines), colors="tab:red", linewidths=1.2))
     points = np.concatenate([triangles.reshape(-1, 3), lines.reshape(-1, 3)])
     low, high = points.min(0), points.max(0)
@@ -41,7 +44,8 @@ def draw_robot(axis: Any, triangles: np.ndarray, shade: np.ndarray, lines: np.nd
 
 
 def cut(triangles: np.ndarray, shade: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles [F, 3, 3] and their shades, cut into four at the middles of their edges until those are short."""
+    """Triangles [F, 3, 3] and their shades, cut into four at the middles of their edges until those
+    are short."""
     done = []
     while len(triangles):
         edges = np.linalg.norm(triangles - np.roll(triangles, -1, 1), axis=2).max(1)
@@ -56,10 +60,13 @@ def cut(triangles: np.ndarray, shade: np.ndarray, longest: float) -> tuple[np.nd
 
 
 def view_lines(camera: Camera, T_robot_cam: torch.Tensor, length_m: float) -> np.ndarray:
-    """The view as lines [8, 2, 3] in the robot's axes: to the corners of the sensor at a depth, and around them."""
+    """The view as lines [8, 2, 3] in the robot's axes: to the corners of the sensor at a depth, and
+    around them."""
     film = camera.film
     half = torch.tensor([film.sensor_width_px, film.sensor_height_px]).double() / 2
-    corners_px = film.middle_px + half * torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]]).double()
+    corners_px = (
+        film.middle_px + half * torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]]).double()
+    )
     rays = camera.chief_rays(corners_px)
     direction = rays.direction.double().reshape(-1, 3)
     ends = pose.apply(T_robot_cam, length_m * direction / direction[:, 2:]).detach().numpy()

@@ -14,14 +14,15 @@ from codesign.types import FlowField
 class Batch:
     """Trajectories before a scene, or before several.
 
-    T_world_body: [..., T, 4, 4] poses of the body at the times t_s [T], metres; of the camera itself where the
-      system has no mount. None where the system has a trajectory of its own.
+    T_world_body: [..., T, 4, 4] poses of the body at the times t_s [T], metres; of the camera
+      itself where the system has no mount. None where the system has a trajectory of its own.
     t_s: [T] seconds, strictly increasing.
-    scene: whatever the render stage takes; a tuple of scenes, one per first index of the poses; None where
-      the system has one.
-    seed: of film samples and sensor noise; None keeps the camera's samples (and its seed for the noise).
-    truth: the true flow as recorded, in the layout of the estimator's; None has it computed through the lens
-      where an objective asks for it.
+    scene: whatever the render stage takes; a tuple of scenes, one per first index of the poses;
+      None where the system has one.
+    seed: of film samples and sensor noise; None keeps the camera's samples (and its seed for the
+      noise).
+    truth: the true flow as recorded, in the layout of the estimator's; None has it computed through
+      the lens where an objective asks for it.
     """
 
     T_world_body: Tensor | None
@@ -32,10 +33,13 @@ class Batch:
 
 
 def check_batch(batch: Any, scene: Any, has_trajectory: bool) -> None:
-    """Raise ShapeError or DomainError with one sentence where poses, times and scenes do not belong together."""
+    """Raise ShapeError or DomainError with one sentence where poses, times and scenes do not belong
+    together."""
     poses = batch.T_world_body
     if scene is None:
-        raise DomainError("the render stage has no scene; give Batch(scene=...) or System(scene=...).")
+        raise DomainError(
+            "the render stage has no scene; give Batch(scene=...) or System(scene=...)."
+        )
     if poses is None:
         if not has_trajectory:
             raise DomainError(

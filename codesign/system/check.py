@@ -1,4 +1,5 @@
-"""What to ask of a system before the first step: do its stages fit, and does every variable reach an objective?"""
+"""What to ask of a system before the first step: do its stages fit, and does every variable reach
+an objective?"""
 
 import contextlib
 import time
@@ -32,19 +33,20 @@ def check(
 ) -> Result:
     """Run one pass, and raise or warn with one sentence where something does not fit.
 
-    What a stage passes on is proven: one vector-Jacobian product from what it makes to what it gets, and where that is
-    nothing, differences (the stage three times more). What that cost is ``check_passes`` of the Result, in passes.
-    Args:
-      variables: what will be optimised: an optimiser, or its tensors; the system's parameters that ask for
-        gradients when None.
+    What a stage passes on is proven: one vector-Jacobian product from what it makes to what it
+    gets, and where that is nothing, differences (the stage three times more). What that cost is
+    ``check_passes`` of the Result, in passes. Args:
+      variables: what will be optimised: an optimiser, or its tensors; the system's parameters that
+        ask for gradients when None.
       objectives: names of those in use; all when None.
       recorded: as for the System.
       may_cut: stages that pass no gradient on, or not all of it, on purpose.
     Returns: the probed Result of the pass.
-    Raises: ShapeError, DomainError where stages, batch and scene do not fit, or a stage changes in place what it is given;
-      GradientError for a stage that cuts the gradient of what is optimised, tensors that a function hides from the
-      system, a frozen variable, one that no objective depends on, or an objective that is no scalar or depends on none;
-      NonFiniteError naming a junction.
+    Raises: ShapeError, DomainError where stages, batch and scene do not fit, or a stage changes in
+      place what it is given; GradientError for a stage that cuts the gradient of what is optimised,
+      tensors that a function hides from the system, a frozen variable, one that no objective
+      depends on, or an objective that is no scalar or depends on none; NonFiniteError naming a
+      junction.
     Warns: of variables whose gradient is exactly 0; of frames on 0 to 1 and times in milliseconds.
     """
     began = time.perf_counter()
@@ -89,8 +91,8 @@ def check(
 
 
 def _check_reach(run: Pass, objectives: dict[str, Tensor], wanted, names, given: bool) -> None:
-    """Raise GradientError for objectives and variables that have nothing to do with one another; warn of variables
-    that move nothing in this batch."""
+    """Raise GradientError for objectives and variables that have nothing to do with one another;
+    warn of variables that move nothing in this batch."""
     reached = [False] * len(wanted)
     felt = [False] * len(wanted)
     for name, value in objectives.items():
@@ -107,11 +109,15 @@ def _check_reach(run: Pass, objectives: dict[str, Tensor], wanted, names, given:
                 "in this batch, or no event comes about; give motion, texture, or lower thresholds."
             )
         reached = [yes or g is not None for yes, g in zip(reached, found, strict=True)]
-        felt = [yes or (g is not None and bool(g.any())) for yes, g in zip(felt, found, strict=True)]
+        felt = [
+            yes or (g is not None and bool(g.any())) for yes, g in zip(felt, found, strict=True)
+        ]
     for number, variable in enumerate(wanted if given else []):
         if not reached[number]:
             stale = (
-                "" if id(variable) in names else " (no parameter of the system: made before its variables?)"
+                ""
+                if id(variable) in names
+                else " (no parameter of the system: made before its variables?)"
             )
             raise GradientError(
                 f"no objective ({', '.join(objectives)}) depends on {_name(names, variable, number)}{stale}; "
@@ -143,16 +149,20 @@ def _gradients(value: Tensor, wanted) -> list[Tensor | None]:
 
 
 def _check_hidden(system: System, wanted: list[Tensor], objectives: tuple[str, ...] | None) -> None:
-    """Raise GradientError for a stage with tensors of its own that the system does not know, unless they are optimised
-    all the same, or only some of the system's are."""
+    """Raise GradientError for a stage with tensors of its own that the system does not know, unless
+    they are optimised all the same, or only some of the system's are."""
     learnable = {id(p) for p in system.parameters() if p.requires_grad}
     if not learnable <= {id(tensor) for tensor in wanted}:
         return
     known = {id(p) for p in (*system.parameters(), *wanted)}
     parts = {name: getattr(system, name) for name in STAGES}
-    parts |= {f"objective {name}": system.named_objectives[name] for name in system.chosen(objectives)}
+    parts |= {
+        f"objective {name}": system.named_objectives[name] for name in system.chosen(objectives)
+    }
     for name, part in parts.items():
-        found = [(owner, tensor) for owner, tensor in hidden_tensors(part) if id(tensor) not in known]
+        found = [
+            (owner, tensor) for owner, tensor in hidden_tensors(part) if id(tensor) not in known
+        ]
         if found:
             raise GradientError(
                 f"stage '{name}' ({label(part)}) holds {found[0][0]} where the system does not see it "
@@ -162,8 +172,8 @@ def _check_hidden(system: System, wanted: list[Tensor], objectives: tuple[str, .
 
 
 def _check_fresh(system: System) -> None:
-    """Raise GradientError for a lens whose tensors were computed once from variables: a second backward pass would
-    go through a graph that is gone."""
+    """Raise GradientError for a lens whose tensors were computed once from variables: a second
+    backward pass would go through a graph that is gone."""
     lens = system.camera.lens if hasattr(system.camera, "rays") else None
     buffers = list(lens.buffers()) if isinstance(lens, torch.nn.Module) else []
     if any(tensor.grad_fn is not None for tensor in buffers):

@@ -1,4 +1,5 @@
-"""The tensors inside what crosses a junction, and those that a function holds without showing them."""
+"""The tensors inside what crosses a junction, and those that a function holds without showing
+them."""
 
 import dataclasses
 import dis
@@ -20,12 +21,15 @@ def tensors_in(value: Any) -> list[Tensor]:
 
 
 def mapped(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
-    """The same value with its tensors changed: those inside dataclasses, tuples, lists and dictionaries too."""
+    """The same value with its tensors changed: those inside dataclasses, tuples, lists and
+    dictionaries too."""
     if isinstance(value, Tensor):
         return change(value)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         names = [field.name for field in dataclasses.fields(value) if field.init]
-        return dataclasses.replace(value, **{name: mapped(getattr(value, name), change) for name in names})
+        return dataclasses.replace(
+            value, **{name: mapped(getattr(value, name), change) for name in names}
+        )
     if type(value) in (list, tuple):
         return type(value)(mapped(each, change) for each in value)
     if isinstance(value, dict):
@@ -34,10 +38,11 @@ def mapped(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
 
 
 def hidden_tensors(part: Any) -> list[tuple[str, Tensor]]:
-    """Tensors that ask for gradients behind a Module, function or object, each with what it was found in.
+    """Tensors that ask for gradients behind a Module, function or object, each with what it was
+    found in.
 
-    Looked through are attributes, containers, partials, defaults and closures, and of the globals that a function names
-    Modules, tensors and what is of the same file.
+    Looked through are attributes, containers, partials, defaults and closures, and of the globals
+    that a function names Modules, tensors and what is of the same file.
     """
     found: list[tuple[str, Tensor]] = []
     seen: set[int] = set()
@@ -51,15 +56,22 @@ def hidden_tensors(part: Any) -> list[tuple[str, Tensor]]:
             if value.is_leaf and value.requires_grad:
                 found.append((owner, value))
             continue
-        owner = f"a {type(value).__name__}" if isinstance(value, nn.Module) and owner == "a tensor" else owner
+        owner = (
+            f"a {type(value).__name__}"
+            if isinstance(value, nn.Module) and owner == "a tensor"
+            else owner
+        )
         inner = gc.get_referents(value)
         if isinstance(value, FunctionType):
-            names = {step.argval for step in dis.get_instructions(value) if step.opname == "LOAD_GLOBAL"}
+            names = {
+                step.argval for step in dis.get_instructions(value) if step.opname == "LOAD_GLOBAL"
+            }
             used = [value.__globals__[name] for name in names if name in value.__globals__]
             inner = [each for each in inner if each is not value.__globals__] + [
                 each
                 for each in used
-                if isinstance(each, nn.Module | Tensor) or getattr(each, "__module__", "") == value.__module__
+                if isinstance(each, nn.Module | Tensor)
+                or getattr(each, "__module__", "") == value.__module__
             ]
         todo += [(owner, each) for each in inner]
     return found

@@ -1,5 +1,5 @@
-"""The mount that was found, for those who build it: a transform between named frames in YAML, lens, sensor and camera
-beside it. It loads back to the same bits."""
+"""The mount that was found, for those who build it: a transform between named frames in YAML, lens,
+sensor and camera beside it. It loads back to the same bits."""
 
 import hashlib
 from collections.abc import Mapping
@@ -34,9 +34,9 @@ The section mount rebuilds the learnable mount to the last bit; leave it out to 
 class HandOver:
     """What is handed over.
 
-    mount, camera: as found; the camera has its lens. sensor: of the events, or None. parent_frame, child_frame: names of
-    the robot's link (REP 105: base_link, base_footprint) and of the camera's optical frame. notes: what was measured,
-    name -> number or text.
+    mount, camera: as found; the camera has its lens. sensor: of the events, or None. parent_frame,
+    child_frame: names of the robot's link (REP 105: base_link, base_footprint) and of the camera's
+    optical frame. notes: what was measured, name -> number or text.
     """
 
     mount: Mount
@@ -50,12 +50,14 @@ class HandOver:
 def save_hand_over(path: str | Path, handed: HandOver) -> None:
     """Write a mount to a .yaml file, and a traced lens to a .lens.json beside it.
 
-    Raises: DomainError for a frame without a name, a lens that no file keeps or a camera whose film has other parts;
-      FileFormatError where the place is not writable.
+    Raises: DomainError for a frame without a name, a lens that no file keeps or a camera whose film
+      has other parts; FileFormatError where the place is not writable.
     """
     path = Path(path)
     if path.suffix.lower() not in (".yaml", ".yml"):
-        raise FileFormatError(f"hand-over {path}: extension '{path.suffix}' is not written; use .yaml.")
+        raise FileFormatError(
+            f"hand-over {path}: extension '{path.suffix}' is not written; use .yaml."
+        )
     for name in (handed.parent_frame, handed.child_frame):
         _check_frame(name)
     pose = handed.mount().detach()
@@ -69,29 +71,37 @@ def save_hand_over(path: str | Path, handed: HandOver) -> None:
         **{name: getattr(camera, name) for name in ("samples_per_pixel", "seed", "falloff", "aim")},
     }
     if camera.spectrum is not None:
-        page["camera"]["wavelengths_um"] = [float(value) for value in camera.spectrum.wavelengths_um]
+        page["camera"]["wavelengths_um"] = [
+            float(value) for value in camera.spectrum.wavelengths_um
+        ]
         page["camera"]["weights"] = [float(value) for value in camera.spectrum.weights]
     if handed.sensor is not None:
         page["sensor"] = asdict(handed.sensor)
     if handed.notes:
         page["notes"] = dict(handed.notes)
-    page["mount"] = {name: value.detach().tolist() for name, value in handed.mount.state_dict().items()}
+    page["mount"] = {
+        name: value.detach().tolist() for name, value in handed.mount.state_dict().items()
+    }
     write_atomic(path, plain_yaml.dump(page, COMMENT).encode())
 
 
 def load_hand_over(path: str | Path) -> HandOver:
     """Read what ``save_hand_over`` wrote: the same mount, lens, camera and sensor, to the last bit.
 
-    A file without the section mount holds the pose of its transform. The file is data: nothing in it is run, and it
-    names no file outside its own folder.
+    A file without the section mount holds the pose of its transform. The file is data: nothing in
+    it is run, and it names no file outside its own folder.
     Raises: FileFormatError, in a sentence that names what is missing, unknown or at odds.
     """
     path = Path(path)
     with building(f"hand-over {path}", "give a .yaml file that save_hand_over wrote"):
         page = plain_yaml.load(read_text(path))
         if page.get("format") != FORMAT:
-            raise FileFormatError(f"it has no line 'format: \"{FORMAT}\"'; write it with save_hand_over.")
-        missing = [name for name in ("transform", "camera", "lens") if not isinstance(page.get(name), dict)]
+            raise FileFormatError(
+                f"it has no line 'format: \"{FORMAT}\"'; write it with save_hand_over."
+            )
+        missing = [
+            name for name in ("transform", "camera", "lens") if not isinstance(page.get(name), dict)
+        ]
         if missing:
             raise FileFormatError(f"the entry '{missing[0]}' is missing; write it anew.")
         transform = page["transform"]
@@ -125,9 +135,13 @@ def _transform(pose, handed):
 
 def _pose(page):
     pose = torch.eye(4, dtype=torch.float64)
-    quaternion = torch.tensor([page["rotation_quaternion"][axis] for axis in "xyzw"], dtype=torch.float64)
+    quaternion = torch.tensor(
+        [page["rotation_quaternion"][axis] for axis in "xyzw"], dtype=torch.float64
+    )
     if not abs(float(quaternion.norm()) - 1) < 1e-6:
-        raise DomainError(f"the quaternion has length {float(quaternion.norm()):.6g}; give one of length 1.")
+        raise DomainError(
+            f"the quaternion has length {float(quaternion.norm()):.6g}; give one of length 1."
+        )
     pose[:3, :3] = torch.from_numpy(Rotation.from_quat(quaternion.numpy()).as_matrix())
     pose[:3, 3] = torch.tensor([page["translation_m"][axis] for axis in "xyz"], dtype=torch.float64)
     return pose
@@ -138,7 +152,9 @@ def _mount(page, pose: Tensor) -> Mount:
         held = Mount(pose[:3, 3], (0.0, 0.0, 0.0))
         held.start_attitude.copy_(pose[:3, :3])
         return held
-    state = {name: torch.tensor(value, dtype=torch.float64) for name, value in page["mount"].items()}
+    state = {
+        name: torch.tensor(value, dtype=torch.float64) for name, value in page["mount"].items()
+    }
     mount = Mount((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     mount.load_state_dict(state)
     off = float((mount().detach() - pose).abs().max())
@@ -154,7 +170,9 @@ def _lens_page(lens, path):
     lens = lens.replace() if hasattr(lens, "replace") else lens  # its values now, of variables too
     dtype = str(getattr(lens, "dtype", torch.float64)).removeprefix("torch.")
     if isinstance(lens, lenses.ThinLens):
-        efl_mm, image_mm = (float(value.detach()) for value in (lens.efl_mm, lens.image_distance_mm))
+        efl_mm, image_mm = (
+            float(value.detach()) for value in (lens.efl_mm, lens.image_distance_mm)
+        )
         page = {"kind": "thin", "dtype": dtype, "efl_mm": efl_mm}
         page["entrance_pupil_diameter_mm"] = lens.entrance_pupil_diameter_mm
         return page if image_mm == efl_mm else {**page, "image_distance_mm": image_mm}
@@ -175,9 +193,13 @@ def _lens(page, path):
         image = page.get("image_distance_mm")
         if diameter == 0 and image is None:
             return lenses.Pinhole(efl)
-        return lenses.ThinLens(efl, diameter, None if image is None else torch.tensor(image, dtype=dtype))
+        return lenses.ThinLens(
+            efl, diameter, None if image is None else torch.tensor(image, dtype=dtype)
+        )
     if page["kind"] != "traced":
-        raise DomainError(f"a lens of the kind {page['kind']!r} is not known; there are 'thin' and 'traced'.")
+        raise DomainError(
+            f"a lens of the kind {page['kind']!r} is not known; there are 'thin' and 'traced'."
+        )
     file = path.parent / page["file"]
     if Path(page["file"]).name != page["file"]:
         raise DomainError(
@@ -207,5 +229,11 @@ def _camera(page, lens):
         spectrum = lenses.Spectrum(tuple(rest.pop("wavelengths_um")), tuple(rest.pop("weights")))
     made = render.Film(**film)
     return render.Camera(
-        lens, made.width_px, made.height_px, made.pixel_pitch_mm, film=made, spectrum=spectrum, **rest
+        lens,
+        made.width_px,
+        made.height_px,
+        made.pixel_pitch_mm,
+        film=made,
+        spectrum=spectrum,
+        **rest,
     )

@@ -1,4 +1,5 @@
-"""What stands at every junction: kinds, shapes, dtypes and devices in every pass, values where a pass is looked at."""
+"""What stands at every junction: kinds, shapes, dtypes and devices in every pass, values where a
+pass is looked at."""
 
 import warnings
 from typing import Any
@@ -32,7 +33,8 @@ def check_layout(
     shape: str | tuple[int, ...] = "",
     **sizes: int,
 ) -> None:
-    """Raise unless a value is of a kind and its tensors have their layouts, with the sizes that letters stand for.
+    """Raise unless a value is of a kind and its tensors have their layouts, with the sizes that
+    letters stand for.
 
     Args:
       by: subject and verb of the sentence, such as "stage 'flow' returned".
@@ -49,12 +51,14 @@ def check_layout(
         check(tensor, axes, what, (torch.bool,) if name == "valid" else (), sizes=sizes)
         devices.append(tensor.device)
     if len(set(devices)) > 1:
-        raise DomainError(f"{by} tensors on {' and '.join(sorted(map(str, set(devices))))}; use one device.")
+        raise DomainError(
+            f"{by} tensors on {' and '.join(sorted(map(str, set(devices))))}; use one device."
+        )
 
 
 def look_at(by: str, value: Any) -> None:
-    """Warn of frames on 0 to 1, and raise DomainError for numbers of events below 0, further than rounding takes
-    them."""
+    """Warn of frames on 0 to 1, and raise DomainError for numbers of events below 0, further than
+    rounding takes them."""
     tensor = value.counts if isinstance(value, EventVolume) else value
     low, high = (float(bound) for bound in tensor.detach().aminmax())
     if tensor is not value and low < -1e-4 * max(high, 1e-3):

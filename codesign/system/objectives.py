@@ -1,4 +1,5 @@
-"""Objectives of a flow system in task units, and the seed project's edge energy; stages to hand to ``System``."""
+"""Objectives of a flow system in task units, and the seed project's edge energy; stages to hand to
+``System``."""
 
 import torch
 from kornia.filters import spatial_gradient
@@ -18,7 +19,8 @@ def angular_error_mrad(
     A flow error in task units, which neither focal length nor distortion can flatter.
     Args:
       field: flow_px [N, 2, H, W], on the pixels of the first pose.
-      camera, scene, T_world_cam [..., T, 4, 4]: as for the System; N trajectories times windows of the film.
+      camera, scene, T_world_cam [..., T, 4, 4]: as for the System; N trajectories times windows of
+      the film.
       every_px: spacing of the pixels looked at.
     Returns: [N] mrad, over the pixels that see a surface.
     Gradient: flow, lens and poses.
@@ -47,11 +49,13 @@ def angular_error_mrad(
 
 
 def edge_energy(volume: EventVolume) -> Tensor:
-    """Mean squared Sobel gradient of the signed event frames (one per bin), events^2 per pixel^2."""
+    """Mean squared Sobel gradient of the signed event frames (one per bin), events^2 per
+    pixel^2."""
     signed = volume.counts[:, 0] - volume.counts[:, 1]
     return spatial_gradient(signed, mode="sobel", normalized=True).square().sum(2).mean()
 
 
 def edge_objective(volume: EventVolume, activity_weight: float = 0.01) -> Tensor:
-    """The seed project's objective: -(edge energy of event frames - weight * events per pixel and bin)."""
+    """The seed project's objective: -(edge energy of event frames - weight * events per pixel and
+    bin)."""
     return activity_weight * volume.counts.sum(1).mean() - edge_energy(volume)

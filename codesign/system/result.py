@@ -29,10 +29,11 @@ _LENS = (
 class Result:
     """Objectives of one pass, and what they were made of.
 
-    objectives: name -> tensor, as the objective returned it. field: what the flow stage returned. estimate: what
-      the stage behind it returned; None without one. camera: with the lens as it was. T_world_cam: [..., T,
-      4, 4]. junctions: name -> tensors, whose .grad is kept; None unless the pass was probed. check_passes: time of
-      ``check`` over that of its pass alone; None elsewhere.
+    objectives: name -> tensor, as the objective returned it. field: what the flow stage returned.
+      estimate: what the stage behind it returned; None without one. camera: with the lens as it
+      was. T_world_cam: [..., T, 4, 4]. junctions: name -> tensors, whose .grad is kept; None unless
+      the pass was probed. check_passes: time of ``check`` over that of its pass alone; None
+      elsewhere.
     """
 
     objectives: dict[str, Tensor]
@@ -55,8 +56,8 @@ class Result:
     def backward(self, weights: Mapping[str, float] | None = None) -> None:
         """Gradients of the weighted sum of objectives (all with weight 1 when none are given).
 
-        Raises: DomainError for unknown names; NonFiniteError naming the first junction, from the loss back,
-          whose gradient is not finite, when the pass was probed.
+        Raises: DomainError for unknown names; NonFiniteError naming the first junction, from the
+          loss back, whose gradient is not finite, when the pass was probed.
         """
         weights = dict.fromkeys(self.objectives, 1.0) if weights is None else weights
         unknown = [name for name in weights if name not in self.objectives]
@@ -65,7 +66,9 @@ class Result:
                 f"there is no objective '{unknown[0]}'; there are {', '.join(self.objectives)}."
             )
         if not weights:
-            raise DomainError(f"no objective is given a weight; there are {', '.join(self.objectives)}.")
+            raise DomainError(
+                f"no objective is given a weight; there are {', '.join(self.objectives)}."
+            )
         for name in weights:
             if self.objectives[name].numel() != 1:
                 raise ShapeError(
@@ -83,12 +86,15 @@ class Result:
                 )
 
     def table(self) -> list[dict[str, Any]]:
-        """Per junction: norm of the values, norm of the gradient, share of gradient entries that are exactly 0.
+        """Per junction: norm of the values, norm of the gradient, share of gradient entries that
+        are exactly 0.
 
         Raises: DomainError when the pass was not probed.
         """
         if self.junctions is None:
-            raise DomainError("this pass kept nothing; run system(batch, probe=True) to read its junctions.")
+            raise DomainError(
+                "this pass kept nothing; run system(batch, probe=True) to read its junctions."
+            )
         return [_row(name, tensors) for name, tensors in self.junctions.items()]
 
 
@@ -111,7 +117,11 @@ def _norm(tensors: list[Tensor]) -> float:
 def tensors_of(junction: str, value: Any) -> tuple[Tensor, ...]:
     """The tensors that stand at a junction."""
     if junction == "lens":
-        learnt = [p for p in value.parameters() if p.requires_grad] if isinstance(value, nn.Module) else []
+        learnt = (
+            [p for p in value.parameters() if p.requires_grad]
+            if isinstance(value, nn.Module)
+            else []
+        )
         made = [getattr(value, name, None) for name in _LENS]
         return tuple(learnt or [t for t in made if torch.is_tensor(t) and t.requires_grad])
     if isinstance(value, Rays):
@@ -124,7 +134,8 @@ def tensors_of(junction: str, value: Any) -> tuple[Tensor, ...]:
 
 
 def probe(junction: str, value: Any) -> tuple[Tensor, ...]:
-    """The junction's tensors, with their gradients kept. Raises: NonFiniteError when one is not finite."""
+    """The junction's tensors, with their gradients kept. Raises: NonFiniteError when one is not
+    finite."""
     tensors = tensors_of(junction, value)
     for tensor in tensors:
         if not bool(tensor.detach().isfinite().all()):

@@ -25,7 +25,9 @@ class Pass(Mapping[str, Any]):
     def __init__(self, system: Any, batch: Any, recorded: dict[str, Any], probed: bool):
         unknown = sorted(set(recorded) - set(RECORDABLE))
         if unknown:
-            raise DomainError(f"junctions {unknown} cannot be replaced; {', '.join(RECORDABLE)} can.")
+            raise DomainError(
+                f"junctions {unknown} cannot be replaced; {', '.join(RECORDABLE)} can."
+            )
         self.system = system
         self.recorded = recorded
         self.junctions: dict[str, tuple[Tensor, ...]] | None = {} if probed else None
@@ -45,7 +47,9 @@ class Pass(Mapping[str, Any]):
         if name in self.made:
             return self.made[name]
         if name in self.making:
-            circle = " needs ".join(f"'{each}'" for each in (*self.making[self.making.index(name) :], name))
+            circle = " needs ".join(
+                f"'{each}'" for each in (*self.making[self.making.index(name) :], name)
+            )
             raise DomainError(
                 f"the stages go in a circle: {circle}; a stage may ask for what comes before it."
             )
@@ -66,14 +70,21 @@ class Pass(Mapping[str, Any]):
         pose = self.made.get("T_world_cam")
         kept = None if self.junctions is None else dict(sorted(self.junctions.items(), key=_order))
         return Result(
-            objectives, self.made.get("field"), self.made.get("estimate"), self["camera"], pose, kept
+            objectives,
+            self.made.get("field"),
+            self.made.get("estimate"),
+            self["camera"],
+            pose,
+            kept,
         )
 
     def objective(self, name: str) -> Tensor:
         """Value of the objective of that name. Raises: DomainError when it is no tensor."""
         value = self._call(f"objective {name}", self.system.named_objectives[name])
         if not torch.is_tensor(value):
-            raise DomainError(f"objective '{name}' returned a {type(value).__name__}; return a tensor.")
+            raise DomainError(
+                f"objective '{name}' returned a {type(value).__name__}; return a tensor."
+            )
         return value
 
     def _call(self, name, part, *inputs, **instead):
@@ -83,9 +94,17 @@ class Pass(Mapping[str, Any]):
         if self.junctions is None:
             return stage(has, *inputs)
         batch = self["batch"]
-        given = {each: has[each] for each in stage.asked} | self.made | {"inputs": inputs, "scene": None}
+        given = (
+            {each: has[each] for each in stage.asked}
+            | self.made
+            | {"inputs": inputs, "scene": None}
+        )
         given |= {"batch": (batch.T_world_body, batch.t_s, getattr(batch, "truth", None))}
-        before = [(each, t, t.detach().clone()) for each, value in given.items() for t in tensors_in(value)]
+        before = [
+            (each, t, t.detach().clone())
+            for each, value in given.items()
+            for t in tensors_in(value)
+        ]
         found = stage(has, *inputs)
         changed = [each for each, tensor, copy in before if not torch.equal(tensor, copy)]
         if changed:
@@ -100,7 +119,9 @@ class Pass(Mapping[str, Any]):
         part = getattr(self.system, stage)
         own = "" if part is None or junction == "rays" else f" ({label(part)})"
         return (
-            f"junction '{junction}' holds" if junction in self.recorded else f"stage '{stage}'{own} returned"
+            f"junction '{junction}' holds"
+            if junction in self.recorded
+            else f"stage '{stage}'{own} returned"
         )
 
     def _looked_at(self, junction: str) -> bool:
@@ -139,7 +160,9 @@ class Pass(Mapping[str, Any]):
         return self.system.bins
 
     def _generator(self):
-        return torch.Generator().manual_seed(self["camera"].seed if self.seed is None else self.seed)
+        return torch.Generator().manual_seed(
+            self["camera"].seed if self.seed is None else self.seed
+        )
 
     def _T_body_cam(self):
         if self.system.mount is None:
@@ -154,7 +177,9 @@ class Pass(Mapping[str, Any]):
         poses = self["batch"].T_world_body
         if poses is None:
             poses = self._call("trajectory", trajectory)
-            check_layout("stage 'trajectory' returned", poses, Tensor, "... T 4 4", T=self["t_s"].numel())
+            check_layout(
+                "stage 'trajectory' returned", poses, Tensor, "... T 4 4", T=self["t_s"].numel()
+            )
         return poses
 
     def _T_world_cam(self):
@@ -175,7 +200,9 @@ class Pass(Mapping[str, Any]):
 
     def _rays(self) -> Rays:
         by = self._by("rays", "camera")
-        return self._at("rays", lambda: self["camera"].rays(), lambda rays: check_layout(by, rays, Rays))
+        return self._at(
+            "rays", lambda: self["camera"].rays(), lambda rays: check_layout(by, rays, Rays)
+        )
 
     def _frames(self):
         return self._at("frames", self._rendered, self._check_frames)
@@ -197,12 +224,21 @@ class Pass(Mapping[str, Any]):
         if self.system.render is None:
             way = self.system.gradient
             self.asked["render"] = ("camera", "rays", "T_world_cam")
-            rays = self["rays"] if way in render_stage.sequence.PROVEN or "rays" in self.recorded else None
+            rays = (
+                self["rays"]
+                if way in render_stage.sequence.PROVEN or "rays" in self.recorded
+                else None
+            )
             return render_stage.frames(self["camera"], scene, poses, way, rays=rays)
         pairs = scenes_of(scene, poses)
-        parts = [self._call("render", self.system.render, scene=one, T_world_cam=its) for one, its in pairs]
+        parts = [
+            self._call("render", self.system.render, scene=one, T_world_cam=its)
+            for one, its in pairs
+        ]
         for part in parts[1:]:
-            check_layout("stage 'render' returned", part, Tensor, tuple(getattr(parts[0], "shape", ())))
+            check_layout(
+                "stage 'render' returned", part, Tensor, tuple(getattr(parts[0], "shape", ()))
+            )
         return torch.stack(parts) if isinstance(scene, (tuple, list)) else parts[0]
 
     def _volume(self) -> EventVolume:
@@ -228,11 +264,14 @@ class Pass(Mapping[str, Any]):
             return found
         count = self["t_s"].numel() - 1
         height, width = self["camera"].film.shape[-2:]
-        check_layout("stage 'events' returned", found, Tensor, f"N {count} 2 H W", H=height, W=width)
+        check_layout(
+            "stage 'events' returned", found, Tensor, f"N {count} 2 H W", H=height, W=width
+        )
         return event_stage.from_counts(found.permute(1, 2, 0, 3, 4), self["t_s"], self.system.bins)
 
     def _check_count(self, what: str, given: int) -> None:
-        """Raise ShapeError when a junction holds other than one sample per trajectory and window."""
+        """Raise ShapeError when a junction holds other than one sample per trajectory and
+        window."""
         if "T_world_cam" in self.made or self["batch"].T_world_body is not None:
             film = self["camera"].film.shape
             windows = film[0] if len(film) == 3 else 1
@@ -246,7 +285,8 @@ class Pass(Mapping[str, Any]):
         self.samples = given
 
     def _samples(self, image: Tensor, channels: int = 0) -> Tensor:
-        """[..., T, channels, *film.shape] as [N, T, channels, H, W]: trajectories times windows first."""
+        """[..., T, channels, *film.shape] as [N, T, channels, H, W]: trajectories times windows
+        first."""
         film = self["camera"].film.shape
         kept = 1 + channels
         flat = image.reshape(-1, *image.shape[image.ndim - len(film) - kept :])
@@ -278,13 +318,16 @@ class Pass(Mapping[str, Any]):
             self._check_count("truth", recorded.flow_px.shape[0])
             return recorded
         last = self["t_s"].numel() - 1
-        flow, valid = render_stage.true_flow(self["camera"], self["scene"], self["T_world_cam"], stride=last)
+        flow, valid = render_stage.true_flow(
+            self["camera"], self["scene"], self["T_world_cam"], stride=last
+        )
         interval_s = float(self["t_s"][-1] - self["t_s"][0])
         return FlowField(self._samples(flow, 1)[:, 0], self._samples(valid)[:, 0], interval_s)
 
 
 def built_bins(flow: Any) -> int | None:
-    """Time bins that an estimator says it was built for (``config``); None where it says nothing."""
+    """Time bins that an estimator says it was built for (``config``); None where it says
+    nothing."""
     for part in (flow, *modules_of(getattr(flow, "call", flow))):
         built = getattr(part, "config", None)
         if isinstance(built, dict) and built.get("bins") is not None:

@@ -1,4 +1,5 @@
-"""How a system calls its stages: the input first, and by name whatever else the stage's signature asks for."""
+"""How a system calls its stages: the input first, and by name whatever else the stage's signature
+asks for."""
 
 import functools
 import inspect
@@ -39,7 +40,8 @@ _PLACED = (
 
 
 class Held(nn.Module):
-    """A bound method or partial, and the Modules that it calls, so that their parameters are known."""
+    """A bound method or partial, and the Modules that it calls, so that their parameters are
+    known."""
 
     def __init__(self, call: Callable[..., Any], modules: list[nn.Module]):
         super().__init__()
@@ -64,7 +66,8 @@ def modules_of(part: Any) -> list[nn.Module]:
 
 
 def registrable(part: Any) -> Any:
-    """The part as torch registers it: the Module behind its ``forward``, or a Module around what holds some."""
+    """The part as torch registers it: the Module behind its ``forward``, or a Module around what
+    holds some."""
     if isinstance(part, functools.partial) and not part.args and not part.keywords:
         return registrable(part.func)
     owner = getattr(part, "__self__", None)
@@ -75,8 +78,8 @@ def registrable(part: Any) -> Any:
 
 
 def event_call(part: Any) -> Any:
-    """What is called of an event stage: its ``volume``, where it has one, which knows when events come between
-    frames; otherwise the stage itself."""
+    """What is called of an event stage: its ``volume``, where it has one, which knows when events
+    come between frames; otherwise the stage itself."""
     volume = getattr(part, "volume", None)
     return volume if callable(volume) else part
 
@@ -94,7 +97,8 @@ class Stage:
     Args:
       name: of the stage, which says what its input is (``INPUT``).
       call: Module or function.
-    Raises: DomainError when the stage asks for something that a system does not have, or cannot take its input.
+    Raises: DomainError when the stage asks for something that a system does not have, or cannot
+      take its input.
     """
 
     def __init__(self, name: str, call: Callable[..., Any]):
@@ -103,7 +107,9 @@ class Stage:
                 f"stage '{name}' is the class {call.__name__}; give an instance: {call.__name__}()."
             )
         if not callable(call):
-            raise DomainError(f"stage '{name}' is a {type(call).__name__}; give a Module or a function.")
+            raise DomainError(
+                f"stage '{name}' is a {type(call).__name__}; give a Module or a function."
+            )
         self.name = name
         self.call = call
         self.input = INPUT.get(name)
@@ -115,7 +121,9 @@ class Stage:
         bound = target.keywords if isinstance(target, functools.partial) else {}
         try:
             target = target.forward if isinstance(target, nn.Module) else target
-            parameters = [p for p in inspect.signature(target).parameters.values() if p.name not in bound]
+            parameters = [
+                p for p in inspect.signature(target).parameters.values() if p.name not in bound
+            ]
         except (TypeError, ValueError):  # written in C: it gets its input and nothing else
             return ()
         if self.input is not None:
@@ -156,7 +164,8 @@ class Stage:
     def __call__(self, has: Mapping[str, Any], *inputs: Any) -> Any:
         """Run the stage on its input, with what it asks for out of ``has``.
 
-        Raises: DomainError naming both sides where torch cannot join weights and input of different dtypes or devices.
+        Raises: DomainError naming both sides where torch cannot join weights and input of different
+          dtypes or devices.
         """
         named = {name: has[name] for name in self.asked}
         if inputs and not self.by_position:
@@ -173,7 +182,9 @@ class Stage:
     def _check_kinds(self, given: list[Tensor], error: RuntimeError) -> None:
         weights = [p for module in modules_of(self.call) for p in module.parameters()]
         weights = weights or [tensor for _, tensor in hidden_tensors(self.call)]
-        own, other = ({_kind(t) for t in part if t.is_floating_point()} for part in (weights, given))
+        own, other = (
+            {_kind(t) for t in part if t.is_floating_point()} for part in (weights, given)
+        )
         if own and other and not own & other:
             source = {
                 "events": " from stage 'render'",

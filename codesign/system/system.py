@@ -22,26 +22,30 @@ _ALSO = ("lens", "objectives", "named_objectives", "gradient", "scene", "bins", 
 class System(nn.Module):
     """Camera, mount, event layer, estimator and named objectives in one graph.
 
-    Every part is a Module or a plain function. A stage gets its input first and, by name, whatever else its
-    signature asks for out of: batch, camera, scene, rays, T_body_cam, T_world_body, T_world_cam, t_s, bins,
-    generator (of the batch's seed), frames, volume, field, estimate, truth (FlowField through the lens).
+    Every part is a Module or a plain function. A stage gets its input first and, by name, whatever
+    else its signature asks for out of: batch, camera, scene, rays, T_body_cam, T_world_body,
+    T_world_cam, t_s, bins, generator (of the batch's seed), frames, volume, field, estimate, truth
+    (FlowField through the lens).
 
     Args:
-      camera: render.Camera (its lens is registered here when it is a Module), or a function that makes one.
-      events: frames [N, T, H, W] -> counts [N, T-1, 2, H, W] or EventVolume. Of a part that has ``volume``
-        (every ``events.layer``) that is called: it knows when events come between two frames. Counts have theirs
-        in the middle of an interval (``events.from_counts``).
+      camera: render.Camera (its lens is registered here when it is a Module), or a function that
+        makes one.
+      events: frames [N, T, H, W] -> counts [N, T-1, 2, H, W] or EventVolume. Of a part that has
+        ``volume`` (every ``events.layer``) that is called: it knows when events come between two
+        frames. Counts have theirs in the middle of an interval (``events.from_counts``).
       flow: EventVolume -> FlowField, or what else the objectives take.
-      objectives: name -> function, all by name, -> tensor; a scalar each to go backward by ``Result.backward``.
+      objectives: name -> function, all by name, -> tensor; a scalar each to go backward by
+        ``Result.backward``.
       mount: () -> T_body_cam [..., 4, 4]; None: the batch's poses are the camera's.
       trajectory: () -> T_world_body [..., T, 4, 4], where the batch brings no poses.
       estimate: what follows the flow, for example a velocity; its input is the field.
       render: () -> frames [..., T, *film.shape] of one scene, for other than ``render.frames``.
       gradient: "interior", "boundary", "difference" or "auto", of ``render.frames``.
-      scene: for batches without one. bins: time bins of the volume; by default those the flow stage was
-        built for (its ``config``), or 5.
+      scene: for batches without one. bins: time bins of the volume; by default those the flow stage
+        was built for (its ``config``), or 5.
     Samples: N counts trajectories times windows of the film, trajectory by trajectory.
-    Raises: DomainError when a stage asks for what a system does not have, or estimator and bins do not fit.
+    Raises: DomainError when a stage asks for what a system does not have, or estimator and bins do
+      not fit.
 
     >>> import torch
     >>> from codesign import System, events, flow, lens, render
@@ -94,7 +98,9 @@ class System(nn.Module):
             raise _unknown(name, (*PARTS, *_ALSO))
         if name == "objectives":
             self.named_objectives = self._checked(value)
-            held = [module for part in self.named_objectives.values() for module in modules_of(part)]
+            held = [
+                module for part in self.named_objectives.values() for module in modules_of(part)
+            ]
             value = nn.ModuleList(dict.fromkeys(held))  # their parameters are the system's too
         elif name == "gradient":
             check_choice(value, "gradient", render_stage.sequence.WAYS)
@@ -109,7 +115,9 @@ class System(nn.Module):
             called = event_call(value) if name == "events" else value
             Stage(name, called)  # refuses what it cannot call
             owner = getattr(value, "__self__", None)
-            of_layer = name == "events" and isinstance(owner, nn.Module) and value == event_call(owner)
+            of_layer = (
+                name == "events" and isinstance(owner, nn.Module) and value == event_call(owner)
+            )
             value = owner if of_layer else registrable(value)
         if name in (*PARTS, "lens"):  # a Module in the place of a function, or the other way round
             self.__dict__.pop(name, None)
@@ -118,7 +126,9 @@ class System(nn.Module):
 
     def _checked(self, objectives: Any) -> dict[str, Callable[..., Tensor]]:
         if not isinstance(objectives, Mapping) or not objectives:
-            raise DomainError("a system needs at least one objective; give objectives={'name': function}.")
+            raise DomainError(
+                "a system needs at least one objective; give objectives={'name': function}."
+            )
         for name, part in objectives.items():
             if "estimate" in Stage(f"objective {name}", part).asked and self.estimate is None:
                 raise DomainError(
@@ -137,19 +147,21 @@ class System(nn.Module):
         """One pass.
 
         Args:
-          batch: Batch, or anything with its fields. recorded: junction ("rays", "frames", "events", "flow",
-            "estimate") -> what to put there; the stages before it are not run.
-          objectives: names of those wanted; all when None. probe: keep value and gradient of every junction
-            and look for values that are not finite; otherwise nothing is kept and nothing is looked at.
+          batch: Batch, or anything with its fields. recorded: junction ("rays", "frames", "events",
+            "flow", "estimate") -> what to put there; the stages before it are not run.
+          objectives: names of those wanted; all when None. probe: keep value and gradient of every
+            junction and look for values that are not finite; otherwise nothing is kept and nothing
+            is looked at.
         Returns: Result.
-        Raises: DomainError for names that are not there; ShapeError where batch or stages do not fit;
-          NonFiniteError naming the junction, when probed.
+        Raises: DomainError for names that are not there; ShapeError where batch or stages do not
+          fit; NonFiniteError naming the junction, when probed.
         """
         run = self.begin(batch, recorded, probe)
         return run.result({name: run.objective(name) for name in self.chosen(objectives)})
 
     def chosen(self, objectives: tuple[str, ...] | None) -> tuple[str, ...]:
-        """Names of the objectives in use, all for None. Raises: DomainError for names that are not there."""
+        """Names of the objectives in use, all for None. Raises: DomainError for names that are not
+        there."""
         chosen = tuple(self.named_objectives) if objectives is None else objectives
         unknown = [name for name in chosen if name not in self.named_objectives]
         if unknown or not chosen:
@@ -163,7 +175,8 @@ class System(nn.Module):
         recorded: Mapping[str, Any] | None = None,
         probe: bool = False,
     ) -> "Pass":
-        """A pass to read from by name (``["frames"]``, ``["volume"]``, ...); each stage runs when it is asked for."""
+        """A pass to read from by name (``["frames"]``, ``["volume"]``, ...); each stage runs when
+        it is asked for."""
         return Pass(self, batch, dict(recorded or {}), probe)
 
     def stage(self, name: str, part: Callable[..., Any]) -> Stage:
@@ -174,7 +187,8 @@ class System(nn.Module):
         return known
 
     def replaced(self, **parts: Any) -> "System":
-        """The same system with other parts, for example the hard sensor for ``events``; what stays is shared."""
+        """The same system with other parts, for example the hard sensor for ``events``; what stays
+        is shared."""
         now = {name: getattr(self, name) for name in (*PARTS, "gradient", "scene", "bins")}
         now["objectives"] = self.named_objectives
         unknown = [name for name in parts if name not in now]

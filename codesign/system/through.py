@@ -1,8 +1,9 @@
 """Whether the gradient passes through every stage.
 
-One vector-Jacobian product from what each stage makes to each thing that it gets. Where that gives nothing, differences
-judge: an input is cut when the output follows it smoothly all the same. A mask or an argument that is not used passes,
-and so does a zero-initialised layer, whose output does not follow yet.
+One vector-Jacobian product from what each stage makes to each thing that it gets. Where that gives
+nothing, differences
+judge: an input is cut when the output follows it smoothly all the same. A mask or an argument that
+is not used passes, and so does a zero-initialised layer, whose output does not follow yet.
 """
 
 import copy
@@ -39,8 +40,9 @@ _READ = ("estimate", "field", "volume", "frames", "rays", *_POSES)
 
 
 class _Way(NamedTuple):
-    """A way into a stage: its name, the tensor that the gradient should reach, the leaf that stands for it where others
-    lie between, and where it is: the name of what is given, or of what is made anew from parameters."""
+    """A way into a stage: its name, the tensor that the gradient should reach, the leaf that stands
+    for it where others lie between, and where it is: the name of what is given, or of what is made
+    anew from parameters."""
 
     name: str
     tensor: Tensor
@@ -49,8 +51,8 @@ class _Way(NamedTuple):
 
 
 def check_stages(run: Pass, wanted: Sequence[Tensor], may_cut: Sequence[str]) -> None:
-    """Raise GradientError naming a stage that passes no gradient on, or not from one of its inputs or parameters,
-    although variables lie before it."""
+    """Raise GradientError naming a stage that passes no gradient on, or not from one of its inputs
+    or parameters, although variables lie before it."""
     for stage, (output, junction) in STAGES.items():
         part = getattr(run.system, stage)
         made = output in run.made and junction not in run.recorded and stage not in may_cut
@@ -61,7 +63,11 @@ def check_stages(run: Pass, wanted: Sequence[Tensor], may_cut: Sequence[str]) ->
         ways = [*inputs, *own]
         outputs = [t for t in _main(output, direct.made[output]) if t.requires_grad]
         found = dict(
-            zip((way.name for way in ways), _products(outputs, [way.leaf for way in ways]), strict=True)
+            zip(
+                (way.name for way in ways),
+                _products(outputs, [way.leaf for way in ways]),
+                strict=True,
+            )
         )
         outer = {way.name for way in inputs}
         silent = [way for way in ways if not found[way.name] and _carries(way.tensor, wanted)]
@@ -73,18 +79,25 @@ def check_stages(run: Pass, wanted: Sequence[Tensor], may_cut: Sequence[str]) ->
                 raise GradientError(
                     f"{before} (a detach, a no_grad, or a hard sensor); exchange that stage, or {meant}."
                 )
-            if any(_follows(run, output, (way.tensor,), way.at, FAR) for way in silent if way.name in outer):
+            if any(
+                _follows(run, output, (way.tensor,), way.at, FAR)
+                for way in silent
+                if way.name in outer
+            ):
                 raise GradientError(
                     f"{before}: it is exactly 0, though what it makes follows its input (rounding, a hard comparison, "
                     f"saturation, or thresholds that this batch does not reach); exchange that stage, or {meant}."
                 )
             silent = [way for way in silent if way.name not in outer]
-        # a zero-initialised layer silences all weights before it: first moved together, each alone if that shows
+        # a zero-initialised layer silences all weights before it: first moved together, each alone
+        # if that shows
         together = tuple(way.tensor for way in silent if not way.at)
         if together and not _follows(run, output, together, (), STEP):
             silent = [way for way in silent if way.at]
         cut = [
-            way.name for way in silent if part is not None and _follows(run, output, (way.tensor,), way.at)
+            way.name
+            for way in silent
+            if part is not None and _follows(run, output, (way.tensor,), way.at)
         ]
         if cut:
             raise GradientError(
@@ -94,9 +107,14 @@ def check_stages(run: Pass, wanted: Sequence[Tensor], may_cut: Sequence[str]) ->
 
 
 def check_objective(run: Pass, name: str, value: Tensor, wanted: Sequence[Tensor]) -> None:
-    """Raise GradientError for an objective that follows the last junction it reads, but passes no gradient to it."""
+    """Raise GradientError for an objective that follows the last junction it reads, but passes no
+    gradient to it."""
     latest = next((each for each in _READ[:5] if each in run.asked[f"objective {name}"]), None)
-    tensors = () if latest is None else tuple(t for t in _main(latest, run.made[latest]) if t.requires_grad)
+    tensors = (
+        ()
+        if latest is None
+        else tuple(t for t in _main(latest, run.made[latest]) if t.requires_grad)
+    )
     if latest is None or not value.requires_grad or any(_products([value], tensors)):
         return
     known = any(_carries(tensor, wanted) for tensor in tensors)
@@ -117,7 +135,10 @@ def _ways(run, direct, stage, output, wanted) -> tuple[list[_Way], list[_Way]]:
         named = lens.named_parameters() if isinstance(lens, torch.nn.Module) else ()
         names = {id(p): name for name, p in named}
         anew = ("camera", "rays") if output == "rays" or "rays" not in asked else ("camera",)
-        ways = [_Way(f"the lens ({names.get(id(t), 'computed')})", t, t, anew) for t in run.junctions["lens"]]
+        ways = [
+            _Way(f"the lens ({names.get(id(t), 'computed')})", t, t, anew)
+            for t in run.junctions["lens"]
+        ]
     for name in (name for name in asked if name in _READ and name in run.made):
         pairs = zip(_main(name, run.made[name]), _main(name, direct.made[name]), strict=True)
         for number, (tensor, leaf) in enumerate(pairs):
@@ -126,7 +147,11 @@ def _ways(run, direct, stage, output, wanted) -> tuple[list[_Way], list[_Way]]:
     learnt = {id(tensor) for tensor in wanted} - {id(way.tensor) for way in ways}
     named = [pair for module in modules_of(part) for pair in module.named_parameters()]
     named = named or hidden_tensors(part)
-    own = [_Way(f"its own '{name}'", tensor, tensor, ()) for name, tensor in named if id(tensor) in learnt]
+    own = [
+        _Way(f"its own '{name}'", tensor, tensor, ())
+        for name, tensor in named
+        if id(tensor) in learnt
+    ]
     return [way for way in ways if way.tensor.requires_grad], own
 
 
@@ -135,7 +160,8 @@ def _main(name: str, value: Any) -> tuple[Tensor, ...]:
 
 
 def _products(outputs: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[bool | None]:
-    """Whether a random vector's product with the Jacobian is other than 0, per input; None without a way back."""
+    """Whether a random vector's product with the Jacobian is other than 0, per input; None without
+    a way back."""
     if not outputs or not inputs:
         return [None] * len(inputs)
     draw = torch.Generator().manual_seed(0)
@@ -152,13 +178,14 @@ def _carries(tensor: Tensor, wanted: Sequence[Tensor]) -> bool:
 
 
 def _alone(run: Pass, stage: str, output: str) -> Pass:
-    """The pass whose output has its own way to every input. Where one input is made of another, the stage runs once
-    more, on leaves."""
+    """The pass whose output has its own way to every input. Where one input is made of another, the
+    stage runs once more, on leaves."""
     names = [name for name in run.asked.get(stage, ()) if name in _READ and name in run.made]
     if stage not in ("events", "flow", "estimate") or len(names) < 2:
         return run
     leaves = {
-        name: mapped(run.made[name], lambda t: t.detach().requires_grad_(t.requires_grad)) for name in names
+        name: mapped(run.made[name], lambda t: t.detach().requires_grad_(t.requires_grad))
+        for name in names
     }
     twin = _twin(run, output, leaves, ())
     with torch.random.fork_rng(devices=[]):
@@ -170,7 +197,9 @@ def _twin(run: Pass, output: str | None, instead: dict[str, Any], anew: tuple[st
     """The pass before an output was made, with other values in it."""
     twin = copy.copy(run)
     twin.junctions = None
-    twin.made = {key: v for key, v in run.made.items() if key not in (output, "generator", *anew)} | instead
+    twin.made = {
+        key: v for key, v in run.made.items() if key not in (output, "generator", *anew)
+    } | instead
     return twin
 
 
@@ -182,13 +211,16 @@ def _follows(
     far: float | None = None,
     ask: Callable[[Pass], Tensor] | None = None,
 ) -> bool:
-    """Whether an output changes in proportion to a small step of tensors; with ``far``, whether it changes at all."""
+    """Whether an output changes in proportion to a small step of tensors; with ``far``, whether it
+    changes at all."""
 
     def moved(step: float) -> Tensor:
         instead = {}
         if isinstance(at, str):
             chosen = {id(tensor) for tensor in tensors}
-            instead[at] = mapped(run.made[at], lambda t: _step(at, t, step) if id(t) in chosen else t)
+            instead[at] = mapped(
+                run.made[at], lambda t: _step(at, t, step) if id(t) in chosen else t
+            )
         twin = _twin(run, output, instead, () if isinstance(at, str) else at)
         with nudged(() if instead else tensors, step), torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
@@ -207,27 +239,34 @@ def _follows(
 
 
 def _step(name: str, tensor: Tensor, step: float) -> Tensor:
-    """A tensor moved: poses as rigid motions, unit vectors turned, others in proportion, so that what is 0 or positive
-    stays so."""
+    """A tensor moved: poses as rigid motions, unit vectors turned, others in proportion, so that
+    what is 0 or positive stays so."""
     draw = torch.Generator().manual_seed(1)
     if name in _POSES:
-        return tensor.detach() @ se3_exp(min(step, 0.05) * torch.randn(6, generator=draw).double()).to(tensor)
+        return tensor.detach() @ se3_exp(
+            min(step, 0.05) * torch.randn(6, generator=draw).double()
+        ).to(tensor)
     noise = 2 * torch.rand(tensor.shape, generator=draw, dtype=torch.float64).to(tensor) - 1
     moved = tensor.detach() * (1 + step * noise)
-    turned = name == "rays" and tensor.ndim == 2 and bool((tensor.norm(dim=1) - 1).abs().max() < 1e-3)
+    turned = (
+        name == "rays" and tensor.ndim == 2 and bool((tensor.norm(dim=1) - 1).abs().max() < 1e-3)
+    )
     return moved / moved.norm(dim=1, keepdim=True) if turned else moved
 
 
 @contextmanager
 def nudged(tensors: Sequence[Tensor], step: float) -> Iterator[None]:
-    """Parameters moved by a step of their size, for a while; torch counts no change, so graphs stay whole."""
+    """Parameters moved by a step of their size, for a while; torch counts no change, so graphs stay
+    whole."""
     draw = torch.Generator().manual_seed(2)
     kept = [tensor.data.clone() for tensor in tensors]
     try:
         for tensor, value in zip(tensors, kept, strict=True):
             size = float(value.double().square().mean().sqrt()) or 1.0
             tensor.data += (
-                step * size * torch.randn(value.shape, generator=draw, dtype=torch.float64).to(value)
+                step
+                * size
+                * torch.randn(value.shape, generator=draw, dtype=torch.float64).to(value)
             )
         yield
     finally:

@@ -1,8 +1,8 @@
-"""Batches by step out of sources of windows: shares of a mix, showings in sixteen ways, finite sources in
-another order every time.
+"""Batches by step out of sources of windows: shares of a mix, showings in sixteen ways, finite
+sources in another order every time.
 
-A source has ``batch(indices) -> FlowWindows``; its sample i depends on i and the source's seed alone. Sources
-with an end have ``__len__`` too.
+A source has ``batch(indices) -> FlowWindows``; its sample i depends on i and the source's seed
+alone. Sources with an end have ``__len__`` too.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,8 +26,8 @@ class Source(Protocol):
 
 
 def pick(parts: Sequence[tuple[float, Any]], group: int) -> Any:
-    """The source of a batch: shares are kept to within one batch at any time (multiples of the golden ratio,
-    modulo 1, are spread evenly)."""
+    """The source of a batch: shares are kept to within one batch at any time (multiples of the
+    golden ratio, modulo 1, are spread evenly)."""
     total = sum(share for share, _ in parts)
     place = (group * GOLDEN % 1.0) * total
     for share, source in parts:
@@ -42,12 +42,12 @@ def _all(indices):
 
 
 class Batches:
-    """Batches by step: each group of windows is made once and shown ``reuse`` times, turned, mirrored and
-    with polarities exchanged in between.
+    """Batches by step: each group of windows is made once and shown ``reuse`` times, turned,
+    mirrored and with polarities exchanged in between.
 
-    Groups are shown in turns of ``pool``, so the same windows do not follow each other. A batch depends on
-    its step and the arguments alone: after a resume, groups that are still needed are made again.
-    Args:
+    Groups are shown in turns of ``pool``, so the same windows do not follow each other. A batch
+    depends on its step and the arguments alone: after a resume, groups that are still needed are
+    made again. Args:
       parts: list of (share, source).
       batch: windows per step.
       reuse: times, >= 1; above 1 the sources give FlowWindows.
@@ -105,8 +105,8 @@ def shuffled(indices: Sequence[int], length: int) -> list[int]:
 
 
 def turned(windows: FlowWindows, way: int) -> FlowWindows:
-    """The same windows seen in a mirror or turned: way 0 to 15, bits: mirror x, mirror y, exchange x and y,
-    exchange polarities. Exact."""
+    """The same windows seen in a mirror or turned: way 0 to 15, bits: mirror x, mirror y, exchange
+    x and y, exchange polarities. Exact."""
     counts = _image(windows.volume.counts, way)
     frames = windows.frames
     return FlowWindows(
@@ -125,8 +125,8 @@ def _image(image, way):
 
 
 def _field(field, way):
-    """A FlowField turned: components of the flow and of the covariance change places and signs with the
-    pixels."""
+    """A FlowField turned: components of the flow and of the covariance change places and signs with
+    the pixels."""
     x = -1.0 if way & 1 else 1.0
     y = -1.0 if way & 2 else 1.0
 
@@ -199,13 +199,16 @@ class Started:
             flows.append(flow * (0.5 + 0.7 * float(draw[1])) if elsewhere else flow)
             covariances.append(unknown if elsewhere else covariance)
         return replace(
-            windows, start=replace(start, flow_px=torch.stack(flows), covariance_px2=torch.stack(covariances))
+            windows,
+            start=replace(
+                start, flow_px=torch.stack(flows), covariance_px2=torch.stack(covariances)
+            ),
         )
 
 
 def probe(source: Source) -> Any:
-    """A few samples to look at before a training: the first, middle and last of a finite source, else the
-    first."""
+    """A few samples to look at before a training: the first, middle and last of a finite source,
+    else the first."""
     sized: Any = source
     if not hasattr(source, "__len__"):
         return source.batch([0])

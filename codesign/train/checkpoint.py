@@ -1,5 +1,5 @@
-"""The state of a training on disk: tensors in safetensors, numbers in JSON, kept so that a resumed run gives
-the same numbers bit for bit."""
+"""The state of a training on disk: tensors in safetensors, numbers in JSON, kept so that a resumed
+run gives the same numbers bit for bit."""
 
 import contextlib
 import json
@@ -21,8 +21,8 @@ NUMBERS = ("step", "data_s", "training_s", "validation_s", "clipped", "blind", "
 
 
 def save(folder: Path, learner: Learner, progress: Progress, facts: dict[str, Any]) -> None:
-    """Write a checkpoint: tensors under a new name first, then checkpoint.json, which names them; a run cut
-    short in between keeps the earlier one.
+    """Write a checkpoint: tensors under a new name first, then checkpoint.json, which names them; a
+    run cut short in between keeps the earlier one.
 
     Args:
       facts: plain values that say what the run is (network, seed, schedule, versions).
@@ -34,10 +34,15 @@ def save(folder: Path, learner: Learner, progress: Progress, facts: dict[str, An
         raise FileFormatError(
             f"cannot make the folder '{folder}' ({error.strerror}); choose another."
         ) from error
-    curves = {f"curve/{name}": torch.tensor(getattr(progress, name), dtype=torch.float64) for name in CURVES}
+    curves = {
+        f"curve/{name}": torch.tensor(getattr(progress, name), dtype=torch.float64)
+        for name in CURVES
+    }
     file = f"step_{progress.step:07d}.safetensors"
     checkpoint.write_tensors(
-        folder / file, {**learner.state_dict(), **curves}, {"kind": "training", "step": progress.step}
+        folder / file,
+        {**learner.state_dict(), **curves},
+        {"kind": "training", "step": progress.step},
     )
     numbers = {name: getattr(progress, name) for name in NUMBERS}
     stored = {"version": VERSION, "tensors": file, "progress": numbers, **facts}
@@ -51,8 +56,8 @@ def save(folder: Path, learner: Learner, progress: Progress, facts: dict[str, An
 def load(folder: Path, learner: Learner, facts: dict[str, Any]) -> Progress | None:
     """Fill ``learner`` from a checkpoint; returns its Progress, or None when the folder has none.
 
-    Raises: FileFormatError when it is damaged, of another version, of another network, or of a run with other
-      facts.
+    Raises: FileFormatError when it is damaged, of another version, of another network, or of a run
+      with other facts.
     """
     path = folder / "checkpoint.json"
     if not path.exists():
@@ -68,14 +73,17 @@ def load(folder: Path, learner: Learner, facts: dict[str, Any]) -> Progress | No
         )
     _check_facts(path, stored, json.loads(json.dumps(facts)))
     if Path(file).name != file or len(file) > 100:
-        raise FileFormatError(f"'{path}' names a file outside its folder ('{file[:100]}'); start a new run.")
+        raise FileFormatError(
+            f"'{path}' names a file outside its folder ('{file[:100]}'); start a new run."
+        )
     tensors, content = checkpoint.read_tensors(folder / file)
     with reading(f"'{path}'", "start a new run"):
         numbers = {name: stored["progress"][name] for name in NUMBERS}
         wrong = [
             name
             for name, value in numbers.items()
-            if name != "validation" and (isinstance(value, bool) or not isinstance(value, int | float))
+            if name != "validation"
+            and (isinstance(value, bool) or not isinstance(value, int | float))
         ]
         if wrong or not isinstance(numbers["validation"], list):
             raise FileFormatError(

@@ -43,38 +43,42 @@ def fit(
 ) -> Progress:
     """Train a flow network, or any nn.Module, in place.
 
-    Ctrl-C ends the training between two steps, saved; the same call goes on from there and ends with the same
-    weights bit for bit, on one machine with one number of threads, as long as ``windows`` gives the same
-    batch at the same step.
+    Ctrl-C ends the training between two steps, saved; the same call goes on from there and ends
+    with the same weights bit for bit, on one machine with one number of threads, as long as
+    ``windows`` gives the same batch at the same step.
 
     Args:
-      network: nn.Module, on the device to train on. Flow networks have ``predictions(volume) -> [FlowField]``
-        or ``forward(volume) -> FlowField``.
-      windows: a source, ``batch(indices) -> FlowWindows`` (codesign.flow.sources); a list of (share, source);
-        or a function step -> batch of anything (codesign.train.Batches, to show windows several times).
+      network: nn.Module, on the device to train on. Flow networks have
+        ``predictions(volume) -> [FlowField]`` or ``forward(volume) -> FlowField``.
+      windows: a source, ``batch(indices) -> FlowWindows`` (codesign.flow.sources); a list of
+        (share, source); or a function step -> batch of anything (codesign.train.Batches, to show
+        windows several times).
       steps: number of steps, those of earlier calls included.
       batch: samples per step from a source.
       loss: (prediction, batch) -> scalar; ``Supervised()`` when None.
       predict: (network, batch) -> prediction.
-      optimiser: torch optimiser over parameters of the network, all or some; AdamW with a step of 2e-3 when
-        None.
+      optimiser: torch optimiser over parameters of the network, all or some; AdamW with a step of
+        2e-3 when None.
       schedule: share of the steps, 0 to 1 -> factor on its learning rates; ``Cosine()`` when None.
       clip: longest gradient; longer ones are shortened to it.
       average: decay of a running average of the weights, which is then judged and kept.
-      validate: network, in evaluation mode -> score, lower is better (``error_ratio(source)``); called every
-        ``validate_every`` steps and at the end. The network ends with the best weights that were judged,
-        without ``validate`` with the last.
+      validate: network, in evaluation mode -> score, lower is better (``error_ratio(source)``);
+        called every ``validate_every`` steps and at the end. The network ends with the best weights
+        that were judged, without ``validate`` with the last.
       validate_every: steps between judgements.
-      save_to: folder of the checkpoint, written every ``save_every`` steps and at the end; None keeps none.
+      save_to: folder of the checkpoint, written every ``save_every`` steps and at the end; None
+        keeps none.
       save_every: steps between checkpoints.
       resume: go on from that checkpoint where there is one; it is started over when False.
       progress: told (steps made, loss) when a step is whole.
       seed: of what the network draws in a step (dropout).
-      ranks: of several processes (``join()``, under torchrun); each takes its share of every batch of a
-        source. A function of the step gives each process its share. The first process validates and saves.
+      ranks: of several processes (``join()``, under torchrun); each takes its share of every batch
+        of a source. A function of the step gives each process its share. The first process
+        validates and saves.
     Returns: Progress: loss, gradient norm and learning rate by step, validation by step.
-    Raises: DomainError for unfit numbers, optimisers or losses, FileFormatError for a checkpoint of another
-      training: both before the first step. NonFiniteError when loss or gradient is not finite.
+    Raises: DomainError for unfit numbers, optimisers or losses, FileFormatError for a checkpoint of
+      another training: both before the first step. NonFiniteError when loss or gradient is not
+      finite.
 
     >>> network, x = nn.Linear(1, 1), torch.linspace(-1, 1, 8)[:, None]
     >>> adam = torch.optim.Adam(network.parameters(), 0.1)
@@ -83,7 +87,12 @@ def fit(
     >>> [round(float(weight.detach()), 2) for weight in network.parameters()], made.step
     ([2.0, 1.0], 300)
     """
-    numbers = {"steps": steps, "batch": batch, "validate_every": validate_every, "save_every": save_every}
+    numbers = {
+        "steps": steps,
+        "batch": batch,
+        "validate_every": validate_every,
+        "save_every": save_every,
+    }
     for name, value in numbers.items():
         check_whole(value, name)
     if batch % ranks.count:

@@ -1,4 +1,5 @@
-"""A network in training: steps on batches, a running average of the weights, and the best weights seen."""
+"""A network in training: steps on batches, a running average of the weights, and the best weights
+seen."""
 
 import copy
 import math
@@ -18,8 +19,9 @@ from codesign.train.parallel import ALONE, Ranks
 
 @dataclass(frozen=True)
 class Step:
-    """What a step saw: loss and norm of the gradient before the weights moved, means over all processes;
-    whether the gradient was shortened; the learning rate (of the optimiser's first group)."""
+    """What a step saw: loss and norm of the gradient before the weights moved, means over all
+    processes; whether the gradient was shortened; the learning rate (of the optimiser's first
+    group)."""
 
     loss: float
     norm: float
@@ -39,22 +41,28 @@ class Best:
 def adamw(
     network: nn.Module, learning_rate: float = 2e-3, weight_decay: float = 1e-4
 ) -> torch.optim.Optimizer:
-    """AdamW over the trainable weights of a network; biases and norms (one axis or none) do not decay."""
+    """AdamW over the trainable weights of a network; biases and norms (one axis or none) do not
+    decay."""
     trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
     if not trained:
-        raise DomainError("the network has no weight that takes a gradient; unfreeze what is to be trained.")
+        raise DomainError(
+            "the network has no weight that takes a gradient; unfreeze what is to be trained."
+        )
     matrices = [parameter for parameter in trained if parameter.ndim > 1]
     others = [parameter for parameter in trained if parameter.ndim <= 1]
-    groups = [{"params": matrices, "weight_decay": weight_decay}, {"params": others, "weight_decay": 0.0}]
+    groups = [
+        {"params": matrices, "weight_decay": weight_decay},
+        {"params": others, "weight_decay": 0.0},
+    ]
     return torch.optim.AdamW([group for group in groups if group["params"]], lr=learning_rate)
 
 
 class Learner:
     """A network with its optimiser, its loss and, where asked, a running average of its weights.
 
-    A step depends on the learner's state and the batch alone: what a step draws from torch's global random
-    numbers (dropout) is drawn from the seed and the step's number, and they are left as they were.
-    Args:
+    A step depends on the learner's state and the batch alone: what a step draws from torch's global
+    random numbers (dropout) is drawn from the seed and the step's number, and they are left as they
+    were. Args:
       network: nn.Module, on the device to train on.
       loss: (prediction, batch) -> scalar.
       optimiser: over the network's parameters, all or some; ``adamw(network)`` when None.
@@ -110,8 +118,9 @@ class Learner:
     def step(self, batch: Any, factor: float = 1.0) -> Step:
         """One step of the optimiser on a batch, with its learning rates times ``factor``.
 
-        Raises: NonFiniteError when loss or gradient is not finite; the weights are then those before the
-          step. DomainError or ShapeError for a loss without gradient or of several values.
+        Raises: NonFiniteError when loss or gradient is not finite; the weights are then those
+          before the step. DomainError or ShapeError for a loss without gradient or of several
+          values.
         """
         batch = to_device(batch, self.device)
         loss = self._loss(batch)
@@ -153,15 +162,19 @@ class Learner:
             score = float(self._judge(network.eval()))
         network.train(training)
         if not math.isfinite(score):
-            raise NonFiniteError(f"step {self.steps}: the validation gave {score}; lower the learning rate.")
+            raise NonFiniteError(
+                f"step {self.steps}: the validation gave {score}; lower the learning rate."
+            )
         if self.best is None or score < self.best.score:
-            weights = {name: tensor.detach().clone() for name, tensor in network.state_dict().items()}
+            weights = {
+                name: tensor.detach().clone() for name, tensor in network.state_dict().items()
+            }
             self.best = Best(score, self.steps, weights)
         return score
 
     def settle(self) -> None:
-        """Give the network the weights to keep: the best that were judged, else the running average, on every
-        process."""
+        """Give the network the weights to keep: the best that were judged, else the running
+        average, on every process."""
         kept = None if self.best is None else self.best.weights
         if kept is None and self.averaged is not None:
             kept = self.averaged.state_dict()
@@ -173,7 +186,9 @@ class Learner:
         """All tensors of the state by name."""
         found = {f"weights/{name}": tensor for name, tensor in self.network.state_dict().items()}
         if self.averaged is not None:
-            found |= {f"average/{name}": tensor for name, tensor in self.averaged.state_dict().items()}
+            found |= {
+                f"average/{name}": tensor for name, tensor in self.averaged.state_dict().items()
+            }
         for index, moments in self.optimiser.state_dict()["state"].items():
             for moment, value in moments.items():
                 if isinstance(value, Tensor):
@@ -188,7 +203,9 @@ class Learner:
             found["best/score"] = torch.tensor(self.best.score, dtype=torch.float64)
             found["best/step"] = torch.tensor(self.best.step)
         found["steps"] = torch.tensor(self.steps)
-        found["kind"] = torch.tensor(list(type(self.optimiser).__name__.encode()), dtype=torch.uint8)
+        found["kind"] = torch.tensor(
+            list(type(self.optimiser).__name__.encode()), dtype=torch.uint8
+        )
         return found
 
     def load_state_dict(self, tensors: dict[str, Tensor], path: Any = "the state") -> None:
@@ -197,12 +214,19 @@ class Learner:
         Raises: FileFormatError when it is not of this network and optimiser.
         """
         kind = type(self.optimiser).__name__
-        stored = bytes(tensors["kind"].tolist()).decode(errors="replace") if "kind" in tensors else kind
+        stored = (
+            bytes(tensors["kind"].tolist()).decode(errors="replace") if "kind" in tensors else kind
+        )
         if stored != kind:
             raise FileFormatError(
                 f"'{path}' is of the optimiser {stored}, this run has {kind}; go on with the same one."
             )
-        parts: dict[str, dict[str, Tensor]] = {"weights": {}, "average": {}, "optimiser": {}, "best": {}}
+        parts: dict[str, dict[str, Tensor]] = {
+            "weights": {},
+            "average": {},
+            "optimiser": {},
+            "best": {},
+        }
         for name, tensor in tensors.items():
             kind, _, rest = name.partition("/")
             parts.setdefault(kind, {})[rest] = tensor
@@ -242,8 +266,8 @@ class Learner:
 
     @torch.no_grad()
     def _follow(self):
-        """Move the running average; early on it spans a tenth of the steps made, so that the first weights
-        fade."""
+        """Move the running average; early on it spans a tenth of the steps made, so that the first
+        weights fade."""
         if self.averaged is None:
             return
         decay = min(self.average, (1 + self.steps) / (10 + self.steps))
@@ -267,7 +291,9 @@ class Learner:
                 )
         state = {index: held[name] for index, name in enumerate(self._names) if name in held}
         self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": state})
-        moved = [parameter for group in self.optimiser.param_groups for parameter in group["params"]]
+        moved = [
+            parameter for group in self.optimiser.param_groups for parameter in group["params"]
+        ]
         # numbers keep their dtype, which torch takes from the weights
         for index, moments in state.items():
             numbers = {name: value.clone() for name, value in moments.items() if value.ndim == 0}
@@ -277,7 +303,9 @@ class Learner:
 def _names(network, optimiser):
     """Names of the weights that an optimiser moves, in its order."""
     if isinstance(optimiser, torch.optim.LBFGS):
-        raise DomainError("LBFGS asks for the loss several times a step; choose an optimiser that asks once.")
+        raise DomainError(
+            "LBFGS asks for the loss several times a step; choose an optimiser that asks once."
+        )
     known = {id(parameter): name for name, parameter in network.named_parameters()}
     moved = [parameter for group in optimiser.param_groups for parameter in group["params"]]
     if any(id(parameter) not in known for parameter in moved):

@@ -1,4 +1,5 @@
-"""The loop of a training: a budget of steps or processor time, a schedule over it, and what is counted."""
+"""The loop of a training: a budget of steps or processor time, a schedule over it, and what is
+counted."""
 
 import math
 import time
@@ -57,8 +58,8 @@ class Clock:
 
 @dataclass(frozen=True)
 class Budget:
-    """When a training ends: after so many steps, or when all processes have spent so many processor seconds;
-    with both, at whichever comes first, and the steps set the schedule."""
+    """When a training ends: after so many steps, or when all processes have spent so many processor
+    seconds; with both, at whichever comes first, and the steps set the schedule."""
 
     steps: int | None = None
     cpu_s: float | None = None
@@ -76,8 +77,8 @@ class Budget:
 
 @dataclass(frozen=True)
 class Cosine:
-    """Factor on the learning rate by share of the budget: grows linearly over ``warm_up``, then falls as a
-    half cosine to a hundredth.
+    """Factor on the learning rate by share of the budget: grows linearly over ``warm_up``, then
+    falls as a half cosine to a hundredth.
 
     >>> [round(Cosine(warm_up=0.2)(share), 3) for share in (0.0, 0.2, 0.6, 1.0)]
     [0.01, 1.0, 0.505, 0.01]
@@ -112,7 +113,8 @@ def run(
       budget: when it ends.
       schedule: share of the budget -> factor on the learning rates.
       clock: counts what was spent before.
-      after_step: is told the share that is spent, when a step is whole; what it raises ends the loop.
+      after_step: is told the share that is spent, when a step is whole; what it raises ends the
+        loop.
     """
     clock = clock or Clock()
     ranks = learner.ranks

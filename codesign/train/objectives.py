@@ -48,7 +48,8 @@ class Supervised:
         unit = 1.0 if self.unit == "px" else relative_unit(windows.truth)
         loss = supervised_loss(predictions, windows.truth, GAMMA, unit_per_px=unit)
         if self.claim_weight > 0 and all(
-            field.covariance_px2 is not None or field.confidence is not None for field in predictions
+            field.covariance_px2 is not None or field.confidence is not None
+            for field in predictions
         ):
             claims = [replace(field, flow_px=field.flow_px.detach()) for field in predictions]
             loss = loss + self.claim_weight * laplace_loss(claims, windows.truth, GAMMA)
@@ -86,8 +87,8 @@ class Contrast:
 
 @dataclass(frozen=True)
 class Photometric:
-    """Difference of the frames at both ends, the later one read where the flow leads, and roughness of the
-    flow; no truth is needed.
+    """Difference of the frames at both ends, the later one read where the flow leads, and roughness
+    of the flow; no truth is needed.
 
     smoothness: weight of the roughness.
     """

@@ -54,8 +54,8 @@ class Ranks:
         return held[0]
 
     def on(self, device_type: str) -> "Ranks":
-        """The same process with its device: the processor, or the graphics card of its number on this
-        machine.
+        """The same process with its device: the processor, or the graphics card of its number on
+        this machine.
 
         Raises: DomainError when a process has no graphics card of its own.
         """
@@ -87,11 +87,15 @@ def place() -> tuple[int, int]:
 
 
 def join() -> Ranks:
-    """Connect to the other processes that torchrun started: gloo for tensors on the processor, nccl for those
-    on CUDA. Device: the processor, until ``on``."""
+    """Connect to the other processes that torchrun started: gloo for tensors on the processor, nccl
+    for those on CUDA. Device: the processor, until ``on``."""
     rank, count = place()
     if count > 1:
-        backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() and dist.is_nccl_available() else "gloo"
+        backend = (
+            "cpu:gloo,cuda:nccl"
+            if torch.cuda.is_available() and dist.is_nccl_available()
+            else "gloo"
+        )
         # the first process validates and draws alone meanwhile
         dist.init_process_group(backend, timeout=timedelta(hours=1))
     return Ranks(rank, count, torch.device("cpu"))

@@ -20,8 +20,10 @@ class Score:
     """Figures of one estimator on one set.
 
     Args:
-      aee_px, zero_flow_px: mean endpoint error over all valid pixels, of the estimate and of zero flow.
-      worse_percent: share of the windows on which the estimate's own mean error is above zero flow's.
+      aee_px, zero_flow_px: mean endpoint error over all valid pixels, of the estimate and of zero
+        flow.
+      worse_percent: share of the windows on which the estimate's own mean error is above zero
+        flow's.
       windows: how many were judged.
       blur: of a set without any true flow, the blur of its events warped by the estimate, as a
         share of that of zero flow (contrast_loss), which then stands for the errors; worse_percent
@@ -45,7 +47,10 @@ def batches(source: Source, count: int) -> Iterator[FlowWindows]:
     sized: Any = source
     if hasattr(source, "__len__"):
         count = min(count, len(sized))
-    return (source.batch(range(first, min(first + TOGETHER, count))) for first in range(0, count, TOGETHER))
+    return (
+        source.batch(range(first, min(first + TOGETHER, count)))
+        for first in range(0, count, TOGETHER)
+    )
 
 
 @torch.no_grad()
@@ -79,18 +84,22 @@ def score(
         if not judged:
             blurs += [
                 float(contrast_loss(replace(windows.volume, counts=counts[None]), one[None]))
-                for counts, one in zip(windows.volume.counts, flow.to(windows.volume.counts), strict=True)
+                for counts, one in zip(
+                    windows.volume.counts, flow.to(windows.volume.counts), strict=True
+                )
             ]
     error, zero, pixels = sums.tolist()
     if not judged and blurs:
         share = sum(blur > 1 for blur in blurs) / len(blurs)
         return Score(0.0, 0.0, 100 * share, len(blurs), sum(blurs) / len(blurs))
-    return Score(error / max(pixels, 1.0), zero / max(pixels, 1.0), 100 * worse / max(judged, 1), judged)
+    return Score(
+        error / max(pixels, 1.0), zero / max(pixels, 1.0), 100 * worse / max(judged, 1), judged
+    )
 
 
 def error_ratio(source: Source, count: int = 48) -> Callable[[nn.Module], float]:
-    """A judge for ``fit``: error of a flow network over that of zero flow, on the first ``count`` windows of
-    a source, which are made once."""
+    """A judge for ``fit``: error of a flow network over that of zero flow, on the first ``count``
+    windows of a source, which are made once."""
     windows = []
 
     def judge(network: nn.Module) -> float:

@@ -29,14 +29,15 @@ def check_pair(
 
     Args:
       camera: to judge by; None is that of the pair's design.
-      numbers: of the worlds and drives looked at; each world is made and one frame of six drives rendered.
-    Raises: DomainError, in a sentence that says what to change, for a design outside its bounds, one that
-      does not keep the pair's requirements, a box inside or far from the robot, a lens whose image circle is
-      smaller than the sensor (``mount.check_mount``) or that is wider than the camera's housing, a box that
-      reaches under the ground whose depth is believed in, drives that never move, or by less than
-      LEAST_MOVED_PX, or so fast that less than LEAST_FOLLOWED of the surfaces seen stays within a window's
-      width, and worlds of which less than LEAST_TEXTURE of what the camera sees (blocks of 8 x 8 pixels)
-      varies by more than the sensor's threshold.
+      numbers: of the worlds and drives looked at; each world is made and one frame of six drives
+        rendered.
+    Raises: DomainError, in a sentence that says what to change, for a design outside its bounds,
+      one that does not keep the pair's requirements, a box inside or far from the robot, a lens
+      whose image circle is smaller than the sensor (``mount.check_mount``) or that is wider than
+      the camera's housing, a box that reaches under the ground whose depth is believed in, drives
+      that never move, or by less than LEAST_MOVED_PX, or so fast that less than LEAST_FOLLOWED of
+      the surfaces seen stays within a window's width, and worlds of which less than LEAST_TEXTURE
+      of what the camera sees (blocks of 8 x 8 pixels) varies by more than the sensor's threshold.
     """
     pair.check(pair.design)
     camera = pair.camera(pair.design) if camera is None else camera
@@ -88,7 +89,9 @@ def _check_width(pair, camera):
     """Raise for a lens that does not fit into the camera's housing."""
     lens, housing_mm = camera.lens, 2e3 * pair.housing_radius_m
     widths = (
-        2 * lens.semi_aperture_mm if hasattr(lens, "semi_aperture_mm") else lens.entrance_pupil_diameter_mm
+        2 * lens.semi_aperture_mm
+        if hasattr(lens, "semi_aperture_mm")
+        else lens.entrance_pupil_diameter_mm
     )
     width_mm = float(torch.as_tensor(widths).max())
     if width_mm > housing_mm:

@@ -1,5 +1,6 @@
-"""A fork truck in a corridor, its own forks in view: near walls with pillars on both sides, far ends. It
-reads its velocity in the plane with a map of the corridor; where it sees itself there is nothing to read."""
+"""A fork truck in a corridor, its own forks in view: near walls with pillars on both sides, far
+ends. It reads its velocity in the plane with a map of the corridor; where it sees itself there is
+nothing to read."""
 
 import math
 
@@ -41,18 +42,21 @@ START = Design(6.5, 1.2, 0.55, 0.2, 0.0, 0.24, 0.0, math.radians(23), 0.0)
 
 
 def corridor() -> RobotPair:
-    """The pair. The estimator has the true depth of walls, floor and things, and knows where it sees the
-    robot itself.
+    """The pair. The estimator has the true depth of walls, floor and things, and knows where it
+    sees the robot itself.
 
     >>> sorted(corridor().bodies)[2:4]
     ['fork left', 'fork right']
     """
     prior = (1.5, 0.08, 0.04, 0.8, 0.8, 0.8)
-    return RobotPair("corridor", BODIES, LOW, HIGH, START, PLANAR, prior, "scene", None, world, drive)
+    return RobotPair(
+        "corridor", BODIES, LOW, HIGH, START, PLANAR, prior, "scene", None, world, drive
+    )
 
 
 def world(number: int) -> MitsubaScene:
-    """Walls, floor, ceiling and ends, pillars along both walls and crates between them, along +y."""
+    """Walls, floor, ceiling and ends, pillars along both walls and crates between them, along
+    +y."""
     mi = backend.mitsuba("cpu")
     random, _, covered = robot_pair.variant(number)
     half = half_width_m(number)

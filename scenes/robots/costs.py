@@ -1,7 +1,8 @@
-"""What a whole design has to pay for: light, low thresholds, a bus of limited width, and high masts.
+"""What a whole design has to pay for: light, low thresholds, a bus of limited width, and high
+masts.
 
-Without these a wide, fast lens on the tallest mast before the most sensitive pixels is best at everything, and
-there is nothing to design.
+Without these a wide, fast lens on the tallest mast before the most sensitive pixels is best at
+everything, and there is nothing to design.
 """
 
 import math
@@ -27,12 +28,13 @@ LEAST_RATE = 1e-7
 class Costs:
     """What a robot's camera pays.
 
-    light: of a world, 1 is daylight; a lens of f-number N passes light (1.2 / N)^2 of it. Bandwidth and shot
-      noise follow the light, and dim pixels lose contrast, as the sensor's model has it.
+    light: of a world, 1 is daylight; a lens of f-number N passes light (1.2 / N)^2 of it. Bandwidth
+      and shot noise follow the light, and dim pixels lose contrast, as the sensor's model has it.
     noise: whether noise events become more as thresholds fall and bandwidth grows.
     bus_hz: events per second that the whole sensor can read out; what comes on top is lost.
-    sway_per_m_s: rate in rad/s, root mean square about roll and pitch, of the tip of a mast of 1 m at 1 m/s. It
-      grows with the square of the mast's length (as the slope of a cantilever) and with the speed, up to 1 m/s.
+    sway_per_m_s: rate in rad/s, root mean square about roll and pitch, of the tip of a mast of 1 m
+      at 1 m/s. It grows with the square of the mast's length (as the slope of a cantilever) and
+      with the speed, up to 1 m/s.
     """
 
     light: float = 1.0
@@ -50,12 +52,13 @@ class Costs:
         return self.light * (FASTEST / fno) ** 2
 
     def sensor(self, nominal: SensorModel, theta: float, cutoff_hz: float) -> SensorModel:
-        """The nominal sensor at another threshold and bandwidth, with the noise rate that they bring.
+        """The nominal sensor at another threshold and bandwidth, with the noise rate that they
+        bring.
 
-        The noise of the level is white, so its deviation grows with the root of the bandwidth; the nominal
-        sensor's own rate says how strong it is.
-        Source: v2e's fit of rate over threshold-to-noise ratio (Hu, Liu, Delbruck, CVPR-W 2021), solved for the
-          rate.
+        The noise of the level is white, so its deviation grows with the root of the bandwidth; the
+        nominal sensor's own rate says how strong it is.
+        Source: v2e's fit of rate over threshold-to-noise ratio (Hu, Liu, Delbruck, CVPR-W 2021),
+          solved for the rate.
         """
         changed = replace(nominal, theta_on=theta, theta_off=theta, cutoff_hz=cutoff_hz)
         if not self.noise:
@@ -64,11 +67,13 @@ class Costs:
         deviation = ratio * math.sqrt(cutoff_hz / nominal.cutoff_hz)
         return replace(changed, shot_rate_hz=noise_rate_hz(theta / deviation, cutoff_hz))
 
-    def sway(self, T_body_cam: Tensor, foot_m: float, speed_m_s: Tensor, deviates: Tensor) -> Tensor:
+    def sway(
+        self, T_body_cam: Tensor, foot_m: float, speed_m_s: Tensor, deviates: Tensor
+    ) -> Tensor:
         """[N, 6] m/s and rad/s in body axes: the twist by which a camera moves beside its body.
 
-        The tip of a cantilever under a load there turns by 3/2 of its deflection over its length, so it moves as if it
-        turned about a point at a third of the mast.
+        The tip of a cantilever under a load there turns by 3/2 of its deflection over its length,
+        so it moves as if it turned about a point at a third of the mast.
 
         Args:
           T_body_cam: [4, 4], or [N, 4, 4].
@@ -86,8 +91,9 @@ class Costs:
 
 
 def noise_rate_hz(ratio: float, cutoff_hz: float) -> float:
-    """Noise events per pixel and second at a threshold of so many noise deviations: ``threshold_to_noise``
-    solved for the rate by bisection, which falls from MOST_RATE to LEAST_RATE times twice the bandwidth."""
+    """Noise events per pixel and second at a threshold of so many noise deviations:
+    ``threshold_to_noise`` solved for the rate by bisection, which falls from MOST_RATE to
+    LEAST_RATE times twice the bandwidth."""
     low, high = math.log(LEAST_RATE), math.log(MOST_RATE)
     for _ in range(60):
         middle = (low + high) / 2
@@ -104,8 +110,8 @@ class Exposed(nn.Module):
       gain: share of full light.
       most: events that a body's windows may read out in one interval; None: all are read.
       windows: of one body.
-    Beyond ``most`` every event is kept with the same probability, as by a bus that serves pixels at random; of a
-    fraction of an event the fraction is. Gradient: that of the mean, counts alike.
+    Beyond ``most`` every event is kept with the same probability, as by a bus that serves pixels at
+    random; of a fraction of an event the fraction is. Gradient: that of the mean, counts alike.
     """
 
     def __init__(self, stage: nn.Module, gain: float, most: float | None, windows: int) -> None:
@@ -125,7 +131,11 @@ class Exposed(nn.Module):
             made = stage.volume(frames, t_s, bins, generator)
         else:
             made = stage(frames, t_s, generator)
-        return made if self.most is None else replace(made, counts=self._read_out(made.counts, generator))
+        return (
+            made
+            if self.most is None
+            else replace(made, counts=self._read_out(made.counts, generator))
+        )
 
     def _read_out(self, counts, generator):
         per_body = counts.detach().unflatten(0, (-1, self.windows)).flatten(1).sum(1)
@@ -134,7 +144,11 @@ class Exposed(nn.Module):
         if bool((kept == 1).all()):
             return counts
         whole = counts.detach().floor()
-        one = generator if isinstance(generator, torch.Generator) else torch.Generator().manual_seed(0)
+        one = (
+            generator
+            if isinstance(generator, torch.Generator)
+            else torch.Generator().manual_seed(0)
+        )
         read = torch.binomial(whole, kept.expand_as(whole).contiguous(), generator=one)
         rest = counts.detach() - whole
         read = read + rest * torch.bernoulli(kept.expand_as(whole), generator=one)

@@ -1,5 +1,5 @@
-"""A quadrotor in a room, from low over the floor to under the ceiling: all six velocities count, in every
-direction of flight, with a map of the room."""
+"""A quadrotor in a room, from low over the floor to under the ceiling: all six velocities count, in
+every direction of flight, with a map of the room."""
 
 import math
 
@@ -50,7 +50,18 @@ def flight() -> RobotPair:
     """
     prior = (0.8, 0.8, 0.4, 0.8, 0.8, 0.8)
     return RobotPair(
-        "flight", BODIES, LOW, HIGH, START, FREE, prior, "scene", None, world, drive, frame="base_link"
+        "flight",
+        BODIES,
+        LOW,
+        HIGH,
+        START,
+        FREE,
+        prior,
+        "scene",
+        None,
+        world,
+        drive,
+        frame="base_link",
     )
 
 
@@ -69,7 +80,10 @@ def world(number: int) -> MitsubaScene:
             shapes[f"ball-{k}"] = (ball(mi, x, y, 0.0, size), covered(1.0, 1.0))
         else:
             half = (size, size, random.uniform(0.2, 0.6))
-            shapes[f"crate-{k}"] = (block(mi, x, y, 0.0, half, random.uniform(0, 90)), covered(0.6, 0.6))
+            shapes[f"crate-{k}"] = (
+                block(mi, x, y, 0.0, half, random.uniform(0, 90)),
+                covered(0.6, 0.6),
+            )
     return emissive(World(shapes))
 
 
@@ -81,10 +95,13 @@ def drive(number: int, motions: int) -> tuple[torch.Tensor, torch.Tensor]:
     climb = CLIMB_RAD * deviates[:, 0]
     onward = torch.stack([climb.cos() * way.cos(), climb.cos() * way.sin(), climb.sin()], 1)
     twist = torch.cat([speed[:, None] * onward, RATE_RAD_S * deviates[:, 1:]], 1)
-    starts = random.uniform((-ABOUT_M, -ABOUT_M, -math.pi), (ABOUT_M, ABOUT_M, math.pi), (motions, 3))
+    starts = random.uniform(
+        (-ABOUT_M, -ABOUT_M, -math.pi), (ABOUT_M, ABOUT_M, math.pi), (motions, 3)
+    )
     lowest, highest = np.log(FLOWN_M)
     height = np.exp(
-        lowest + (highest - lowest) * (random.permutation(motions) + random.random(motions)) / motions
+        lowest
+        + (highest - lowest) * (random.permutation(motions) + random.random(motions)) / motions
     )
     tilt = torch.zeros(motions, 6, dtype=torch.float64)
     tilt[:, 3:5] = TILT_RAD * torch.from_numpy(random.standard_normal((motions, 2)))

@@ -1,5 +1,6 @@
-"""A rover outdoors: rough ground with crates, balls and posts under a sky. It reads its velocity in the plane
-off ground it knows to be flat, from ahead of its bumper, and must also see what lies before it."""
+"""A rover outdoors: rough ground with crates, balls and posts under a sky. It reads its velocity in
+the plane off ground it knows to be flat, from ahead of its bumper, and must also see what lies
+before it."""
 
 import math
 
@@ -40,15 +41,17 @@ START = Design(6.5, 1.2, 0.55, 0.4, 0.0, 0.22, 0.0, math.radians(19), 0.0)
 
 
 def outdoors() -> RobotPair:
-    """The pair. The estimator knows the height and attitude of the rover over flat ground; what stands on it,
-    and the sky, it takes for what they are not.
+    """The pair. The estimator knows the height and attitude of the rover over flat ground; what
+    stands on it, and the sky, it takes for what they are not.
 
     >>> pair = outdoors()
     >>> pair.check(pair.design).mount()[:3, 3].tolist()
     [0.4, 0.0, 0.22]
     """
     prior = (1.5, 0.2, 0.05, 0.8, 0.8, 0.8)
-    return RobotPair("outdoors", BODIES, LOW, HIGH, START, PLANAR, prior, "ground", (3.0, 0.1), world, drive)
+    return RobotPair(
+        "outdoors", BODIES, LOW, HIGH, START, PLANAR, prior, "ground", (3.0, 0.1), world, drive
+    )
 
 
 def world(number: int) -> MitsubaScene:
@@ -101,5 +104,9 @@ def drive(number: int, motions: int) -> tuple[torch.Tensor, torch.Tensor]:
         if (np.hypot(things[:, 0] - x, things[:, 1] - y) > CLEAR_M + 1.5 * things[:, 2]).all():
             starts.append((x, y, heading))
     if len(starts) < motions:
-        raise DomainError(f"world {number} has room for {len(starts)} of {motions} drives; ask for fewer.")
-    return robot_pair.moved(robot_pair.standing(torch.tensor(starts, dtype=torch.float64)), twist), twist
+        raise DomainError(
+            f"world {number} has room for {len(starts)} of {motions} drives; ask for fewer."
+        )
+    return robot_pair.moved(
+        robot_pair.standing(torch.tensor(starts, dtype=torch.float64)), twist
+    ), twist

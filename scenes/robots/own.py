@@ -36,18 +36,18 @@ Drive = Callable[[int, int], tuple[Tensor, Tensor]]
 
 
 def own_pair(settings: OwnRobot | str | Path) -> RobotPair:
-    """The pair that a page of settings describes; to be looked at by ``check.check_pair`` before the first
-    frame.
+    """The pair that a page of settings describes; to be looked at by ``check.check_pair`` before
+    the first frame.
 
-    A robot that drives through the world of a pair stands with its lowest point 8 mm over the ground,
-    wherever its origin is. Windows of a trajectory begin at random places, for training in its first two
-    thirds, for judging in the rest. A world from a file is the same for all numbers.
+    A robot that drives through the world of a pair stands with its lowest point 8 mm over the
+    ground, wherever its origin is. Windows of a trajectory begin at random places, for training in
+    its first two thirds, for judging in the rest. A world from a file is the same for all numbers.
 
     Args:
       settings: or the path of their page (``page.read_own``).
-    Raises: FileFormatError for files that are missing or damaged; DomainError, naming the entry, for what is
-      unknown, missing, out of range, or does not go together: a robot without room in the world, a trajectory
-      that stands still or is shorter than three windows.
+    Raises: FileFormatError for files that are missing or damaged; DomainError, naming the entry,
+      for what is unknown, missing, out of range, or does not go together: a robot without room in
+      the world, a trajectory that stands still or is shorter than three windows.
     """
     own = settings if isinstance(settings, OwnRobot) else read_own(settings)
     bodies, frame = _bodies(own)
@@ -88,18 +88,20 @@ def own_pair(settings: OwnRobot | str | Path) -> RobotPair:
         ground_z_m=-float(middle[:, 2, 3].mean()),
         frame=frame,
         one_world=own.world not in PAIRS,
-        files=tuple(Path(name) for name in (own.robot, own.world, own.motion) if name and name not in PAIRS),
+        files=tuple(
+            Path(name) for name in (own.robot, own.world, own.motion) if name and name not in PAIRS
+        ),
         page=repr(own),
     )
 
 
 def recorded_drives(path: Path) -> tuple[Drive, tuple[float, ...]]:
-    """Windows of a trajectory (``RobotPair.drive``), with the constant twist that leads from the first pose
-    whose events are read to the last; and the root mean squares of its six velocities, at least 0.05 m/s and
-    rad/s, as a prior.
+    """Windows of a trajectory (``RobotPair.drive``), with the constant twist that leads from the
+    first pose whose events are read to the last; and the root mean squares of its six velocities,
+    at least 0.05 m/s and rad/s, as a prior.
 
-    Raises: FileFormatError, as ``scenes.tum.read_tum``; DomainError for one that is too short or stands
-      still.
+    Raises: FileFormatError, as ``scenes.tum.read_tum``; DomainError for one that is too short or
+      stands still.
     """
     t_s, poses = read_tum(path)
     window_s = float(robot_pair.times()[-1])
@@ -147,9 +149,13 @@ def _file(entry, name, kinds=()):
     """Path of a file that an entry names, of one of some kinds."""
     path = Path(name)
     if kinds and path.suffix.lower() not in kinds:
-        raise DomainError(f"{entry}: '{path}' is of no kind that is read here; give {', '.join(kinds)}.")
+        raise DomainError(
+            f"{entry}: '{path}' is of no kind that is read here; give {', '.join(kinds)}."
+        )
     if not path.is_file():
-        raise FileFormatError(f"{entry}: there is no file '{path}'; paths count from the folder of the page.")
+        raise FileFormatError(
+            f"{entry}: there is no file '{path}'; paths count from the folder of the page."
+        )
     return path
 
 
@@ -157,7 +163,9 @@ def _bodies(own):
     """Meshes in body axes, less those that move with the camera, and the name of the axes."""
     path = _file("robot", own.robot, (".urdf", *mesh_files.KINDS))
     missing = [
-        f"'{name}' in '{folder}'" for name, folder in own.packages.items() if not Path(folder).is_dir()
+        f"'{name}' in '{folder}'"
+        for name, folder in own.packages.items()
+        if not Path(folder).is_dir()
     ]
     if missing:
         raise FileFormatError(
@@ -178,7 +186,9 @@ def _bodies(own):
         )
     left = [part for part in parts if part.name not in own.without]
     if not left:
-        raise DomainError(f"robot: of '{path}' nothing with a shape is left; name fewer links in 'without'.")
+        raise DomainError(
+            f"robot: of '{path}' nothing with a shape is left; name fewer links in 'without'."
+        )
     bodies = {
         f"{k}-{re.sub(r'[^A-Za-z0-9_-]', '_', part.name)}": Body(part.vertices_m, part.faces)
         for k, part in enumerate(left)
@@ -241,14 +251,20 @@ def _designs(own):
     """Lowest, highest and first design."""
     bounds = own.camera.bounds()
     first = {name: getattr(own.start, name) for name in bounds}
-    first = {name: sum(bounds[name]) / 2 if value is None else value for name, value in first.items()}
+    first = {
+        name: sum(bounds[name]) / 2 if value is None else value for name, value in first.items()
+    }
     lens = (own.lens.focal_length_mm, own.lens.fno, 1 / own.lens.focus_m)
     low, high = ({name: ends[k] for name, ends in bounds.items()} for k in (0, 1))
     return [Design(*lens, **_in_radians(each)) for each in (low, high, first)]
 
 
 def _in_radians(numbers):
-    turns = {name.replace("_deg", "_rad"): math.radians(v) for name, v in numbers.items() if "_deg" in name}
+    turns = {
+        name.replace("_deg", "_rad"): math.radians(v)
+        for name, v in numbers.items()
+        if "_deg" in name
+    }
     return turns | {name: value for name, value in numbers.items() if name.endswith("_m")}
 
 

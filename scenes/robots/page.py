@@ -1,15 +1,15 @@
-"""A page of plain YAML that describes a user's robot: its body, where its camera may sit, what it moves
-through and how.
+"""A page of plain YAML that describes a user's robot: its body, where its camera may sit, what it
+moves through and how.
 
-    robot: rover.urdf          # or .obj, .stl, .ply, .dae, .gltf, .glb: metres, or unit_m; x forward, y left,
-      z up
+    robot: rover.urdf          # or .obj, .stl, .ply, .dae, .gltf, .glb: metres, or unit_m; x
+      forward, y left, z up
     without: [camera_link]     # links that move with the camera
     camera:
       low_m: [0.1, -0.1, 0.4]
       high_m: [0.3, 0.1, 0.6]
 
-What else may stand there is what the classes below have; units are in the names. Paths count from the page's
-folder.
+What else may stand there is what the classes below have; units are in the names. Paths count from
+the page's folder.
 """
 
 import difflib
@@ -38,7 +38,8 @@ HALF_DIAGONAL_MM = robot_pair.PITCH_MM * math.hypot(*robot_pair.SENSOR_PX) / 2
 
 @dataclass(frozen=True)
 class CameraBox:
-    """Where the camera may sit, in body axes, and how far it may turn: yaw to the left, pitch downwards."""
+    """Where the camera may sit, in body axes, and how far it may turn: yaw to the left, pitch
+    downwards."""
 
     low_m: Three
     high_m: Three
@@ -59,7 +60,9 @@ class CameraBox:
         for name in ("yaw_deg", "roll_deg"):
             low, high = getattr(self, name)
             if high - low > 360:
-                raise DomainError(f"camera: {name} goes from {low:g} to {high:g}; a turn, 360, is the most.")
+                raise DomainError(
+                    f"camera: {name} goes from {low:g} to {high:g}; a turn, 360, is the most."
+                )
 
     def bounds(self) -> dict[str, Two]:
         """Lowest and highest of the six numbers of a mount, by the names that Start has."""
@@ -91,7 +94,9 @@ class OwnLens:
 
     def __post_init__(self):
         if not self.focal_length_mm > 0:
-            raise DomainError(f"lens: focal_length_mm is {self.focal_length_mm:g}; a number > 0 is needed.")
+            raise DomainError(
+                f"lens: focal_length_mm is {self.focal_length_mm:g}; a number > 0 is needed."
+            )
         spans_deg = 2 * math.degrees(math.atan(HALF_DIAGONAL_MM / self.focal_length_mm))
         if spans_deg > WIDEST_DEG:
             raise DomainError(
@@ -147,19 +152,19 @@ class Require:
 class OwnRobot:
     """A user's robot, and how its camera is judged.
 
-    robot: URDF or mesh file. camera: bounds of the mount. without: links left out, those that move with the
-      camera.
+    robot: URDF or mesh file. camera: bounds of the mount. without: links left out, those that move
+      with the camera.
     start: of the mount, where the first search begins. lens: held. packages: package -> folder, for
-    package:// paths of a URDF. unit_m: metres per unit of the robot's mesh file, world_unit_m of the world's;
-    None is as the file says it, or metres.
-    world: "outdoors", "corridor" or "flight", or a file: a mesh (metres, z up; glTF y up) or a Mitsuba scene
-      (.xml).
-    motion: the drives of a pair by the same names, or a file of poses T_world_body (scenes.tum); None is the
-      world's.
-    velocities: which count, "planar" or "free"; None is as the pair has it that the motion names, "free" for
-      a file.
-    depth: how it is known, "ground" (the plane z = 0 of the world) or "scene" (a map); None is as the world's
-      pair has it, "scene" for a file.
+    package:// paths of a URDF. unit_m: metres per unit of the robot's mesh file, world_unit_m of
+    the world's; None is as the file says it, or metres.
+    world: "outdoors", "corridor" or "flight", or a file: a mesh (metres, z up; glTF y up) or a
+      Mitsuba scene (.xml).
+    motion: the drives of a pair by the same names, or a file of poses T_world_body (scenes.tum);
+      None is the world's.
+    velocities: which count, "planar" or "free"; None is as the pair has it that the motion names,
+      "free" for a file.
+    depth: how it is known, "ground" (the plane z = 0 of the world) or "scene" (a map); None is as
+      the world's pair has it, "scene" for a file.
     require: what the mount has to keep.
     Raises: DomainError for what does not go together.
     """
@@ -188,7 +193,9 @@ class OwnRobot:
                 )
         for name, known in (("velocities", VELOCITIES), ("depth", DEPTHS)):
             if getattr(self, name) not in (None, *known):
-                raise DomainError(f"{name} is {shown(getattr(self, name))}; give {' or '.join(known)}.")
+                raise DomainError(
+                    f"{name} is {shown(getattr(self, name))}; give {' or '.join(known)}."
+                )
         for name, of in (("unit_m", self.robot), ("world_unit_m", self.world)):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
@@ -196,7 +203,9 @@ class OwnRobot:
                     f"{name} is {value:g}; metres > 0 are needed, such as 0.001 for millimetres."
                 )
             if value is not None and of in PAIRS:
-                raise DomainError(f"{name} is of mesh files, and '{of}' is in metres; leave it out.")
+                raise DomainError(
+                    f"{name} is of mesh files, and '{of}' is in metres; leave it out."
+                )
             if value is not None and Path(of).suffix.lower() == ".urdf":
                 raise DomainError(
                     f"{name} is of mesh files, and '{of}' is in metres; give its meshes a scale there, such as "
@@ -213,8 +222,9 @@ class OwnRobot:
 def read_own(path: str | Path) -> OwnRobot:
     """The settings on a page of plain YAML (codesign.plain_yaml).
 
-    Raises: FileFormatError where the file is missing or no such page; DomainError, naming file and entry, for
-      an entry that is unknown (with the nearest name), missing, of another kind, or out of range.
+    Raises: FileFormatError where the file is missing or no such page; DomainError, naming file and
+      entry, for an entry that is unknown (with the nearest name), missing, of another kind, or out
+      of range.
     """
     path = Path(path)
     text = read_text(path, MOST_BYTES)
@@ -243,16 +253,21 @@ def _filled(kind, page, entry):
         if name not in kinds:
             near = difflib.get_close_matches(name, kinds, n=1)
             meant = f"did you mean '{where}{near[0]}'? " if near else ""
-            raise DomainError(f"there is no entry '{where}{name}'; {meant}There are {', '.join(kinds)}.")
+            raise DomainError(
+                f"there is no entry '{where}{name}'; {meant}There are {', '.join(kinds)}."
+            )
     for each in fields(kind):
         required = each.default is MISSING and each.default_factory is MISSING
         if required and each.name not in page:
             raise DomainError(f"the entry '{where}{each.name}' is missing; add it.")
-    return kind(**{name: _value(kinds[name], given, f"{where}{name}") for name, given in page.items()})
+    return kind(
+        **{name: _value(kinds[name], given, f"{where}{name}") for name, given in page.items()}
+    )
 
 
 def _value(kind, given, entry):
-    """What stands at an entry, checked to be of a kind: text, a number, so many of them, or a mapping."""
+    """What stands at an entry, checked to be of a kind: text, a number, so many of them, or a
+    mapping."""
     parts = get_args(kind)
     if get_origin(kind) is dict:
         if not isinstance(given, Mapping):

@@ -1,15 +1,17 @@
 """A robot and the world it moves through: what the design of its camera is judged by.
 
-A pair says where a camera may sit on a robot's body, which lens and mount it starts from, which velocities of
-the body count, and makes worlds and drives by number. Numbers below ``UNSEEN_FROM`` are for training, those
-from there on for judging; they share neither photographs nor random patterns, places or motions.
+A pair says where a camera may sit on a robot's body, which lens and mount it starts from, which
+velocities of the body count, and makes worlds and drives by number. Numbers below ``UNSEEN_FROM``
+are for training, those from there on for judging; they share neither photographs nor random
+patterns, places or motions.
 
-All pairs move in one hard regime: speeds from 0.05 to 3 m/s, evenly in their logarithm, unknown roll, pitch
-and yaw rates, half of the contrast of photographs, a slow sensor with high thresholds. There is no velocity
-at which flow is always within the estimator's reach, so that focal length, focus, height and attitude all
-matter.
+All pairs move in one hard regime: speeds from 0.05 to 3 m/s, evenly in their logarithm, unknown
+roll, pitch and yaw rates, half of the contrast of photographs, a slow sensor with high thresholds.
+There is no velocity at which flow is always within the estimator's reach, so that focal length,
+focus, height and attitude all matter.
 
-Body axes: x forward, y left, z up. The body is drawn in front of its camera (``render.MovingScene``).
+Body axes: x forward, y left, z up. The body is drawn in front of its camera
+(``render.MovingScene``).
 """
 
 import math
@@ -53,7 +55,11 @@ PITCH_MM = 0.0185
 WINDOW_PX = 32
 LEFTS_PX, TOPS_PX = ((0, (size - WINDOW_PX) // 2, size - WINDOW_PX) for size in SENSOR_PX)
 FILM = render.Film(
-    *SENSOR_PX, WINDOW_PX, WINDOW_PX, PITCH_MM, tuple((left, top) for top in TOPS_PX for left in LEFTS_PX)
+    *SENSOR_PX,
+    WINDOW_PX,
+    WINDOW_PX,
+    PITCH_MM,
+    tuple((left, top) for top in TOPS_PX for left in LEFTS_PX),
 )
 RAYS_PER_PX = 8
 DURATION_S = 0.02
@@ -78,8 +84,8 @@ PHOTOS = {False: ("gravel", "grass", "coffee"), True: ("brick", "astronaut", "ch
 
 @dataclass(frozen=True)
 class Design:
-    """A lens and where it looks from: focal length, f-number, 1 / distance in focus; position, yaw to the
-    left, pitch downwards and roll in body axes; bending of a family's lens."""
+    """A lens and where it looks from: focal length, f-number, 1 / distance in focus; position, yaw
+    to the left, pitch downwards and roll in body axes; bending of a family's lens."""
 
     efl_mm: float
     fno: float
@@ -99,21 +105,24 @@ class Design:
         return Mount(at, (0.0, 0.0, 0.0), **attitude)().detach()
 
     def camera(self, family: str | None = None) -> render.Camera:
-        """Nine windows behind a thin lens, or behind a traced one of a family (``lens.family``), whose image is darker
-        and less sharp towards the corners; numbers of the lens may then be tensors, whose gradients its rays carry."""
+        """Nine windows behind a thin lens, or behind a traced one of a family (``lens.family``),
+        whose image is darker and less sharp towards the corners; numbers of the lens may then be
+        tensors, whose gradients its rays carry."""
         if family is None:
             image_mm = 1 / (1 / self.efl_mm - 1e-3 * self.focus_per_m)
             optics = lens.ThinLens(self.efl_mm, self.efl_mm / self.fno, image_mm)
         else:
             optics = lens.family(family).lens(self.efl_mm, self.fno, self.focus_per_m, self.bending)
         falloff = family is not None
-        return render.Camera(optics, WINDOW_PX, WINDOW_PX, PITCH_MM, RAYS_PER_PX, 0, FILM, falloff=falloff)
+        return render.Camera(
+            optics, WINDOW_PX, WINDOW_PX, PITCH_MM, RAYS_PER_PX, 0, FILM, falloff=falloff
+        )
 
 
 @dataclass(frozen=True)
 class Drives(Batch):
-    """A batch that knows the truth. twist: [N, 6] of the body over the interval, m/s and rad/s in its own
-    axes."""
+    """A batch that knows the truth. twist: [N, 6] of the body over the interval, m/s and rad/s in
+    its own axes."""
 
     twist: Any = None
 
@@ -122,21 +131,25 @@ class Drives(Batch):
 class RobotPair:
     """A robot, its worlds and its drives.
 
-    name: of the pair. bodies: link -> mesh in body axes. low, high: bounds of the design. design: where to
-      start, inside them.
-    axes: which of the six velocities count (``mount.PLANAR`` or ``mount.FREE``); all six are estimated.
+    name: of the pair. bodies: link -> mesh in body axes. low, high: bounds of the design. design:
+      where to start, inside them.
+    axes: which of the six velocities count (``mount.PLANAR`` or ``mount.FREE``); all six are
+      estimated.
     prior: standard deviations expected of the six, m/s and rad/s.
     depth: how depth is known, "ground" or "scene" (``mount.EgoVelocity``).
-    look_ahead: distance in metres, and the share of the image that must see beyond it; None where nothing
-      must.
-    world: number -> what stands still. drive: (number, how many) -> T_world_body [M, T, 4, 4], twist [M, 6].
-    housing_radius_m, margin_m: of the camera, and by how much it must stay clear of the body. own_body_share:
-      of the image, that the body may cover. cable: direction in body axes and half angle in radians of a cone
-      into which the camera's back must not point; None where it may point anywhere. ground_z_m: height of the
-      ground in body axes.
-    frame: name of the body's axes (REP 105). one_world: whether all numbers are the same world, with other
-      drives. files: of which the pair was made, where a user gave them; page: what they wrote of it.
-    family: of traced lenses (``lens.family``), which every design has its camera from; None is a thin lens.
+    look_ahead: distance in metres, and the share of the image that must see beyond it; None where
+      nothing must.
+    world: number -> what stands still. drive: (number, how many) -> T_world_body [M, T, 4, 4],
+      twist [M, 6].
+    housing_radius_m, margin_m: of the camera, and by how much it must stay clear of the body.
+      own_body_share: of the image, that the body may cover. cable: direction in body axes and half
+      angle in radians of a cone into which the camera's back must not point; None where it may
+      point anywhere. ground_z_m: height of the ground in body axes.
+    frame: name of the body's axes (REP 105). one_world: whether all numbers are the same world,
+      with other drives. files: of which the pair was made, where a user gave them; page: what they
+      wrote of it.
+    family: of traced lenses (``lens.family``), which every design has its camera from; None is a
+      thin lens.
     """
 
     name: str
@@ -196,10 +209,13 @@ class RobotPair:
     def body(self) -> render.MitsubaScene:
         """The robot in its own axes, grey in the light of a plain sky that turns with it."""
         grey = Paint(np.full((1, 1), 90.0))
-        return emissive(World({name: (mesh, grey) for name, mesh in self.bodies.items()}, two_sided=True))
+        return emissive(
+            World({name: (mesh, grey) for name, mesh in self.bodies.items()}, two_sided=True)
+        )
 
     def batch(self, numbers: Sequence[int], motions: int, seed: int = 0) -> Drives:
-        """Worlds of these numbers with as many drives each, the body in them; the same for every design.
+        """Worlds of these numbers with as many drives each, the body in them; the same for every
+        design.
 
         seed: of film samples and sensor noise.
         """
@@ -213,10 +229,11 @@ class RobotPair:
         return Drives(poses, times(), scenes, seed, twist=twists.flatten(0, 1))
 
     def system(self, design: Design, layer: str = "memory") -> System:
-        """Camera, mount, sensor, flow and estimate of a design; objective "error" is the mean bounded one.
+        """Camera, mount, sensor, flow and estimate of a design; objective "error" is the mean
+        bounded one.
 
-        layer: "memory" (hard counts, straight-through gradient), "counts" (smooth, without noise) or "sensor"
-          (single events, no gradient: the judge).
+        layer: "memory" (hard counts, straight-through gradient), "counts" (smooth, without noise)
+          or "sensor" (single events, no gradient: the judge).
         """
         mount = self.check(design).mount()
 
@@ -253,13 +270,17 @@ LAYERS = {
 
 
 def mount_at(ranges: MountRanges, T_body_cam: Tensor) -> Mount:
-    """The learnable mount in the middle of a box that stands at a pose [4, 4]; a wall is approached to a
-    billionth."""
+    """The learnable mount in the middle of a box that stands at a pose [4, 4]; a wall is approached
+    to a billionth."""
     low, high = ranges.low[:3], ranges.high[:3]
     half, middle = (high - low) / 2, (low + high) / 2
-    inside = torch.where(half > 0, (T_body_cam[:3, 3] - middle).clamp(-INSIDE * half, INSIDE * half), 0.0)
+    inside = torch.where(
+        half > 0, (T_body_cam[:3, 3] - middle).clamp(-INSIDE * half, INSIDE * half), 0.0
+    )
     yaw, pitch, roll = yaw_pitch_roll_rad(T_body_cam).tolist()
-    return Mount(middle, half, yaw_rad=yaw, pitch_rad=pitch, roll_rad=roll, position_m=middle + inside)
+    return Mount(
+        middle, half, yaw_rad=yaw, pitch_rad=pitch, roll_rad=roll, position_m=middle + inside
+    )
 
 
 def closed_form(volume):
@@ -284,15 +305,15 @@ def _counted(count):
 
 
 def times() -> Tensor:
-    """[T] seconds of the frames: one before the window, in which the sensor settles, and those of the
-    window."""
+    """[T] seconds of the frames: one before the window, in which the sensor settles, and those of
+    the window."""
     window = LEAD_S + torch.linspace(0, DURATION_S, FRAMES - 1, dtype=torch.float64)
     return torch.cat([torch.zeros(1, dtype=torch.float64), window])
 
 
 def moved(T_world_body: Tensor, twist: Tensor) -> Tensor:
-    """Poses [M, T, 4, 4] of bodies that are at [M, 4, 4] in the middle of the window and go with twists [M,
-    6]."""
+    """Poses [M, T, 4, 4] of bodies that are at [M, 4, 4] in the middle of the window and go with
+    twists [M, 6]."""
     return T_world_body[:, None] @ se3_exp((times() - MIDDLE_S)[:, None] * twist[:, None])
 
 
@@ -317,8 +338,9 @@ def slowed(pair: RobotPair, share: float) -> RobotPair:
 
 
 def speeds_and_deviates(number: int, motions: int, columns: int) -> tuple[Tensor, Tensor]:
-    """Speeds [M] m/s, even in the logarithm over SPEED_M_S, and standard normal numbers [M, columns]; each of
-    them spread evenly over its distribution, in an order of its own (a Latin hypercube)."""
+    """Speeds [M] m/s, even in the logarithm over SPEED_M_S, and standard normal numbers
+    [M, columns]; each of them spread evenly over its distribution, in an order of its own
+    (a Latin hypercube)."""
     random = np.random.default_rng([number, 1])
     order = random.permuted(np.tile(np.arange(motions), (columns + 1, 1)), axis=1)
     share = torch.from_numpy((order + random.random(order.shape)) / motions).T
@@ -328,14 +350,15 @@ def speeds_and_deviates(number: int, motions: int, columns: int) -> tuple[Tensor
 
 
 def rolling(speed: Tensor, deviates: Tensor, slip: float, heave_m_s: float) -> Tensor:
-    """Twists [M, 6] of bodies that roll at speeds [M]: they slip sideways by a share of it, heave and turn, all by
-    standard normal numbers [M, 5]."""
+    """Twists [M, 6] of bodies that roll at speeds [M]: they slip sideways by a share of it, heave
+    and turn, all by standard normal numbers [M, 5]."""
     slide = [slip * speed * deviates[:, 0], heave_m_s * deviates[:, 1]]
     return torch.stack([speed, *slide, *(RATE_RAD_S * deviates[:, 2:]).unbind(1)], 1)
 
 
 def picture(random: np.random.Generator, unseen: bool, level: float) -> np.ndarray:
-    """A photograph or a random pattern of many scales as radiance [H, W] of a mean level, at CONTRAST."""
+    """A photograph or a random pattern of many scales as radiance [H, W] of a mean level, at
+    CONTRAST."""
     if random.random() < 0.5:
         found = textures.photo(str(random.choice(PHOTOS[unseen])))
     else:
@@ -345,16 +368,18 @@ def picture(random: np.random.Generator, unseen: bool, level: float) -> np.ndarr
 
 
 def variant(number: int) -> tuple[np.random.Generator, float, Callable[[float, float], Paint]]:
-    """What every world of a number begins with: its random numbers, the mean radiance of its surfaces, even
-    in the logarithm over LIGHT, and what paints a surface of a width and height in metres, in texels of 1.5
-    to 3 mm."""
+    """What every world of a number begins with: its random numbers, the mean radiance of its
+    surfaces, even in the logarithm over LIGHT, and what paints a surface of a width and height in
+    metres, in texels of 1.5 to 3 mm."""
     random = np.random.default_rng([number, 2])
     level = float(np.exp(random.uniform(*np.log(LIGHT))))
 
     def paint(width_m: float, height_m: float) -> Paint:
         found = picture(random, number >= UNSEEN_FROM, level)
         texel_m = random.uniform(0.0015, 0.003)
-        return Paint(found, (width_m / (texel_m * found.shape[1]), height_m / (texel_m * found.shape[0])))
+        return Paint(
+            found, (width_m / (texel_m * found.shape[1]), height_m / (texel_m * found.shape[0]))
+        )
 
     return random, level, paint
 

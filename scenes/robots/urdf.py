@@ -1,5 +1,5 @@
-"""Robots from URDF files: their bodies at given joint angles as scenes, and named frames to mount a camera
-on. Metres, radians; the robot's own axes are those of one of its links.
+"""Robots from URDF files: their bodies at given joint angles as scenes, and named frames to mount a
+camera on. Metres, radians; the robot's own axes are those of one of its links.
 
     robot = robots.from_urdf("rover.urdf", {"mast": 0.3})
     world = render.MovingScene(static, {"robot": (robot.scene(), T_world_robot)})
@@ -33,8 +33,8 @@ yourdfpy = optional("yourdfpy", "worlds", "reading URDF")
 trimesh = optional("trimesh", "worlds", "reading URDF")
 etree = optional("lxml.etree", "worlds", "reading URDF")
 
-# from the axes of a camera (z forward, x right, y down) to those of a link (x forward, y left, z up): ROS REP
-# 103
+# from the axes of a camera (z forward, x right, y down) to those of a link (x forward, y left, z
+# up): ROS REP 103
 T_LINK_OPTICAL = torch.tensor(
     [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64
 )
@@ -48,8 +48,9 @@ MOST_BYTES = 100_000_000
 
 @dataclass(frozen=True)
 class Robot:
-    """Links at joint angles. path: of the URDF. frames: name of each link -> T_robot_link [4, 4]. parts: what
-    is seen, in the robot's axes, named by link. base: the link whose axes are the robot's."""
+    """Links at joint angles. path: of the URDF. frames: name of each link -> T_robot_link [4, 4].
+    parts: what is seen, in the robot's axes, named by link. base: the link whose axes are the
+    robot's."""
 
     path: Path
     frames: Mapping[str, np.ndarray]
@@ -59,12 +60,14 @@ class Robot:
     def frame(self, name: str) -> Tensor:
         """T_robot_frame [4, 4] float64 of a link. Raises: DomainError for one that is not there."""
         if name not in self.frames:
-            raise DomainError(f"robot '{self.path}' has no frame '{name}'; it has {', '.join(self.frames)}.")
+            raise DomainError(
+                f"robot '{self.path}' has no frame '{name}'; it has {', '.join(self.frames)}."
+            )
         return torch.from_numpy(self.frames[name].copy())
 
     def scene(self, device: str = "cpu") -> MitsubaScene:
-        """The robot in its own axes, as an emissive scene before nothing: its colours in the light of a plain
-        sky that turns with it. Raises: DomainError for a robot without a body."""
+        """The robot in its own axes, as an emissive scene before nothing: its colours in the light
+        of a plain sky that turns with it. Raises: DomainError for a robot without a body."""
         return emissive(World(self.shapes(), two_sided=True), device)
 
     def shapes(self) -> dict[str, Any]:
@@ -89,19 +92,20 @@ def from_urdf(
 
     Args:
       path: a .urdf file (a .xacro has to be expanded before).
-      joint_angles: joint -> radians (metres of a prismatic one), within its limits; the others are at 0, or
-        at the limit next to it. Joints that mimic others follow them. Floating and planar joints are held at
-        0.
+      joint_angles: joint -> radians (metres of a prismatic one), within its limits; the others are
+        at 0, or at the limit next to it. Joints that mimic others follow them. Floating and planar
+        joints are held at 0.
       base: the link whose axes are the robot's; None is the root of the tree.
-      packages: package -> folder, for package:// paths; one that is not named is searched from the URDF's
-        folder upwards.
-      collision: whether collision shapes are shown even where there are visual ones; a link without visual
-        shapes shows its collision shapes always.
-    Returns: Robot. Meshes keep their own colours, or take those of the URDF's material (as sRGB); the
-      pictures of URDF materials are left. A .dae counts in the unit that it says, with its axes as they are,
-      as ROS's own viewer has it.
-    Raises: FileFormatError for a file that is missing or damaged, or for meshes that are (all of them in one
-      sentence); DomainError for joints and frames that are not there and for angles outside their limits.
+      packages: package -> folder, for package:// paths; one that is not named is searched from the
+        URDF's folder upwards.
+      collision: whether collision shapes are shown even where there are visual ones; a link without
+        visual shapes shows its collision shapes always.
+    Returns: Robot. Meshes keep their own colours, or take those of the URDF's material (as sRGB);
+      the pictures of URDF materials are left. A .dae counts in the unit that it says, with its axes
+      as they are, as ROS's own viewer has it.
+    Raises: FileFormatError for a file that is missing or damaged, or for meshes that are (all of
+      them in one sentence); DomainError for joints and frames that are not there and for angles
+      outside their limits.
     """
     path = Path(path)
     model = _model(path)
@@ -117,13 +121,16 @@ def from_urdf(
     parts = []
     _check_places(path, frames.values())
     for link in model.robot.links:
-        shapes = link.collisions if collision and link.collisions else link.visuals or link.collisions
+        shapes = (
+            link.collisions if collision and link.collisions else link.visuals or link.collisions
+        )
         for shape in shapes:
             placed = frames[link.name] @ (np.eye(4) if shape.origin is None else shape.origin)
             _check_places(path, [placed])
             colour = _colour(getattr(shape, "material", None), materials)
             parts += [
-                _moved(part, placed, link.name, colour) for part in _parts(shape.geometry, finder, link.name)
+                _moved(part, placed, link.name, colour)
+                for part in _parts(shape.geometry, finder, link.name)
             ]
     finder.check()
     robot = Robot(path, frames, tuple(parts), root)
@@ -145,7 +152,9 @@ def _model(path):
     if not path.is_file():
         raise FileFormatError(f"robot '{path}' is not a file; give the path of a .urdf file.")
     if path.suffix.lower() == ".xacro":
-        raise FileFormatError(f"robot '{path}' is a xacro; expand it first: xacro {path.name} > robot.urdf")
+        raise FileFormatError(
+            f"robot '{path}' is a xacro; expand it first: xacro {path.name} > robot.urdf"
+        )
     data = read_bytes(path, MOST_BYTES)
     with building(f"robot '{path}'", "it is no whole URDF; correct or export it anew"):
         # whole or not at all: yourdfpy would go on with what it can read
@@ -176,7 +185,11 @@ def _no_tree(model):
     if looped:
         return f"joints lead in a loop through {', '.join(looped)}"
     roots = sorted(set(links) - {child for _, child in pairs})
-    return "" if len(roots) == 1 else f"it has {len(roots)} root links instead of 1: {', '.join(roots)}"
+    return (
+        ""
+        if len(roots) == 1
+        else f"it has {len(roots)} root links instead of 1: {', '.join(roots)}"
+    )
 
 
 def _wrong_joint(joints):
@@ -186,9 +199,7 @@ def _wrong_joint(joints):
         if joint.type not in KINDS:
             return f"joint '{joint.name}' is of the type '{joint.type}', which is none of {', '.join(KINDS)}"
         if joint.mimic is not None and joint.mimic.joint not in leaders:
-            return (
-                f"joint '{joint.name}' mimics '{joint.mimic.joint}', which is no joint that moves by itself"
-            )
+            return f"joint '{joint.name}' mimics '{joint.mimic.joint}', which is no joint that moves by itself"
         if joint.type in MOVES and not 1e-9 < np.linalg.norm(joint.axis) < 1e9:
             return f"joint '{joint.name}' has the axis {' '.join(f'{v:g}' for v in joint.axis)}, which has no direction"
     return ""
@@ -241,7 +252,9 @@ def _parts(geometry, finder, link):
         (radius,) = finder.sizes((geometry.sphere.radius,), 1, "sphere", link)
         mesh = trimesh.creation.icosphere(FINE, radius)
     grey = np.full(len(mesh.faces), mesh_files.UNCOLOURED)
-    return [mesh_files.Part("", np.array(mesh.vertices), np.array(mesh.faces), grey, coloured=False)]
+    return [
+        mesh_files.Part("", np.array(mesh.vertices), np.array(mesh.faces), grey, coloured=False)
+    ]
 
 
 def _moved(part, T_robot_shape, link, colour):

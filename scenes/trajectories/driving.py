@@ -1,5 +1,6 @@
-"""A ground robot with differential drive: turns, wheel slip and the shake of its suspension, all of them smooth
-random functions of time whose integrals and products are known in closed form (Waves)."""
+"""A ground robot with differential drive: turns, wheel slip and the shake of its suspension, all of
+them smooth random functions of time whose integrals and products are known in closed form
+(Waves)."""
 
 import math
 from dataclasses import dataclass
@@ -17,7 +18,8 @@ NODES = 8  # of Gauss and Legendre on such a step: exact to rounding for the slo
 
 @dataclass(frozen=True)
 class Waves:
-    """mean + sum of amplitude cos(rate t + phase); amplitude, rate_rad_s, phase_rad: [K] float64."""
+    """mean + sum of amplitude cos(rate t + phase); amplitude, rate_rad_s, phase_rad: [K]
+    float64."""
 
     mean: float
     amplitude: Tensor
@@ -26,24 +28,27 @@ class Waves:
 
     @staticmethod
     def random(generator, mean, bound, lowest_hz, highest_hz, count=3):
-        """``count`` waves with frequencies drawn between two, which never lead further than ``bound`` from
-        the mean."""
+        """``count`` waves with frequencies drawn between two, which never lead further than
+        ``bound`` from the mean."""
         draw = torch.rand(3, count, generator=generator, dtype=torch.float64)
         share = 0.5 + draw[0]
         frequency = lowest_hz * (highest_hz / lowest_hz) ** draw[1]
-        return Waves(float(mean), bound * share / share.sum(), 2 * math.pi * frequency, 2 * math.pi * draw[2])
+        return Waves(
+            float(mean), bound * share / share.sum(), 2 * math.pi * frequency, 2 * math.pi * draw[2]
+        )
 
     def __call__(self, t_s):
         """Values at times of any shape."""
-        return self.mean + (self.amplitude * (self.rate_rad_s * t_s[..., None] + self.phase_rad).cos()).sum(
-            -1
-        )
+        return self.mean + (
+            self.amplitude * (self.rate_rad_s * t_s[..., None] + self.phase_rad).cos()
+        ).sum(-1)
 
     def integral(self, t_s):
         """Integral from 0 to each time."""
         half = self.rate_rad_s * t_s[..., None] / 2
         return t_s * (
-            self.mean + (self.amplitude * (half + self.phase_rad).cos() * torch.sinc(half / math.pi)).sum(-1)
+            self.mean
+            + (self.amplitude * (half + self.phase_rad).cos() * torch.sinc(half / math.pi)).sum(-1)
         )
 
     def scaled(self, factor):
@@ -68,7 +73,8 @@ class Waves:
             return (getattr(self, name)[:, None] + sign * getattr(other, name)).reshape(-1)
 
         mixed = (
-            Waves(0.0, amplitude, pairs("rate_rad_s", sign), pairs("phase_rad", sign)) for sign in (-1, 1)
+            Waves(0.0, amplitude, pairs("rate_rad_s", sign), pairs("phase_rad", sign))
+            for sign in (-1, 1)
         )
         total = self.scaled(other.mean).plus(
             Waves(0.0, other.amplitude * self.mean, other.rate_rad_s, other.phase_rad)
@@ -81,19 +87,19 @@ class Waves:
 class Driving(Trajectory):
     """Pose of the body of a robot that drives on the plane z = 0.
 
-    The wheels turn at speeds v -/+ w track / 2 (left, right), with speed v and turn rate w smooth random
-    functions of time. Over the ground a wheel moves slower, by its slip (a share, at most ``slip``); in a
-    turn the robot slides outwards at ``side_slip_s`` times its sideways acceleration. Without slip the
-    velocity has no sideways part (the nonholonomic constraint) and heading and distance are those the wheels
-    count.
+    The wheels turn at speeds v -/+ w track / 2 (left, right), with speed v and turn rate w smooth
+    random functions of time. Over the ground a wheel moves slower, by its slip (a share, at most
+    ``slip``); in a turn the robot slides outwards at ``side_slip_s`` times its sideways
+    acceleration. Without slip the velocity has no sideways part (the nonholonomic constraint) and
+    heading and distance are those the wheels count.
 
     Args:
       generator: torch.Generator. duration_s: poses exist from 0 to there.
-      speed_m_s, turn_rad_s: mean speed and turn rate (left positive). speed_share: by how much the speed
-        varies, below 1. turn_swing_rad_s: by how much the rate does.
+      speed_m_s, turn_rad_s: mean speed and turn rate (left positive). speed_share: by how much the
+        speed varies, below 1. turn_swing_rad_s: by how much the rate does.
       track_m: distance of the wheels. slip: largest slip, 0 to below 1. side_slip_s: seconds.
-      height_m: of the body's origin over the ground. heave_m, pitch_rad, roll_rad: largest shake, between 2
-        and 9 Hz.
+      height_m: of the body's origin over the ground. heave_m, pitch_rad, roll_rad: largest shake,
+        between 2 and 9 Hz.
       x_m, y_m, yaw_rad: pose at time 0 (without shake).
     """
 
@@ -132,11 +138,13 @@ class Driving(Trajectory):
         turn = Waves.random(generator, turn_rad_s, turn_swing_rad_s, 0.1, 0.5)
         self._wheels = tuple(speed.plus(turn.scaled(side * self.track_m / 2)) for side in (-1, 1))
         self._rolled = tuple(
-            wheel.times(Waves.random(generator, 1 - slip / 2, slip / 2, 0.2, 1.5)) for wheel in self._wheels
+            wheel.times(Waves.random(generator, 1 - slip / 2, slip / 2, 0.2, 1.5))
+            for wheel in self._wheels
         )
         self._turn = self._rolled[1].plus(self._rolled[0].scaled(-1)).scaled(1 / self.track_m)
         self._shake = tuple(
-            Waves.random(generator, 0.0, bound, 2.0, 9.0, 4) for bound in (heave_m, pitch_rad, roll_rad)
+            Waves.random(generator, 0.0, bound, 2.0, 9.0, 4)
+            for bound in (heave_m, pitch_rad, roll_rad)
         )
         self.height_m = float(height_m)
         self.start = (float(x_m), float(y_m), float(yaw_rad))

@@ -1,10 +1,11 @@
-"""A quadrotor's flight of least snap (fourth derivative) through waypoints; the attitude follows from acceleration
-and yaw.
+"""A quadrotor's flight of least snap (fourth derivative) through waypoints; the attitude follows
+from acceleration and yaw.
 
-The path of least integral of squared snap with given points, and with velocity, acceleration and jerk of 0 at
-both ends, has degree 7 between points and six continuous derivatives at them (the Euler-Lagrange equation
-x^(8) = 0 with its natural conditions).
-Source: Mellinger and Kumar, Minimum snap trajectory generation and control for quadrotors, ICRA 2011.
+The path of least integral of squared snap with given points, and with velocity, acceleration and
+jerk of 0 at both ends, has degree 7 between points and six continuous derivatives at them (the
+Euler-Lagrange equation x^(8) = 0 with its natural conditions).
+Source: Mellinger and Kumar, Minimum snap trajectory generation and control for quadrotors, ICRA
+  2011.
 """
 
 import math
@@ -31,18 +32,18 @@ SAMPLES = 64  # per segment, at which flights are checked
 
 @dataclass(frozen=True)
 class Polynomials:
-    """Piecewise polynomials: coefficient [M, 8, D] of powers of (t - start) / length per segment, knots_s [M
-    + 1]."""
+    """Piecewise polynomials: coefficient [M, 8, D] of powers of (t - start) / length per segment,
+    knots_s [M + 1]."""
 
     coefficient: Tensor
     knots_s: Tensor
 
     def __call__(self, t_s, order=0):
-        """The ``order``-th derivative at times [n] (seconds): [n, D]. At a knot the segment behind it counts;
-        gradient to the time."""
-        segment = (torch.searchsorted(self.knots_s, t_s.detach().contiguous(), right=True) - 1).clamp(
-            0, len(self.knots_s) - 2
-        )
+        """The ``order``-th derivative at times [n] (seconds): [n, D]. At a knot the segment behind
+        it counts; gradient to the time."""
+        segment = (
+            torch.searchsorted(self.knots_s, t_s.detach().contiguous(), right=True) - 1
+        ).clamp(0, len(self.knots_s) - 2)
         length = self.knots_s.diff()[segment]
         u = ((t_s - self.knots_s[segment]) / length)[:, None]
         value = torch.zeros_like(u)
@@ -57,8 +58,8 @@ def minimum_snap(points, t_s):
     Args:
       points: [K >= 2, D] to pass, t_s: [K] when, strictly increasing seconds.
     Returns: Polynomials, float64.
-    Raises: ShapeError; DomainError for values that are not finite, times that do not increase, durations that
-      differ more than 100 times, more than 200 points.
+    Raises: ShapeError; DomainError for values that are not finite, times that do not increase,
+      durations that differ more than 100 times, more than 200 points.
     """
     points = torch.as_tensor(points, dtype=torch.float64)
     t_s = torch.as_tensor(t_s, dtype=torch.float64)
@@ -92,14 +93,14 @@ def minimum_snap(points, t_s):
 class Flying(Trajectory):
     """Pose of a quadrotor that flies through waypoints, at rest at both ends.
 
-    The thrust axis (body z) is along acceleration plus gravity; the heading is the yaw, whose path has least
-    snap too (differential flatness).
+    The thrust axis (body z) is along acceleration plus gravity; the heading is the yaw, whose path
+    has least snap too (differential flatness).
 
     Args:
-      waypoints_m: [K >= 2, 3]. yaw_rad: [K] heading at each, not wrapped (350 to 10 degrees is a turn of
-        -340). t_s: [K] seconds, increasing.
-    Raises: ShapeError; DomainError as minimum_snap, and when the flight comes close to free fall or to thrust
-      along its heading (fly slower).
+      waypoints_m: [K >= 2, 3]. yaw_rad: [K] heading at each, not wrapped (350 to 10 degrees is a
+        turn of -340). t_s: [K] seconds, increasing.
+    Raises: ShapeError; DomainError as minimum_snap, and when the flight comes close to free fall or
+      to thrust along its heading (fly slower).
     Source: Mellinger and Kumar, ICRA 2011, sections III and IV.
     """
 
@@ -125,7 +126,10 @@ class Flying(Trajectory):
                 f"the flight comes within {LEAST_THRUST:g} g of free fall at {at:.3g} s, where its attitude "
                 "is undefined; allow more time between waypoints."
             )
-        if float(torch.linalg.cross(thrust / size[:, None], heading).norm(dim=1).min()) < LEVEL_ENOUGH:
+        if (
+            float(torch.linalg.cross(thrust / size[:, None], heading).norm(dim=1).min())
+            < LEVEL_ENOUGH
+        ):
             raise DomainError(
                 "the flight tilts until its thrust points along its heading, where its attitude is "
                 "undefined; allow more time between waypoints."
@@ -133,15 +137,18 @@ class Flying(Trajectory):
 
     @staticmethod
     def random(generator, duration_s, low_m, high_m, target_m=None, seconds_per_leg=1.2):
-        """A flight through points drawn in a box, looking at ``target_m`` at each (along the path when None);
-        lasts at least ``duration_s``.
+        """A flight through points drawn in a box, looking at ``target_m`` at each
+        (along the path when None); lasts at least ``duration_s``.
 
-        Raises: DomainError when the box is so large that no such flight is possible in the time per leg.
+        Raises: DomainError when the box is so large that no such flight is possible in the time per
+          leg.
         """
         legs = max(2, math.ceil(duration_s / seconds_per_leg))
         low = torch.tensor(low_m, dtype=torch.float64)
         high = torch.tensor(high_m, dtype=torch.float64)
-        points = low + (high - low) * torch.rand(legs + 1, 3, generator=generator, dtype=torch.float64)
+        points = low + (high - low) * torch.rand(
+            legs + 1, 3, generator=generator, dtype=torch.float64
+        )
         towards = (
             points.diff(dim=0)[:, :2]
             if target_m is None
@@ -155,7 +162,9 @@ class Flying(Trajectory):
 
     def _thrust(self, t_s):
         """Thrust per mass [n, 3], m/s^2."""
-        return self.path(t_s, 2)[:, :3] + torch.tensor([0.0, 0.0, GRAVITY_M_S2], dtype=torch.float64)
+        return self.path(t_s, 2)[:, :3] + torch.tensor(
+            [0.0, 0.0, GRAVITY_M_S2], dtype=torch.float64
+        )
 
     def _heading(self, t_s):
         yaw = self.path(t_s)[:, 3]
@@ -167,4 +176,6 @@ class Flying(Trajectory):
 
         up = unit(self._thrust(t_s))
         left = unit(torch.linalg.cross(up, self._heading(t_s)))
-        return rigid(torch.stack([torch.linalg.cross(left, up), left, up], 2), self.path(t_s)[:, :3])
+        return rigid(
+            torch.stack([torch.linalg.cross(left, up), left, up], 2), self.path(t_s)[:, :3]
+        )

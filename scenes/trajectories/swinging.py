@@ -1,4 +1,5 @@
-"""Motions about a place: orbits of varying radius and speed, and swings towards the scene or up and down."""
+"""Motions about a place: orbits of varying radius and speed, and swings towards the scene or up and
+down."""
 
 import math
 
@@ -12,11 +13,12 @@ class Orbital(Trajectory):
     """A circle about a vertical axis, looking at a point on it, with radius and speed that swing.
 
     Args:
-      centre_m: the point looked at. radius_m, height_m: mean distance from the axis; height above the centre.
+      centre_m: the point looked at. radius_m, height_m: mean distance from the axis; height above
+        the centre.
       rate_rad_s: mean angular rate, of either sign, not 0. phase_rad: bearing at time 0.
-      radius_swing, rate_swing: shares (below 1) by which radius and rate go up and down; radius_period_s,
-        rate_period_s: in which time. Angular rate: rate (1 + rate_swing cos(2 pi t / period)). Radius: radius
-        (1 + radius_swing sin(2 pi t / period)).
+      radius_swing, rate_swing: shares (below 1) by which radius and rate go up and down;
+        radius_period_s, rate_period_s: in which time. Angular rate: rate (1 + rate_swing
+        cos(2 pi t / period)). Radius: radius (1 + radius_swing sin(2 pi t / period)).
     """
 
     def __init__(
@@ -35,7 +37,9 @@ class Orbital(Trajectory):
         self.radius_m = positive("radius_m", radius_m)
         self.height_m = float(height_m)
         self.phase_rad = float(phase_rad)
-        self.rate_rad_s = math.copysign(positive("the size of rate_rad_s", abs(rate_rad_s)), rate_rad_s)
+        self.rate_rad_s = math.copysign(
+            positive("the size of rate_rad_s", abs(rate_rad_s)), rate_rad_s
+        )
         self.radius_swing = positive("radius_swing", radius_swing, 0, 1, inclusive=True)
         self.rate_swing = positive("rate_swing", rate_swing, 0, 1, inclusive=True)
         self._radius_turn = 2 * math.pi / positive("radius_period_s", radius_period_s)
@@ -51,12 +55,14 @@ class Orbital(Trajectory):
         away = torch.stack([radius * angle.cos(), radius * angle.sin(), height], 1)
         forward = -away / away.square().sum(1, keepdim=True).sqrt()
         left = torch.stack([angle.sin(), -angle.cos(), nothing], 1)  # up x forward, for any height
-        return rigid(torch.stack([forward, left, torch.linalg.cross(forward, left)], 2), self.centre_m + away)
+        return rigid(
+            torch.stack([forward, left, torch.linalg.cross(forward, left)], 2), self.centre_m + away
+        )
 
 
 class Swinging(Trajectory):
-    """start + direction * amplitude * sin(2 pi frequency t), with the attitude of the start; the speed is at
-    most 2 pi frequency amplitude.
+    """start + direction * amplitude * sin(2 pi frequency t), with the attitude of the start; the
+    speed is at most 2 pi frequency amplitude.
 
     Args:
       T_world_start: [4, 4] body pose.
@@ -66,7 +72,9 @@ class Swinging(Trajectory):
 
     def __init__(self, T_world_start, direction, amplitude_m, frequency_hz):
         self.start = check_pose(T_world_start.detach().double())
-        self.direction = torch.nn.functional.normalize(torch.as_tensor(direction, dtype=torch.float64), dim=0)
+        self.direction = torch.nn.functional.normalize(
+            torch.as_tensor(direction, dtype=torch.float64), dim=0
+        )
         self.amplitude_m = positive("amplitude_m", amplitude_m)
         self.frequency_hz = positive("frequency_hz", frequency_hz)
 
@@ -83,5 +91,6 @@ class Swinging(Trajectory):
     def _pose(self, t_s):
         shift = self.amplitude_m * (2 * math.pi * self.frequency_hz * t_s).sin()
         return rigid(
-            self.start[:3, :3].expand(len(t_s), 3, 3), self.start[:3, 3] + shift[:, None] * self.direction
+            self.start[:3, :3].expand(len(t_s), 3, 3),
+            self.start[:3, 3] + shift[:, None] * self.direction,
         )

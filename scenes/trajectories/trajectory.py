@@ -1,8 +1,8 @@
-"""What a trajectory is: a smooth function from time to the pose of a body, with its velocity; a camera mounted on
-one; and the simplest, as poses T_world_cam [T, 4, 4] at given times.
+"""What a trajectory is: a smooth function from time to the pose of a body, with its velocity; a
+camera mounted on one; and the simplest, as poses T_world_cam [T, 4, 4] at given times.
 
-Body axes: x forward, y left, z up. A velocity is a twist in body axes: [n, 6], metres per second, then
-radians per second, so that T(t + dt) is T(t) exp(dt velocity(t)) to first order.
+Body axes: x forward, y left, z up. A velocity is a twist in body axes: [n, 6], metres per second,
+then radians per second, so that T(t + dt) is T(t) exp(dt velocity(t)) to first order.
 """
 
 import math
@@ -33,18 +33,21 @@ class Trajectory(ABC):
         Args:
           t_s: [n] seconds, in any order.
         Returns: [n, 4, 4] float64, without gradient to the time.
-        Raises: ShapeError for anything but a list of times; DomainError for times that are not finite or lie
-          outside ``span_s``.
+        Raises: ShapeError for anything but a list of times; DomainError for times that are not
+          finite or lie outside ``span_s``.
         """
         return self._pose(self._times(t_s))
 
     def velocity(self, t_s):
-        """Twist in body axes at times [n]: [n, 6] float64 (m/s, rad/s), the exact derivative of the poses."""
+        """Twist in body axes at times [n]: [n, 6] float64 (m/s, rad/s), the exact derivative of the
+        poses."""
         with torch.enable_grad():
             t = self._times(t_s).clone().requires_grad_()
             pose = self._pose(t)[:, :3]
             entries = pose.flatten(1).unbind(1)
-            change = [torch.autograd.grad(entry.sum(), t, retain_graph=True)[0] for entry in entries]
+            change = [
+                torch.autograd.grad(entry.sum(), t, retain_graph=True)[0] for entry in entries
+            ]
         local = pose[:, :, :3].detach().mT @ torch.stack(change, 1).reshape(-1, 3, 4)
         turn = local[:, (2, 0, 1), (1, 2, 0)] - local[:, (1, 2, 0), (2, 0, 1)]
         return torch.cat([local[:, :, 3], turn / 2], 1)
@@ -56,7 +59,9 @@ class Trajectory(ABC):
     def _times(self, t_s):
         t = torch.as_tensor(t_s, dtype=torch.float64).detach()
         if t.ndim != 1 or t.numel() == 0:
-            raise ShapeError(f"a trajectory takes a list of times [n >= 1], got shape {tuple(t.shape)}.")
+            raise ShapeError(
+                f"a trajectory takes a list of times [n >= 1], got shape {tuple(t.shape)}."
+            )
         check_finite(t, "trajectory times", "give finite seconds")
         if self.span_s is not None and not (
             self.span_s[0] <= float(t.min()) and float(t.max()) <= self.span_s[1]
@@ -87,8 +92,8 @@ class _Mounted:
 
 
 def mounted(trajectory: Any, T_body_cam: Tensor) -> Any:
-    """The path of a camera on a body: T_world_cam = T_world_body T_body_cam, with the camera's velocity in
-    its own axes.
+    """The path of a camera on a body: T_world_cam = T_world_body T_body_cam, with the camera's
+    velocity in its own axes.
 
     Args:
       trajectory: anything with a call, ``velocity`` and ``span_s``.
@@ -102,7 +107,8 @@ def mounted(trajectory: Any, T_body_cam: Tensor) -> Any:
 
 
 def body_at(origin_m, target_m, up=(0.0, 0.0, 1.0)):
-    """Pose T_world_body [4, 4] of a body at ``origin_m`` whose forward axis points at ``target_m``. Raises:
+    """Pose T_world_body [4, 4] of a body at ``origin_m`` whose forward axis points at ``target_m``.
+    Raises:
     as codesign.pose.look_at."""
     pose = look_at(origin_m, target_m, tuple(-v for v in up))
     pose[:3, :3] = pose[:3, :3] @ AXES_BODY_CAM.mT
@@ -116,8 +122,8 @@ def rigid(rotation, position_m):
 
 
 def positive(name, value, least=0.0, most=float("inf"), inclusive=False):
-    """Raise DomainError unless ``least`` < value < ``most`` (or ``least`` <= value); returns it as a
-    float."""
+    """Raise DomainError unless ``least`` < value < ``most`` (or ``least`` <= value); returns it as
+    a float."""
     if not ((least <= value if inclusive else least < value) and value < most):
         raise DomainError(
             f"trajectory: {name} = {value} must be {'at least' if inclusive else 'above'} {least:g} and "
@@ -136,8 +142,8 @@ def times(count: int, rate_hz: float) -> Tensor:
 
 
 def body_twist(start: Tensor, twist_per_s: Tensor, t_s: Tensor) -> Tensor:
-    """Constant velocity in the camera's own axes: start [4, 4], twist_per_s [..., 6] (m/s, rad/s), t_s [T] ->
-    [..., T, 4, 4]."""
+    """Constant velocity in the camera's own axes: start [4, 4], twist_per_s [..., 6] (m/s, rad/s),
+    t_s [T] -> [..., T, 4, 4]."""
     return start @ se3_exp(t_s[:, None] * twist_per_s[..., None, :])
 
 

@@ -45,7 +45,8 @@ class Plane:
 
 
 class Bent:
-    """A point seen at p + share(t) d(p) at time 0 is seen at H(t) p at time t, with a smooth field d.
+    """A point seen at p + share(t) d(p) at time 0 is seen at H(t) p at time t, with a smooth field
+    d.
 
     Args:
       homographies: [T, 3, 3], centred px.
@@ -187,7 +188,8 @@ def cover(draw, size, scale, image_px):
         if shape == 0:
             bearing = np.arctan2(across, along)
             wave = sum(
-                draw.normal(0, 0.15) * np.cos(n * bearing + draw.uniform(0, 2 * np.pi)) for n in (2, 3, 5)
+                draw.normal(0, 0.15) * np.cos(n * bearing + draw.uniform(0, 2 * np.pi))
+                for n in (2, 3, 5)
             )
             cover |= np.hypot(along, across) < radius * (1 + wave)
         elif shape == 1:
@@ -222,7 +224,8 @@ def apply(homography, points):
 
 
 def lookup(crop, units):
-    """A texture [C, S, S] at grid_sample's units [T, 2, H, W] -> [T, C, H, W]; mirrored beyond the border."""
+    """A texture [C, S, S] at grid_sample's units [T, 2, H, W] -> [T, C, H, W]; mirrored beyond the
+    border."""
     times, _, height, width = units.shape
     grid = units.permute(0, 2, 3, 1).reshape(1, times * height, width, 2)
     found = grid_sample(crop[None], grid, padding_mode="reflection", align_corners=False)

@@ -51,7 +51,8 @@ def vibration(draw, t, width_px, height_px, flow_px):
 
 
 def zoom(draw, t, width_px, height_px, rate):
-    """An approach or a retreat at a steady course, by exp(rate t); rate: (least, most) per window."""
+    """An approach or a retreat at a steady course, by exp(rate t); rate: (least, most) per
+    window."""
     return _about(draw, t, width_px, draw.choice([-1.0, 1.0]) * draw.uniform(*rate))
 
 
@@ -97,7 +98,8 @@ def camera(draw, t, width_px, height_px, flow_px, layers):
     turn, move = _twist(draw, focal, extent)
     still = np.zeros(3), np.zeros(3)
     extra = [
-        _twist(draw, focal, extent) if layer and draw.random() < 1 / 4 else still for layer in range(layers)
+        _twist(draw, focal, extent) if layer and draw.random() < 1 / 4 else still
+        for layer in range(layers)
     ]
     wanted = draw.uniform(*flow_px)
     twists = [(turn + 0.5 * w, move + v, n) for (w, v), n in zip(extra, normal, strict=True)]
@@ -110,7 +112,8 @@ def warps(draw, t, width_px, height_px, flow_px, layers):
     what each layer does by itself.
 
     flow_px: root mean square flow over the image and all layers, drawn evenly; the same draw with
-    twice the range has twice the flow. Raises: DomainError for a flow so long that the field would fold.
+    twice the range has twice the flow. Raises: DomainError for a flow so long that the field would
+    fold.
     """
     extent = max(width_px, height_px)
     wanted = draw.uniform(*flow_px)
@@ -125,7 +128,9 @@ def warps(draw, t, width_px, height_px, flow_px, layers):
     probe = torch.stack([x, y], -1).double()
     share = torch.from_numpy(np.asarray(t, dtype=np.float64))
     unit = [Warp(wave, phase, part, affine, share) for wave, phase, part, affine in found]
-    length = torch.stack([field.displacement(probe).square().sum(-1) for field in unit]).mean().sqrt()
+    length = (
+        torch.stack([field.displacement(probe).square().sum(-1) for field in unit]).mean().sqrt()
+    )
     size = wanted / float(length)
     steepest = size * float(torch.stack([field.stretch(probe) for field in unit]).max())
     if steepest > STEEPEST_WARP:
@@ -133,7 +138,9 @@ def warps(draw, t, width_px, height_px, flow_px, layers):
             f"a flow of {wanted:.1f} px would stretch a field by {steepest:.2f} on {width_px} x {height_px} "
             f"pixels, {STEEPEST_WARP} at most is possible; give a shorter flow_px or larger images."
         )
-    return [Warp(wave, phase, size * part, size * affine, share) for wave, phase, part, affine in found]
+    return [
+        Warp(wave, phase, size * part, size * affine, share) for wave, phase, part, affine in found
+    ]
 
 
 def displacement(draw, width_px, height_px, rms_px):
@@ -203,8 +210,8 @@ def _sized(focal, twists, size_px, wanted, size, most, t):
 
 
 def _twist(draw, focal, width_px):
-    """Turn (rad) and move (in depths of the nearest plane), one of them sometimes absent; turning about the
-    view axis acts with the image's radius."""
+    """Turn (rad) and move (in depths of the nearest plane), one of them sometimes absent; turning
+    about the view axis acts with the image's radius."""
     turn, move = draw.normal(0, 1, (2, 3)) * np.array([1, 1, 2 * focal / width_px])
     kind = draw.random()
     return turn * draw.uniform(0.1, 1) * (kind > 0.3), move * draw.uniform(0.1, 1) * (kind < 0.8)
@@ -215,7 +222,9 @@ def _field(draw, extent, heading, near):
     length_px = extent * np.exp(draw.uniform(np.log(1.0), np.log(3.0), MODES))
     bearing = draw.uniform(0, 2 * np.pi, MODES)
     wave = 2 * np.pi / length_px[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], -1)
-    size = BEND * draw.normal(0, 1, (MODES, 2)) * (length_px / length_px.mean())[:, None] / MODES**0.5
+    size = (
+        BEND * draw.normal(0, 1, (MODES, 2)) * (length_px / length_px.mean())[:, None] / MODES**0.5
+    )
     own = draw.normal(0, 0.3, 2)
     affine = np.zeros((2, 3))
     affine[:, 0] = near * np.array([np.cos(heading), np.sin(heading)]) + own

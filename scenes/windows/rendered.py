@@ -1,8 +1,10 @@
-"""Windows of events with exact flow, made on the fly: flat layers of texture before a moving camera, hard
-events, sensor noise.
+"""Windows of events with exact flow, made on the fly: flat layers of texture before a moving
+camera, hard events, sensor noise.
 
-Every sample is drawn from its own random numbers (seed, index), so it is the same in any batch, on any
-process: frames, events and flow to the last bit on one machine, the volume to the rounding of its sums.
+Every sample is drawn from its own random numbers (seed, index), so it is the same in any batch, on
+any
+process: frames, events and flow to the last bit on one machine, the volume to the rounding of its
+  sums.
 """
 
 from collections.abc import Sequence
@@ -59,7 +61,8 @@ class Draws:
       flow_px: see scenes.windows.motion.
       theta: contrast threshold, drawn evenly in its logarithm.
       mismatch: relative spread of thresholds over pixels.
-      noise: background events per pixel, polarity and eighth of the window, evenly in the logarithm.
+      noise: background events per pixel, polarity and eighth of the window, evenly in the
+        logarithm.
       contrast: factor on log radiance.
       scale: texels per pixel.
       blur_px: Gaussian defocus, standard deviation.
@@ -82,7 +85,8 @@ class Draws:
 
 
 def planes(textures="fine", theta=0.2, noise=(0.0005, 0.01)):
-    """The plain test case: one plane, rotation, zoom and translation up to 6 px, nothing else varied."""
+    """The plain test case: one plane, rotation, zoom and translation up to 6 px, nothing else
+    varied."""
     return Draws(
         textures,
         "similarity",
@@ -134,7 +138,8 @@ class Windows:
 
 @dataclass(frozen=True)
 class Sample:
-    """What was drawn for a window. theta: [2, H, W]. noise: [4, N] interval, polarity, row, column."""
+    """What was drawn for a window. theta: [2, H, W]. noise: [4, N] interval, polarity, row,
+    column."""
 
     layers: list[Layer]
     distortion: float
@@ -157,7 +162,9 @@ class RenderedWindows(Windows):
         self.height_px = height_px
         self.width_px = width_px
         if self.draws.motion not in MOTIONS:
-            raise DomainError(f"motion is {self.draws.motion!r}; {', '.join(MOTIONS)} are possible.")
+            raise DomainError(
+                f"motion is {self.draws.motion!r}; {', '.join(MOTIONS)} are possible."
+            )
         if self.draws.motion in ONE_PLANE and self.draws.layers[1] > 0:
             raise DomainError(
                 f"motion {self.draws.motion!r} has one plane; give layers=(0, 0), or motion='camera'."
@@ -223,7 +230,9 @@ class RenderedWindows(Windows):
         contrast = float(draw.uniform(d.contrast[0], d.contrast[1]))
         ratio = log_uniform(draw, *d.on_over_off) ** 0.5
         thetas *= np.array([ratio, 1 / ratio])[:, None, None]
-        return Sample(layers, distortion, contrast, torch.from_numpy(thetas).float(), torch.from_numpy(noise))
+        return Sample(
+            layers, distortion, contrast, torch.from_numpy(thetas).float(), torch.from_numpy(noise)
+        )
 
     def _texture(self, draw, covering, blur_px):
         """A piece of a texture with its cover [2, C, C], blurred, and where pixels lie on it, [3,
@@ -232,7 +241,9 @@ class RenderedWindows(Windows):
         texture = self.textures[draw.integers(len(self.textures))]
         size = min(self.crop, *texture.shape)
         top, left = (int(draw.integers(0, extent - size + 1)) for extent in texture.shape)
-        values = torch.from_numpy(np.ascontiguousarray(texture[top : top + size, left : left + size]))
+        values = torch.from_numpy(
+            np.ascontiguousarray(texture[top : top + size, left : left + size])
+        )
         piece = torch.ones(2, self.crop, self.crop)
         piece[0] = mirrored(values, self.crop)
         scale = draw.uniform(*self.draws.scale)
@@ -241,7 +252,9 @@ class RenderedWindows(Windows):
         if covering:
             piece[1] = cover(draw, self.crop, scale, min(self.height_px, self.width_px))
             piece[0] *= piece[1]
-        turn = np.array([[np.cos(angle), -np.sin(angle) * flip], [np.sin(angle), np.cos(angle) * flip]])
+        turn = np.array(
+            [[np.cos(angle), -np.sin(angle) * flip], [np.sin(angle), np.cos(angle) * flip]]
+        )
         place = np.eye(3)
         place[:2, :2] = scale * turn * 2 / self.crop
         return gaussian(piece, blur_px * scale), place
@@ -267,17 +280,21 @@ class RenderedWindows(Windows):
         at = pixels(self.height_px, self.width_px)
 
         def look(layer):
-            return (self._distorted(layer.motion.end(points), sample.distortion) - at).movedim(-1, 0), points
+            return (self._distorted(layer.motion.end(points), sample.distortion) - at).movedim(
+                -1, 0
+            ), points
 
-        return topmost(sample.layers, look), torch.ones(self.height_px, self.width_px, dtype=torch.bool)
+        return topmost(sample.layers, look), torch.ones(
+            self.height_px, self.width_px, dtype=torch.bool
+        )
 
 
 class PacketWindows(RenderedWindows):
     """Windows cut as real recordings are: they end where they hold ``events_per_px`` events of the
     scene per pixel, and at the latest where the motion drawn ends.
 
-    So much contrast, fine texture and a low threshold make short windows of little motion; a few edges make
-    long ones. Noise comes on top. Args: as RenderedWindows.
+    So much contrast, fine texture and a low threshold make short windows of little motion; a few
+    edges make long ones. Noise comes on top. Args: as RenderedWindows.
     """
 
     def __init__(self, draws, events_per_px, **sizes):
@@ -291,9 +308,9 @@ class PacketWindows(RenderedWindows):
         probes = np.linspace(0, 1, PROBES + 1) ** 2  # fine where packets of busy scenes end
         sample = self._draw(index, np.concatenate([lead, probes]))
         level = self._level(sample, compose(sample.layers, self._undistorted(sample.distortion)))
-        so_far = self._counts([(level, sample.theta, sample.noise[:, :0])]).sum((1, 2, 3, 4)).cumsum(
-            0
-        ).double() / (self.height_px * self.width_px)
+        so_far = self._counts([(level, sample.theta, sample.noise[:, :0])]).sum(
+            (1, 2, 3, 4)
+        ).cumsum(0).double() / (self.height_px * self.width_px)
         held = torch.cat([so_far.new_zeros(1), so_far]).numpy()
         end = np.interp(self.events_per_px, held, probes) if held[-1] > self.events_per_px else 1.0
         return np.concatenate([lead, max(end, SHORTEST) * np.linspace(0, 1, self.intervals + 1)])
@@ -360,7 +377,9 @@ class DiscWindows(RenderedWindows):
 def _shift(draw, t, length_px):
     angle = draw.uniform(0, 2 * np.pi)
     matrices = np.tile(np.eye(3), (len(t), 1, 1))
-    matrices[:, :2, 2] = np.outer(t, draw.uniform(*length_px) * np.array([np.cos(angle), np.sin(angle)]))
+    matrices[:, :2, 2] = np.outer(
+        t, draw.uniform(*length_px) * np.array([np.cos(angle), np.sin(angle)])
+    )
     return Plane(torch.from_numpy(matrices).float())
 
 

@@ -1,5 +1,6 @@
-"""Windows of events as real sensors give them, to train on: few or many events per pixel, unequal thresholds,
-bandwidth, dead time, noise per second, leak and hot pixels; layers that bend and hurry while they move."""
+"""Windows of events as real sensors give them, to train on: few or many events per pixel, unequal
+thresholds, bandwidth, dead time, noise per second, leak and hot pixels; layers that bend and hurry
+while they move."""
 
 from dataclasses import dataclass, replace
 
@@ -21,15 +22,16 @@ class Sensors:
     """Ranges (least, most) of sensors and of what they look at, each drawn evenly in the logarithm.
 
     Args:
-      density: events per pixel and window that contrast is set for (noise comes on top, and what contrasts of
-        0.02 to 2.5 times the texture's cannot reach stays as it is).
+      density: events per pixel and window that contrast is set for (noise comes on top, and what
+        contrasts of 0.02 to 2.5 times the texture's cannot reach stays as it is).
       light: mean radiance, 0..255 scale; the bandwidth grows with it.
       duration_s: length of the window, which noise, leak, bandwidth and dead time refer to.
       theta, imbalance: threshold ON, and OFF over ON.
       mismatch: spread over pixels, relative.
       cutoff_hz, shot_rate_hz, leak_rate_hz, refractory_s, hot_rate_hz: as in events.SensorModel.
       hot_share: of the pixels, drawn evenly from 0 to this.
-      bend: displacement of a layer on top of its homography, relative to flow_px's upper end, evenly from 0.
+      bend: displacement of a layer on top of its homography, relative to flow_px's upper end,
+        evenly from 0.
       pace: largest change of speed within a window.
     """
 
@@ -52,9 +54,8 @@ class Sensors:
 class SensorWindows(RenderedWindows):
     """Windows seen by sensors that all differ.
 
-    The memorised levels start between the thresholds with the triangular density of a level that has wandered
-    for long: each event sets it to the middle.
-    Args:
+    The memorised levels start between the thresholds with the triangular density of a level that
+    has wandered for long: each event sets it to the middle. Args:
       draws: what moves (its theta, mismatch, noise and contrast are not used).
       sensors: what looks.
       intervals: frames per window.
@@ -69,7 +70,9 @@ class SensorWindows(RenderedWindows):
         draw = np.random.default_rng((self.seed, index, 1))
         sample = self._draw(index, pace(draw, self.t, self.sensors.pace))
         if self.sensors.bend > 0:
-            layers = [replace(layer, motion=self._bent(draw, layer.motion)) for layer in sample.layers]
+            layers = [
+                replace(layer, motion=self._bent(draw, layer.motion)) for layer in sample.layers
+            ]
             sample = replace(sample, layers=layers)
         points = self._undistorted(sample.distortion)
         frames = compose(sample.layers, points)
@@ -95,9 +98,13 @@ class SensorWindows(RenderedWindows):
             theta_off=theta * imbalance,
             theta_sigma=theta * mismatch,
             cutoff_hz=log_uniform(draw, *s.cutoff_hz),
-            leak_rate_hz=min(log_uniform(draw, *s.leak_rate_hz), NOISE_SHARE / 2 * density / duration_s),
+            leak_rate_hz=min(
+                log_uniform(draw, *s.leak_rate_hz), NOISE_SHARE / 2 * density / duration_s
+            ),
             rate_cov_decades=0.2,
-            shot_rate_hz=min(log_uniform(draw, *s.shot_rate_hz), NOISE_SHARE * density / duration_s),
+            shot_rate_hz=min(
+                log_uniform(draw, *s.shot_rate_hz), NOISE_SHARE * density / duration_s
+            ),
             refractory_s=log_uniform(draw, *s.refractory_s),
             hot_pixel_share=float(draw.uniform(0, s.hot_share)),
             hot_pixel_rate_hz=log_uniform(draw, *s.hot_rate_hz),
@@ -111,5 +118,7 @@ class SensorWindows(RenderedWindows):
         state = SensorState()
         begin(state, sensor, level[0].exp(), level[0], float(t_s[0]), generator)
         place = torch.rand((2, *level[0].shape), generator=generator).sum(0) - 1
-        state.reference = state.reference - place * torch.where(place > 0, state.theta_on, state.theta_off)
+        state.reference = state.reference - place * torch.where(
+            place > 0, state.theta_on, state.theta_off
+        )
         return dense_counts(level[1:], t_s[1:], sensor, generator, state, log_input=True)[LEAD:]

@@ -1,15 +1,24 @@
 """The sets of windows that event flow is learnt on and judged on.
 
-Packets of real recordings hold 0.05 to 1 event per pixel, since most of a room is smooth, contrasts are weak
-and thresholds high. So a packet of a fixed number of events is cut from a scene of photographs and of few
-shapes; the lower its number, the weaker the contrast, so that flows are some pixels long in all sets.
+Packets of real recordings hold 0.05 to 1 event per pixel, since most of a room is smooth, contrasts
+are weak and thresholds high. So a packet of a fixed number of events is cut from a scene of
+photographs and of few shapes; the lower its number, the weaker the contrast, so that flows are some
+pixels long in all sets.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from scenes.windows.rendered import Discs, DiscWindows, Draws, PacketWindows, RenderedWindows, Windows, planes
+from scenes.windows.rendered import (
+    Discs,
+    DiscWindows,
+    Draws,
+    PacketWindows,
+    RenderedWindows,
+    Windows,
+    planes,
+)
 from scenes.windows.sensors import Sensors, SensorWindows
 
 UNSEEN = 1_000_000  # added to the seed of what networks are judged on
@@ -18,7 +27,8 @@ LARGE_PX = 128
 NOISE_SHARE = (0.01, 0.15)  # noise events over those of the scene
 WEAK = (0.12, 0.35)  # thresholds
 STRONG = (0.05, 0.15)
-# events of the scene per pixel -> thresholds, factors on log radiance of single planes and of layers
+# events of the scene per pixel -> thresholds, factors on log radiance of single planes and of
+# layers
 CONTRASTS = {
     0.05: (WEAK, (0.2, 0.6), (0.1, 0.3)),
     0.1: (WEAK, (0.3, 0.8), (0.12, 0.4)),
@@ -26,7 +36,9 @@ CONTRASTS = {
     1.0: (STRONG, (0.8, 1.6), (0.3, 0.6)),
     3.0: (STRONG, (1.8, 3.5), (0.6, 1.2)),
 }
-EVERYDAY = Draws("everyday", flow_px=(2.0, 12.0), mismatch=0.05, scale=(1.0, 2.0), on_over_off=(0.8, 1.25))
+EVERYDAY = Draws(
+    "everyday", flow_px=(2.0, 12.0), mismatch=0.05, scale=(1.0, 2.0), on_over_off=(0.8, 1.25)
+)
 MOVED = replace(EVERYDAY, theta=(0.1, 0.25), contrast=(0.8, 1.6), noise=(0.0005, 0.01))
 
 Make = Callable[[int, int], Windows]
@@ -39,7 +51,12 @@ def packets(events_per_px: float, layers: tuple[int, int]) -> Make:
     noise = tuple(share * events_per_px / 16 for share in NOISE_SHARE)
     theta, *contrast = CONTRASTS[events_per_px]
     return _packets(
-        events_per_px, (SIDE_PX, SIDE_PX), layers, theta=theta, contrast=contrast[layers[1] > 0], noise=noise
+        events_per_px,
+        (SIDE_PX, SIDE_PX),
+        layers,
+        theta=theta,
+        contrast=contrast[layers[1] > 0],
+        noise=noise,
     )
 
 
@@ -53,7 +70,9 @@ def _packets(events_per_px, size_px, layers, **changed) -> Make:
 
 def moved(motion, flow_px, layers=(0, 0), textures="mixed", **changed) -> Make:
     """Windows of a motion, at usual densities."""
-    draws = replace(MOVED, textures=textures, motion=motion, flow_px=flow_px, layers=layers, **changed)
+    draws = replace(
+        MOVED, textures=textures, motion=motion, flow_px=flow_px, layers=layers, **changed
+    )
     return lambda seed, bins: RenderedWindows(
         draws, seed=seed, height_px=LARGE_PX, width_px=LARGE_PX, bins=bins
     )
@@ -78,8 +97,9 @@ SETS: dict[str, Make] = (
         "rotation": moved("rotation", (0.5, 8.0)),
     }
 )
-"""Name -> function (seed, bins) -> source of FlowWindows. packets by events per pixel; "many_depths": several
-layers, each of which bends, as Middlebury's flows do, and the same flows three times as long."""
+"""Name -> function (seed, bins) -> source of FlowWindows. packets by events per pixel;
+"many_depths": several layers, each of which bends, as Middlebury's flows do, and the same flows
+three times as long."""
 
 HARSH: dict[str, Make] = {
     "zoom": moved("zoom", (0.1, 0.3), textures="everyday", contrast=(0.2, 1.0)),
@@ -91,11 +111,16 @@ HARSH: dict[str, Make] = {
     "stripes": moved("similarity", (0.5, 6.0), textures="stripes"),
     "out_and_back": moved("out_and_back", (2.0, 10.0), textures="everyday"),
     "vibration_hard": moved("vibration", (2.0, 8.0), textures="everyday"),
-    "packets_5k": _packets(5000 / (180 * 240), (180, 240), (0, 2), theta=(0.12, 0.35), contrast=(0.5, 1.2)),
-    "noise": moved("similarity", (0.5, 6.0), textures="everyday", contrast=(0.0, 0.0), noise=(0.003, 0.06)),
+    "packets_5k": _packets(
+        5000 / (180 * 240), (180, 240), (0, 2), theta=(0.12, 0.35), contrast=(0.5, 1.2)
+    ),
+    "noise": moved(
+        "similarity", (0.5, 6.0), textures="everyday", contrast=(0.0, 0.0), noise=(0.003, 0.06)
+    ),
 }
 """Families that estimators of flow fail on: approach, roll, bodies before still ground, stripes,
-motion that turns back, packets of few events, and noise alone. Name -> function (seed, bins) -> source."""
+motion that turns back, packets of few events, and noise alone. Name -> function (seed, bins) ->
+source."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +148,9 @@ class Shape:
 
 
 DENSE = Draws(flow_px=(0.5, 7.0), contrast=(0.8, 1.8), theta=(0.08, 0.25))
-FLAT = Draws(motion="similarity", layers=(0, 0), flow_px=(0.0, 7.0), contrast=(0.7, 1.6), theta=(0.08, 0.25))
+FLAT = Draws(
+    motion="similarity", layers=(0, 0), flow_px=(0.0, 7.0), contrast=(0.7, 1.6), theta=(0.08, 0.25)
+)
 WIDE = Draws(layers=(1, 4), flow_px=(1.0, 9.0), contrast=(0.8, 1.8), theta=(0.08, 0.25))
 
 LENSES: dict[str, Any] = {"blur_px": (0.0, 1.2), "distortion": (-0.06, 0.06)}
@@ -168,6 +195,8 @@ VALIDATION: dict[str, Callable[[Shape, int], Any]] = {
     "fine_theta_0.2": lambda shape, seed: shape(planes("fine", 0.2), seed + UNSEEN),
     "mixed_theta_0.1": lambda shape, seed: shape(planes("mixed", 0.1), seed + UNSEEN),
     "mixed_theta_0.2": lambda shape, seed: shape(planes("mixed", 0.2), seed + UNSEEN),
-    "layers": lambda shape, seed: shape(replace(DENSE, textures="mixed", layers=(1, 3)), seed + UNSEEN),
+    "layers": lambda shape, seed: shape(
+        replace(DENSE, textures="mixed", layers=(1, 3)), seed + UNSEEN
+    ),
 }
 """Name -> function (shape, seed) -> source; textures and seeds that no training mix uses."""

@@ -11,7 +11,17 @@ from codesign import events
 from codesign.events import SensorModel, SensorState
 from codesign.types import EventStream, FlowField
 from scenes import textures
-from scenes.windows.layers import Layer, Plane, apply, compose, cover, gaussian, mirrored, pixels, topmost
+from scenes.windows.layers import (
+    Layer,
+    Plane,
+    apply,
+    compose,
+    cover,
+    gaussian,
+    mirrored,
+    pixels,
+    topmost,
+)
 
 SENSOR = SensorModel(
     theta_on=0.27,
@@ -119,10 +129,13 @@ def _recorded(name, layers, duration_s, size_px, seed):
     for first in range(0, len(t_s), CHUNK):
         some = t_s[first : first + CHUNK]
         moved = [
-            replace(layer, motion=Plane(torch.from_numpy(layer.motion(some)).float())) for layer in layers
+            replace(layer, motion=Plane(torch.from_numpy(layer.motion(some)).float()))
+            for layer in layers
         ]
         frames = 255 * (compose(moved, points) / 255).clamp_min(1e-3) ** CONTRAST
-        parts.append(events.simulate(frames, torch.from_numpy(some + SETTLING_S), SENSOR, state=state))
+        parts.append(
+            events.simulate(frames, torch.from_numpy(some + SETTLING_S), SENSOR, state=state)
+        )
     whole = events.concatenate(parts)
     start_us = round(SETTLING_S * 1e6)
     kept = whole.t_us >= start_us

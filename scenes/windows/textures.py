@@ -20,20 +20,22 @@ POOLS = ("procedural", "fine", "mixed", "everyday", "stripes")
 def pool(name):
     """Textures of a kind, as a tuple of [H, W] float32 radiances (0..255 scale).
 
-    "procedural": speckle of many spectra and piles of discs and bars with smooth areas between; what networks
-    are trained on. "fine": gravel, grass, brick and three speckles with seeds of their own: detail
-    everywhere. "mixed": camera, chelsea, coffee, astronaut, rocket: photographs with large smooth areas.
-    "everyday": those and as many piles of few, mostly smooth shapes with seeds of their own: what a camera
-    sees in rooms. "stripes": lines of several widths that all run the same way, so that motion along them is
-    not seen. No photograph is in "procedural".
+    "procedural": speckle of many spectra and piles of discs and bars with smooth areas between;
+    what networks are trained on. "fine": gravel, grass, brick and three speckles with seeds of
+    their own: detail everywhere. "mixed": camera, chelsea, coffee, astronaut, rocket: photographs
+    with large smooth areas. "everyday": those and as many piles of few, mostly smooth shapes with
+    seeds of their own: what a camera sees in rooms. "stripes": lines of several widths that all run
+    the same way, so that motion along them is not seen. No photograph is in "procedural".
     """
     if name == "fine":
         return tuple(textures.photo(source) for source in ("gravel", "grass", "brick")) + tuple(
-            textures.speckle(90_000 + k, finest_px=f, coarsest_px=24.0) for k, f in enumerate((4.0, 6.0, 8.0))
+            textures.speckle(90_000 + k, finest_px=f, coarsest_px=24.0)
+            for k, f in enumerate((4.0, 6.0, 8.0))
         )
     if name == "mixed":
         return tuple(
-            textures.photo(source) for source in ("camera", "chelsea", "coffee", "astronaut", "rocket")
+            textures.photo(source)
+            for source in ("camera", "chelsea", "coffee", "astronaut", "rocket")
         )
     if name == "everyday":
         return pool("mixed") + tuple(
@@ -52,7 +54,10 @@ def _procedural(seed):
     if seed % 3 == 0:
         finest = draw.uniform(3.0, 12.0)
         return textures.speckle(
-            seed, finest_px=finest, coarsest_px=finest * draw.uniform(3, 16), contrast=draw.uniform(0.2, 0.7)
+            seed,
+            finest_px=finest,
+            coarsest_px=finest * draw.uniform(3, 16),
+            contrast=draw.uniform(0.2, 0.7),
         )
     return pile(draw)
 
@@ -66,21 +71,23 @@ def _stripes(draw):
         line = gaussian_filter(draw.standard_normal(SIZE), draw.uniform(1.5, 5), mode="wrap")
         line = line / line.std()
     values = np.exp(4 + draw.uniform(0.3, 0.8) * line).astype(np.float32)
-    return textures.check_texture(np.broadcast_to(values, (SIZE, SIZE)).clip(textures.LIFT, 255.0), "stripes")
+    return textures.check_texture(
+        np.broadcast_to(values, (SIZE, SIZE)).clip(textures.LIFT, 255.0), "stripes"
+    )
 
 
 def pile(draw, shapes=1500):
-    """Discs and bars of many sizes, each hiding what lies below, over a soft ramp; some carry grain, most are
-    smooth.
+    """Discs and bars of many sizes, each hiding what lies below, over a soft ramp; some carry
+    grain, most are smooth.
 
-    Occluding shapes with sizes of density r^-3 have the statistics of natural images (Lee, Mumford and Huang,
-    IJCV 2001).
+    Occluding shapes with sizes of density r^-3 have the statistics of natural images (Lee, Mumford
+    and Huang, IJCV 2001).
     """
     y, x = np.mgrid[:SIZE, :SIZE].astype(np.float32)
     log_level = np.float32(draw.uniform(3.0, 4.5)) + _ramp(x, y, draw)
-    grain = gaussian_filter(draw.standard_normal((SIZE, SIZE)), draw.uniform(0.7, 2.5), mode="wrap").astype(
-        np.float32
-    )
+    grain = gaussian_filter(
+        draw.standard_normal((SIZE, SIZE)), draw.uniform(0.7, 2.5), mode="wrap"
+    ).astype(np.float32)
     grain /= grain.std()
     smallest = draw.uniform(2, 6)
     largest = draw.uniform(60, 160)

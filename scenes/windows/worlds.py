@@ -1,5 +1,5 @@
-"""Windows of events out of the rendered 3-D worlds: surfaces that hide one another, the full sensor, exact
-flow. Networks are judged on them."""
+"""Windows of events out of the rendered 3-D worlds: surfaces that hide one another, the full
+sensor, exact flow. Networks are judged on them."""
 
 import torch
 
@@ -47,7 +47,9 @@ class WorldWindows(Windows):
     ):
         unknown = sorted(set(names) - set(worlds.WORLDS))
         if unknown or not names:
-            raise DomainError(f"worlds {unknown} are unknown; there are {', '.join(worlds.WORLDS)}.")
+            raise DomainError(
+                f"worlds {unknown} are unknown; there are {', '.join(worlds.WORLDS)}."
+            )
         super().__init__(seed, bins, intervals)
         self.names = tuple(names)
         self.size_px = size_px

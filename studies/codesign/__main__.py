@@ -1,10 +1,11 @@
 """Does it pay to design lens, mount, sensor and estimator of a robot's camera together?
 
-One whole design is a vector: focal length, f-number and focus of the lens; place and pitch of the mount; threshold and
-bandwidth of the pixels; the prior of the flow's estimator. It pays for what it takes: light as 1 / N^2, noise events as
-thresholds fall, a bus of limited width, a mast that sways (scenes/robots/costs.py). Arms start at the same designs and
-render as many drives: jointly, in every order of the blocks, alternating, nested, by the book, and by searches without
-gradients. Single events of the hard sensor in worlds that no arm saw judge them.
+One whole design is a vector: focal length, f-number and focus of the lens; place and pitch of the
+mount; threshold and bandwidth of the pixels; the prior of the flow's estimator. It pays for what it
+takes: light as 1 / N^2, noise events as thresholds fall, a bus of limited width, a mast that sways
+(scenes/robots/costs.py). Arms start at the same designs and render as many drives: jointly, in
+every order of the blocks, alternating, nested, by the book, and by searches without gradients.
+Single events of the hard sensor in worlds that no arm saw judge them.
 """
 
 import math
@@ -82,23 +83,29 @@ class Config(StudyConfig):
     judged_drives: int = 2
     """Drives in each."""
     designs: int = 64
-    """Designs all over the bounds, and as many near the best, looked at before the race; 64 and more calibrate it."""
+    """Designs all over the bounds, and as many near the best, looked at before the race; 64 and
+    more calibrate it."""
     grid: int = 5
     """Designs along each number, through the best."""
     slopes: int = 24
     """Draws by which the objective's slope is compared with rendered differences; 0: it is not."""
     couplings: int = 4
-    """Draws by which the couplings of the parts are measured around the best joint answer; 0: they are not."""
+    """Draws by which the couplings of the parts are measured around the best joint answer; 0: they
+    are not."""
     read_outs: int = 24
-    """Read-outs of the best joint answer by which it is asked what should settle them; 0: it is not."""
+    """Read-outs of the best joint answer by which it is asked what should settle them; 0: it is
+    not."""
     settling: int = 24
     """Designs of sensor and estimator tried on recorded frames, wherever they are settled."""
     processes: int = 0
-    """Arms that race side by side, each in a process of its own; 0: one after the other in this one."""
+    """Arms that race side by side, each in a process of its own; 0: one after the other in this
+    one."""
     cluster: str = ""
-    """Address of a Ray cluster on whose cores arms race instead: "auto" for that of this machine, "here" for one of its own."""
+    """Address of a Ray cluster on whose cores arms race instead: "auto" for that of this machine,
+    "here" for one of its own."""
     raw: Path | None = None
-    """Answers of earlier runs (answers.jsonl of their folder, or race.jsonl of one that was cut): not raced again."""
+    """Answers of earlier runs (answers.jsonl of their folder, or race.jsonl of one that was cut):
+    not raced again."""
 
 
 def study(run: Run[Config]) -> None:
@@ -151,8 +158,13 @@ def study(run: Run[Config]) -> None:
 def best_joint(drawn: Drawn, rows: Sequence[Row]) -> torch.Tensor:
     """Shares [V] of the joint answer of which least error is expected on one fresh draw."""
     fresh = drawn.draw(couplings.FIRST - 1)
-    shares = [torch.tensor(row["share"], dtype=torch.float64) for row in rows if row["arm"] == "joint"]
-    return min(shares, key=lambda share: float(drawn.looked(drawn.space.made(share), fresh).expected.mean()))
+    shares = [
+        torch.tensor(row["share"], dtype=torch.float64) for row in rows if row["arm"] == "joint"
+    ]
+    return min(
+        shares,
+        key=lambda share: float(drawn.looked(drawn.space.made(share), fresh).expected.mean()),
+    )
 
 
 def around(run: Run[Config], drawn: Drawn, at: torch.Tensor, rows: Sequence[Row]) -> None:
@@ -165,7 +177,8 @@ def around(run: Run[Config], drawn: Drawn, at: torch.Tensor, rows: Sequence[Row]
 
 
 def raced(run: Run[Config], judge: Judge, setting: dict[str, Any]) -> list[Row]:
-    """Every arm from every start, and its errors by the judge; those of ``raw`` are taken from there."""
+    """Every arm from every start, and its errors by the judge; those of ``raw`` are taken from
+    there."""
     size = run.config
     axes = {"seed": range(size.seed, size.seed + size.seeds), "arm": size.arms}
     beside = {"processes": size.processes, "cluster": size.cluster}
@@ -201,7 +214,9 @@ def checked(size: Config) -> None:
     if size.family != THIN:
         lens.family(size.family)
     if not 0 < size.light <= 1:
-        raise DomainError(f"--light is {size.light:g}; a share of daylight above 0 and at most 1 is needed.")
+        raise DomainError(
+            f"--light is {size.light:g}; a share of daylight above 0 and at most 1 is needed."
+        )
     if not 0 < size.speed <= 1:
         raise DomainError(
             f"--speed is {size.speed:g}; a share of the drives' speed above 0 and at most 1 is needed."
@@ -215,7 +230,9 @@ def checked(size: Config) -> None:
         )
     for name in ("worlds", "per_draw", "judged_worlds", "judged_drives", "settling"):
         if getattr(size, name) < 1:
-            raise DomainError(f"--{name.replace('_', '-')} is {getattr(size, name)}; at least 1 is needed.")
+            raise DomainError(
+                f"--{name.replace('_', '-')} is {getattr(size, name)}; at least 1 is needed."
+            )
     if size.grid < 2 or size.slopes == 1 or min(size.slopes, size.couplings, size.read_outs) < 0:
         raise DomainError(
             f"--grid needs 2 or more, --slopes 0, or 2 and more, --couplings and --read-outs 0 or more; they are "

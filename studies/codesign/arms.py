@@ -1,4 +1,5 @@
-"""Ways to a whole design at equal rendered drives: joint, one block after the other, alternating, by the book, nested."""
+"""Ways to a whole design at equal rendered drives: joint, one block after the other, alternating,
+by the book, nested."""
 
 import math
 from collections.abc import Callable
@@ -29,7 +30,8 @@ GEOMETRY = ("lens", "mount")
 
 @dataclass
 class Way:
-    """shares: looked at, with the error to be expected at each; recorded: the last drives that were rendered."""
+    """shares: looked at, with the error to be expected at each; recorded: the last drives that were
+    rendered."""
 
     shares: list[Tensor] = field(default_factory=list)
     errors: list[float] = field(default_factory=list)
@@ -53,7 +55,8 @@ def descend(
     done: int = 0,
     of: int = 0,
 ) -> Tensor:
-    """Steps of equal length down the slope with momentum, shorter and shorter; fresh drives in each.
+    """Steps of equal length down the slope with momentum, shorter and shorter; fresh drives in
+    each.
 
     Args:
       start: [V] shares.
@@ -61,7 +64,8 @@ def descend(
       first: number of the first draw.
       way: what is looked at goes there.
       before: called before every step, for what is solved within it.
-      done, of: steps that went before, and all those over which their length falls; those of this call for 0.
+      done, of: steps that went before, and all those over which their length falls; those of this
+        call for 0.
     Returns: mean of the last quarter.
     """
     here, pace = start.clone(), torch.zeros_like(start)
@@ -74,17 +78,20 @@ def descend(
         blocked = ((here <= 0) & (slope > 0)) | ((here >= 1) & (slope < 0))
         slope = torch.where(blocked, 0.0, slope)
         pace = MOMENTUM * pace + (1 - MOMENTUM) * slope / slope.norm().clamp_min(1e-12)
-        length = FIRST_LENGTH * (LAST_LENGTH / FIRST_LENGTH) ** ((done + step) / max(1, (of or steps) - 1))
+        length = FIRST_LENGTH * (LAST_LENGTH / FIRST_LENGTH) ** (
+            (done + step) / max(1, (of or steps) - 1)
+        )
         here = (here - length * pace / pace.norm().clamp_min(1e-12)).clamp(0, 1)
     return torch.stack([*mine, here][-max(1, round(END * steps)) :]).mean(0)
 
 
 def read_out(task: "Task", share: Tensor, way: Way, tries: int = 0) -> Tensor:
-    """Shares [V] with the sensor and the estimator that let expect least error on the drives recorded last.
+    """Shares [V] with the sensor and the estimator that let expect least error on the drives
+    recorded last.
 
-    Nothing is rendered: a simplex (Nelder and Mead) from what they are now, on frames that are there; ``tries`` of it,
-    those of the task for 0. By expected errors, which rank good read-outs better than hard ones of so few drives do (0.93
-    and 0.85, docs/joint_design.md).
+    Nothing is rendered: a simplex (Nelder and Mead) from what they are now, on frames that are
+    there; ``tries`` of it, those of the task for 0. By expected errors, which rank good read-outs
+    better than hard ones of so few drives do (0.93 and 0.85, docs/joint_design.md).
     """
     space, drawn = task.space, task.objective.drawn
     free = space.part("read-out")
@@ -118,8 +125,8 @@ def read_out(task: "Task", share: Tensor, way: Way, tries: int = 0) -> Tensor:
 
 @dataclass(frozen=True)
 class Task:
-    """What every arm gets: objective, start [V], steps in all, first number of draws, seed, designs of sensor and
-    estimator tried wherever these are settled."""
+    """What every arm gets: objective, start [V], steps in all, first number of draws, seed, designs
+    of sensor and estimator tried wherever these are settled."""
 
     objective: Objective
     start: Tensor
@@ -155,8 +162,8 @@ def joint(task: Task) -> tuple[Tensor, Way]:
 
 
 def ordered(names: tuple[str, ...]) -> Callable[[Task], tuple[Tensor, Way]]:
-    """One block after the other, half of the steps for lens and mount each; sensor and estimator in their turn on
-    what is recorded, for which one step is spent where nothing is yet."""
+    """One block after the other, half of the steps for lens and mount each; sensor and estimator in
+    their turn on what is recorded, for which one step is spent where nothing is yet."""
 
     def arm(task):
         way, here = Way(), task.start
@@ -193,7 +200,8 @@ def alternating(sweeps: int) -> Callable[[Task], tuple[Tensor, Way]]:
 
 
 def nested(task: Task) -> tuple[Tensor, Way]:
-    """Lens and mount in one descent, sensor and estimator solved again on recorded frames at every step."""
+    """Lens and mount in one descent, sensor and estimator solved again on recorded frames at every
+    step."""
     way = Way()
 
     def solved(share, so_far):
@@ -203,9 +211,9 @@ def nested(task: Task) -> tuple[Tensor, Way]:
 
 
 def by_the_book(task: Task) -> tuple[Tensor, Way]:
-    """What a careful engineer does without a model of the task: the longest lens that still sees ahead from the nominal
-    place, focused at the hyperfocal distance and stopped down as far as light allows, default pixels; then the mount by
-    the task's own error, then the read-out."""
+    """What a careful engineer does without a model of the task: the longest lens that still sees
+    ahead from the nominal place, focused at the hyperfocal distance and stopped down as far as
+    light allows, default pixels; then the mount by the task's own error, then the read-out."""
     way, space = Way(), task.space
     share = space.share(**chosen_by_the_book(space, task.objective.drawn.requirements))
     return task.descend(share, ("mount",), task.steps, way), way
@@ -214,8 +222,9 @@ def by_the_book(task: Task) -> tuple[Tensor, Way]:
 def chosen_by_the_book(space: Space, requirements) -> dict[str, float]:
     """Focal length, f-number and focus in the order of the handbook.
 
-    f-number: full light for half of the darkest surfaces' contrast, so the smallest at which the picture is as bright as
-    the sensor's knee (20 of 255). Focus: hyperfocal for a blur of one pixel.
+    f-number: full light for half of the darkest surfaces' contrast, so the smallest at which the
+    picture is as bright as the sensor's knee (20 of 255). Focus: hyperfocal for a blur of one
+    pixel.
     """
     low, high = space.limits("fno")
     bright = 20 / robot_pair.LIGHT[0] / space.costs.light
@@ -228,13 +237,15 @@ def chosen_by_the_book(space: Space, requirements) -> dict[str, float]:
         if first_missed(requirements, made.T_body_cam, made.camera) is None:
             break
     near, far = space.limits("focus_per_m")
-    has = space.made(space.share(efl_mm=focal, fno=fno)).numbers  # what is not free stays as it is held
+    # what is not free stays as it is held
+    has = space.made(space.share(efl_mm=focal, fno=fno)).numbers
     hyperfocal = 1e3 * has["fno"] * robot_pair.PITCH_MM / has["efl_mm"] ** 2
     return {"efl_mm": focal, "fno": fno, "focus_per_m": min(max(hyperfocal, near), far)}
 
 
 def searched(name: str) -> Callable[[Task], tuple[Tensor, Way]]:
-    """A search without gradients over the whole design, by the errors to be expected on one set of drives."""
+    """A search without gradients over the whole design, by the errors to be expected on one set of
+    drives."""
 
     def arm(task):
         way, drawn = Way(), task.objective.drawn

@@ -1,5 +1,6 @@
-"""What flow's own covariance does not know: noise events, the photoreceptor's lag, and flow beyond reach; fitted to hard
-errors of designs all over the bounds, so that expected errors rank designs as hard ones do."""
+"""What flow's own covariance does not know: noise events, the photoreceptor's lag, and flow beyond
+reach; fitted to hard errors of designs all over the bounds, so that expected errors rank designs as
+hard ones do."""
 
 import math
 from collections.abc import Sequence
@@ -25,8 +26,8 @@ GOOD = 3.0  # weight of the better half of the designs
 
 @dataclass(frozen=True)
 class Conditions:
-    """Under which flow was read. noise: noise events as a share of all. lag: of the photoreceptor, as a share of the
-    interval. prior_px: of the flow's estimator."""
+    """Under which flow was read. noise: noise events as a share of all. lag: of the photoreceptor,
+    as a share of the interval. prior_px: of the flow's estimator."""
 
     noise: float
     lag: float
@@ -36,7 +37,8 @@ class Conditions:
     def of(
         sensor: SensorModel, per_px: float, level: float, interval_s: float, prior_px: float
     ) -> "Conditions":
-        """Of a sensor that gives ``per_px`` events per pixel in an interval, at a mean intensity (0 to 255)."""
+        """Of a sensor that gives ``per_px`` events per pixel in an interval, at a mean intensity
+        (0 to 255)."""
         noise = SHOTS * sensor.shot_rate_hz * interval_s
         lag_s = LIT / (2 * math.pi * sensor.cutoff_hz * (level + DIM))
         return Conditions(noise / max(per_px, LEAST_EVENTS), lag_s / interval_s, prior_px)
@@ -44,9 +46,10 @@ class Conditions:
 
 @dataclass(frozen=True)
 class Calibration:
-    """claimed: factor on the claimed variance. noise: what it grows by, per share of noise events. share: deviation in
-    shares of the flow's length; lag: what adds to it (in squares), per share of the interval. reach_px: flow that is
-    lost half of the time, however wide the prior; priors: the same, in units of the prior.
+    """claimed: factor on the claimed variance. noise: what it grows by, per share of noise events.
+    share: deviation in shares of the flow's length; lag: what adds to it (in squares), per share of
+    the interval. reach_px: flow that is lost half of the time, however wide the prior; priors: the
+    same, in units of the prior.
 
     The numbers are those of docs/joint_design.md.
     """
@@ -69,10 +72,13 @@ class Calibration:
 
 @torch.no_grad()
 def fitted(
-    expected: Any, conditions: Sequence[Conditions], hard: Tensor, first: Calibration = Calibration()
+    expected: Any,
+    conditions: Sequence[Conditions],
+    hard: Tensor,
+    first: Calibration = Calibration(),
 ) -> Calibration:
-    """The calibration by which the logarithms of expected errors are nearest to those of hard ones, in the mean square;
-    the better half of the designs counts threefold.
+    """The calibration by which the logarithms of expected errors are nearest to those of hard ones,
+    in the mean square; the better half of the designs counts threefold.
 
     Args:
       expected: (number of a design, FlowErrors) -> its mean expected error.

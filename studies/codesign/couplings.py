@@ -1,4 +1,5 @@
-"""How strongly the blocks of a design pull at each other, and what designing them one after the other would leave there:
+"""How strongly the blocks of a design pull at each other, and what designing them one after the
+other would leave there:
 second differences of the errors to be expected around one design."""
 
 import math
@@ -22,8 +23,8 @@ FLATTEST = 0.02  # of the largest curvature, below which none is taken
 
 
 def curvatures(run: Run[Any], drawn: Drawn, at: Tensor, draws: int) -> list[Row]:
-    """Rows of every draw and pair of numbers around shares [V], a STEP off the bounds: the mixed second difference of the
-    mean expected error, and that error itself."""
+    """Rows of every draw and pair of numbers around shares [V], a STEP off the bounds: the mixed
+    second difference of the mean expected error, and that error itself."""
     names = drawn.space.free
 
     def error(draw, *moves):
@@ -38,9 +39,13 @@ def curvatures(run: Run[Any], drawn: Drawn, at: Tensor, draws: int) -> list[Row]
         rows = []
         for a in range(len(names)):
             ends = sum(error(draw, (a, step)) for step in (-STEP, STEP))
-            rows.append({"one": names[a], "other": names[a], "curvature": (ends - 2 * here) / STEP**2})
+            rows.append(
+                {"one": names[a], "other": names[a], "curvature": (ends - 2 * here) / STEP**2}
+            )
         for a, b in combinations(range(len(names)), 2):
-            mixed = sum(i * j * error(draw, (a, i * STEP), (b, j * STEP)) for i in (-1, 1) for j in (-1, 1))
+            mixed = sum(
+                i * j * error(draw, (a, i * STEP), (b, j * STEP)) for i in (-1, 1) for j in (-1, 1)
+            )
             rows.append({"one": names[a], "other": names[b], "curvature": mixed / (4 * STEP**2)})
         return [{**row, "error": here} for row in rows]
 
@@ -67,7 +72,8 @@ def bowl(curvature: Tensor) -> Tensor | None:
 
 
 def by_noise(space: Space, curvature: Tensor, error: Tensor) -> dict[str, float]:
-    """What couplings nineteen in twenty times are not above if there is none, by the standard errors [V, V] alone."""
+    """What couplings nineteen in twenty times are not above if there is none, by the standard
+    errors [V, V] alone."""
     generator = torch.Generator().manual_seed(0)
     found: dict[str, list[float]] = {}
     for _ in range(NULLS):
@@ -79,8 +85,8 @@ def by_noise(space: Space, curvature: Tensor, error: Tensor) -> dict[str, float]
 
 
 def coupled(space: Space, curvature: Tensor) -> dict[str, float]:
-    """Of every two parts the largest canonical coupling, 0 to 1: one pass over both leaves at most its square of the error
-    above the bottom."""
+    """Of every two parts the largest canonical coupling, 0 to 1: one pass over both leaves at most
+    its square of the error above the bottom."""
     found = {}
     for one, other in combinations(PARTS, 2):
         a, b = space.part(one), space.part(other)
@@ -93,17 +99,25 @@ def coupled(space: Space, curvature: Tensor) -> dict[str, float]:
 
 
 def left_by(
-    space: Space, curvature: Tensor, error: float, at: Tensor, starts: Sequence[Tensor], order: Sequence[str]
+    space: Space,
+    curvature: Tensor,
+    error: float,
+    at: Tensor,
+    starts: Sequence[Tensor],
+    order: Sequence[str],
 ) -> float:
-    """Error of one pass over the parts in an order and, as in the race, over the read-out once more, each brought to its
-    bottom, over that of the joint bottom: median over the starts, by the second-order model."""
+    """Error of one pass over the parts in an order and, as in the race, over the read-out once
+    more, each brought to its bottom, over that of the joint bottom: median over the starts, by the
+    second-order model."""
     ratios = []
     for start in starts:
         away = start - at
         for part in (*order, "read-out"):
             mine = space.part(part)
             rest = [k for k in range(len(away)) if k not in mine]
-            away[mine] = -torch.linalg.solve(curvature[mine][:, mine], curvature[mine][:, rest] @ away[rest])
+            away[mine] = -torch.linalg.solve(
+                curvature[mine][:, mine], curvature[mine][:, rest] @ away[rest]
+            )
         ratios.append(1 + float(away @ curvature @ away) / 2 / error)
     return float(torch.tensor(ratios).quantile(0.5))
 
@@ -126,7 +140,9 @@ def show(
         "without the other. By noise: what nineteen in twenty times is not passed where there is none.",
     )
     if curvature is None:
-        run.text("Errors bend upwards along nothing there: no valley, and nothing to be said of couplings.")
+        run.text(
+            "Errors bend upwards along nothing there: no valley, and nothing to be said of couplings."
+        )
         return
     noise = by_noise(space, curvature, spread)
     lines = [
@@ -141,9 +157,12 @@ def show(
             predicted = left_by(space, curvature, error, at, starts, order)
             lines.append({"order": arm, "predicted": predicted, "measured": ratio})
     if lines:
-        tabulate(run, "Error of an order over the joint one", lines, "order", prefix="order_over_joint")
+        tabulate(
+            run, "Error of an order over the joint one", lines, "order", prefix="order_over_joint"
+        )
     steepness = curvature.diagonal().sqrt() / math.sqrt(2 * error)
     each = [
-        {"number": name, "per_share": float(value)} for name, value in zip(space.free, steepness, strict=True)
+        {"number": name, "per_share": float(value)}
+        for name, value in zip(space.free, steepness, strict=True)
     ]
     tabulate(run, "How steep the valley is along each number", each, "number", prefix="steepness")

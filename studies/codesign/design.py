@@ -1,4 +1,5 @@
-"""A whole design in one vector: lens, mount, sensor and estimator of a robot's camera, as shares 0..1 of their bounds."""
+"""A whole design in one vector: lens, mount, sensor and estimator of a robot's camera, as shares
+0..1 of their bounds."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -57,9 +58,11 @@ OF_SENSOR = (
 class Space:
     """Whole designs of a robot's camera.
 
-    pair: robot, worlds and drives, behind a thin lens or the traced ones of a family. costs: what a design pays.
-    free: names of the numbers that shares are of, all of BLOCKS that its lens has and that have room when left out;
-      the others are held as the pair's own design, or ``held``, has them. bounds: name -> (low, high), in place of those of the pair or of BOUNDS.
+    pair: robot, worlds and drives, behind a thin lens or the traced ones of a family. costs: what a
+      design pays.
+    free: names of the numbers that shares are of, all of BLOCKS that its lens has and that have
+      room when left out; the others are held as the pair's own design, or ``held``, has them.
+      bounds: name -> (low, high), in place of those of the pair or of BOUNDS.
     Raises: DomainError for a name that is unknown or bounds that leave out the held design.
 
     >>> space = Space.of("outdoors", None)
@@ -78,7 +81,9 @@ class Space:
         known = [name for names in BLOCKS.values() for name in names]
         if not self.free:
             own = [
-                name for name in known if name not in self.held and (name != "bending" or self.pair.family)
+                name
+                for name in known
+                if name not in self.held and (name != "bending" or self.pair.family)
             ]
             roomy = [name for name in own if name in self.bounds or self._has_room(name)]
             object.__setattr__(self, "free", tuple(roomy))
@@ -98,7 +103,9 @@ class Space:
         for name in self.free:
             low, high = self.limits(name)
             if not low < high:
-                raise DomainError(f"{name} is free between {low:g} and {high:g}; give it room, or hold it.")
+                raise DomainError(
+                    f"{name} is free between {low:g} and {high:g}; give it room, or hold it."
+                )
             if not low <= self.default[name] <= high:
                 raise DomainError(
                     f"{name} starts at {self.default[name]:g}, outside its bounds, {low:g} to {high:g}."
@@ -113,8 +120,8 @@ class Space:
         free: Sequence[str] = (),
         held: Mapping[str, float] = MappingProxyType({}),
     ) -> "Space":
-        """By names: of one of the three pairs or of an own robot's page (.yaml), behind a thin lens for None, in a share of
-        daylight, at a share of the drives' speed."""
+        """By names: of one of the three pairs or of an own robot's page (.yaml), behind a thin lens
+        for None, in a share of daylight, at a share of the drives' speed."""
         found = PAIRS[pair]() if pair in PAIRS else own_pair(pair)
         if speed != 1:
             found = robot_pair.slowed(found, speed)
@@ -158,14 +165,17 @@ class Space:
         return found
 
     def share(self, **numbers: float) -> Tensor:
-        """Shares [V] of a design; what is not given is as the pair has it. Raises: DomainError out of bounds."""
+        """Shares [V] of a design; what is not given is as the pair has it. Raises: DomainError out
+        of bounds."""
         every = {**self.default, **numbers}
         found = []
         for name in self.free:
             low, high = self.limits(name)
             value = every[name]
             if not low <= value <= high:
-                raise DomainError(f"{name} = {value:g} lies outside its bounds, {low:g} to {high:g}.")
+                raise DomainError(
+                    f"{name} = {value:g} lies outside its bounds, {low:g} to {high:g}."
+                )
             if name in LOGARITHMIC:
                 found.append(math.log(value / low) / math.log(high / low))
             else:
@@ -212,7 +222,9 @@ class Whole:
     @cached_property
     def sensor(self) -> events.SensorModel:
         """At its threshold and bandwidth, with the noise that they bring."""
-        return self.space.costs.sensor(robot_pair.SENSOR, self.numbers["theta"], self.numbers["cutoff_hz"])
+        return self.space.costs.sensor(
+            robot_pair.SENSOR, self.numbers["theta"], self.numbers["cutoff_hz"]
+        )
 
     def events(self, kind: str) -> nn.Module:
         """Event stage: "memory" (hard counts) or "sensor" (single events)."""

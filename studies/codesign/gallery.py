@@ -22,7 +22,8 @@ FIELDS_RAD = (0.0, 0.2, 0.4)  # of the rays that are drawn
 
 
 def side_by_side(judge: Judge, designs: Mapping[str, Whole]) -> Figure:
-    """A row for each design: lens, robot with the camera's view, frame, single events and flow of one unseen drive."""
+    """A row for each design: lens, robot with the camera's view, frame, single events and flow of
+    one unseen drive."""
     drawn = judge.drawn
     samples = fastest(drawn.base, JUDGED)
     figure = plt.figure(figsize=(15, 2.9 * len(designs)), layout="constrained")
@@ -43,12 +44,15 @@ def side_by_side(judge: Judge, designs: Mapping[str, Whole]) -> Figure:
         axes[0].set_axis_off()
         axes[0].set_title(title, fontsize=9, loc="left")
         draw_pair(axes[1], whole.space.pair, whole.camera, whole.T_body_cam)
-        draw_seen(axes[2:], looked.batch, whole.camera, whole.T_body_cam, looked.run, titled=row == 0)
+        draw_seen(
+            axes[2:], looked.batch, whole.camera, whole.T_body_cam, looked.run, titled=row == 0
+        )
     return figure
 
 
 def handed(run: Run[Any], judge: Judge, whole: Whole, error: float) -> None:
-    """Write a design as design.yaml with its lens beside it, read it back, and see that it has the same score."""
+    """Write a design as design.yaml with its lens beside it, read it back, and see that it has the
+    same score."""
     path = run.path("design.yaml")
     save(path, whole, error)
     back = loaded(path, whole)
@@ -73,7 +77,8 @@ def save(path: Path, whole: Whole, error: float) -> None:
 
 
 def loaded(path: Path, like: Whole) -> Whole:
-    """A design of the same space as the file has it: its lens, camera, mount and sensor, none of them made anew."""
+    """A design of the same space as the file has it: its lens, camera, mount and sensor, none of
+    them made anew."""
     back = load_hand_over(path)
     numbers = {name: float(back.notes[name]) for name in like.numbers}
     found = Whole(like.space, numbers)

@@ -1,5 +1,6 @@
-"""Is there anything to design, and does the objective rank it? Hard and expected errors of designs all over the bounds, of
-others near the best of them, and along every number through the best, before any race."""
+"""Is there anything to design, and does the objective rank it? Hard and expected errors of designs
+all over the bounds, of others near the best of them, and along every number through the best,
+before any race."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -31,8 +32,8 @@ ENOUGH = 64  # designs, from which a calibration is fitted
 
 @dataclass(frozen=True)
 class Landscape:
-    """designs: rows of hard and expected errors all over the bounds; near: near the best of them; grid: along every
-    number through the best. calibration: by which errors were expected."""
+    """designs: rows of hard and expected errors all over the bounds; near: near the best of them;
+    grid: along every number through the best. calibration: by which errors were expected."""
 
     designs: list[Row]
     near: list[Row]
@@ -68,7 +69,8 @@ class Landscape:
         return float(linregress(expected, hard).slope) if len(set(expected)) > 1 else None
 
     def csv(self, space: Space) -> str:
-        """Every design: where it was drawn, its numbers, and its errors; "near" are those that judge the fit."""
+        """Every design: where it was drawn, its numbers, and its errors; "near" are those that
+        judge the fit."""
         lines = [",".join(("drawn", *space.free, "hard", "expected"))]
         for kind, rows in (
             ("all over", self.designs),
@@ -127,7 +129,8 @@ def near_by(space: Space, best: list[Tensor], count: int) -> list[Tensor]:
 
 
 class Looks:
-    """Designs looked at: the rows of a sweep, and beside them what expected errors are made of, in files."""
+    """Designs looked at: the rows of a sweep, and beside them what expected errors are made of, in
+    files."""
 
     def __init__(self, run: Run[Any], space: Space) -> None:
         size = run.config
@@ -137,10 +140,13 @@ class Looks:
         self.space = space
 
     def row(self, name: str, share: Tensor) -> Row:
-        """Hard errors of single events and of the memory layer; the expected one without calibration."""
+        """Hard errors of single events and of the memory layer; the expected one without
+        calibration."""
         whole = self.space.made(share)
         looked = self.drawn.looked(whole, self.drawn.draw(LOOKED))
-        single = self.drawn.looked(whole, looked.samples, "sensor", {"frames": looked.run["frames"]})
+        single = self.drawn.looked(
+            whole, looked.samples, "sensor", {"frames": looked.run["frames"]}
+        )
         path = self.run.path(f"looks/{name}.safetensors")
         path.parent.mkdir(exist_ok=True)
         conditions = {key: float(value) for key, value in vars(looked.conditions).items()}
@@ -169,7 +175,11 @@ def _flat(seen: Seen) -> Mapping[str, Tensor]:
     for part in ("read", "surfaces"):
         read = getattr(seen, part)
         tensors |= {f"{part}.{f.name}": getattr(read, f.name) for f in fields(Readings)}
-    return {name: value.float().contiguous() for name, value in tensors.items() if torch.is_tensor(value)}
+    return {
+        name: value.float().contiguous()
+        for name, value in tensors.items()
+        if torch.is_tensor(value)
+    }
 
 
 def _unflat(tensors: Mapping[str, Tensor], windows: int) -> Seen:
@@ -182,17 +192,23 @@ def _unflat(tensors: Mapping[str, Tensor], windows: int) -> Seen:
 
 
 def landscape(run: Run[Any], space: Space, count: int) -> Landscape:
-    """Look at ``count`` designs, at as many near the best, fit the calibration to the first and every second of the others
-    where there are enough, then look along every number through the best."""
+    """Look at ``count`` designs, at as many near the best, fit the calibration to the first and
+    every second of the others where there are enough, then look along every number through the
+    best."""
     looks = Looks(run, space)
     shares = all_over(space, count)
     designs = sweep(
-        run, lambda number: looks.row(f"all_{number}", shares[number]), "designs", number=range(count)
+        run,
+        lambda number: looks.row(f"all_{number}", shares[number]),
+        "designs",
+        number=range(count),
     )
     order = sorted(designs, key=lambda row: row["hard"])
     best = [torch.tensor(row["share"], dtype=torch.float64) for row in order]
     others = near_by(space, best[:BEST], count)
-    near = sweep(run, lambda number: looks.row(f"near_{number}", others[number]), "near", number=range(count))
+    near = sweep(
+        run, lambda number: looks.row(f"near_{number}", others[number]), "near", number=range(count)
+    )
     every = [f"all_{k}" for k in range(count)] + [f"near_{k}" for k in range(0, count, 2)]
     calibration = Calibration()
     if count >= ENOUGH:
@@ -224,7 +240,8 @@ def _fit(looks, names, rows):
 
 
 def _along(run, looks, best, calibration):
-    """Errors along every number, the others as in the best design; None where something required is missed."""
+    """Errors along every number, the others as in the best design; None where something required is
+    missed."""
     space = looks.space
     requirements = space.pair.requirements()
 
@@ -235,7 +252,9 @@ def _along(run, looks, best, calibration):
         share[space.free.index(number_of)] = step / last
         row = {"at": step / last, "value": space.numbers(share)[number_of]}
         hard = (
-            looks.row(f"grid_{number_of}_{step}", share)["hard"] if kept(space, share, requirements) else None
+            looks.row(f"grid_{number_of}_{step}", share)["hard"]
+            if kept(space, share, requirements)
+            else None
         )
         return {**row, "hard": hard}
 

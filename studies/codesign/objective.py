@@ -1,9 +1,10 @@
 """The slope of the error that a whole design lets expect.
 
-One set of drives is rendered for the design itself. What lens and mount change around it is geometry: surfaces, their
-true flow, blur, what the robot covers; how well flow is told there is carried over by a trend that knows blur and
-magnification; all of these designs are looked through in one cast of rays. What sensor, estimator and light change is
-seen on the recorded frames, one of these numbers a step.
+One set of drives is rendered for the design itself. What lens and mount change around it is
+geometry: surfaces, their true flow, blur, what the robot covers; how well flow is told there is
+carried over by a trend that knows blur and magnification; all of these designs are looked through
+in one cast of rays. What sensor, estimator and light change is seen on the recorded frames, one of
+these numbers a step.
 """
 
 from collections.abc import Sequence
@@ -27,7 +28,8 @@ ON_FRAMES = ("fno", *BLOCKS["sensor"], *BLOCKS["network"])
 class Objective:
     """drawn: worlds and drives. trend: what flow's precision does, learnt on the way.
 
-    Of the numbers that act on recorded frames one takes its turn in every call; the others keep the slope that they had.
+    Of the numbers that act on recorded frames one takes its turn in every call; the others keep the
+    slope that they had.
     """
 
     def __init__(self, drawn: Drawn) -> None:
@@ -40,11 +42,13 @@ class Objective:
     def __call__(
         self, share: Tensor, samples: Samples, free: Sequence[int], learn: bool = True
     ) -> tuple[float, Tensor, Looked]:
-        """Error to be expected of shares [V] with the penalty of what is required, its slope [V] along the free ones,
-        and what was rendered."""
+        """Error to be expected of shares [V] with the penalty of what is required, its slope [V]
+        along the free ones, and what was rendered."""
         looked = self.drawn.looked(self.space.made(share), samples)
         if learn:
-            self.trend.add(looked.seen.surfaces, looked.seen.flow_px, looked.seen.covered, looked.optics)
+            self.trend.add(
+                looked.seen.surfaces, looked.seen.flow_px, looked.seen.covered, looked.optics
+            )
         slope = torch.zeros_like(share)
         moved = [k for k in free if self.space.free[k] in GEOMETRY]
         if moved:
@@ -62,7 +66,9 @@ class Objective:
         value = float(looked.expected.mean())
         penalty = self.penalty(share)
         if penalty and moved:
-            slope[moved] += self._differences(share, moved, PENALTY_STEP, looked.whole, self._penalties)
+            slope[moved] += self._differences(
+                share, moved, PENALTY_STEP, looked.whole, self._penalties
+            )
         return value + penalty, slope, looked
 
     def forget(self) -> None:
@@ -79,7 +85,8 @@ class Objective:
         return oldest
 
     def _differences(self, share, places, step, whole, errors):
-        """Slopes [places] of the errors [2 x places] of designs that are a step to either side of shares [V]."""
+        """Slopes [places] of the errors [2 x places] of designs that are a step to either side of
+        shares [V]."""
         ends = share.repeat(2 * len(places), 1)
         for number, k in enumerate(places):
             low, high = float(share[k]) - step, float(share[k]) + step
@@ -90,11 +97,13 @@ class Objective:
             for name, end in zip(names, ends, strict=True)
         ]
         low, high = errors(wholes).reshape(-1, 2).unbind(1)
-        return (high - low) / torch.stack([ends[1::2, k][n] - ends[::2, k][n] for n, k in enumerate(places)])
+        return (high - low) / torch.stack(
+            [ends[1::2, k][n] - ends[::2, k][n] for n, k in enumerate(places)]
+        )
 
     def _again(self, looked, wholes):
-        """Mean errors [M] to be expected of other designs on the frames that were recorded, or on the events where these
-        are the same."""
+        """Mean errors [M] to be expected of other designs on the frames that were recorded, or on
+        the events where these are the same."""
         same = all(
             whole.numbers[name] == looked.whole.numbers[name]
             for whole in wholes
@@ -108,13 +117,21 @@ class Objective:
         return torch.stack([each.expected.mean() for each in found])
 
     def carried(self, looked: Looked, wholes: Sequence[Whole]) -> Tensor:
-        """Mean errors [M] to be expected behind other lenses and of other mounts; nothing is rendered."""
+        """Mean errors [M] to be expected behind other lenses and of other mounts; nothing is
+        rendered."""
         mounts = torch.stack([whole.T_body_cam for whole in wholes])
         worlds, each = len(looked.samples.numbers), len(looked.samples.which)
-        which = torch.arange(worlds * each).reshape(worlds, 1, each).expand(-1, len(mounts), -1).flatten()
+        which = (
+            torch.arange(worlds * each)
+            .reshape(worlds, 1, each)
+            .expand(-1, len(mounts), -1)
+            .flatten()
+        )
         batch, twist = self.drawn.scenes(mounts, looked.samples)
         field = of_bodies(looked.run["field"], which, worlds * each)
-        there, optics = self.drawn.seen([whole.camera for whole in wholes], mounts, batch, twist, field)
+        there, optics = self.drawn.seen(
+            [whole.camera for whole in wholes], mounts, batch, twist, field
+        )
         told = self._told(looked.seen, looked.optics)
         here = of_bodies(looked.seen.read, which, worlds * each)
         read = self.trend.carried(here, told[which], there.read, self._told(there, optics))

@@ -1,4 +1,5 @@
-"""The page of the race: the answer in one sentence, the arms beside one another, what the landscape is like, every design."""
+"""The page of the race: the answer in one sentence, the arms beside one another, what the landscape
+is like, every design."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -55,7 +56,9 @@ def answer(run: Run[Any], pair: str, found: Mapping[str, tuple[Interval, float]]
     )
 
 
-def race(run: Run[Any], pair: str, found: Mapping[str, tuple[Interval, float]], rows: Sequence[Row]) -> None:
+def race(
+    run: Run[Any], pair: str, found: Mapping[str, tuple[Interval, float]], rows: Sequence[Row]
+) -> None:
     """The arms beside one another."""
     run.section(
         "The race",
@@ -95,7 +98,9 @@ def race(run: Run[Any], pair: str, found: Mapping[str, tuple[Interval, float]], 
     if found:
         for arm, name in [*((arm, arm) for arm in found), (best_order(found), "best_order")]:
             over = found[arm][0]
-            ends = zip(("median", "low95", "high95"), (over.value, over.low, over.high), strict=True)
+            ends = zip(
+                ("median", "low95", "high95"), (over.value, over.low, over.high), strict=True
+            )
             plain_name = plain("joint_over", name)
             run.record(**{f"{plain_name}_{end}_{pair}": math.exp(log) for end, log in ends})
         ratios = {
@@ -122,7 +127,9 @@ def trails(run: Run[Any], rows: Sequence[Row]) -> None:
         series[arm] = (drives, median)
         bands[arm] = (drives, low, high)
     if series:
-        chart = Panel(series, "drives rendered", "error expected, with penalty", log="y", bands=bands)
+        chart = Panel(
+            series, "drives rendered", "error expected, with penalty", log="y", bands=bands
+        )
         caption = (
             "Errors to be expected of what each arm looks at, on its own drives, with the penalty of what is required: median over "
             "starts, and the middle half."
@@ -137,7 +144,8 @@ def shown(
     rows: Sequence[Row],
     judge: Judge,
 ) -> None:
-    """Three designs of the start whose joint one expected the median error on its own drives, and the hand-over of that."""
+    """Three designs of the start whose joint one expected the median error on its own drives, and
+    the hand-over of that."""
     mean = {(row["seed"], row["arm"]): sum(row["errors"]) / len(row["errors"]) for row in rows}
     ours = sorted((row["expected"], row["seed"]) for row in rows if row["arm"] == "joint")
     seed = ours[(len(ours) - 1) // 2][1]
@@ -155,7 +163,9 @@ def shown(
         "worlds: lens, robot and view, "
         "and an unseen drive as frame, single events and flow.",
     )
-    run.figure(side_by_side(judge, dict(designs[arm] for arm in arms)), "designs", "Whole designs.", 110)
+    run.figure(
+        side_by_side(judge, dict(designs[arm] for arm in arms)), "designs", "Whole designs.", 110
+    )
     handed(run, judge, designs["joint"][1], mean[seed, "joint"])
 
 
@@ -174,7 +184,8 @@ def looked(run: Run[Any], space: Space, gates: Landscape) -> None:
     told = ""
     if gates.rank is not None and gates.slope is not None:
         run.record(
-            rank_of_expected_near_the_best=gates.rank, slope_of_hard_over_expected_near_the_best=gates.slope
+            rank_of_expected_near_the_best=gates.rank,
+            slope_of_hard_over_expected_near_the_best=gates.slope,
         )
         told = (
             f" Expected errors rank {len(gates.judged)} designs near the best, to which nothing was fitted, by {gates.rank:.2f} "
@@ -183,7 +194,9 @@ def looked(run: Run[Any], space: Space, gates: Landscape) -> None:
     enough = "enough to design" if gates.spread >= SPREAD else "too little to design"
     walls = [name for name in space.free if not gates.inside(name)]
     at_walls = (
-        f" The best lies on a bound of {', '.join(walls)}." if walls else " The best lies off all bounds."
+        f" The best lies on a bound of {', '.join(walls)}."
+        if walls
+        else " The best lies off all bounds."
     )
     run.text(
         f"The ninetieth percentile of {len(gates.designs)} designs is {gates.spread:.2f} times the tenth: {enough}.{at_walls}{told}"
@@ -198,12 +211,17 @@ def looked(run: Run[Any], space: Space, gates: Landscape) -> None:
     for name, part in (("grid_first", charts[:half]), ("grid_last", charts[half:])):
         if part:
             run.figure(
-                panels(*part, width=2.6), name, "Errors along numbers through the best of the designs.", 110
+                panels(*part, width=2.6),
+                name,
+                "Errors along numbers through the best of the designs.",
+                110,
             )
 
 
 def designs(run: Run[Any], space: Space, rows: Sequence[Row]) -> None:
     """Every answer."""
-    run.section("Every answer", "What each arm ended with, and whether it kept what is required there.")
+    run.section(
+        "Every answer", "What each arm ended with, and whether it kept what is required there."
+    )
     titles = {name: name for name in ("seed", "arm", *space.free, "kept")}
     run.table("Designs", *table(rows, **titles))

@@ -1,5 +1,5 @@
-"""What a search for a whole design looks at: drives of a robot through worlds, rendered for one design; the errors of its
-velocities, hard ones and those to be expected."""
+"""What a search for a whole design looks at: drives of a robot through worlds, rendered for one
+design; the errors of its velocities, hard ones and those to be expected."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -34,9 +34,10 @@ EVERY_PX = 2  # of the pixels that tell what the robot covers
 class Seen:
     """Drives as one design sees them.
 
-    twist: [N, 6] of the bodies. seen_twist: [N, 6] of what the camera moves with, the sway of its mast in it.
-    read: by the depth that the estimator believes in. surfaces: the same with true depths. true_rows: [N, P, 2,
-      6]. flow_px: [N, P, 2], true. covered: [N, windows] by the robot.
+    twist: [N, 6] of the bodies. seen_twist: [N, 6] of what the camera moves with, the sway of its
+      mast in it.
+    read: by the depth that the estimator believes in. surfaces: the same with true depths.
+      true_rows: [N, P, 2, 6]. flow_px: [N, P, 2], true. covered: [N, windows] by the robot.
     """
 
     twist: Tensor
@@ -86,8 +87,8 @@ class Drawn:
         return self.base.requirements
 
     def scenes(self, mounts: Tensor, samples: Samples) -> tuple[Drives, Tensor]:
-        """Drives behind mounts [M, 4, 4], those of a world one mount after the other, and the twists [N, 6] that
-        the camera moves with; a mast sways."""
+        """Drives behind mounts [M, 4, 4], those of a world one mount after the other, and the
+        twists [N, 6] that the camera moves with; a mast sways."""
         count, each = len(mounts), len(samples.which)
         plain = self.base.scenes(replace(samples, which=samples.which * count))
         worlds = len(samples.numbers)
@@ -107,7 +108,11 @@ class Drawn:
         parts = {"estimate": head} if head is not None else {}
         pose = whole.T_body_cam
         return self._system.replaced(
-            camera=whole.camera, mount=lambda: pose, events=whole.events(kind), flow=whole.flow, **parts
+            camera=whole.camera,
+            mount=lambda: pose,
+            events=whole.events(kind),
+            flow=whole.flow,
+            **parts,
         )
 
     @torch.no_grad()
@@ -129,8 +134,8 @@ class Drawn:
     def seen(
         self, cameras: Sequence[Any], mounts: Tensor, batch: Drives, twist: Tensor, field: Any
     ) -> tuple[Seen, Tensor]:
-        """What flow in the windows is of, behind mounts [M, 4, 4] (``scenes``) and a camera each, and its optics [N,
-        windows, 2] (``window_optics``)."""
+        """What flow in the windows is of, behind mounts [M, 4, 4] (``scenes``) and a camera each,
+        and its optics [N, windows, 2] (``window_optics``)."""
         estimator = self.estimate
         each = batch.T_world_body.shape[1] // len(mounts)
         of_drive = mounts.repeat_interleave(each, 0)
@@ -139,7 +144,9 @@ class Drawn:
         of_mount = torch.tensor([unlike.index(camera) for camera in cameras])
         worlds = len(batch.T_world_body)
         rig = Rig(unlike, of_mount.repeat_interleave(each).repeat(worlds))
-        read, true = estimator.read_beside_truth(field, rig, batch.scene, of_drive, T_world_cam, batch.t_s)
+        read, true = estimator.read_beside_truth(
+            field, rig, batch.scene, of_drive, T_world_cam, batch.t_s
+        )
         flow_px = (true.rows @ twist[:, None, :, None])[..., 0]
         covered = torch.cat(
             [
@@ -149,11 +156,13 @@ class Drawn:
         )[of_mount.argsort(stable=True).argsort()]
         covered = covered.repeat_interleave(each, 0).repeat(worlds, 1)
         surfaces = replace(read, depth_m=true.depth_m)
-        return Seen(batch.twist, twist, read, surfaces, true.rows, flow_px, covered), rig.optics(read)
+        return Seen(batch.twist, twist, read, surfaces, true.rows, flow_px, covered), rig.optics(
+            read
+        )
 
     def expected(self, seen: Seen, read: Readings, errors: FlowErrors) -> Tensor:
-        """Mean bounded error [N] to be expected of drives: over errors drawn from their normal distribution,
-        the same for all designs."""
+        """Mean bounded error [N] to be expected of drives: over errors drawn from their normal
+        distribution, the same for all designs."""
         estimator = self.estimate
         axes = list(self.space.pair.axes)
         found = expected_errors(estimator, read, seen.seen_twist, seen.true_rows, errors)
@@ -168,7 +177,9 @@ class Drawn:
 
 def _normal(axes):
     """[DRAWS, axes] standard normal numbers, evenly spread."""
-    points = torch.quasirandom.SobolEngine(axes, scramble=True, seed=0).draw(DRAWS, dtype=torch.float64)
+    points = torch.quasirandom.SobolEngine(axes, scramble=True, seed=0).draw(
+        DRAWS, dtype=torch.float64
+    )
     return torch.special.ndtri(points.clamp(1e-6, 1 - 1e-6))
 
 
@@ -206,7 +217,9 @@ class Looked:
         counts = self.run["volume"].counts
         per_px = float(counts.sum()) / (counts.shape[0] * counts.shape[-1] * counts.shape[-2])
         level = costs.gain(whole.numbers["fno"]) * float(self.run["frames"].mean())
-        return Conditions.of(whole.sensor, per_px, level, robot_pair.DURATION_S, whole.numbers["prior_px"])
+        return Conditions.of(
+            whole.sensor, per_px, level, robot_pair.DURATION_S, whole.numbers["prior_px"]
+        )
 
     @cached_property
     def errors(self) -> FlowErrors:

@@ -1,4 +1,5 @@
-"""The race of the arms: from the same starts at equal rendered drives, judged by single events in worlds that none saw."""
+"""The race of the arms: from the same starts at equal rendered drives, judged by single events in
+worlds that none saw."""
 
 import json
 import math
@@ -30,7 +31,8 @@ JUDGED = 7_700_000  # number of the judge's draw
 
 
 def start(space: Space, seed: int) -> Tensor:
-    """Shares [V] at random, sensor and estimator as they are by default, that keep what is required.
+    """Shares [V] at random, sensor and estimator as they are by default, that keep what is
+    required.
 
     Raises: DomainError where none of TRIES does.
     """
@@ -38,7 +40,9 @@ def start(space: Space, seed: int) -> Tensor:
     requirements = space.pair.requirements()
     held = space.part("read-out")
     for _ in range(TRIES):
-        share = EDGE + (1 - 2 * EDGE) * torch.rand(len(space.free), generator=generator, dtype=torch.float64)
+        share = EDGE + (1 - 2 * EDGE) * torch.rand(
+            len(space.free), generator=generator, dtype=torch.float64
+        )
         share[held] = space.start[held]
         if kept(space, share, requirements):
             return share
@@ -54,8 +58,8 @@ def kept(space: Space, share: Tensor, requirements: Sequence[Any]) -> bool:
 
 
 def run_arm(drawn: Drawn, arm: str, seed: int, steps: int, settling: int) -> dict[str, Any]:
-    """One arm from one start: its answer, sensor and estimator settled once more on the drives recorded last; or the last
-    design on its way that keeps what is required."""
+    """One arm from one start: its answer, sensor and estimator settled once more on the drives
+    recorded last; or the last design on its way that keeps what is required."""
     begun, rendered = time.process_time(), drawn.rendered
     space = drawn.space
     task = Task(Objective(drawn), start(space, seed), steps, 10_000 * seed, seed, settling)
@@ -77,7 +81,8 @@ def run_arm(drawn: Drawn, arm: str, seed: int, steps: int, settling: int) -> dic
 def racing(seed: int, arm: str, setting: Mapping[str, Any], threads: int = 0) -> dict[str, Any]:
     """``run_arm`` in a process that may know nothing yet.
 
-    setting: of the race, plain values. threads: that the process may use, beside others; 0: as it is.
+    setting: of the race, plain values. threads: that the process may use, beside others; 0: as it
+      is.
     """
     if threads:
         torch.set_num_threads(threads)
@@ -87,7 +92,8 @@ def racing(seed: int, arm: str, setting: Mapping[str, Any], threads: int = 0) ->
 
 
 def taken_up(path: Path, setting: Mapping[str, Any]) -> tuple[bytes, bytes]:
-    """Lines of a table of answers (race.jsonl, answers.jsonl), all of them and those that the same judge has judged.
+    """Lines of a table of answers (race.jsonl, answers.jsonl), all of them and those that the same
+    judge has judged.
 
     Raises: FileFormatError for what is no such table; DomainError for answers of another setting.
     """
@@ -103,13 +109,17 @@ def taken_up(path: Path, setting: Mapping[str, Any]) -> tuple[bytes, bytes]:
             ) from error
         for each in theirs:
             other = [
-                name for name in setting if name != "judge" and not _alike(each.get(name), setting[name])
+                name
+                for name in setting
+                if name != "judge" and not _alike(each.get(name), setting[name])
             ]
             if other:
                 raise DomainError(
                     f"'{path}' has answers of another setting: {other[0]} is {each.get(other[0])} there and {setting[other[0]]} here."
                 )
-        if all("head_errors" in row and row["setting"].get("judge") == setting["judge"] for row in rows):
+        if all(
+            "head_errors" in row and row["setting"].get("judge") == setting["judge"] for row in rows
+        ):
             judged.append(line)
     return b"".join(lines), b"".join(judged)
 
@@ -144,15 +154,16 @@ def spread_over(worlds: int, drives: int) -> tuple[int, int]:
 
 
 class Judge:
-    """Single events in unseen worlds, the same drives for every design; nothing that searched has seen them."""
+    """Single events in unseen worlds, the same drives for every design; nothing that searched has
+    seen them."""
 
     def __init__(self, space: Space, worlds: int, per_world: int) -> None:
         self.drawn = Drawn(space, robot_pair.unseen(worlds), worlds, per_world)
         self.worlds = worlds
 
     def __call__(self, share: Sequence[float]) -> dict[str, list[float]]:
-        """Of shares [V] the mean bounded errors in each world: ``errors`` of least squares, and ``head_errors`` of the
-        delivered velocity head on the same flow."""
+        """Of shares [V] the mean bounded errors in each world: ``errors`` of least squares, and
+        ``head_errors`` of the delivered velocity head on the same flow."""
         return self.of(self.drawn.space.made(torch.tensor(share, dtype=torch.float64)))
 
     def of(self, whole: Whole) -> dict[str, list[float]]:
@@ -165,13 +176,16 @@ class Judge:
         return {"errors": None, "head_errors": VelocityHead.pretrained(self.drawn.estimate)}
 
     def _by_world(self, errors):
-        return [round(error, 6) for error in errors.unflatten(0, (self.worlds, -1)).mean(1).tolist()]
+        return [
+            round(error, 6) for error in errors.unflatten(0, (self.worlds, -1)).mean(1).tolist()
+        ]
 
 
 def compared(
     rows: Sequence[Mapping[str, Any]], ours: str = "joint", of: str = "errors"
 ) -> dict[str, tuple[Interval, float]]:
-    """The log ratio of our error to each rival's over paired seeds and worlds, and its p after Holm."""
+    """The log ratio of our error to each rival's over paired seeds and worlds, and its p after
+    Holm."""
     errors = {
         arm: torch.tensor([row[of] for row in rows if row["arm"] == arm], dtype=torch.float64)
         for arm in dict.fromkeys(row["arm"] for row in rows)

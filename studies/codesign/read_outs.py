@@ -1,5 +1,6 @@
-"""By what should sensor and estimator be settled on few recorded drives: by the hard errors of these, or by those to be
-expected? Read-outs of one design, ranked by both, beside single events in many drives of other worlds."""
+"""By what should sensor and estimator be settled on few recorded drives: by the hard errors of
+these, or by those to be expected? Read-outs of one design, ranked by both, beside single events in
+many drives of other worlds."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -25,8 +26,8 @@ LOST = 0.5  # hard error, from which on a read-out is none of the good ones
 
 
 def looked(run: Run[Any], space: Space, drawn: Drawn, at: Tensor, count: int) -> list[Row]:
-    """Rows of read-outs around that of shares [V]: errors on as many recorded drives as an arm has, hard and expected, and
-    the hard ones of single events in other worlds."""
+    """Rows of read-outs around that of shares [V]: errors on as many recorded drives as an arm has,
+    hard and expected, and the hard ones of single events in other worlds."""
     free = space.part("read-out")
     if not free:
         return []
@@ -82,5 +83,9 @@ def show(run: Run[Any], rows: Sequence[Row]) -> None:
         lines.append(line)
     run.record(read_outs=len(rows), read_outs_good=len(good))
     tabulate(
-        run, "Ranks beside other worlds, and the error of the pick there", lines, "judge", prefix="read_out"
+        run,
+        "Ranks beside other worlds, and the error of the pick there",
+        lines,
+        "judge",
+        prefix="read_out",
     )

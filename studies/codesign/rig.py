@@ -14,7 +14,8 @@ from studies.placement.problem import of_bodies
 
 @dataclass(frozen=True)
 class Rig:
-    """A camera for placement (``ChiefRayCamera``), behind which each of N bodies looks through one of several.
+    """A camera for placement (``ChiefRayCamera``), behind which each of N bodies looks through one
+    of several.
 
     cameras: with films alike. of_body: [N] number of each body's camera.
     """

@@ -1,5 +1,5 @@
-"""Is the slope that steers a design the slope of its errors? The objective's own against rendered differences, of the
-errors it expects and of hard ones, over the same draws."""
+"""Is the slope that steers a design the slope of its errors? The objective's own against rendered
+differences, of the errors it expects and of hard ones, over the same draws."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -24,8 +24,9 @@ FIRST = 5_000_000  # number of the first draw, beyond those of any race
 class Agreement:
     """Of a mean slope with a mean of differences over the same draws.
 
-    cosine: between them, in the cube. length: of the slope over that of the differences. beyond: relative L2 distance
-    that the standard errors of both do not explain. signal_to_noise: of the slope in one draw.
+    cosine: between them, in the cube. length: of the slope over that of the differences. beyond:
+    relative L2 distance that the standard errors of both do not explain. signal_to_noise: of the
+    slope in one draw.
     """
 
     cosine: float
@@ -48,8 +49,11 @@ def agreement(slopes: Tensor, differences: Tensor) -> Agreement:
     )
 
 
-def slopes(run: Run[Any], space: Space, drawn: Drawn, at: Mapping[str, Tensor], draws: int) -> list[Row]:
-    """Rows of every place, draw and number: the slope at shares [V], and the differences over a step to either side.
+def slopes(
+    run: Run[Any], space: Space, drawn: Drawn, at: Mapping[str, Tensor], draws: int
+) -> list[Row]:
+    """Rows of every place, draw and number: the slope at shares [V], and the differences over a
+    step to either side.
 
     The slope of the first draw, by which the trend has learnt nothing else, is not among them.
     """
@@ -76,13 +80,19 @@ def slopes(run: Run[Any], space: Space, drawn: Drawn, at: Mapping[str, Tensor], 
             [float(each.mean()) for each in of]
             for of in zip(*((e.expected, e.hard()) for e in looked), strict=True)
         )
-        return {"expected": (expected[1] - expected[0]) / width, "hard": (hard[1] - hard[0]) / width}
+        return {
+            "expected": (expected[1] - expected[0]) / width,
+            "hard": (hard[1] - hard[0]) / width,
+        }
 
     found = sweep(run, of_slope, "slopes", place=list(at), draw=range(draws))
     known = {(row["place"], row["draw"]): row["slope"] for row in found}
-    rows = sweep(run, of_differences, "differences", place=list(at), draw=range(draws), number=space.free)
+    rows = sweep(
+        run, of_differences, "differences", place=list(at), draw=range(draws), number=space.free
+    )
     return [
-        {**row, "slope": known[row["place"], row["draw"]][space.free.index(row["number"])]} for row in rows
+        {**row, "slope": known[row["place"], row["draw"]][space.free.index(row["number"])]}
+        for row in rows
     ]
 
 
@@ -117,4 +127,6 @@ def show(run: Run[Any], space: Space, rows: Sequence[Row]) -> None:
         "drives.",
     )
     tabulate(run, "Agreement", lines, "at", "block", "against", prefix="slope")
-    tabulate(run, "Mean slopes, per share of the bounds", numbers, "at", "number", prefix="mean_slope")
+    tabulate(
+        run, "Mean slopes, per share of the bounds", numbers, "at", "number", prefix="mean_slope"
+    )

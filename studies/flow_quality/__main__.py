@@ -72,7 +72,11 @@ FIGURES = {
         "By confidence less by true error, over the error of all pixels; 0 is best.",
         3,
     ),
-    "sharpness": ("Flow warp loss (FWL)", "Of the bins, each at its centroid; above 1 is sharper.", 3),
+    "sharpness": (
+        "Flow warp loss (FWL)",
+        "Of the bins, each at its centroid; above 1 is sharper.",
+        3,
+    ),
 }
 
 
@@ -99,8 +103,8 @@ class Config(StudyConfig):
     recording: tuple[Path, ...] = ()
     """Recordings (docs/flow_recordings.md) to judge on beside the two that are made."""
     focal_px: float | None = None
-    """Focal length of a camera that only turned, px: those recordings are then compared with the sharpest
-    rotation, else with the sharpest affine flow."""
+    """Focal length of a camera that only turned, px: those recordings are then compared with the
+    sharpest rotation, else with the sharpest affine flow."""
     packet_events: tuple[int, ...] = (5_000, 10_000, 30_000)
     """Events of a packet of a recording."""
     packets: int = 6
@@ -187,7 +191,9 @@ def judged(config, bins):
     chosen = [each for name in config.sets for each in (cells if name == "cells" else (name,))]
     unknown = [name for name in chosen if name not in found | cells]
     if unknown:
-        raise DomainError(f"--sets {unknown[0]} is unknown; choose from cells, {', '.join(found | cells)}.")
+        raise DomainError(
+            f"--sets {unknown[0]} is unknown; choose from cells, {', '.join(found | cells)}."
+        )
     return {name: (found | cells)[name] for name in chosen}
 
 
@@ -217,7 +223,13 @@ def _record(run, name, found, density, rows):
             f"{name}_refiner_over_closed_form": found[BEST]["aee_px"] / found[START]["aee_px"],
         }
     )
-    run.record(**{f"{name}_{who}_{key}": value for who, mine in found.items() for key, value in mine.items()})
+    run.record(
+        **{
+            f"{name}_{who}_{key}": value
+            for who, mine in found.items()
+            for key, value in mine.items()
+        }
+    )
     run.card(
         name.replace("_", " "),
         f"{found[BEST]['ratio']:.3f} x zero flow",
@@ -231,7 +243,9 @@ def _tables(run, found, about, who):
         shares = [round(float(density.quantile(share)), 3) for share in (0.5, 0.05, 0.95)]
         zero = round(float(measured[START]["zero_px"].mean()), 2)
         rows.append([name.replace("_", " "), len(density), *shares, zero])
-    run.table("Sets", ["set", "windows", "events per px, median", "5 %", "95 %", "mean flow, px"], rows)
+    run.table(
+        "Sets", ["set", "windows", "events per px, median", "5 %", "95 %", "mean flow, px"], rows
+    )
     for key, (title, note, digits) in FIGURES.items():
         rows = []
         for name, mine in found.items():
@@ -247,7 +261,9 @@ def _tables(run, found, about, who):
 def _cell(figures, key, digits):
     if key not in figures:
         return None
-    interval = f" ({figures['ratio_low']:.3f} to {figures['ratio_high']:.3f})" if key == "ratio" else ""
+    interval = (
+        f" ({figures['ratio_low']:.3f} to {figures['ratio_high']:.3f})" if key == "ratio" else ""
+    )
     return f"{figures[key]:.{digits}f}{interval}"
 
 
@@ -256,7 +272,8 @@ def _worlds(run, measured):
     for place, name in enumerate(ALL):
         zero = measured[START]["zero_px"][place :: len(ALL)].mean()
         shares = {
-            who: float(mine["error_px"][place :: len(ALL)].mean() / zero) for who, mine in measured.items()
+            who: float(mine["error_px"][place :: len(ALL)].mean() / zero)
+            for who, mine in measured.items()
         }
         run.record(**{f"world_{name}_{who}_ratio": share for who, share in shares.items()})
         rows.append([name, round(float(zero), 2), *(round(share, 3) for share in shares.values())])
@@ -269,7 +286,8 @@ def _worlds(run, measured):
 
 
 def _pictures(shown, who):
-    """Figure: a row per window of its events, true flow, every estimate, and the network's claim."""
+    """Figure: a row per window of its events, true flow, every estimate, and the network's
+    claim."""
     rows = {}
     for number, (given, fields, k) in enumerate(shown, 1):
         counts = given.volume.counts[k]

@@ -26,7 +26,8 @@ def estimators(network, models, clock) -> dict[str, Estimator]:
     """By name. models, clock: of the closed form. All sensors here saw the scene before, so events
     can be the clock."""
     found: dict[str, Estimator] = {
-        f"closed_form_{model}": partial(flow.estimate_lk, model=model, clock=clock) for model in models
+        f"closed_form_{model}": partial(flow.estimate_lk, model=model, clock=clock)
+        for model in models
     }
     found["estimate"] = flow.estimate
     refines = isinstance(network, flow.Refiner)
@@ -42,7 +43,9 @@ def _between_images(method, volume):
     half = volume.counts.shape[2] // 2
     when = [part.mean() for part in (volume.centroid_s[:half], volume.centroid_s[half:])]
     whole = float(volume.collected_s.sum() / (when[1] - when[0]))
-    images = torch.stack([part.sum((1, 2)) for part in volume.counts.tensor_split([half], 2)]).double()
+    images = torch.stack(
+        [part.sum((1, 2)) for part in volume.counts.tensor_split([half], 2)]
+    ).double()
     images = gaussian_filter(images.numpy(), (0, 0, BLUR_PX, BLUR_PX))
     images /= images.max((0, 2, 3), keepdims=True) + 1e-12
     flows = [method(*pair) for pair in zip(*images, strict=True)]  # down, right
@@ -59,9 +62,13 @@ def plain_lk(volume: EventVolume) -> FlowField:
     share = (volume.collected_s / span).to(counts)[:, None, None]
     time = (volume.centroid_s / span).to(counts)[:, None, None] - 0.5
     rate = (counts[:, 0] - counts[:, 1]) / share
-    y, x = torch.meshgrid(torch.arange(height).to(counts), torch.arange(width).to(counts), indexing="ij")
+    y, x = torch.meshgrid(
+        torch.arange(height).to(counts), torch.arange(width).to(counts), indexing="ij"
+    )
     half = max(height, width) / 2
-    basis = torch.stack([torch.ones_like(x), (x - (width - 1) / 2) / half, (y - (height - 1) / 2) / half])
+    basis = torch.stack(
+        [torch.ones_like(x), (x - (width - 1) / 2) / half, (y - (height - 1) / 2) / half]
+    )
     parameters = torch.zeros(batch, 2, 3).to(counts)
     for sigma in LEVELS_PX:
         size = 2 * int(3 * sigma + 0.5) + 1
@@ -69,11 +76,15 @@ def plain_lk(volume: EventVolume) -> FlowField:
         for _ in range(STEPS):
             u, v = torch.einsum("bck,khw->bchw", parameters, basis)[:, :, None].unbind(1)
             at = torch.stack(
-                [(x + time * u) * (2 / (width - 1)) - 1, (y + time * v) * (2 / (height - 1)) - 1], -1
+                [(x + time * u) * (2 / (width - 1)) - 1, (y + time * v) * (2 / (height - 1)) - 1],
+                -1,
             )
             inside = (at.abs() <= 1).all(-1).all(1)
             warped = grid_sample(
-                blurred.flatten(0, 1)[:, None], at.flatten(0, 1), padding_mode="border", align_corners=True
+                blurred.flatten(0, 1)[:, None],
+                at.flatten(0, 1),
+                padding_mode="border",
+                align_corners=True,
             ).reshape(blurred.shape)
             mean = (warped * share).sum(1)
             slope = (warped * share * time).sum(1) / (share * time.square()).sum()

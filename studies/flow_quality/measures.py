@@ -23,8 +23,10 @@ MARGIN_PX = 0.05
 Rows = dict[str, np.ndarray]
 """Of N windows: error_px, zero_px: [N] mean endpoint error over valid pixels of the estimate and of
 zero flow.
-claim, claim_median: [N] mean squared error over the trace of the claimed covariance, and median of its root.
-normalised, within: [N] mean of half of e^T C^-1 e, and share of the pixels in the claimed ellipse of 90 %.
+claim, claim_median: [N] mean squared error over the trace of the claimed covariance, and median of
+  its root.
+normalised, within: [N] mean of half of e^T C^-1 e, and share of the pixels in the claimed ellipse
+  of 90 %.
 spearman, spearman_if_true: [N] rank correlation within a window of 1 - confidence with the error,
 and with errors drawn from the claim. left, best: [N, len(SHARES)] mean error of the pixels left
 when a share of them is taken out, least confident first, and largest error first. fwl, truth_fwl:
@@ -71,7 +73,9 @@ def of_claim(miss, covariance, doubt, random) -> dict[str, float]:
     claim = (x**2 + y**2) / (xx + yy)
     across = xy / np.sqrt(xx)
     one, other = random.standard_normal((2, len(xx)))
-    drawn = np.hypot(np.sqrt(xx) * one, across * one + np.sqrt(np.maximum(yy - across**2, 0)) * other)
+    drawn = np.hypot(
+        np.sqrt(xx) * one, across * one + np.sqrt(np.maximum(yy - across**2, 0)) * other
+    )
     return {
         "claim": claim.mean(),
         "claim_median": np.median(np.sqrt(claim)),
@@ -132,8 +136,8 @@ def spearman(doubt, error) -> float:
 
 
 def sparsified(error, doubt) -> np.ndarray:
-    """Mean error [len(SHARES)] of the pixels that are left when the most doubtful share is taken out; pixels
-    of equal doubt count with their mean error."""
+    """Mean error [len(SHARES)] of the pixels that are left when the most doubtful share is taken
+    out; pixels of equal doubt count with their mean error."""
     order = np.argsort(doubt, kind="stable")
     _, group, sizes = np.unique(doubt[order], return_inverse=True, return_counts=True)
     mean = np.bincount(group, error[order]) / sizes
@@ -143,8 +147,8 @@ def sparsified(error, doubt) -> np.ndarray:
 
 
 def warp_loss(volume: EventVolume, flow_px, k: int) -> float:
-    """FWL of sample k by the contents of its bins, each at its centroid (codesign.flow.metrics.fwl has it for
-    streams); NaN where the unwarped image is even."""
+    """FWL of sample k by the contents of its bins, each at its centroid (codesign.flow.metrics.fwl
+    has it for streams); NaN where the unwarped image is even."""
     one = EventVolume(volume.counts[k : k + 1], volume.centroid_s, volume.collected_s)
     tracks = volume_tracks(one, flow_px[k : k + 1])
     still, moved = (

@@ -56,7 +56,8 @@ class Case:
 
 
 def cases(config, say):
-    """Cases of all recordings, the made ones first; a recording with too few events for a packet says so."""
+    """Cases of all recordings, the made ones first; a recording with too few events for a packet
+    says so."""
     found = []
     for make, turns in ((turning, True), (sliding, False)):
         recording = make(seed=config.seed)
@@ -64,18 +65,27 @@ def cases(config, say):
             packets = cut(recording, count, config.packets)
             assumed = "rotation" if turns else "affine"
             found += [
-                Case(_kind(recording.name, count), p, partial(in_context, recording, p, turns), assumed)
+                Case(
+                    _kind(recording.name, count),
+                    p,
+                    partial(in_context, recording, p, turns),
+                    assumed,
+                )
                 for p in packets
             ]
     for path in config.recording:
         for count in config.packet_events:
             try:
-                packets = read_packets(path, None, PacketOptions(events=count, count=config.packets))
+                packets = read_packets(
+                    path, None, PacketOptions(events=count, count=config.packets)
+                )
             except DomainError as error:
                 say(f"{path}, packets of {count} events: left out: {error}")
                 continue
             seek = (
-                partial(sharpest.rotation, focal_px=config.focal_px) if config.focal_px else sharpest.affine
+                partial(sharpest.rotation, focal_px=config.focal_px)
+                if config.focal_px
+                else sharpest.affine
             )
             assumed = "rotation" if config.focal_px else "affine"
             kind = _kind(Path(path).stem, count)
@@ -105,8 +115,8 @@ def _packet(recording, first, stop):
 
 
 def in_context(recording, packet, turns):
-    """Flow of a packet of a made recording by contrast maximisation over at least CONTEXT events around its
-    middle, scaled to its length: a few thousand events are too few to be sure of."""
+    """Flow of a packet of a made recording by contrast maximisation over at least CONTEXT events
+    around its middle, scaled to its length: a few thousand events are too few to be sure of."""
     stream = recording.stream
     first = int(torch.searchsorted(stream.t_us, torch.tensor(packet.t0_us)))
     extra = max(0, CONTEXT - len(packet.stream)) // 2
@@ -136,7 +146,8 @@ def measured(case, who, bins):
     volume = events.from_stream(packet.stream, packet.t0_us, packet.t1_us, bins)
     mask = metrics.event_mask(volume)
     rows = {
-        name: judged(packet, mask, estimate(volume).flow_px, sharpest_px) for name, estimate in who.items()
+        name: judged(packet, mask, estimate(volume).flow_px, sharpest_px)
+        for name, estimate in who.items()
     }
     rows["contrast_maximisation"] = judged(packet, mask, sharpest_px.float())
     if packet.truth is not None:
@@ -165,17 +176,26 @@ def show(run, who, bins, todo):
     rows = []
     for kind, mine in cases_of.items():
         stream = mine[0].packet.stream
-        length_ms = statistics.fmean(1e-3 * (each.packet.t1_us - each.packet.t0_us) for each in mine)
+        length_ms = statistics.fmean(
+            1e-3 * (each.packet.t1_us - each.packet.t0_us) for each in mine
+        )
         density = statistics.fmean(len(each.packet.stream) for each in mine)
         density /= stream.height_px * stream.width_px
         rows.append([kind, len(mine), round(length_ms, 2), round(density, 3), mine[0].assumed])
-    run.table("Packets", ["packets", "number", "mean ms", "events per px", "contrast maximisation of"], rows)
+    run.table(
+        "Packets",
+        ["packets", "number", "mean ms", "events per px", "contrast maximisation of"],
+        rows,
+    )
     names = [*who, "contrast_maximisation", "true_flow", "zero_flow"]
     for measure, (title, note, _, worst) in MEASURES.items():
         rows = []
         for kind, packets in found.items():
             values = [_values(packets, name, measure) for name in names]
-            cells = [f"{statistics.fmean(each):.2f} ({worst(each):.2f})" if each else None for each in values]
+            cells = [
+                f"{statistics.fmean(each):.2f} ({worst(each):.2f})" if each else None
+                for each in values
+            ]
             if any(cells):
                 rows.append([kind, *cells])
         run.table(title, ["packets", *(name.replace("_", " ") for name in names)], rows, note)

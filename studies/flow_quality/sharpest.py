@@ -1,8 +1,8 @@
-"""Flow of a packet by contrast maximisation, independent of every estimator: a dense search and a simplex, on
-single events, with numpy alone.
+"""Flow of a packet by contrast maximisation, independent of every estimator: a dense search and a
+simplex, on single events, with numpy alone.
 
-Source: Gallego, Rebecq, Scaramuzza, A unifying contrast maximization framework for event cameras, CVPR 2018,
-with an image for each polarity.
+Source: Gallego, Rebecq, Scaramuzza, A unifying contrast maximization framework for event cameras,
+CVPR 2018, with an image for each polarity.
 """
 
 from dataclasses import dataclass
@@ -27,16 +27,16 @@ STEEPEST = 0.3
 
 @dataclass(frozen=True)
 class Sharpest:
-    """flow_px: [2, H, W] px over the packet on the pixels of its start. contrast: variance of the image it
-    makes, over the unwarped one's."""
+    """flow_px: [2, H, W] px over the packet on the pixels of its start. contrast: variance of the
+    image it makes, over the unwarped one's."""
 
     flow_px: np.ndarray
     contrast: float
 
 
 def rotation(packet, focal_px) -> Sharpest:
-    """The turn of a pinhole camera, its axis in the image's middle, that makes the events of a packet
-    sharpest.
+    """The turn of a pinhole camera, its axis in the image's middle, that makes the events of a
+    packet sharpest.
 
     Args:
       packet: with stream, t0_us, t1_us.
@@ -53,7 +53,9 @@ def rotation(packet, focal_px) -> Sharpest:
 
     best = _best(events, speed, 3)
     h = np.diag([focal_px, focal_px, 1.0])
-    turn = Rotation.from_rotvec([-best[1] / focal_px, best[0] / focal_px, best[2] / events.corner_px])
+    turn = Rotation.from_rotvec(
+        [-best[1] / focal_px, best[0] / focal_px, best[2] / events.corner_px]
+    )
     x, y = events.pixels()
     seen = np.einsum(
         "ij,jhw->ihw", h @ turn.as_matrix() @ np.linalg.inv(h), np.stack([x, y, np.ones_like(x)])
@@ -114,7 +116,9 @@ class _Events:
     def __init__(self, packet):
         stream = packet.stream
         if not len(stream):
-            raise DomainError(f"the packet {packet.name} holds no event, so nothing can be made sharp.")
+            raise DomainError(
+                f"the packet {packet.name} holds no event, so nothing can be made sharp."
+            )
         self.height = stream.height_px
         self.width = stream.width_px
         self.corner_px = float(np.hypot(self.height, self.width) / 2)
@@ -127,7 +131,9 @@ class _Events:
         """Every so many-th event."""
         other = object.__new__(_Events)
         every = slice(None, None, max(1, len(self.x) // count))
-        vars(other).update(vars(self), **{name: getattr(self, name)[every] for name in ("x", "y", "t", "on")})
+        vars(other).update(
+            vars(self), **{name: getattr(self, name)[every] for name in ("x", "y", "t", "on")}
+        )
         return other
 
     def pixels(self):
@@ -138,8 +144,9 @@ class _Events:
         """Variance of the images of the events moved to the middle of the packet, both polarities
         added, on cells of cell_px px.
 
-        Every event is spread by the quadratic B-spline, whose width does not depend on where it falls: with
-        bilinear shares the unmoved image, whose events sit on pixels, would be the sharpest.
+        Every event is spread by the quadratic B-spline, whose width does not depend on where it
+        falls: with bilinear shares the unmoved image, whose events sit on pixels, would be the
+        sharpest.
         """
         height, width = (-(-side // cell_px) for side in (self.height, self.width))
         x = (self.x - self.t * flow[0] + self.width / 2) / cell_px - 0.5

@@ -1,9 +1,10 @@
-"""How well does event flow work on a recording: errors against true flow where there is one, sharpness of the
-warped events always.
+"""How well does event flow work on a recording: errors against true flow where there is one,
+sharpness of the warped events always.
 
-Recordings in the layout of the Event-Camera Dataset (events.txt with imu.txt, groundtruth.txt, calib.txt),
-packets of events with flow files, and every event file the package reads (docs/flow_recordings.md). Without
---recording a small synthetic one is made and used, and the page says so.
+Recordings in the layout of the Event-Camera Dataset (events.txt with imu.txt, groundtruth.txt,
+calib.txt), packets of events with flow files, and every event file the package reads
+(docs/flow_recordings.md). Without --recording a small synthetic one is made and used, and the page
+says so.
 """
 
 import sys
@@ -32,39 +33,41 @@ MADE_QUICK_PX = (90, 120)
 @dataclass(frozen=True)
 class Config(StudyConfig):
     recording: Path | None = None
-    """Folder with events.txt, folder of packets, event file, or zip archive; a synthetic one when left
-    out."""
-    truth: Path | None = None
-    """True flow: a flow file, a folder of them, imu.txt or groundtruth.txt; what lies beside the events when
+    """Folder with events.txt, folder of packets, event file, or zip archive; a synthetic one when
     left out."""
+    truth: Path | None = None
+    """True flow: a flow file, a folder of them, imu.txt or groundtruth.txt; what lies beside the
+    events when left out."""
     estimator: str = "auto"
-    """lk, refiner, a .safetensors file, or auto: lk and the delivered refiner where there is one."""
+    """lk, refiner, a .safetensors file, or auto: lk and the delivered refiner where there is
+    one."""
     window_ms: float | None = None
     """Length of the windows; the whole of a short recording or packet, else 20 ms."""
     start_s: float | None = None
-    """Start of the first window, seconds after the first event; windows spread over the recording when left
-    out."""
+    """Start of the first window, seconds after the first event; windows spread over the recording
+    when left out."""
     packets: int | None = None
     """Most windows to look at; 10 where the recording does not say."""
     events: int | None = None
     """Cut windows by this number of events instead."""
     width_px: int | None = None
-    """Width of the sensor, with height-px; otherwise what the files say, or the smallest known sensor
-    (DAVIS240C first)."""
+    """Width of the sensor, with height-px; otherwise what the files say, or the smallest known
+    sensor (DAVIS240C first)."""
     height_px: int | None = None
     """Height of the sensor."""
     columns: str = "auto"
     """Order of the columns of event text, for example txyp."""
     time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
-    """Unit of the times of event text; auto: seconds where they have a fraction, else microseconds."""
+    """Unit of the times of event text; auto: seconds where they have a fraction, else
+    microseconds."""
     truth_unit: Literal["px", "px/s"] = "px"
     """Unit of flow files."""
     truth_pixels: Literal["raw", "undistorted"] = "raw"
     """Whose pixels flow files belong to: the sensor's, or those of a pinhole, from which they are
     then carried to the sensor's by calib.txt."""
     skip: tuple[str, ...] = ()
-    """Faults to leave out and count instead of refusing (events) or keeping (windows): events_back_in_time,
-    events_off_sensor, windows_without_events, windows_across_gaps."""
+    """Faults to leave out and count instead of refusing (events) or keeping (windows):
+    events_back_in_time, events_off_sensor, windows_without_events, windows_across_gaps."""
     truth_interval_ms: float | None = None
     """What a flow file without times covers; the whole packet when left out."""
     gyro_axes: str = "xyz"
@@ -91,7 +94,9 @@ def study(run: Run[Config]) -> None:
         run.say(
             "No --recording given: making a small synthetic one (a camera that turns before a photograph)."
         )
-        made.make(recording, *((0.06, MADE_QUICK_PX) if config.quick else (0.2, MADE_PX)), config.seed)
+        made.make(
+            recording, *((0.06, MADE_QUICK_PX) if config.quick else (0.2, MADE_PX)), config.seed
+        )
     read = options(config)
     packets = read_packets(recording, config.truth, read)
     run.say(f"{len(packets)} packet(s); {'; '.join(packets[0].notes)}")
@@ -104,7 +109,9 @@ def study(run: Run[Config]) -> None:
                 rows.append((packet, name, found))
                 progress.advance()
             if number < SHOWN:
-                run.figure(page.pictures(packet, fields), f"packet_{number:02d}", page.caption(packet))
+                run.figure(
+                    page.pictures(packet, fields), f"packet_{number:02d}", page.caption(packet)
+                )
     film = filmed(run, recording, estimators, read) if config.video else None
     page.show(run, packets, rows, tuple(estimators), film)
 
@@ -128,7 +135,9 @@ def load(name):
     if name == "auto":
         return closed_form | load("refiner") if DELIVERED["refiner"].is_file() else closed_form
     network = load_network(name).requires_grad_(False)
-    return {name if name == "refiner" else Path(name).stem: (network, network.config.get("bins", 8))}
+    return {
+        name if name == "refiner" else Path(name).stem: (network, network.config.get("bins", 8))
+    }
 
 
 def options(config):
@@ -188,7 +197,8 @@ def measured(packet, estimate, bins):
 
 
 def errors(flow_px, truth, valid, both):
-    """{figure: value} of the errors where the truth is valid, and where events are too (``both``)."""
+    """{figure: value} of the errors where the truth is valid, and where events are too
+    (``both``)."""
     found = {}
     if bool(both.any()):
         found["aee_px"] = float(metrics.aee(flow_px, truth, both))

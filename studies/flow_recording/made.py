@@ -1,5 +1,5 @@
-"""A recording to run on where there is none: a camera that turns before a photograph, written in the layout
-of the Event-Camera Dataset (events.txt, imu.txt, groundtruth.txt, calib.txt)."""
+"""A recording to run on where there is none: a camera that turns before a photograph, written in
+the layout of the Event-Camera Dataset (events.txt, imu.txt, groundtruth.txt, calib.txt)."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -46,6 +46,8 @@ def make(folder, duration_s=0.2, size_px=(180, 240), seed=0):
     for name, (columns, form) in tables.items():
         with replacing(folder / name) as temporary:
             np.savetxt(temporary, np.column_stack(columns), fmt=form)
-    calibration = f"{made.focal_px} {made.focal_px} {(width - 1) / 2} {(height - 1) / 2} 0 0 0 0 0\n"
+    calibration = (
+        f"{made.focal_px} {made.focal_px} {(width - 1) / 2} {(height - 1) / 2} 0 0 0 0 0\n"
+    )
     write_atomic(folder / "calib.txt", calibration.encode())
     return made

@@ -49,7 +49,13 @@ def show(run, packets, rows, names, film):
     notes = " ".join(f"{note}." for note in packets[0].notes)
     run.section("Packets", f"{made_up if synthetic else ''}{notes}")
     table = [
-        (packet.name, _ms(packet), len(packet.stream), name, *(found.get(figure) for figure in UNITS))
+        (
+            packet.name,
+            _ms(packet),
+            len(packet.stream),
+            name,
+            *(found.get(figure) for figure in UNITS),
+        )
         for packet, name, found in rows
     ]
     run.table(
@@ -88,7 +94,9 @@ def _means(found):
             "fwl_above_1_share": statistics.fmean(value > 1 for value in sharp),
         }
     if "aee_px" in means:
-        worse = [ours > zero for ours, zero in zip(values["aee_px"], values["zero_aee_px"], strict=True)]
+        worse = [
+            ours > zero for ours, zero in zip(values["aee_px"], values["zero_aee_px"], strict=True)
+        ]
         means["worse_than_zero_share"] = statistics.fmean(worse)
     return means
 
@@ -114,14 +122,18 @@ def doubts(packets, rows, name):
     empty = found["packets_without_events"]
     blind = found["packets_without_truth"]
     left_out = [
-        f"{number} {fault.replace('_', ' ')}" for fault, number in packets[0].left_out.items() if number
+        f"{number} {fault.replace('_', ' ')}"
+        for fault, number in packets[0].left_out.items()
+        if number
     ]
     gaps = found["packets_across_gaps"]
     moving = [packet.name for packet in packets if packet.translates]
     distorted_px = found["truth_undistorted_doubt_px"]
     sharper = _sharper(rows, name)
     blurred = [
-        packet.name for packet, one, figures in rows if one == name and figures.get("truth_fwl", 1) < 1
+        packet.name
+        for packet, one, figures in rows
+        if one == name and figures.get("truth_fwl", 1) < 1
     ]
     sentences = (
         (
@@ -166,7 +178,9 @@ def _sharper(rows, name):
     return [
         packet.name
         for packet, one, figures in rows
-        if one == name and "truth_fwl" in figures and figures["fwl"] > SHARPER * figures["truth_fwl"]
+        if one == name
+        and "truth_fwl" in figures
+        and figures["fwl"] > SHARPER * figures["truth_fwl"]
     ]
 
 
@@ -182,8 +196,8 @@ def caption(packet):
 
 
 def pictures(packet, fields):
-    """Figure: per estimator a row of the events as they came, the events warped to the window's end, the
-    flow, and the true flow. fields: {name: FlowField}."""
+    """Figure: per estimator a row of the events as they came, the events warped to the window's
+    end, the flow, and the true flow. fields: {name: FlowField}."""
     still = _warped(packet, torch.zeros(1, 2, packet.stream.height_px, packet.stream.width_px))
     truth = packet.truth
     longest = None
@@ -192,7 +206,11 @@ def pictures(packet, fields):
     rows = {}
     for name, field in fields.items():
         full = longest or max(float(field.flow_px.abs().max()), 1e-6)
-        known = field.valid[0] if field.confidence is None else field.valid[0] & (field.confidence[0] > 0)
+        known = (
+            field.valid[0]
+            if field.confidence is None
+            else field.valid[0] & (field.confidence[0] > 0)
+        )
         row = rows[f"{name}, full colour {full:.1f} px"] = {
             "events as they came": still,
             "warped by the flow": _warped(packet, field.flow_px),
@@ -211,4 +229,6 @@ def _colours(flow_px, known, full):
 def _warped(packet, flow_px):
     if not len(packet.stream):
         return torch.zeros(flow_px.shape[2:])
-    return count_image(stream_tracks(packet.stream, flow_px, packet.t0_us, packet.t1_us), 1.0)[0].sum(0)
+    return count_image(stream_tracks(packet.stream, flow_px, packet.t0_us, packet.t1_us), 1.0)[
+        0
+    ].sum(0)

@@ -53,14 +53,20 @@ def write(run, held, tracker, name, start_s):
     found = []
     spent_ms = []
     with run.progress(run.config.video_windows, "windows") as progress:
-        for window in islice(tracker.track(held.chunks(start_us=start_us)), run.config.video_windows):
+        for window in islice(
+            tracker.track(held.chunks(start_us=start_us)), run.config.video_windows
+        ):
             found.append(arrows(held, window, cell))
             spent_ms.append(1e3 * window.processor_s)
             progress.advance()
     speeds = np.concatenate([np.hypot(one.u, one.v)[one.sure > SURE] for one in found])
     full = max(float(np.quantile(speeds, FULL)), 1e-6) if len(speeds) else 1.0
     path = run.path("flow.mp4")
-    write_video(path, pictures(held, found, cell, full, tracker.real_time_factor, name), run.config.video_fps)
+    write_video(
+        path,
+        pictures(held, found, cell, full, tracker.real_time_factor, name),
+        run.config.video_fps,
+    )
     metrics = {
         "video_windows": len(found),
         "video_events": tracker.events,
@@ -100,7 +106,14 @@ def arrows(held, window, cell):
     confidence = (weighed / share.clamp_min(1e-9))[0, 0, y, x].numpy()
     middle = (cell - 1) / 2
     return Arrows(
-        window.t0_us, window.t1_us, window.events, x * cell + middle, y * cell + middle, u, v, confidence
+        window.t0_us,
+        window.t1_us,
+        window.events,
+        x * cell + middle,
+        y * cell + middle,
+        u,
+        v,
+        confidence,
     )
 
 

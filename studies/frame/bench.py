@@ -1,11 +1,12 @@
-"""What something costs: seconds by the clock and of the processor, memory, and functions in processes of
-their own.
+"""What something costs: seconds by the clock and of the processor, memory, and functions in
+processes of their own.
 
     timing = measure(lambda: trace(rays), repeats=7)
     f"{1e3 * timing.cpu:.1f} ms of processor time, {1e3 * timing.wall:.1f} by the clock"
 
     turns({"ours": ours, "peer": peer}, rounds=5)   # a change of the machine's load meets both
-    apart(cost_of_tracing, "float32", 1_000_000)    # a fresh process: its memory is the function's alone
+    apart(cost_of_tracing, "float32", 1_000_000)    # a fresh process: its memory is the function's
+    alone
 
 Processor time is what to judge by on a shared machine, the median what to judge by at all.
 """
@@ -91,8 +92,8 @@ def turns(
     warm: int = 1,
     after_each: Callable[[], object] | None = None,
 ) -> dict[Key, Timing]:
-    """Times of several functions, each ``repeats`` times in every round, so that what else the machine does
-    meets all.
+    """Times of several functions, each ``repeats`` times in every round, so that what else the
+    machine does meets all.
 
     Args:
       works: what is timed, by name.
@@ -128,7 +129,8 @@ def apart(
       function: of the top level of a module.
       arguments, keywords: plain values, as JSON keeps them; so is what it returns.
       environment: variables that the process has besides those of this one.
-    Raises: CodesignError with the last line of its stderr when the process fails, KilledError when a signal ended it.
+    Raises: CodesignError with the last line of its stderr when the process fails, KilledError when
+      a signal ended it.
     """
     name = f"{function.__module__}:{function.__qualname__}"
     process = subprocess.Popen(
@@ -164,7 +166,8 @@ def end_running() -> None:
 
 
 def resident_mb() -> float:
-    """Memory of the process that is in use now, MB; its largest so far where the system does not tell."""
+    """Memory of the process that is in use now, MB; its largest so far where the system does not
+    tell."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
         return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
@@ -175,15 +178,17 @@ def resident_mb() -> float:
 def peak_mb(function: Callable[[], object]) -> float:
     """Largest memory during one call beyond what was in use before it, MB.
 
-    Where the system cannot start that count anew (not Linux), earlier peaks count too. Freed memory that the
-    process kept hides a peak: ask in a process of its own (``apart``).
+    Where the system cannot start that count anew (not Linux), earlier peaks count too. Freed memory
+    that the process kept hides a peak: ask in a process of its own (``apart``).
     """
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
     before = resident_mb()
     result = function()
     try:
-        line = next(x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith("VmHWM"))
+        line = next(
+            x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith("VmHWM")
+        )
         largest = int(line.split()[1]) * 1024 / 1e6
     except (OSError, StopIteration):
         largest = _largest_mb()
@@ -192,19 +197,24 @@ def peak_mb(function: Callable[[], object]) -> float:
 
 
 def cost(work: Callable[[], object], repeats: int) -> dict[str, float]:
-    """Median seconds of calls after the first, wall_s and cpu_s, and the peak of memory of the first,
-    peak_mb: the figures of a process of its own, in which what compiles has run on something small."""
+    """Median seconds of calls after the first, wall_s and cpu_s, and the peak of memory of the
+    first,
+    peak_mb: the figures of a process of its own, in which what compiles has run on something
+      small."""
     peak = peak_mb(work)
     timing = measure(work, repeats, warm=0)
     return {"wall_s": timing.wall, "cpu_s": timing.cpu, "peak_mb": peak}
 
 
 def _largest_mb():
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (
+        1e6 if sys.platform == "darwin" else 1e3
+    )
 
 
 def called(name: str, arguments: Sequence[Any], keywords: Mapping[str, Any]) -> str:
-    """JSON of what the function with this name ("module:function") returns; what it prints goes to stderr."""
+    """JSON of what the function with this name ("module:function") returns; what it prints goes to
+    stderr."""
     import codesign  # noqa: F401  (first: it sets OpenMP's wait policy before torch is imported)
 
     module, function = name.split(":")

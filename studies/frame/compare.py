@@ -1,5 +1,5 @@
-"""How sure a figure is: intervals of means, of shares, of anything that can be resampled, and of paired
-errors.
+"""How sure a figure is: intervals of means, of shares, of anything that can be resampled, and of
+paired errors.
 
     student(accuracies)                             # mean over seeds, Student's t
     bootstrap(lambda x: x.median(-1).values, errors)    # any statistic of units that can be redrawn
@@ -42,7 +42,8 @@ class Interval:
         return f"{self:.3g}"
 
     def metrics(self, name: str) -> dict[str, float]:
-        """What ``Run.record`` takes: <name>, and <name>_low and <name>_high where there are ends."""
+        """What ``Run.record`` takes: <name>, and <name>_low and <name>_high where there are
+        ends."""
         found = {name: self.value}
         if math.isfinite(self.low) and math.isfinite(self.high):
             found |= {f"{name}_low": self.low, f"{name}_high": self.high}
@@ -50,8 +51,8 @@ class Interval:
 
     @property
     def outcome(self) -> str:
-        """Of a log ratio of errors: "wins" or "loses" (ours) where the interval leaves out 0, "ties"
-        otherwise."""
+        """Of a log ratio of errors: "wins" or "loses" (ours) where the interval leaves out 0,
+        "ties" otherwise."""
         if self.high < 0:
             return "wins"
         return "loses" if self.low > 0 else "ties"
@@ -59,7 +60,8 @@ class Interval:
     def percent(self) -> str:
         """A log ratio as the change it is: "-3.1 % (-5.0 to -1.2 %)"."""
         value, low, high = (
-            f"{100 * math.expm1(x):+.1f}" if x < 700 else "inf" for x in (self.value, self.low, self.high)
+            f"{100 * math.expm1(x):+.1f}" if x < 700 else "inf"
+            for x in (self.value, self.low, self.high)
         )
         return f"{value} % ({low} to {high} %)"
 
@@ -81,15 +83,17 @@ def student(values: Any, level: float = LEVEL) -> Interval:
 def pooled(values: Any, level: float = LEVEL) -> Interval:
     """Mean of values [seeds, cases], the same cases for every seed.
 
-    The interval is the wider of two: over cases, each averaged over the seeds (other cases, these seeds),
-    and over seeds, each averaged over its cases (these cases, other seeds). Of a single seed it is that
-    over its cases.
+    The interval is the wider of two: over cases, each averaged over the seeds
+    (other cases, these seeds), and over seeds, each averaged over its cases
+    (these cases, other seeds). Of a single seed it is that over its cases.
     """
     values = torch.as_tensor(values, dtype=torch.float64)
     if len(values) == 1:
         return student(values[0], level)
     both = (student(values.mean(0), level), student(values.mean(1), level))
-    return replace(max(both, key=lambda interval: interval.high - interval.low), count=values.shape[1])
+    return replace(
+        max(both, key=lambda interval: interval.high - interval.low), count=values.shape[1]
+    )
 
 
 def bootstrap(
@@ -102,8 +106,8 @@ def bootstrap(
     """A statistic of units, and its percentile interval when they are redrawn.
 
     Args:
-      statistic: takes every sample as a float64 tensor and reduces its last dimension; called once with the
-        units [..., N] and once with all draws [..., draws, N].
+      statistic: takes every sample as a float64 tensor and reduces its last dimension; called once
+        with the units [..., N] and once with all draws [..., draws, N].
       samples: arrays whose last dimension counts the N units, which are redrawn together (paired).
       level: share of the draws between the ends.
       draws: number of draws.
@@ -137,13 +141,17 @@ def median_ratio(ours: Any, theirs: Any, **how: Any) -> Interval:
 def log_ratios(ours: Sequence[float], theirs: Sequence[float]) -> Tensor:
     """Log ratio of errors > 0, case by case, [N] float64.
 
-    Raises: ShapeError for rows of different lengths or none; DomainError for errors that are not above 0.
+    Raises: ShapeError for rows of different lengths or none; DomainError for errors that are not
+      above 0.
     """
     if len(ours) != len(theirs) or not len(ours):
         raise ShapeError(f"{len(ours)} and {len(theirs)} errors; pairs need one of each per case.")
     if not all(0 < e < math.inf for e in (*ours, *theirs)):
         raise DomainError("errors must be finite and above 0, since their log ratio is taken.")
-    return torch.tensor(ours, dtype=torch.float64).log() - torch.tensor(theirs, dtype=torch.float64).log()
+    return (
+        torch.tensor(ours, dtype=torch.float64).log()
+        - torch.tensor(theirs, dtype=torch.float64).log()
+    )
 
 
 def log_ratio(ours: Sequence[float], theirs: Sequence[float], level: float = LEVEL) -> Interval:
@@ -169,8 +177,8 @@ def _units(values) -> Tensor:
 
 
 def crossed(logs: Any, level: float = LEVEL, draws: int = DRAWS, seed: int = 0) -> Interval:
-    """Median over seeds of the mean over worlds of paired log ratios [seeds, worlds], and its interval when seeds and
-    worlds are redrawn, each by itself."""
+    """Median over seeds of the mean over worlds of paired log ratios [seeds, worlds], and its
+    interval when seeds and worlds are redrawn, each by itself."""
     logs = torch.as_tensor(logs, dtype=torch.float64)
     generator = torch.Generator().manual_seed(seed)
     seeds, worlds = logs.shape
@@ -183,7 +191,8 @@ def crossed(logs: Any, level: float = LEVEL, draws: int = DRAWS, seed: int = 0) 
 
 
 def sign_flip(differences: Any, draws: int = 20_000, seed: int = 0) -> float:
-    """Two-sided p of paired differences [N] under random signs of their mean; every sign there is up to N = 14."""
+    """Two-sided p of paired differences [N] under random signs of their mean; every sign there is
+    up to N = 14."""
     found = _units(differences)
     count = len(found)
     if count <= 14:

@@ -25,8 +25,8 @@ class StudyConfig:
     """What --quick sets those options to that were not given."""
 
     quick: bool = False
-    """Smaller and shorter: shows that everything works, not the best result. Options given beside it
-    count."""
+    """Smaller and shorter: shows that everything works, not the best result. Options given beside
+    it count."""
     out: Path | None = None
     """Folder for the results; runs/<study>/<time> when left out."""
     seed: int = 0
@@ -84,7 +84,8 @@ def resume_command(study: str, folder: Path) -> str:
 
 
 def configured(kind: type[Config], quick: bool, **given: Any) -> Config:
-    """A study's configuration: what is given comes before what --quick sets, and that before the defaults."""
+    """A study's configuration: what is given comes before what --quick sets, and that before the
+    defaults."""
     return kind(quick=quick, **{**(kind.QUICK if quick else {}), **given})
 
 
@@ -93,10 +94,11 @@ def resolved(study: str, kind: type[Config], parse: Callable[[Config], Config]) 
 
     Args:
       study, kind: the study and its dataclass.
-      parse: reads the command line into a configuration, with defaults out of the one it is handed. What is
-        typed and what is a default need not be told apart: the line is read again over other defaults.
-    Raises: FileFormatError when there is no such run; DomainError when an option typed beside --resume is not
-      that of the stored run: it would have no effect.
+      parse: reads the command line into a configuration, with defaults out of the one it is handed.
+        What is typed and what is a default need not be told apart: the line is read again over
+        other defaults.
+    Raises: FileFormatError when there is no such run; DomainError when an option typed beside
+      --resume is not that of the stored run: it would have no effect.
     """
     asked = parse(kind())
     if asked.resume is None:

@@ -14,7 +14,8 @@ from studies.frame.config import resume_command
 
 try:
     import fcntl
-except ImportError:  # Windows has no such locks: two processes in one folder are not told apart there
+# Windows has no such locks: two processes in one folder are not told apart there
+except ImportError:
     fcntl = None
 
 LOCK = ".lock"
@@ -29,13 +30,16 @@ def fresh(study: str, out: Path | None):
     folder = out or _timed(Path("runs") / study)
     try:
         holds = (
-            sorted(entry.name for entry in folder.iterdir() if entry.name != LOCK) if folder.exists() else []
+            sorted(entry.name for entry in folder.iterdir() if entry.name != LOCK)
+            if folder.exists()
+            else []
         )
     except OSError as error:
         raise CodesignError(
             f"the output folder '{folder}' cannot be read ({error.strerror}); {REMEDY}."
         ) from error
-    # a run that stopped at bad input leaves config.json alone, and nothing is lost by starting over it
+    # a run that stopped at bad input leaves config.json alone, and nothing is lost by starting over
+    # it
     if holds and (holds != ["config.json"] or owner(folder) != study):
         if owner(folder) == study:
             raise CodesignError(
@@ -80,7 +84,9 @@ def held(folder: Path) -> Iterator[None]:
         try:
             handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         except OSError as error:
-            raise CodesignError(f"'{folder}' cannot be written ({error.strerror}); {REMEDY}.") from error
+            raise CodesignError(
+                f"'{folder}' cannot be written ({error.strerror}); {REMEDY}."
+            ) from error
         try:
             # a record lock: workers that outlive a killed run do not inherit it
             fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,5 +1,5 @@
-"""The studies there are, by question, and what to say of a name that is none of them. Reads their files and
-imports nothing, so that it takes no time."""
+"""The studies there are, by question, and what to say of a name that is none of them. Reads their
+files and imports nothing, so that it takes no time."""
 
 import ast
 import difflib
@@ -26,9 +26,12 @@ RUNS = re.compile(r'^if __name__ == "__main__":', re.M)
 
 
 def studies() -> dict[str, Path]:
-    """Name -> file of every study: a file of the folder studies, or a folder there with a __main__.py."""
+    """Name -> file of every study: a file of the folder studies, or a folder there with a
+    __main__.py."""
     found = {path.parent.name: path for path in FOLDER.glob("*/__main__.py")}
-    found |= {path.stem: path for path in FOLDER.glob("*.py") if path.stem[0] != "_" and _runs(path)}
+    found |= {
+        path.stem: path for path in FOLDER.glob("*.py") if path.stem[0] != "_" and _runs(path)
+    }
     return dict(sorted(found.items()))
 
 
@@ -42,7 +45,9 @@ def question(path: Path) -> str:
 def by_group() -> dict[str, list[str]]:
     """Names of the studies by group, each once; those that no group names under OTHERS."""
     names = list(studies())
-    grouped = {group: [name for name in members if name in names] for group, members in GROUPS.items()}
+    grouped = {
+        group: [name for name in members if name in names] for group, members in GROUPS.items()
+    }
     rest = [name for name in names if not any(name in members for members in GROUPS.values())]
     return {**grouped, OTHERS: rest} if rest else grouped
 
@@ -56,7 +61,9 @@ def show(columns: int | None = None) -> str:
     columns = columns or min(shutil.get_terminal_size().columns, 120)
     files = studies()
     width = max(map(len, files)) + 4
-    lines = ["codesign run NAME [OPTIONS], or python -m studies.NAME [OPTIONS]; --help explains them."]
+    lines = [
+        "codesign run NAME [OPTIONS], or python -m studies.NAME [OPTIONS]; --help explains them."
+    ]
     for group, names in by_group().items():
         lines += ["", group]
         lines += [
@@ -80,16 +87,20 @@ def refusal(name: str) -> str:
     files = studies()
     if name in files:
         return ""
-    if name and (FOLDER.joinpath(*name.split(".")).with_suffix(".py").is_file() or (FOLDER / name).is_dir()):
-        return f"studies.{name} is a part of the studies and no study; 'python -m studies' lists them."
+    if name and (
+        FOLDER.joinpath(*name.split(".")).with_suffix(".py").is_file() or (FOLDER / name).is_dir()
+    ):
+        return (
+            f"studies.{name} is a part of the studies and no study; 'python -m studies' lists them."
+        )
     near = difflib.get_close_matches(name.replace("-", "_"), files, n=1)
     hint = f"did you mean {near[0]}? " if near else ""
     return f"there is no study '{name}'; {hint}'python -m studies' lists them."
 
 
 def refuse_parts(command: list[str]):
-    """End with exit code 2 when Python was started as `python -m studies.NAME` for something that would
-    run in silence, or not at all: a part of a study, or a name that is none.
+    """End with exit code 2 when Python was started as `python -m studies.NAME` for something that
+    would run in silence, or not at all: a part of a study, or a name that is none.
 
     Args:
       command: sys.orig_argv.

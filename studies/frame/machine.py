@@ -1,4 +1,5 @@
-"""What a run ran on: versions of the software that made its numbers, and the hardware that made its times."""
+"""What a run ran on: versions of the software that made its numbers, and the hardware that made its
+times."""
 
 import os
 import platform
@@ -12,8 +13,8 @@ PACKAGES = ("codesign", "torch", "mitsuba", "drjit", "numpy", "kornia")
 
 
 def versions():
-    """Dictionary name -> version of Python, the packages that compute, and the git commit ("unknown" outside
-    a checkout)."""
+    """Dictionary name -> version of Python, the packages that compute, and the git commit
+    ("unknown" outside a checkout)."""
     found = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -25,10 +26,13 @@ def versions():
 
 
 def hardware():
-    """Dictionary of processor, usable cores, memory, graphics card, system. No host or user names."""
+    """Dictionary of processor, usable cores, memory, graphics card, system. No host or user
+    names."""
     return {
         "cpu": _cpu(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count(),
         "threads_torch": torch.get_num_threads(),
         "memory_gb": _memory_gb(),
         "gpu": torch.cuda.get_device_name(0) if torch.cuda.is_available() else "none",
@@ -41,7 +45,11 @@ def _commit(root):
         return "unknown"
     try:
         commit = subprocess.run(
-            ["git", "-C", root, "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10, check=True
+            ["git", "-C", root, "rev-parse", "HEAD"],
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
         ).stdout.strip()
         changed = subprocess.run(
             ["git", "-C", root, "status", "--porcelain"],

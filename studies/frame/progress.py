@@ -1,5 +1,5 @@
-"""Progress of a loop: a bar with loss and time left on a terminal; elsewhere a line at the first and last
-step and every few seconds."""
+"""Progress of a loop: a bar with loss and time left on a terminal; elsewhere a line at the first
+and last step and every few seconds."""
 
 import time
 from dataclasses import asdict, dataclass
@@ -12,8 +12,8 @@ SECONDS_BETWEEN_LINES = 5.0
 
 @dataclass
 class Pace:
-    """Seconds and number of the timed steps of one loop, over all sessions: the first step of each session,
-    which compiles kernels, apart from the others."""
+    """Seconds and number of the timed steps of one loop, over all sessions: the first step of each
+    session, which compiles kernels, apart from the others."""
 
     seconds: float = 0.0
     steps: int = 0
@@ -26,15 +26,16 @@ class Pace:
 
     @property
     def seconds_per_step(self):
-        """Mean seconds of a step; of first steps only where there were no others, None where there were
-        none."""
+        """Mean seconds of a step; of first steps only where there were no others, None where there
+        were none."""
         if self.steps:
             return self.seconds / self.steps
         return self.first_seconds / self.first_steps if self.first_steps else None
 
 
 class StepProgress:
-    """Context manager around a loop of ``total`` steps, of which ``done`` were made in an earlier session.
+    """Context manager around a loop of ``total`` steps, of which ``done`` were made in an earlier
+    session.
 
     Args:
       console: rich console; its kind decides between bar and lines.
@@ -76,7 +77,9 @@ class StepProgress:
 
     def __enter__(self):
         if self._interruption.in_loop:
-            raise RuntimeError("loops with progress cannot be nested: an interrupt needs one safe point")
+            raise RuntimeError(
+                "loops with progress cannot be nested: an interrupt needs one safe point"
+            )
         self._interruption.in_loop = True
         self._last_line = self._last_step = time.monotonic()
         if self._bar:
@@ -89,15 +92,19 @@ class StepProgress:
             self._bar.stop()
 
     def advance(self, **numbers):
-        """One more whole step was made; ``numbers`` (loss=…) are shown. A pressed Ctrl-C takes effect here,
-        after saving."""
+        """One more whole step was made; ``numbers`` (loss=…) are shown. A pressed Ctrl-C takes
+        effect here, after saving."""
         self.done += 1
         first = self._fresh
         self._time_step(first)
         shown = "  ".join(f"{name} {float(value):.4g}" for name, value in numbers.items())
         if self._bar:
             self._bar.update(self._task, completed=self.done, numbers=shown)
-        elif first or self.done == self.total or self._last_step - self._last_line >= SECONDS_BETWEEN_LINES:
+        elif (
+            first
+            or self.done == self.total
+            or self._last_step - self._last_line >= SECONDS_BETWEEN_LINES
+        ):
             self._last_line = self._last_step
             self._console.print(
                 f"{self.description}  {self.done}/{self.total}  {shown}  {self._time_left()}".rstrip(),
@@ -120,9 +127,9 @@ class StepProgress:
 
     @property
     def seconds_per_step(self):
-        """Mean wall-clock seconds of a step over all sessions of the run whose state was stored, the first
-        step of each (which compiles kernels) left out where there are others; None where no step was
-        timed."""
+        """Mean wall-clock seconds of a step over all sessions of the run whose state was stored,
+        the first step of each (which compiles kernels) left out where there are others; None where
+        no step was timed."""
         return self._pace.seconds_per_step
 
     def _time_left(self):

@@ -56,10 +56,11 @@ TIMES = "times"  # of the frame itself, among the numbers of state.npz
 
 
 class Run(Generic[Config]):
-    """What a study works with: configuration, folder, device, and the ways to keep and show results.
+    """What a study works with: configuration, folder, device, and the ways to keep and show
+    results.
 
-    config: the study's dataclass. folder: where everything is written. device: torch.device with "auto"
-      resolved.
+    config: the study's dataclass. folder: where everything is written. device: torch.device with
+      "auto" resolved.
     resumed: True when this session goes on with an earlier one.
     """
 
@@ -81,7 +82,11 @@ class Run(Generic[Config]):
         self._console = Console(highlight=False)
         self._interruption = interruption or Interruption()
         self._machine = {"versions": machine.versions(), "hardware": machine.hardware()}
-        self._identity = {"version": VERSION, "study": study, "configuration": _digest(study, config)}
+        self._identity = {
+            "version": VERSION,
+            "study": study,
+            "configuration": _digest(study, config),
+        }
         self._cards: list[page.Card] = []
         self._sections = [page.Section("")]
         self._paces: dict[str, Pace] = {}
@@ -92,13 +97,16 @@ class Run(Generic[Config]):
         self.state_unread = stored is not None
         if stored is not None:
             self._earlier_s = stored.numbers[TIMES]["seconds"]
-            self._paces = {name: Pace(**pace) for name, pace in stored.numbers[TIMES]["loops"].items()}
+            self._paces = {
+                name: Pace(**pace) for name, pace in stored.numbers[TIMES]["loops"].items()
+            }
             self._continue_from(stored.numbers[TIMES].get("commit", "unknown"))
         if resumed and (folder / "metrics.json").exists():
             self.metrics = _read_metrics(folder / "metrics.json")
 
     def _continue_from(self, commit):
-        """Say, here and among the versions, that other code than this made a part of the results."""
+        """Say, here and among the versions, that other code than this made a part of the
+        results."""
         versions = self._machine["versions"]
         now = versions["commit"]
         if commit.split(", ")[-1] == now:
@@ -112,29 +120,32 @@ class Run(Generic[Config]):
         self._console.print(text, markup=False, soft_wrap=True)
 
     def progress(self, total: int, description: str, done: int = 0):
-        """Context manager around a loop of ``total`` steps; call its ``advance(loss=…)`` after each whole
-        step.
+        """Context manager around a loop of ``total`` steps; call its ``advance(loss=…)`` after each
+        whole step.
 
         Args:
-          total: number of steps, those of earlier sessions included. done: how many earlier sessions made.
-        Returns: StepProgress, with ``seconds_per_step``, which counts the steps of earlier sessions too.
+          total: number of steps, those of earlier sessions included. done: how many earlier
+            sessions made.
+        Returns: StepProgress, with ``seconds_per_step``, which counts the steps of earlier sessions
+          too.
         """
         pace = self._paces.setdefault(description, Pace())
         return StepProgress(self._console, total, description, done, self._interruption, pace)
 
     @property
     def seconds(self):
-        """Wall-clock seconds of this session, and of the earlier ones up to their last stored state."""
+        """Wall-clock seconds of this session, and of the earlier ones up to their last stored
+        state."""
         return self._earlier_s + time.monotonic() - self._began
 
     def on_interrupt(self, save: Callable[[], object]):
-        """Call ``save`` when Ctrl-C was pressed, at the next ``advance``, where a step is whole. The last one
-        given counts."""
+        """Call ``save`` when Ctrl-C was pressed, at the next ``advance``, where a step is whole.
+        The last one given counts."""
         self._interruption.save = save
 
     def save_state(self, tensors: dict[str, torch.Tensor], numbers: dict[str, Any]):
-        """Store what is needed to go on, exactly, in one atomic write (see codesign.state.write_state), with
-        the times of the loops and of the run."""
+        """Store what is needed to go on, exactly, in one atomic write (see
+        codesign.state.write_state), with the times of the loops and of the run."""
         times = {
             "seconds": self.seconds,
             "loops": {name: pace.to_json() for name, pace in self._paces.items()},
@@ -154,10 +165,11 @@ class Run(Generic[Config]):
         return stored and state.State(stored.tensors, stored.numbers["numbers"])
 
     def record(self, **numbers: float):
-        """Add to metrics.json, written at once: flat names with their unit, finite numbers (0-d tensors too).
+        """Add to metrics.json, written at once: flat names with their unit, finite numbers
+        (0-d tensors too).
 
-        Raises: NonFiniteError on NaN or infinity, DomainError on anything that is not a number; nothing is
-          written then.
+        Raises: NonFiniteError on NaN or infinity, DomainError on anything that is not a number;
+          nothing is written then.
         """
         accepted = {name: _metric(name, value) for name, value in numbers.items()}
         self.metrics.update(accepted)
@@ -171,8 +183,8 @@ class Run(Generic[Config]):
             self.text(text)
 
     def card(self, label: str, value: str, note: str = ""):
-        """Add a headline figure at the top of the page, for example ("RMS spot", "12.3 µm", "detuned: 41
-        µm")."""
+        """Add a headline figure at the top of the page, for example ("RMS spot", "12.3 µm",
+        "detuned: 41 µm")."""
         self._cards.append(page.Card(label, value, note))
 
     def text(self, text: str):
@@ -184,7 +196,8 @@ class Run(Generic[Config]):
         self._show("table", page.table(title, columns, rows, caption))
 
     def figure(self, figure, name: str, caption: str, dpi: int = 160):
-        """Save a matplotlib figure as <name>.png, show it on the page, and close it. Returns the path."""
+        """Save a matplotlib figure as <name>.png, show it on the page, and close it. Returns the
+        path."""
         path = self.path(f"{name}.png")
         png = io.BytesIO()
         figure.savefig(png, format="png", dpi=dpi, bbox_inches="tight", facecolor="white")
@@ -204,7 +217,9 @@ class Run(Generic[Config]):
         """
         path = self.folder / name
         if not path.resolve().is_relative_to(self.folder.resolve()):
-            raise DomainError(f"the file name '{name}' leads out of the run's folder; use a plain name.")
+            raise DomainError(
+                f"the file name '{name}' leads out of the run's folder; use a plain name."
+            )
         return path
 
     def finish(self, title: str, lead: str):
@@ -230,7 +245,9 @@ class Run(Generic[Config]):
             return None
         made_by = {name: stored.numbers.get(name) for name in self._identity}
         if made_by != self._identity or stored.numbers.keys() != {"numbers", TIMES, *made_by}:
-            other = next((name for name in made_by if made_by[name] != self._identity[name]), "version")
+            other = next(
+                (name for name in made_by if made_by[name] != self._identity[name]), "version"
+            )
             raise FileFormatError(
                 f"'{path}' was written by another {other} ({made_by[other]}, not "
                 f"{self._identity[other]}); start a new run."
@@ -247,11 +264,12 @@ def open_run(
     interruption: Interruption | None = None,
     held: contextlib.ExitStack | None = None,
 ) -> Run[Config]:
-    """Make the folder of a new run and write its config.json, or find the run that ``config.resume`` names,
-    which goes on with its stored configuration; what a killed session left half written is removed
-    there. No other process may work in the folder until ``held`` ends.
+    """Make the folder of a new run and write its config.json, or find the run that
+    ``config.resume`` names, which goes on with its stored configuration; what a killed session left
+    half written is removed there. No other process may work in the folder until ``held`` ends.
 
-    Raises: CodesignError with one sentence when the folder, the stored configuration or the device is unfit.
+    Raises: CodesignError with one sentence when the folder, the stored configuration or the device
+      is unfit.
     """
     if config.resume is not None:
         stored = read_config(config.resume / "config.json", study, type(config))
@@ -275,8 +293,8 @@ def main(
 ) -> int:
     """Run a study from its command line.
 
-    Returns: exit code: 0 done, 2 bad input (one clear line on stderr), 130 interrupted, 143 ended by SIGTERM
-      (both with the line to go on).
+    Returns: exit code: 0 done, 2 bad input (one clear line on stderr), 130 interrupted, 143 ended
+      by SIGTERM (both with the line to go on).
     Raises: SystemExit from the command line itself (0 for --help, 2 for a wrong option).
     """
     name = _name(kind)
@@ -369,6 +387,8 @@ def _read_metrics(path):
         if isinstance(stored, dict)
         else {}
     )
-    if not isinstance(stored, dict) or not all(type(value) in (int, float) for value in numbers.values()):
+    if not isinstance(stored, dict) or not all(
+        type(value) in (int, float) for value in numbers.values()
+    ):
         raise FileFormatError(f"'{path}' is damaged; remove it to go on with this run.")
     return numbers

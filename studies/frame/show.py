@@ -1,11 +1,11 @@
-"""What a page shows of figures: tables out of long rows, what was asked beside what was found, charts,
-pictures.
+"""What a page shows of figures: tables out of long rows, what was asked beside what was found,
+charts, pictures.
 
-    run.table("Errors", *table(rows, method="method", error_px="error, px"))
-    tabulate(run, "Errors", rows, "method")
-    lead = asked(run, [Asked("speed over optiland", 22.0, least=10.0), Asked("memory, MB", 3.0, most=5.0)])
-    run.figure(panels(Panel({"ours": (x, y)}, "rays", "seconds", log="xy")), "growth", "Time against rays.")
-    run.figure(pictures({"room": {"traced": frame, "difference": off}}, signed=["difference"]), "room", "…")
+    run.table("Errors", *table(rows, method="method", error_px="error, px")) tabulate(run, "Errors",
+    rows, "method") lead = asked(run, [Asked("speed over optiland", 22.0, least=10.0),
+    Asked("memory, MB", 3.0, most=5.0)]) run.figure(panels(Panel({"ours": (x, y)}, "rays",
+    "seconds", log="xy")), "growth", "Time against rays.") run.figure(pictures({"room": {"traced":
+    frame, "difference": off}}, signed=["difference"]), "room", "…")
 
 Single charts (``curves``), image strips, heat maps and lens layouts: codesign.report.chain_figures,
 lens_layout.
@@ -56,7 +56,8 @@ def tabulate(
 
 @dataclass(frozen=True)
 class Asked:
-    """A figure that something was asked of: at least, at most, or between both; ``what`` names it."""
+    """A figure that something was asked of: at least, at most, or between both; ``what`` names
+    it."""
 
     what: str
     value: float
@@ -80,7 +81,8 @@ class Asked:
 def asked(run: Run, figures: Iterable[Asked], title: str = "Against what was asked") -> str:
     """Show figures beside what was asked of them, as a table, and record them by their names.
 
-    Returns: "All figures are met." or the sentence about those that are not, for the head of the page.
+    Returns: "All figures are met." or the sentence about those that are not, for the head of the
+      page.
     """
     figures = list(figures)
     run.record(**{plain(figure.what): figure.value for figure in figures})
@@ -92,8 +94,9 @@ def asked(run: Run, figures: Iterable[Asked], title: str = "Against what was ask
 
 @dataclass(frozen=True)
 class Panel:
-    """One chart. series: label -> (x, y). log: axes that are logarithmic, of "xy". levels: heights of
-    dashed lines. bands: label -> (x, low, high), shaded in the colour of the series of that label."""
+    """One chart. series: label -> (x, y). log: axes that are logarithmic, of "xy". levels: heights
+    of dashed lines. bands: label -> (x, low, high), shaded in the colour of the series of that
+    label."""
 
     series: Mapping[str, tuple[Any, Any]]
     xlabel: str
@@ -104,7 +107,8 @@ class Panel:
 
 
 def panels(*charts: Panel, width: float = 4.5) -> Figure:
-    """Figure of charts beside one another; a legend for all stands below where there are several series."""
+    """Figure of charts beside one another; a legend for all stands below where there are several
+    series."""
     figure, axes = plt.subplots(
         1, len(charts), figsize=(width * len(charts), 3.4), squeeze=False, layout="constrained"
     )
@@ -137,8 +141,9 @@ def pictures(
 ) -> Figure:
     """Figure of pictures: row label -> column title -> [H, W] or, in colours of 0 to 1, [H, W, 3].
 
-    Grey pictures of a row share their scale, with a display's gamma; columns that are ``signed`` are red
-    above zero and blue below, on one scale per row. A picture that a row lacks leaves its place empty.
+    Grey pictures of a row share their scale, with a display's gamma; columns that are ``signed``
+    are red above zero and blue below, on one scale per row. A picture that a row lacks leaves its
+    place empty.
     """
     titles = list(dict.fromkeys(title for row in rows.values() for title in row))
     figure, axes = plt.subplots(
@@ -155,7 +160,9 @@ def pictures(
             if title not in row:
                 axis.axis("off")
                 continue
-            of_scale = [image for other, image in row.items() if (other in signed) == (title in signed)]
+            of_scale = [
+                image for other, image in row.items() if (other in signed) == (title in signed)
+            ]
             draw_image(axis, row[title], of_scale, title in signed)
             axis.set_title(title if line is axes[0] else "", fontsize=9)
         line[0].set_ylabel(label, fontsize=9, rotation=0, ha="right", va="center")
@@ -168,8 +175,8 @@ def bars(
     log: bool = False,
     level: float | None = None,
 ) -> Figure:
-    """Figure of horizontal bars, with whiskers where a value is an Interval; ``level`` is drawn as a red
-    line."""
+    """Figure of horizontal bars, with whiskers where a value is an Interval; ``level`` is drawn as
+    a red line."""
     figure, axis = plt.subplots(figsize=(7, 0.8 + 0.4 * len(values)), layout="constrained")
     for at, value in enumerate(values.values()):
         of = value if isinstance(value, Interval) else Interval(value, value, value, 1)

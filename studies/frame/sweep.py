@@ -7,7 +7,8 @@
     rows[0]      # {"lens": "cooke-triplet", "seed": 0, "error_px": 0.31, "cpu_s": 2.0}
     column(rows, "error_px", lens="double-gauss")      # [0.28, 0.33, ...] by seed
 
-The table stands in the run's folder, a line of JSON a cell, written as soon as its figures are there.
+The table stands in the run's folder, a line of JSON a cell, written as soon as its figures are
+there.
 """
 
 import itertools
@@ -40,20 +41,22 @@ def sweep(
     """Rows of every combination of the axes; those that an earlier session wrote are read back.
 
     Args:
-      cell: called with one value of every axis, by the axis's name; returns figures by name, or several
-        such rows.
+      cell: called with one value of every axis, by the axis's name; returns figures by name, or
+        several such rows.
       name: of the table, <name>.jsonl, and of the progress bar.
-      processes: 0 calls ``cell`` here; otherwise each call gets a fresh process, so many at a time, and
-        ``cell`` stands at the top level of a module. A process that is killed is asked again.
-      turns: how often every cell is asked, all cells in turns, so that what else the machine does meets all;
-        of figures that are numbers the rows have the medians.
+      processes: 0 calls ``cell`` here; otherwise each call gets a fresh process, so many at a time,
+        and ``cell`` stands at the top level of a module. A process that is killed is asked again.
+      turns: how often every cell is asked, all cells in turns, so that what else the machine does
+        meets all; of figures that are numbers the rows have the medians.
       given: further arguments of every call, which are no axes.
-      cluster: address of a Ray cluster instead ("auto": that of this machine; "here": one of its own).
-      axes: name -> values as JSON keeps them (numbers, text), or label -> value of any kind, where the row
-        has the label. The last axis changes fastest.
+      cluster: address of a Ray cluster instead ("auto": that of this machine; "here": one of its
+        own).
+      axes: name -> values as JSON keeps them (numbers, text), or label -> value of any kind, where
+        the row has the label. The last axis changes fastest.
     Returns: the long table, in the order of the axes: a row has the axes' values, then the figures.
-    Raises: DomainError when a figure is not plain and finite, or named as an axis; FileFormatError when the
-      table in the folder is of other axes or damaged, or an earlier version kept another kind of progress there.
+    Raises: DomainError when a figure is not plain and finite, or named as an axis; FileFormatError
+      when the table in the folder is of other axes or damaged, or an earlier version kept another
+      kind of progress there.
     """
     path = run.path(f"{name}.jsonl")
     if run.state_unread and not path.exists():
@@ -62,8 +65,15 @@ def sweep(
             "state.npz instead of a table; start a new run."
         )
     known = _read(path, {*axes, "turn"} if turns > 1 else set(axes))
-    cells = [dict(zip(axes, point, strict=True)) for point in itertools.product(*map(list, axes.values()))]
-    asked = cells if turns == 1 else [{**point, "turn": turn} for turn in range(turns) for point in cells]
+    cells = [
+        dict(zip(axes, point, strict=True))
+        for point in itertools.product(*map(list, axes.values()))
+    ]
+    asked = (
+        cells
+        if turns == 1
+        else [{**point, "turn": turn} for turn in range(turns) for point in cells]
+    )
     missing = [point for point in asked if _key(point) not in known]
     measured = _measured(cell, missing, axes, given, processes, cluster)
     with (
@@ -86,7 +96,9 @@ def sweep(
 def _median(rows: Sequence[Row]) -> Row:
     """One row for those of several turns."""
     return {
-        name: statistics.median(row[name] for row in rows) if isinstance(value, int | float) else value
+        name: statistics.median(row[name] for row in rows)
+        if isinstance(value, int | float)
+        else value
         for name, value in rows[0].items()
     }
 
@@ -102,8 +114,8 @@ def column(rows: Iterable[Row], name: str, **where: Any) -> list[Any]:
 
 
 def metrics(rows: Iterable[Mapping[str, Any]], *axes: str, prefix: str = "") -> dict[str, float]:
-    """What ``Run.record`` takes of a table: every number by the values of the axes and its own name, in
-    plain letters.
+    """What ``Run.record`` takes of a table: every number by the values of the axes and its own
+    name, in plain letters.
 
     Args:
       axes: names of the columns that tell rows apart.
@@ -113,7 +125,9 @@ def metrics(rows: Iterable[Mapping[str, Any]], *axes: str, prefix: str = "") -> 
     for row in rows:
         name = plain(prefix, *(row[axis] for axis in axes))
         numbers = {
-            key: value for key, value in row.items() if isinstance(value, int | float) and key not in axes
+            key: value
+            for key, value in row.items()
+            if isinstance(value, int | float) and key not in axes
         }
         found |= {f"{name}_{key}": value for key, value in numbers.items()}
     return found
@@ -139,7 +153,9 @@ def _measured(cell, points, axes, given, processes, cluster) -> Generator[tuple[
         return
     calls = {number: values(point) for number, point in enumerate(points)}
     answers = (
-        workers.on_cluster(cell, calls, cluster) if cluster else workers.in_processes(cell, calls, processes)
+        workers.on_cluster(cell, calls, cluster)
+        if cluster
+        else workers.in_processes(cell, calls, processes)
     )
     with closing(answers):
         for number, found in answers:
@@ -151,7 +167,8 @@ def _key(point):
 
 
 def _read(path: Path, axes: set[str]) -> dict[str, list[Row]]:
-    """Figures of an earlier session by cell. A line that was cut off when it was killed is cut away."""
+    """Figures of an earlier session by cell. A line that was cut off when it was killed is cut
+    away."""
     known: dict[str, list[Row]] = {}
     text = path.read_bytes() if path.exists() else b""
     whole = text[: text.rfind(b"\n") + 1]

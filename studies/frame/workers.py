@@ -1,5 +1,5 @@
-"""Calls in processes of their own, on this machine or on the nodes of a Ray cluster. A worker that is killed is asked
-again; one that fails by itself ends all of them."""
+"""Calls in processes of their own, on this machine or on the nodes of a Ray cluster. A worker that
+is killed is asked again; one that fails by itself ends all of them."""
 
 import json
 import os
@@ -23,7 +23,8 @@ HERE = "here"  # a Ray of this machine's own, for the time of the calls
 def in_processes(
     function: Callable[..., Any], calls: Mapping[Key, Mapping[str, Any]], processes: int
 ) -> Generator[tuple[Key, Any]]:
-    """What a function of the top level of a module returns for the arguments of each call, in the order in which they are
+    """What a function of the top level of a module returns for the arguments of each call, in the
+    order in which they are
     done: so many fresh processes at a time.
 
     Raises: CodesignError of a call that fails, or whose worker was killed TRIES times.
@@ -55,11 +56,14 @@ def in_processes(
 def on_cluster(
     function: Callable[..., Any], calls: Mapping[Key, Mapping[str, Any]], address: str
 ) -> Generator[tuple[Key, Any]]:
-    """The same on a Ray cluster, a core a call. The package is installed on its nodes, at the same version.
+    """The same on a Ray cluster, a core a call. The package is installed on its nodes, at the same
+    version.
 
     Args:
-      address: of its head, "auto" for the one that this machine belongs to, HERE for one of its own.
-    Raises: MissingPackageError without Ray; CodesignError where there is no cluster, or as ``in_processes``.
+      address: of its head, "auto" for the one that this machine belongs to, HERE for one of its
+        own.
+    Raises: MissingPackageError without Ray; CodesignError where there is no cluster, or as
+      ``in_processes``.
     """
     ray = require("ray", "cluster", "a sweep over a cluster")
     environment = {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
@@ -88,7 +92,9 @@ def on_cluster(
                     yield waiting.pop(each), json.loads(ray.get(each))
                 except ray.exceptions.RayError as error:
                     last = str(error).strip().splitlines()[-1][:300]
-                    raise CodesignError(f"a call of {name} failed on the cluster: {last}") from error
+                    raise CodesignError(
+                        f"a call of {name} failed on the cluster: {last}"
+                    ) from error
     finally:
         ray.shutdown()
 

@@ -1,8 +1,10 @@
-"""Are the gradients right, from the lens to the loss? Against central differences with common random
-numbers, by case.
+"""Are the gradients right, from the lens to the loss? Against central differences with common
+random numbers, by case.
 
-chain, joint: junction by junction, and the whole graph with lens, mount, thresholds and network. layers,
-sensors, timing: the event layers against differences of hard counts. silhouettes, silhouettes_chain:
+chain, joint: junction by junction, and the whole graph with lens, mount, thresholds and network.
+  layers,
+sensors, timing: the event layers against differences of hard counts. silhouettes,
+  silhouettes_chain:
 where objects hide one another.
 """
 
@@ -38,12 +40,14 @@ class Config(StudyConfig):
     cases: tuple[str, ...] = ("chain", "joint")
     """What to measure: chain, joint, layers, sensors, timing, silhouettes, silhouettes_chain."""
     hard_cases: int = 32
-    """Motions and textures averaged for the straight-through layer against the hard loss (chain)."""
+    """Motions and textures averaged for the straight-through layer against the hard loss
+    (chain)."""
     scenes: int = 2
-    """Textures and paths over which cosine and scale are taken together (event layers, silhouettes_chain)."""
+    """Textures and paths over which cosine and scale are taken together (event layers,
+    silhouettes_chain)."""
     samples: int = 1024
-    """Samples per pixel of differences and precise gradients at silhouettes; a quarter of them along
-    the chain."""
+    """Samples per pixel of differences and precise gradients at silhouettes; a quarter of them
+    along the chain."""
     seeds: int = 4
     """Seeds of these; twice as many along the chain."""
 
@@ -52,7 +56,9 @@ def study(run: Run[Config]) -> None:
     config = run.config
     unknown = [name for name in config.cases if name not in CASES]
     if unknown or not config.cases:
-        raise DomainError(f"--cases is {' '.join(config.cases)!r}; choose among {', '.join(CASES)}.")
+        raise DomainError(
+            f"--cases is {' '.join(config.cases)!r}; choose among {', '.join(CASES)}."
+        )
     for name, least in (("hard_cases", 1), ("scenes", 1), ("samples", 64), ("seeds", 2)):
         if getattr(config, name) < least:
             raise DomainError(f"{name} = {getattr(config, name)} must be at least {least}.")
@@ -77,7 +83,8 @@ def measured(run: Run[Config], name: str) -> list[Row]:
 
     rows = sweep(run, cell, name, job={label(job): job for job in topic.jobs(run.config.quick)})
     return [
-        Row(tuple(row["names"]), {k: v for k, v in row.items() if k not in ("job", "names")}) for row in rows
+        Row(tuple(row["names"]), {k: v for k, v in row.items() if k not in ("job", "names")})
+        for row in rows
     ]
 
 
@@ -94,15 +101,21 @@ def show(run: Run[Config], name: str, rows: list[Row]) -> list[str]:
         topic.title,
         (*topic.columns, *(key.replace("_", " ") for key in numbers)),
         [(*row.names, *(row.numbers[key] for key in numbers)) for row in rows],
-        caption="Below what is asked: " + "; ".join(" ".join(row.names) for row in short) if short else "",
+        caption="Below what is asked: " + "; ".join(" ".join(row.names) for row in short)
+        if short
+        else "",
     )
     if "relative_error" in numbers:
         lines, columns = (list(dict.fromkeys(row.names[k] for row in rows)) for k in (0, 1))
         errors = np.full((len(lines), len(columns)), np.nan)
         for row in rows:
-            errors[lines.index(row.names[0]), columns.index(row.names[1])] = row.numbers["relative_error"]
+            errors[lines.index(row.names[0]), columns.index(row.names[1])] = row.numbers[
+                "relative_error"
+            ]
         figure = chain_figures.heat_map(errors, lines, columns, "relative error")
-        run.figure(figure, f"heat_map_{name}", f"{topic.title}: relative error against differences.")
+        run.figure(
+            figure, f"heat_map_{name}", f"{topic.title}: relative error against differences."
+        )
     return [f"{name}: {len(short)} of {judged} rows"] if short else []
 
 

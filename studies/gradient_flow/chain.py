@@ -1,4 +1,5 @@
-"""Gradients along the chain, junction by junction, and of one graph with lens, mount, thresholds and
+"""Gradients along the chain, junction by junction, and of one graph with lens, mount, thresholds
+and
 network: functions of named parameters, with their required figures. The tests certify them too."""
 
 import math
@@ -29,7 +30,8 @@ def normal(*shape, seed):
 
 
 def rays_rows():
-    """Sum of weighted landing points and optical paths of 200 rays, with respect to all lens tensors."""
+    """Sum of weighted landing points and optical paths of 200 rays, with respect to all lens
+    tensors."""
     geo = lens.load("cooke-triplet").freeze()
     disc = normal(200, 2, seed=0).clamp(-1.5, 1.5) * 2.5
     origin = torch.cat([disc, torch.full((200, 1), -5.0, dtype=torch.float64)], 1)
@@ -48,8 +50,8 @@ def rays_rows():
 
 
 def _camera_rows(loss, size_px, samples, seed, curvature, **options):
-    """Rows of loss(camera, twist) with respect to curvatures, thicknesses and pose. curvature: its step
-    unit."""
+    """Rows of loss(camera, twist) with respect to curvatures, thicknesses and pose. curvature: its
+    step unit."""
     geo = lens.load("cooke-triplet").scaled(0.22).freeze()
     params = {
         "curvature": geo.curvature_per_mm,
@@ -83,11 +85,14 @@ def plane_rows(seed):
     """Frames of the analytic plane, everything in float64."""
     plane = worlds.smooth_plane(seed, pose.look_at((0, 0, 0), (0, -1, 0)))
     start = pose.look_at((0.1, -2, 0.05), (0, 0, 0))
-    return _frame_rows(plane, start, seed, 8, ladder=(0.1, 0.03, 0.01, 0.003, 0.001), tolerance=1e-5)
+    return _frame_rows(
+        plane, start, seed, 8, ladder=(0.1, 0.03, 0.01, 0.003, 0.001), tolerance=1e-5
+    )
 
 
 def room_rows(seed):
-    """Frames of the photo-textured room without objects, so that no silhouette moves; scene in float32."""
+    """Frames of the photo-textured room without objects, so that no silhouette moves; scene in
+    float32."""
     start = pose.look_at((0.3, -0.8, 1.2), (0.1, 2.0, 1.0))
     scene = worlds.room(objects=False)
     return _frame_rows(scene, start, seed, 16, ladder=(0.03, 0.02, 0.014, 0.01), tolerance=0.01)
@@ -108,8 +113,8 @@ def truth_rows():
 
 
 def _moving_frames(seed, contrast=0.6):
-    """A small band-limited sequence in float64, as a function of contrast and shift per frame: fn(p) ->
-    frames [8, 24, 24]; and the point where it is asked."""
+    """A small band-limited sequence in float64, as a function of contrast and shift per frame:
+    fn(p) -> frames [8, 24, 24]; and the point where it is asked."""
     frequency, amplitude, phase = (
         part[..., None, None, None] for part in textures.waves(seed, 12, 6.0, 24.0, contrast)
     )
@@ -127,10 +132,12 @@ def _moving_frames(seed, contrast=0.6):
 
 
 def count_rows(seed):
-    """Smooth event counts with respect to contrast, motion and threshold. Small steps: counts have a kink
-    where the level stands still."""
+    """Smooth event counts with respect to contrast, motion and threshold. Small steps: counts have
+    a kink where the level stands still."""
     frames, params = _moving_frames(seed)
-    weight = torch.rand(7, 2, 24, 24, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    weight = torch.rand(
+        7, 2, 24, 24, generator=torch.Generator().manual_seed(2), dtype=torch.float64
+    )
     params = {**params, "theta": torch.tensor([0.2], dtype=torch.float64)}
     return certify(
         lambda p: (weight * events.soft_counts(frames(p), p["theta"], p["theta"])).mean(),
@@ -155,7 +162,8 @@ def flow_rows(seed):
 
 
 def _final(task, case_list, layer, samples, sensor=SENSOR):
-    """Mean log angular flow error over cases, as a function of three curvatures and the camera pose."""
+    """Mean log angular flow error over cases, as a function of three curvatures and the camera
+    pose."""
     base = task.design.reference
 
     def fn(p, cases=case_list):
@@ -166,25 +174,33 @@ def _final(task, case_list, layer, samples, sensor=SENSOR):
         system = task.system(
             task.camera(optics, samples), events.layer(layer, sensor, learn=()), flow.estimate_lk
         )
-        moved = [replace(case, T_world_body=case.T_world_body @ pose.se3_exp(p["pose"])) for case in cases]
+        moved = [
+            replace(case, T_world_body=case.T_world_body @ pose.se3_exp(p["pose"]))
+            for case in cases
+        ]
         return torch.stack([system(case).loss for case in moved]).mean()
 
     # moves the rays by about a pixel
     unit = task.design.basis[:5, -1].abs().max() * torch.ones(3, dtype=torch.float64)
-    params = {"curvature": torch.zeros(3, dtype=torch.float64), "pose": torch.zeros(6, dtype=torch.float64)}
+    params = {
+        "curvature": torch.zeros(3, dtype=torch.float64),
+        "pose": torch.zeros(6, dtype=torch.float64),
+    }
     return fn, params, {"curvature": unit, "pose": POSE_UNIT}
 
 
 def loss_rows(seed):
     """The final loss with the smooth counts layer, whole chain, scene in float32.
 
-    Without noise the smooth layer lets the closed-form flow come within hundredths of a pixel, and the
-    gradient is that of rounding; shot noise of 40 Hz gives an error that the optics can change. Band-limited
-    textures, since texel borders are kinks.
+    Without noise the smooth layer lets the closed-form flow come within hundredths of a pixel, and
+    the gradient is that of rounding; shot noise of 40 Hz gives an error that the optics can change.
+    Band-limited textures, since texel borders are kinks.
     """
     task = make_task("cooke-triplet", seed, 1.0)
     walls = [
-        worlds.wall(textures.speckle(k, size_px=1024, finest_px=32.0, coarsest_px=128.0), texel_m=0.002)
+        worlds.wall(
+            textures.speckle(k, size_px=1024, finest_px=32.0, coarsest_px=128.0), texel_m=0.002
+        )
         for k in (5, 6)
     ]
     cases = [draw_case(walls, 61 + i) for i in range(4)]
@@ -194,7 +210,8 @@ def loss_rows(seed):
 
 
 def plane_loss_rows():
-    """Endpoint error of the closed form on smooth counts of the analytic plane, whole chain in float64."""
+    """Endpoint error of the closed form on smooth counts of the analytic plane, whole chain in
+    float64."""
     plane = worlds.smooth_plane(3, pose.look_at((0, 0, 0), (0, -1, 0)))
     t_s = torch.linspace(0, 0.05, 8, dtype=torch.float64)
     path = trajectories.translation(pose.look_at((0.1, -2, 0.05), (0, 0, 0)), (0.4, 0.1, 0.2), t_s)
@@ -212,11 +229,11 @@ def plane_loss_rows():
 def hard_rows(seed, count, moved=("curvature", "pose")):
     """Straight-through gradient against central differences of the hard loss.
 
-    Steps of half a pixel of ray motion and 1 to 2 pixels of image motion move several counts per pixel row.
-    Single cases are noisy on both sides, so both are averaged over motions and textures before they are
-    compared; the noise floor is the standard error of the mean difference. On walls that look alike
-    everywhere the mean loss hardly depends on the pose: there the floor is above 1, and the differences
-    themselves say nothing.
+    Steps of half a pixel of ray motion and 1 to 2 pixels of image motion move several counts per
+    pixel row. Single cases are noisy on both sides, so both are averaged over motions and textures
+    before they are compared; the noise floor is the standard error of the mean difference. On walls
+    that look alike everywhere the mean loss hardly depends on the pose: there the floor is above 1,
+    and the differences themselves say nothing.
     """
     task = make_task("cooke-triplet", seed)
     pool = make_worlds(TRAINING)
@@ -237,15 +254,18 @@ def hard_rows(seed, count, moved=("curvature", "pose")):
                 ]
             change = torch.stack([ahead - behind for ahead, behind in ends])
             differences[name].append(change / (2 * step[name]))
-    columns = [{name: torch.stack(values) for name, values in side.items()} for side in (slopes, differences)]
+    columns = [
+        {name: torch.stack(values) for name, values in side.items()}
+        for side in (slopes, differences)
+    ]
     both = [torch.cat(list(side.values()), 1) for side in columns]
     rows = [_averaged(name, *(side[name] for side in columns), step[name]) for name in params]
     return [*rows, _averaged("all", *both, 1.0)]
 
 
 def _averaged(name, slopes, differences, step):
-    """Row of mean gradients; each sample's gradient is clipped to five times the median length, as an
-    optimiser would."""
+    """Row of mean gradients; each sample's gradient is clipped to five times the median length, as
+    an optimiser would."""
     length = slopes.norm(dim=1, keepdim=True)
     a = (slopes * (5 * length.median() / length).clamp(max=1)).mean(0)
     d = differences.mean(0)
@@ -274,13 +294,14 @@ BLOCK_MM = 0.074  # blocks of 4 x 4 pixels of a DAVIS346
 BINS = 4
 DURATION_S = 0.05
 DEPTH_M = 1.5  # of the room, about
-# pixels of motion: an untrained network answers to a tenth of a pixel with another flow, so steps are
-# small; the rounding of float32 frames allows it
+# pixels of motion: an untrained network answers to a tenth of a pixel with another flow, so steps
+# are small; the rounding of float32 frames allows it
 LADDER = (0.005, 0.0035, 0.0025, 0.0018)
 
 
 def make_system(weights: int, seed: int) -> System:
-    """A system with learnable lens (curvatures, focus), mount, thresholds and network, in natural steps."""
+    """A system with learnable lens (curvatures, focus), mount, thresholds and network, in natural
+    steps."""
     geo = lens.load("cooke-triplet").scaled(0.22)
     geo.variables("curvature", "focus", step_mm=BLOCK_MM, keep_efl=True)
     camera = render.Camera(geo, SIDE_PX, SIDE_PX, BLOCK_MM, samples_per_pixel=16, seed=seed)
@@ -316,7 +337,9 @@ def draw_batch(drives: int, seed: int, frames: int = 9) -> Batch:
         start[:2, :2] = torch.stack([turn.cos(), -turn.sin(), turn.sin(), turn.cos()]).reshape(2, 2)
         start[:3, 3] = torch.tensor([*at.tolist(), 0.8], dtype=torch.float64)
         forward, slip, yaw = torch.randn(3, generator=generator, dtype=torch.float64).tolist()
-        twist = torch.tensor([0.8 + 0.2 * forward, 0.2 * slip, 0.0, 0.0, 0.0, 0.4 * yaw], dtype=torch.float64)
+        twist = torch.tensor(
+            [0.8 + 0.2 * forward, 0.2 * slip, 0.0, 0.0, 0.0, 0.4 * yaw], dtype=torch.float64
+        )
         poses.append(trajectories.body_twist(start, twist, t_s))
     return Batch(torch.stack(poses), t_s, seed=seed)
 
@@ -327,14 +350,20 @@ def joint_rows(system: System, batch: Batch, directions: int) -> list[Certificat
         frames = system.begin(batch)["frames"]
 
     def behind_frames(call):
-        # gradients pass through the whole graph; differences of what lies behind the frames need one rendering
+        # gradients pass through the whole graph; differences of what lies behind the frames need
+        # one rendering
         recorded = {} if torch.is_grad_enabled() else {"frames": frames}
         return call(batch, recorded=recorded).loss
 
     whole, params = by_group(system, lambda call: call(batch).loss, GROUPS)
     behind, _ = by_group(system, behind_frames, GROUPS)
     loss = {"lens": whole, "mount": whole, "thresholds": behind, "network": behind}
-    scales = {"lens": 1.0, "mount": 1.0, "thresholds": 1.0, "network": float(params["network"].norm()) / 4}
+    scales = {
+        "lens": 1.0,
+        "mount": 1.0,
+        "thresholds": 1.0,
+        "network": float(params["network"].norm()) / 4,
+    }
     return [
         row
         for name in params
@@ -360,7 +389,10 @@ JUNCTIONS = {
     "true flow, float64": (Asked({}, {"relative_error": 1e-5}), lambda seed: truth_rows()),
     "event counts, smooth": (Asked({}, {"relative_error": 1e-5}), lambda seed: count_rows(seed)),
     "flow estimate, float64": (Asked({}, {"relative_error": 1e-5}), lambda seed: flow_rows(seed)),
-    "final loss, plane, float64": (Asked({}, {"relative_error": 1e-6}), lambda seed: plane_loss_rows()),
+    "final loss, plane, float64": (
+        Asked({}, {"relative_error": 1e-6}),
+        lambda seed: plane_loss_rows(),
+    ),
     "final loss, smooth events": (
         Asked({"cosine": 0.99}, {"relative_error": 0.05}),
         lambda seed: loss_rows(seed),
@@ -372,13 +404,18 @@ HARD = "final loss, hard events"
 def shown(label: str, row: CertificateRow) -> Row:
     """A row of a certificate as one of the study's."""
     numbers = {
-        name: getattr(row, name) for name in ("relative_error", "cosine", "signed_bias", "noise_floor")
+        name: getattr(row, name)
+        for name in ("relative_error", "cosine", "signed_bias", "noise_floor")
     }
     return Row((label, row.name), {**numbers, "plateau_step": median(row.step_plateau)})
 
 
 def measure_junction(config, label):
-    rows = hard_rows(config.seed, config.hard_cases) if label == HARD else JUNCTIONS[label][1](config.seed)
+    rows = (
+        hard_rows(config.seed, config.hard_cases)
+        if label == HARD
+        else JUNCTIONS[label][1](config.seed)
+    )
     return [shown(label, row) for row in rows]
 
 
@@ -394,7 +431,8 @@ TEXT = (
 )
 CHAIN = Topic(
     "Along the chain",
-    TEXT + " Lens rays in float64, frames (textured room, no silhouettes) with respect to lens and pose, "
+    TEXT
+    + " Lens rays in float64, frames (textured room, no silhouettes) with respect to lens and pose, "
     "event counts, flow, and the final loss with respect to three curvatures and all six pose components, "
     "once with the smooth event layer and once with the straight-through layer against differences of the "
     "hard loss.",
@@ -405,7 +443,8 @@ CHAIN = Topic(
 )
 JOINT = Topic(
     "Lens, mount, thresholds and network in one graph",
-    TEXT + " Smooth event layer, textured room, a network of ten thousand weights along random directions.",
+    TEXT
+    + " Smooth event layer, textured room, a network of ten thousand weights along random directions.",
     ("graph", "group"),
     lambda quick: [()],
     measure_joint,

@@ -1,5 +1,5 @@
-"""A topic: some rows about one question, measured job by job, so that an interrupted run goes on behind
-the last."""
+"""A topic: some rows about one question, measured job by job, so that an interrupted run goes on
+behind the last."""
 
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -10,8 +10,8 @@ Job = tuple[str | float, ...]  # plain values, which tell it from other jobs
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a table. names: what tells it from the others. numbers: figures by name, such as cosine
-    and scale."""
+    """A line of a table. names: what tells it from the others. numbers: figures by name, such as
+    cosine and scale."""
 
     names: tuple[str, ...]
     numbers: dict[str, float]

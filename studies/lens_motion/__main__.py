@@ -1,10 +1,12 @@
-"""Where does a lens designed by event flow beat spots and mean MTF, when the motion has a direction?
+"""Where does a lens designed by event flow beat spots and mean MTF, when the motion has a
+direction?
 
-A cheap fast lens with few free numbers looks at textured walls from a drive with statistics of its own: forward, a
-turn, hovering, any motion, or a file of poses. Five designers with the same variables, light and limits place and
-bend it: the film alone, RMS spots, mean MTF at 0.15 cycles per pixel, the same MTF along the motion of every window,
-and, on development cases with hard events, the edge energy and the flow error itself. Held-out cases judge, once as
-they are and once, where the motion has a direction, with the motion turned by 90 degrees.
+A cheap fast lens with few free numbers looks at textured walls from a drive with statistics of its
+own: forward, a turn, hovering, any motion, or a file of poses. Five designers with the same
+variables, light and limits place and bend it: the film alone, RMS spots, mean MTF at 0.15 cycles
+per pixel, the same MTF along the motion of every window, and, on development cases with hard
+events, the edge energy and the flow error itself. Held-out cases judge, once as they are and once,
+where the motion has a direction, with the motion turned by 90 degrees.
 """
 
 import csv
@@ -38,7 +40,8 @@ DEVELOPMENT = ("coffee", "chelsea", "rocket", "speckle-101", "speckle-102", "spe
 HELD_OUT = ("camera", "gravel", "grass", "speckle-201", "speckle-202", "speckle-203")
 DEVELOPED = 31_000_000  # first seeds of the cases
 JUDGED = 32_000_000
-TURNED = ("spots", "mtf", "mtf_along", "flow")  # the designers that are judged with the motion turned
+# the designers that are judged with the motion turned
+TURNED = ("spots", "mtf", "mtf_along", "flow")
 POWER = 0.8  # with which the smallest detectable difference would have been seen
 
 
@@ -85,7 +88,8 @@ def study(run: Run[Config]):
 
 
 def _designs(run, form, motion):
-    """A row for every designer without frames: its variables, as text of one line in the sweep's table."""
+    """A row for every designer without frames: its variables, as text of one line in the sweep's
+    table."""
 
     def cell(designer):
         run.say(f"designing: {designer}")
@@ -100,8 +104,11 @@ def _designs(run, form, motion):
 
 
 def judge(optics: lens.GeoLens, motion: Motion, case) -> dict[str, float]:
-    """Hard flow error of a lens on one case, geometric mean over the windows in mrad, and its edge energy."""
-    camera = render.Camera(optics, WIDE_PX, TALL_PX, PITCH_MM, SAMPLES, 0, motion.film(), spectrum=LIGHT)
+    """Hard flow error of a lens on one case, geometric mean over the windows in mrad, and its edge
+    energy."""
+    camera = render.Camera(
+        optics, WIDE_PX, TALL_PX, PITCH_MM, SAMPLES, 0, motion.film(), spectrum=LIGHT
+    )
     system = System(
         camera=camera,
         events=HardSensor(SENSOR, BINS),
@@ -111,7 +118,9 @@ def judge(optics: lens.GeoLens, motion: Motion, case) -> dict[str, float]:
     )
     with torch.no_grad():
         seen = system.begin(case)
-        error = angular_error_mrad(seen["field"], seen["camera"], seen["scene"], seen["T_world_cam"])
+        error = angular_error_mrad(
+            seen["field"], seen["camera"], seen["scene"], seen["T_world_cam"]
+        )
         return {
             "error_mrad": float(error.log().mean().exp()),
             "edge_energy": float(edge_energy(seen["volume"])),
@@ -119,16 +128,20 @@ def judge(optics: lens.GeoLens, motion: Motion, case) -> dict[str, float]:
 
 
 def _chosen(run, form: Form, motion, answers):
-    """What flow and edge energy choose on the development cases: among the answers of the others and what lies between
-    them, then among film places around flow's best."""
+    """What flow and edge energy choose on the development cases: among the answers of the others
+    and what lies between them, then among film places around flow's best."""
     pool = make_worlds(DEVELOPMENT)
 
     def tried(name, points):
-        lenses = {label: form.optics(torch.tensor(point)).freeze() for label, point in points.items()}
+        lenses = {
+            label: form.optics(torch.tensor(point)).freeze() for label, point in points.items()
+        }
 
         def cell(case):
             drawn = motion.case(pool, DEVELOPED + case)
-            return [{"lens": label, **judge(optics, motion, drawn)} for label, optics in lenses.items()]
+            return [
+                {"lens": label, **judge(optics, motion, drawn)} for label, optics in lenses.items()
+            ]
 
         return sweep(run, cell, name, case=range(run.config.developed))
 
@@ -146,7 +159,8 @@ def _chosen(run, form: Form, motion, answers):
     by_edge = max(points, key=lambda label: sum(column(rows, "edge_energy", lens=label)))
     run.say(f"flow chooses: {by_flow}; edge energy chooses: {by_edge}")
     shown = {
-        label: {"mrad": _geometric(column(rows, "error_mrad", lens=label)), "lens": label} for label in points
+        label: {"mrad": _geometric(column(rows, "error_mrad", lens=label)), "lens": label}
+        for label in points
     }
     run.section(
         "What flow and edge energy chose from",
@@ -169,10 +183,14 @@ def _judged(run, lenses, motion):
 
         def cell(case, drives=drives, shown=shown):
             drawn = drives.case(pool, JUDGED + case)
-            return [{"lens": name, **judge(optics, drives, drawn)} for name, optics in shown.items()]
+            return [
+                {"lens": name, **judge(optics, drives, drawn)} for name, optics in shown.items()
+            ]
 
         name = "turned" if turned else "judged"
-        rows += [{"turned": turned, **row} for row in sweep(run, cell, name, case=range(counts[turned]))]
+        rows += [
+            {"turned": turned, **row} for row in sweep(run, cell, name, case=range(counts[turned]))
+        ]
     return rows
 
 
@@ -222,10 +240,15 @@ def _finish(run, lenses, motion, rows):
         if name in turned:
             row["turned"] = turned[name].percent()
         shown.append(row)
-    for prefix, pairs in (("log_ratio", flown), ("along_log_ratio", along), ("turned_log_ratio", turned)):
+    for prefix, pairs in (
+        ("log_ratio", flown),
+        ("along_log_ratio", along),
+        ("turned_log_ratio", turned),
+    ):
         for name, pair in pairs.items():
             run.record(
-                **pair.metrics(f"{prefix}_{name}"), **{f"{prefix}_{name}_detectable": detectable(pair)}
+                **pair.metrics(f"{prefix}_{name}"),
+                **{f"{prefix}_{name}_detectable": detectable(pair)},
             )
     said = verdict("the flow design", {page.LABELS[name]: pair for name, pair in flown.items()})
     spots_and_mtf = {page.LABELS[name]: along[name] for name in ("spots", "mtf")}
@@ -254,7 +277,8 @@ def _finish(run, lenses, motion, rows):
 
 
 def _redraw(run):
-    """The figure of all settings out of the table of finished runs: ratios of the design along the motion."""
+    """The figure of all settings out of the table of finished runs: ratios of the design along the
+    motion."""
     with run.config.raw.open(encoding="utf-8", newline="") as file:
         rows = [
             {**row, "turned": int(row["turned"]), "error_mrad": float(row["error_mrad"])}
@@ -268,7 +292,9 @@ def _redraw(run):
             words = (setting, "turned" if turned else "as it is")
             run.record(**pair.metrics(f"log_ratio_{plain(*words, design, name)}"))
             if design == "mtf_along":
-                values[f"{setting}{', turned' if turned else ''}: over {name}"] = page.as_ratio(pair)
+                values[f"{setting}{', turned' if turned else ''}: over {name}"] = page.as_ratio(
+                    pair
+                )
     run.figure(
         bars(values, "flow error of MTF along the motion, ratio", log=True, level=1.0),
         "lens_motion",

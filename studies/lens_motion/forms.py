@@ -1,7 +1,8 @@
 """Cheap fast lenses with few free numbers: the film's place, a bending, and up to two thicknesses.
 
-The stop is the first lens's own cell, as it is where a lens is cheap: no stop can be shifted to take astigmatism
-away. A bending adds the same curvature to all surfaces, which leaves the power of every thin element as it was.
+The stop is the first lens's own cell, as it is where a lens is cheap: no stop can be shifted to
+take astigmatism away. A bending adds the same curvature to all surfaces, which leaves the power of
+every thin element as it was.
 """
 
 import math
@@ -24,7 +25,8 @@ BENDING = 2.5  # the most, in its steps: a stock lens, not a meniscus
 FILM = (-40.0, 20.0)  # about the paraxial image of the wall, in its steps
 EDGE_MM = 0.1  # the least thickness of a glass edge
 PENALTY = 100.0  # of edges thinner than that, per mm^2
-# rows of radius (mm at a focal length of 11), thickness (mm), glass; then which thicknesses are free
+# rows of radius (mm at a focal length of 11), thickness (mm), glass; then which thicknesses are
+# free
 ROWS = {
     "singlet": (((5.7, 2.6, CROWN), (math.inf, 9.5, None)), (0,)),
     "achromat": (((6.75, 3.0, CROWN), (-4.9, 1.2, FLINT), (-14.3, 9.5, None)), (0, 1)),
@@ -36,7 +38,8 @@ FORMS = {"singlet": (9.0, 3.2), "achromat": (11.0, 1.8), "pair": (9.0, 2.0), "tr
 
 @dataclass(frozen=True)
 class Form:
-    """A lens and what of it is free. start: the lens at all variables 0. free: indices of its free thicknesses."""
+    """A lens and what of it is free. start: the lens at all variables 0. free: indices of its free
+    thicknesses."""
 
     start: lens.GeoLens
     free: tuple[int, ...]
@@ -49,7 +52,8 @@ class Form:
         return [FILM, (-BENDING, BENDING), *((-r, r) for r in reach)]
 
     def optics(self, variables: Tensor) -> lens.GeoLens:
-        """The lens at variables [2 + thicknesses], its focal length held by the last curvature. Gradient: all."""
+        """The lens at variables [2 + thicknesses], its focal length held by the last curvature.
+        Gradient: all."""
         film, bending, *thicker = variables.unbind()
         thickness = list(self.start.thickness_mm.unbind())
         for k, more in zip(self.free, thicker, strict=True):
@@ -60,7 +64,9 @@ class Form:
         )
         held = hold_efl(bent, self.efl_mm)
         focused = held.focus_at(DISTANCE_M).thickness_mm
-        return held.replace(thickness_mm=torch.cat([focused[:-1], (focused[-1] + STEPS[0] * film)[None]]))
+        return held.replace(
+            thickness_mm=torch.cat([focused[:-1], (focused[-1] + STEPS[0] * film)[None]])
+        )
 
     def penalty(self, optics: lens.GeoLens) -> Tensor:
         """Of glass edges that are too thin, scalar."""
@@ -85,7 +91,11 @@ def make_form(name: str, fno: float | None = None) -> Form:
     rows, free = ROWS[name]
     surfaces = [
         lens.Surface(
-            r * efl_mm / 11, t, lens.Glass.named(g) if g else None, half_mm + MARGIN_MM, is_stop=i == 0
+            r * efl_mm / 11,
+            t,
+            lens.Glass.named(g) if g else None,
+            half_mm + MARGIN_MM,
+            is_stop=i == 0,
         )
         for i, (r, t, g) in enumerate(rows)
     ]
@@ -94,7 +104,8 @@ def make_form(name: str, fno: float | None = None) -> Form:
 
 
 def _opened(published, efl_mm, half_mm):
-    """A published lens at another focal length and a wider aperture, its elements as much wider as they need be."""
+    """A published lens at another focal length and a wider aperture, its elements as much wider as
+    they need be."""
     scaled = published.scaled(efl_mm / float(published.first_order().efl_mm))
     wide = scaled.semi_aperture_mm.clamp_min(half_mm)
     opened = lens.GeoLens(scaled.to_surfaces(), 2 * half_mm, name=published.name)

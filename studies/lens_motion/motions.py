@@ -1,8 +1,8 @@
-"""Drives of a camera that looks along its motion, the flow directions they make in every window, and cases drawn
-from them: a textured wall across the axis, a place before it, a motion.
+"""Drives of a camera that looks along its motion, the flow directions they make in every window,
+and cases drawn from them: a textured wall across the axis, a place before it, a motion.
 
-A drive is a constant twist in camera axes over the interval (x right, y down, z forward). Speeds are set so that the
-flow in a window at HEIGHT_PX is about SPEED_PX, whatever the focal length.
+A drive is a constant twist in camera axes over the interval (x right, y down, z forward). Speeds
+are set so that the flow in a window at HEIGHT_PX is about SPEED_PX, whatever the focal length.
 """
 
 import math
@@ -27,18 +27,21 @@ WIDE_PX, TALL_PX = 32, 64  # of a window: within it the focus of an uncorrected 
 HEIGHT_PX = 157.0  # of the windows off axis
 FRAMES = 13
 NAMES = ("any", "forward", "turn", "hover")
-# centres from the axis in pixels: both sides of the film, or the axis where no direction is preferred
+# centres from the axis in pixels: both sides of the film, or the axis where no direction is
+# preferred
 SIDES = ((157, 0), (-157, 0))
 WINDOWS = {"hover": ((0, 0),)}
-OFFSETS_PX = tuple((x, y) for x in (-10, 0, 10) for y in (-20, 20))  # in a window, where a lens is looked at
+# in a window, where a lens is looked at
+OFFSETS_PX = tuple((x, y) for x in (-10, 0, 10) for y in (-20, 20))
 
 
 @dataclass(frozen=True)
 class Motion:
     """Statistics of drives: one of NAMES, or a file of camera poses in TUM format.
 
-    efl_mm: focal length, by which turns are scaled. turned: the same with every flow vector turned by 90 degrees
-      (forward becomes a roll about the axis, a turn sideways one up and down); of the directed motions only.
+    efl_mm: focal length, by which turns are scaled. turned: the same with every flow vector turned
+      by 90 degrees (forward becomes a roll about the axis, a turn sideways one up and down); of the
+      directed motions only.
     """
 
     name: str
@@ -51,7 +54,9 @@ class Motion:
                 f"--motion {self.name} is neither a file of poses nor one of {', '.join(NAMES)}; give one of them."
             )
         if self.turned and not self.directed:
-            raise DomainError(f"--motion {self.name} has no direction of its own that could be turned.")
+            raise DomainError(
+                f"--motion {self.name} has no direction of its own that could be turned."
+            )
 
     @property
     def directed(self) -> bool:
@@ -65,7 +70,9 @@ class Motion:
     def points_px(self) -> Tensor:
         """Where a lens is looked at: OFFSETS_PX in every window, [P, 2] from the axis."""
         offsets = torch.tensor(OFFSETS_PX, dtype=torch.float64)
-        return (torch.tensor(self.windows_px, dtype=torch.float64)[:, None] + offsets).reshape(-1, 2)
+        return (torch.tensor(self.windows_px, dtype=torch.float64)[:, None] + offsets).reshape(
+            -1, 2
+        )
 
     def film(self) -> render.Film:
         corners = tuple(
@@ -91,13 +98,17 @@ class Motion:
             twist[:2] = SPEED_PX / speed_px * slide_m * draw[:2] / math.sqrt(2)
         elif self.name == "forward":
             twist[:2] = STRAY * slide_m * draw[:2]
-            twist[5 if self.turned else 2] = (1.0 if self.turned else DISTANCE_M) * speed_px / HEIGHT_PX
+            twist[5 if self.turned else 2] = (
+                (1.0 if self.turned else DISTANCE_M) * speed_px / HEIGHT_PX
+            )
         elif self.name == "turn":
             along, across = (3, 4) if self.turned else (4, 3)
             twist[along], twist[across] = turn_rad, STRAY * turn_rad * float(draw[0])
         else:
             times = self._recorded.t_s
-            at = times[0] + (times[-1] - times[0]) * torch.rand(1, generator=generator, dtype=torch.float64)
+            at = times[0] + (times[-1] - times[0]) * torch.rand(
+                1, generator=generator, dtype=torch.float64
+            )
             twist = self._recorded.velocity(at)[0] * DURATION_S
         return twist
 
@@ -112,8 +123,8 @@ class Motion:
         return Batch(drive, t_s, world, seed)
 
     def directions_rad(self, draws: int = 32, at_px: Tensor | None = None) -> Tensor:
-        """Directions of flow of that many drives as angles from the radius, at ``points_px`` or other places [P, 2]
-        from the axis: [P, draws]."""
+        """Directions of flow of that many drives as angles from the radius, at ``points_px`` or
+        other places [P, 2] from the axis: [P, draws]."""
         generator = torch.Generator().manual_seed(0)
         twists = torch.stack([self.twist(generator) for _ in range(draws)])
         at = self.points_px() if at_px is None else at_px

@@ -38,7 +38,8 @@ def as_ratio(pair: Interval) -> Interval:
 
 
 def point_images(lenses, motion) -> Figure:
-    """A row of windows per lens: rays in pixels, radius turned to where it points on the sensor, and the flow.
+    """A row of windows per lens: rays in pixels, radius turned to where it points on the sensor,
+    and the flow.
 
     lenses: by the name of their designer.
     """
@@ -68,7 +69,11 @@ def point_images(lenses, motion) -> Figure:
                 axis.plot([0.7 * dx, dx], [0.7 * dy, dy], color="firebrick", linewidth=1)
             axis.add_patch(plt.Rectangle((-0.5, -0.5), 1, 1, fill=False, color="0.6"))
             axis.set(
-                xlim=(-REACH_PX, REACH_PX), ylim=(REACH_PX, -REACH_PX), aspect="equal", xticks=[], yticks=[]
+                xlim=(-REACH_PX, REACH_PX),
+                ylim=(REACH_PX, -REACH_PX),
+                aspect="equal",
+                xticks=[],
+                yticks=[],
             )
         column[0].set_title(LABELS[name].removeprefix("the "), fontsize=9)
     for axis, at in zip(axes[:, 0], windows, strict=True):

@@ -1,5 +1,5 @@
-"""Designers that need no rendered frame: the same lens, variables and limits, minimised for spots, for MTF over all
-directions, or for MTF along the motion."""
+"""Designers that need no rendered frame: the same lens, variables and limits, minimised for spots,
+for MTF over all directions, or for MTF along the motion."""
 
 import math
 from collections.abc import Callable
@@ -30,19 +30,22 @@ def mtf(rays: SpotRays, directions_rad: Tensor, per_px: float = FREQUENCY_PER_PX
     """Contrast of a grating by the rays alone, without the pixel's own.
 
     Args:
-      directions_rad: [F, D] of the grating's wave vector, from the radius (y of the rays), per point.
+      directions_rad: [F, D] of the grating's wave vector, from the radius (y of the rays), per
+        point.
       per_px: its cycles per pixel.
     Returns: [F, D] in [0, 1]. Gradient: to the rays.
     """
-    wave = torch.stack([directions_rad.sin(), directions_rad.cos()], -1) * (2 * math.pi * per_px / PITCH_MM)
+    wave = torch.stack([directions_rad.sin(), directions_rad.cos()], -1) * (
+        2 * math.pi * per_px / PITCH_MM
+    )
     phase = torch.einsum("fdk,fnk->fdn", wave, rays.spread()[0])
     share = rays.share[:, None]
     return torch.hypot((share * phase.cos()).sum(-1), (share * phase.sin()).sum(-1))
 
 
 def rays_at(optics: GeoLens, at_px: Tensor, grid: int) -> SpotRays:
-    """Rays of the wall at places of the film, [P, 2] from the axis, by the field angles of a lens without
-    distortion."""
+    """Rays of the wall at places of the film, [P, 2] from the axis, by the field angles of a lens
+    without distortion."""
     angles = (at_px.norm(dim=1) * PITCH_MM / optics.first_order().efl_mm.detach()).atan()
     return spot_rays(optics, angles.tolist(), DISTANCE_M, LIGHT, grid=grid)
 

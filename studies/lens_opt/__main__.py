@@ -1,15 +1,17 @@
 """What does an event-flow objective buy a lens designer over the best spot-size designer?
 
-A published lens is scaled to a DAVIS346-like sensor and focused on the wall it looks at; a stated seed detunes its
-curvatures, and it is focused again, so that what is left no focusing takes away. From there it is optimised by
-gradients through rays, frames, events and flow, beside rivals with the same free variables, focal length, f-number and
-limits: refocused alone, damped least squares on spots, and the seed project's edge energy. All are judged on textures
-and motions never optimised on, with a hard event sensor, case by case.
+A published lens is scaled to a DAVIS346-like sensor and focused on the wall it looks at; a stated
+seed detunes its curvatures, and it is focused again, so that what is left no focusing takes away.
+From there it is optimised by gradients through rays, frames, events and flow, beside rivals with
+the same free variables, focal length, f-number and
+limits: refocused alone, damped least squares on spots, and the seed project's edge energy. All are
+judged on textures and motions never optimised on, with a hard event sensor, case by case.
 
-With --motion any, forward, turn, hover or a file of poses, the lens is designed for a motion of that kind: another
-study with options of its own (python -m studies.lens_motion --help).
+With --motion any, forward, turn, hover or a file of poses, the lens is designed for a motion of
+that kind: another study with options of its own (python -m studies.lens_motion --help).
 
-The event layer and the flow estimator can be any of the toolkit's; a network can be trained together with the lens.
+The event layer and the flow estimator can be any of the toolkit's; a network can be trained
+together with the lens.
 """
 
 import sys
@@ -46,8 +48,8 @@ class Config(StudyConfig):
     lens: str = "cooke-triplet"
     """Lens to start from: cooke-triplet, double-gauss, la1509, or a lens .json file."""
     objective: Literal["flow", "edge"] = "flow"
-    """flow: log angular error of event flow; edge: the seed project's edge energy of event frames. The other of the
-    two is a rival."""
+    """flow: log angular error of event flow; edge: the seed project's edge energy of event frames.
+    The other of the two is a rival."""
     events: str = "memory"
     """Event layer: memory, sigmoid, counts, dense, expected, srm or physical."""
     flow: str = "closed-form"
@@ -65,7 +67,8 @@ class Config(StudyConfig):
     cases: int = 4
     """Samples (texture, motion, noise) per step."""
     samples: int = 16
-    """Rays per pixel while optimising, a multiple of the 4 wavelengths; twice as many when judging."""
+    """Rays per pixel while optimising, a multiple of the 4 wavelengths; twice as many when
+    judging."""
     step_size: float = 0.3
     """Flow objective: length of a step in pixels of ray motion."""
     edge_step_size: float = 0.3
@@ -89,16 +92,20 @@ MEANS = ("flow_error_mrad", "edge_energy", "events_per_pixel")
 
 
 class Course:
-    """How far a run has come: what the rivals chose, the designs by gradients, what was judged. All of it is
-    stored."""
+    """How far a run has come: what the rivals chose, the designs by gradients, what was judged. All
+    of it is stored."""
 
     def __init__(self, run: Run[Config]):
         stored = run.load_state()
         self.run = run
         self.fresh = stored is None
         self.jobs: dict[str, Job] = {}
-        self.choices: dict[str, list[dict[str, Any]]] = {} if stored is None else stored.numbers["choices"]
-        self.found: dict[str, list[dict[str, float]]] = {} if stored is None else stored.numbers["found"]
+        self.choices: dict[str, list[dict[str, Any]]] = (
+            {} if stored is None else stored.numbers["choices"]
+        )
+        self.found: dict[str, list[dict[str, float]]] = (
+            {} if stored is None else stored.numbers["found"]
+        )
         self._left = {} if stored is None else stored.numbers["jobs"]
         self._tensors = {} if stored is None else stored.tensors
 
@@ -116,7 +123,9 @@ class Course:
         for name, job in self.jobs.items():
             own, numbers[name] = job.state()
             tensors |= {f"{name}.{key}": value for key, value in own.items()}
-        self.run.save_state(tensors, {"choices": self.choices, "found": self.found, "jobs": numbers})
+        self.run.save_state(
+            tensors, {"choices": self.choices, "found": self.found, "jobs": numbers}
+        )
 
 
 def study(run: Run[Config]):
@@ -161,7 +170,9 @@ def _check(config):
         "spot_starts",
     ):
         if getattr(config, name) < 1:
-            raise DomainError(f"--{name.replace('_', '-')} is {getattr(config, name)}; at least 1 is needed.")
+            raise DomainError(
+                f"--{name.replace('_', '-')} is {getattr(config, name)}; at least 1 is needed."
+            )
     if config.samples % len(LIGHT.weights):
         raise DomainError(
             f"--samples is {config.samples}; the light has {len(LIGHT.weights)} wavelengths, so give a multiple of that."
@@ -172,7 +183,8 @@ def _check(config):
 
 
 def designed_without_frames(course, job):
-    """The refocused lens and the spot designer's, stored as files; what they chose from goes into the course."""
+    """The refocused lens and the spot designer's, stored as files; what they chose from goes into
+    the course."""
     run = course.run
     config = run.config
     names = ("refocused", "spots")
@@ -180,10 +192,14 @@ def designed_without_frames(course, job):
         # a network that is yet to be trained cannot choose
         stage = flow.estimate_lk if config.train_network else job.system.flow
         error = development_error(job.task, stage, config.developed, config.samples)
-        run.say("refocusing, and shrinking spots by damped least squares; settings by development cases")
+        run.say(
+            "refocusing, and shrinking spots by damped least squares; settings by development cases"
+        )
         found = (
             rivals.refocus(job.task, error),
-            rivals.shrink_spots(job.task, error, config.spot_steps, config.spot_starts, config.seed),
+            rivals.shrink_spots(
+                job.task, error, config.spot_steps, config.spot_starts, config.seed
+            ),
         )
         for name, variants in zip(names, found, strict=True):
             best = rivals.least(variants)
@@ -197,8 +213,8 @@ def designed_without_frames(course, job):
 
 
 def descend(course, name):
-    """Take the steps of a design by gradients that are still to be made. Returns: seconds per step, None when none
-    was timed."""
+    """Take the steps of a design by gradients that are still to be made. Returns: seconds per step,
+    None when none was timed."""
     run = course.run
     config = run.config
     job = course.jobs[name]
@@ -222,7 +238,9 @@ def descend(course, name):
             job.loop.run(steps, advance, judged)
             return bar.seconds_per_step
     except NonFiniteError as error:
-        raise NonFiniteError(f"{error} The last good lens is {run.path(f'lens_{name}.json')}.") from error
+        raise NonFiniteError(
+            f"{error} The last good lens is {run.path(f'lens_{name}.json')}."
+        ) from error
 
 
 def _finish(run, course, lenses, seconds):
@@ -272,10 +290,14 @@ def _finish(run, course, lenses, seconds):
 
 
 def pairs_of(lenses):
-    """(name, design, rival) of the pairs that are compared: the design with every other lens, and the spot designer's
-    lens after flow steps with itself before."""
+    """(name, design, rival) of the pairs that are compared: the design with every other lens, and
+    the spot designer's lens after flow steps with itself before."""
     found = [(rival, "optimised", rival) for rival in lenses if rival != "optimised"]
-    return [*found, ("after_spots_over_spots", "after_spots", "spots")] if "after_spots" in lenses else found
+    return (
+        [*found, ("after_spots_over_spots", "after_spots", "spots")]
+        if "after_spots" in lenses
+        else found
+    )
 
 
 def _mean(rows, key):
@@ -283,13 +305,16 @@ def _mean(rows, key):
 
 
 def judge_all(course, lenses):
-    """Hard errors of every lens on the held-out cases, by name: list of dict (see LensTask.judge)."""
+    """Hard errors of every lens on the held-out cases, by name: list of dict
+    (see LensTask.judge)."""
     run = course.run
     job = course.jobs["optimised"]
     pool = make_worlds(HELD_OUT)
     found = course.found
     done = min((len(found.get(name, [])) for name in lenses), default=0)
-    with run.progress(run.config.judged, "judging on held-out textures and motions", done=done) as bar:
+    with run.progress(
+        run.config.judged, "judging on held-out textures and motions", done=done
+    ) as bar:
         for i in range(done, run.config.judged):
             case = draw_case(pool, JUDGED + i, frames=17)
             for name, optics in lenses.items():

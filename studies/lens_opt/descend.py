@@ -1,4 +1,5 @@
-"""One design by gradients through rendered frames: the system of an objective, its optimiser, and its way so far."""
+"""One design by gradients through rendered frames: the system of an objective, its optimiser, and
+its way so far."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -85,11 +86,14 @@ def prepare(
       objective: "flow" or "edge", by default that of config.
       stage: flow stage to share.
       part: of the step size.
-    Raises: DomainError for an event layer and an estimator that make no sense together, with the reason.
+    Raises: DomainError for an event layer and an estimator that make no sense together, with the
+      reason.
     """
     layer = event_layer(config.events)
     if stage is None:
-        stage = estimator(config.flow, config.train_network, config.objective, config.weights, config.seed)
+        stage = estimator(
+            config.flow, config.train_network, config.objective, config.weights, config.seed
+        )
     task = task or make_task(config.lens, config.seed, config.detuned_px)
     chosen: str = objective or config.objective
     pool = make_worlds(TRAINING)
@@ -111,14 +115,16 @@ def prepare(
         return fmean(float(hard(case).loss) for case in scored) + float(penalty())
 
     optimiser = _optimiser(config, system, chosen, train, part, scored[0])
-    return Job(task, camera, system, Loop(optimiser, samples, clip=None, judge=score), scored[0], History())
+    return Job(
+        task, camera, system, Loop(optimiser, samples, clip=None, judge=score), scored[0], History()
+    )
 
 
 def _optimiser(config, system, objective, train, part, case):
     """Descent on the design; with a network, Adam on both, for the weights that the objective sees.
 
-    A log error and an edge energy have no common scale: the gradients of each are clipped to the median length of the
-    samples, and every step has a set length, each objective its own.
+    A log error and an edge energy have no common scale: the gradients of each are clipped to the
+    median length of the samples, and every step has a set length, each objective its own.
     """
     variables = system.camera.variables
     if not train:
@@ -128,7 +134,10 @@ def _optimiser(config, system, objective, train, part, case):
     slopes = torch.autograd.grad(system(case).loss, weights, allow_unused=True)
     seen = [weight for weight, slope in zip(weights, slopes, strict=True) if slope is not None]
     return torch.optim.Adam(
-        [{"params": [variables], "lr": config.step_size / 6}, {"params": seen, "lr": config.learning_rate}]
+        [
+            {"params": [variables], "lr": config.step_size / 6},
+            {"params": seen, "lr": config.learning_rate},
+        ]
     )
 
 

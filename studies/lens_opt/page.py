@@ -1,4 +1,5 @@
-"""The page of a lens_opt run: who wins, the rivals, layouts, spots, frames, event frames, curves, junction table."""
+"""The page of a lens_opt run: who wins, the rivals, layouts, spots, frames, event frames, curves,
+junction table."""
 
 import math
 from collections.abc import Mapping
@@ -38,7 +39,8 @@ def label(name, objective):
 
 
 def verdict(design: str, rivals: Mapping[str, Interval]) -> str:
-    """One sentence that says first who wins: the rivals that do, those that tie, or the design where it beats all.
+    """One sentence that says first who wins: the rivals that do, those that tie, or the design
+    where it beats all.
 
     Args:
       design: what it is called, "the flow design".
@@ -55,7 +57,9 @@ def verdict(design: str, rivals: Mapping[str, Interval]) -> str:
             )
     if not said:
         name, closest = max(rivals.items(), key=lambda item: item[1].value)
-        said.append(f"{design} wins: its flow error against its best rival, {name}, is {closest.percent()}")
+        said.append(
+            f"{design} wins: its flow error against its best rival, {name}, is {closest.percent()}"
+        )
     sentence = f"{'; '.join(said)} on {next(iter(rivals.values())).count} unseen cases."
     return sentence[0].upper() + sentence[1:]
 
@@ -71,11 +75,15 @@ def write(run, course, lenses, junctions):
     task = course.jobs["optimised"].task
     names = {name: label(name, config.objective) for name in lenses}
     errors = {name: [row["flow_error_mrad"] for row in rows] for name, rows in course.found.items()}
-    pairs = {name: log_ratio(errors["optimised"], errors[name]) for name in lenses if name != "optimised"}
+    pairs = {
+        name: log_ratio(errors["optimised"], errors[name]) for name in lenses if name != "optimised"
+    }
     rivals = [name for name in RIVALS if name in lenses]
     said = verdict(DESIGNS[config.objective], {RIVALS[name]: pairs[name] for name in rivals})
     _who_wins(run, names, pairs, rivals)
-    for complaint in sorted({v["complaint"] for rows in course.choices.values() for v in rows} - {""}):
+    for complaint in sorted(
+        {v["complaint"] for rows in course.choices.values() for v in rows} - {""}
+    ):
         run.text(f"**Note**: {complaint}")
     if "after_spots" in lenses:
         pair = log_ratio(errors["after_spots"], errors["spots"])
@@ -115,10 +123,14 @@ def _who_wins(run, names, pairs, rivals):
     m = run.metrics
     for name in ("optimised", *rivals):
         change = (
-            f"the design against it: {pairs[name].percent()}" if name in pairs else "mean of held-out cases"
+            f"the design against it: {pairs[name].percent()}"
+            if name in pairs
+            else "mean of held-out cases"
         )
         error, spot = m[f"flow_error_mrad_hard_{name}"], m[f"rms_spot_um_{name}"]
-        run.card(f"Flow error, {names[name]}", f"{error:.3f} mrad", f"RMS spot {spot:.1f} µm; {change}")
+        run.card(
+            f"Flow error, {names[name]}", f"{error:.3f} mrad", f"RMS spot {spot:.1f} µm; {change}"
+        )
     run.section(
         "Who wins",
         "Hard events from the physical sensor, textures and motions never optimised on, the same cases for every "
@@ -129,7 +141,8 @@ def _who_wins(run, names, pairs, rivals):
     rows = []
     for name, title in names.items():
         figures = (
-            m[f"{key}_{name}"] for key in ("flow_error_mrad_hard", "rms_spot_um", "edge_below_floor_mm")
+            m[f"{key}_{name}"]
+            for key in ("flow_error_mrad_hard", "rms_spot_um", "edge_below_floor_mm")
         )
         change = (pairs[name].percent(), pairs[name].outcome) if name in pairs else ("", "")
         rows.append([title, *figures, *change])
@@ -166,7 +179,9 @@ def _by_window(run, found, names, rivals):
     for h in FIELDS:
         key = f"flow_error_mrad_field_{h:g}"
         own, *others = ([row[key] for row in found[name]] for name in ("optimised", *rivals))
-        rows.append([f"{h:g}", sum(own) / len(own), *(log_ratio(own, other).percent() for other in others)])
+        rows.append(
+            [f"{h:g}", sum(own) / len(own), *(log_ratio(own, other).percent() for other in others)]
+        )
     run.table(
         "Where: by window",
         [
@@ -198,7 +213,9 @@ def _settings(run, course):
 
 
 def _lenses(run, task, shown):
-    run.section("The lenses", "Cross-sections with meridional rays at the three fields, and their spots.")
+    run.section(
+        "The lenses", "Cross-sections with meridional rays at the three fields, and their spots."
+    )
     run.figure(
         lens_figures.layouts(shown, task.fields_rad),
         "lens_layout",
@@ -234,7 +251,8 @@ def _seen_by_the_sensor(run, job, shown):
 
 
 def _fading_events(run, frames, t_s):
-    """Events as a frame-difference emulator makes them of frames: a CSV file, and a video in which they fade."""
+    """Events as a frame-difference emulator makes them of frames: a CSV file, and a video in which
+    they fade."""
     stream = events.naive(frames.flatten(1, 2), t_s, SENSOR.theta_on)
     events.write(run.path("events_naive.csv"), stream)
     try:
@@ -259,7 +277,9 @@ def _way(run, course):
             "each step, its own cases": (range(1, len(record.loss) + 1), record.loss),
             "fixed training cases, hard sensor": (record.judged_step, record.score),
         }
-        title = "mean log angular error (log mrad)" if of == "flow" else "−(edge energy − λ activity)"
+        title = (
+            "mean log angular error (log mrad)" if of == "flow" else "−(edge energy − λ activity)"
+        )
         caption = f"Loss while optimising: {label(name, objective)}."
         run.figure(panels(Panel(losses, "step", title), width=7), f"loss_curve_{name}", caption)
     job = course.jobs["optimised"]
@@ -267,10 +287,14 @@ def _way(run, course):
     charts = []
     for name, unit in (("curvature", "1/mm"), ("thickness", "mm")):
         rows = np.array(getattr(job.history, name))
-        series = {f"surface {k + 1}": (steps, column) for k, column in enumerate((rows - rows[0]).T)}
+        series = {
+            f"surface {k + 1}": (steps, column) for k, column in enumerate((rows - rows[0]).T)
+        }
         charts.append(Panel(series, "step", f"change of {name} ({unit})"))
     spots = zip(FIELDS, np.array(job.history.spot_um).T, strict=True)
-    charts.append(Panel({f"field {h:g}": (steps, row) for h, row in spots}, "step", "RMS spot (µm)"))
+    charts.append(
+        Panel({f"field {h:g}": (steps, row) for h, row in spots}, "step", "RMS spot (µm)")
+    )
     run.figure(
         panels(*charts),
         "design_curves",
@@ -281,7 +305,10 @@ def _way(run, course):
 def _cases(run, errors, names):
     m = run.metrics
     run.section("Case by case", "The control is a wall without texture, where no lens can help.")
-    rows = [[i + 1, *(round(errors[name][i], 3) for name in names)] for i in range(len(errors["optimised"]))]
+    rows = [
+        [i + 1, *(round(errors[name][i], 3) for name in names)]
+        for i in range(len(errors["optimised"]))
+    ]
     run.table("Angular flow error per held-out case (mrad)", ["case", *names.values()], rows)
     keys = ("edge_energy_hard", "events_per_pixel_hard", "efl_mm", "fno")
     run.table(
@@ -289,5 +316,9 @@ def _cases(run, errors, names):
         ["lens", "edge energy", "events per pixel", "focal length (mm)", "f-number"],
         [[title, *(m[f"{key}_{name}"] for key in keys)] for name, title in names.items()],
     )
-    detuned, optimised = (m[f"flow_error_mrad_hard_control_{name}"] for name in ("detuned", "optimised"))
-    run.text(f"Control without texture: detuned {detuned:.2f} mrad, optimised {optimised:.2f} mrad.")
+    detuned, optimised = (
+        m[f"flow_error_mrad_hard_control_{name}"] for name in ("detuned", "optimised")
+    )
+    run.text(
+        f"Control without texture: detuned {detuned:.2f} mrad, optimised {optimised:.2f} mrad."
+    )

@@ -1,7 +1,9 @@
-"""Lenses made from the same start without a single rendered frame: refocused, and optimised for spot size.
+"""Lenses made from the same start without a single rendered frame: refocused, and optimised for
+spot size.
 
-Both have the free variables and the limits of the flow design, and both may choose: among light and weights of the
-fields, by the flow error on development cases, which are neither optimised on nor judged.
+Both have the free variables and the limits of the flow design, and both may choose: among light and
+weights of the fields, by the flow error on development cases, which are neither optimised on nor
+judged.
 """
 
 from collections.abc import Callable
@@ -31,8 +33,8 @@ SETTLED = 1e-3
 
 @dataclass(frozen=True)
 class Variant:
-    """A lens, the setting that made it, its mean flow error on development cases, and what is wrong with it ("" if
-    nothing)."""
+    """A lens, the setting that made it, its mean flow error on development cases, and what is wrong
+    with it ("" if nothing)."""
 
     setting: str
     optics: lens.GeoLens
@@ -45,7 +47,8 @@ class Variant:
 
 
 def field_weights(task: LensTask) -> dict[str, tuple[float, ...]]:
-    """Weights of HEIGHTS by name, sum 1. "windows" are the shares of the pixels that are looked at."""
+    """Weights of HEIGHTS by name, sum 1. "windows" are the shares of the pixels that are looked
+    at."""
     seen = film()
     radius = (seen.pixels() - seen.middle_px).norm(dim=1) * PITCH_MM / HALF_DIAGONAL_MM
     nearest = (radius[:, None] - torch.tensor(HEIGHTS, dtype=radius.dtype)).abs().argmin(1)
@@ -67,7 +70,8 @@ def angles_rad(task: LensTask) -> tuple[float, ...]:
 
 
 def refocus(task: LensTask, judge: Callable[[lens.GeoLens], float]) -> list[Variant]:
-    """The start at every best focus there is: of the d line, or of all wavelengths by the weights of the fields."""
+    """The start at every best focus there is: of the d line, or of all wavelengths by the weights
+    of the fields."""
     weights = field_weights(task)
     settings = [
         ("d line", lens.Spectrum.line("d"), FIRST),
@@ -75,7 +79,9 @@ def refocus(task: LensTask, judge: Callable[[lens.GeoLens], float]) -> list[Vari
     ]
     found = []
     for colour, light, name in settings:
-        optics = refocused(task.design.reference, angles_rad(task), DISTANCE_M, light, weights[name])
+        optics = refocused(
+            task.design.reference, angles_rad(task), DISTANCE_M, light, weights[name]
+        )
         found.append(Variant(f"{colour}, fields {name}", optics, judge(optics)))
     return found
 
@@ -83,11 +89,11 @@ def refocus(task: LensTask, judge: Callable[[lens.GeoLens], float]) -> list[Vari
 def shrink_spots(
     task: LensTask, judge: Callable[[lens.GeoLens], float], steps: int, starts: int, seed: int
 ) -> list[Variant]:
-    """Designs of least weighted mean square spot, by damped least squares, one per weights of the fields.
+    """Designs of least weighted mean square spot, by damped least squares, one per weights of the
+    fields.
 
-    The even weights are optimised from ``starts`` starts, the detuned lens and others around it; the other weights go
-    on from the best of them.
-    Args:
+    The even weights are optimised from ``starts`` starts, the detuned lens and others around it;
+    the other weights go on from the best of them. Args:
       judge: mean flow error on development cases.
       steps: most steps of a run.
     Returns: the start itself, with a complaint, when no start gives a smaller spot than it had.
@@ -97,7 +103,8 @@ def shrink_spots(
     size = sizes_of(task.design.reference)
     first = torch.zeros_like(size)
     others = [
-        SPREAD * torch.randn(len(size), generator=generator, dtype=size.dtype) for _ in range(starts - 1)
+        SPREAD * torch.randn(len(size), generator=generator, dtype=size.dtype)
+        for _ in range(starts - 1)
     ]
     tried = []
     for start in (first, *others):
@@ -120,7 +127,9 @@ def shrink_spots(
     found = []
     for name in weights:
         optics = _lens(task, size, solved[name].variables).freeze()
-        found.append(Variant(f"fields {name}", optics, judge(optics), _complaint(solved[name], steps)))
+        found.append(
+            Variant(f"fields {name}", optics, judge(optics), _complaint(solved[name], steps))
+        )
     return found
 
 
@@ -129,8 +138,8 @@ def residuals(
     size: Tensor,
     weights: tuple[float, ...],
 ) -> Callable[[Tensor], Tensor]:
-    """Function of relative changes [V] to ray errors in pixels, whose squares sum to the weighted mean square spot;
-    and to failed rays and edges below their floors."""
+    """Function of relative changes [V] to ray errors in pixels, whose squares sum to the weighted
+    mean square spot; and to failed rays and edges below their floors."""
     kept = [(angle, w) for angle, w in zip(angles_rad(task), weights, strict=True) if w > 0]
     angles, shares = zip(*kept, strict=True)
     root = torch.tensor(shares, dtype=torch.float64).sqrt()[:, None, None]
@@ -143,7 +152,9 @@ def residuals(
             return changes.new_full((1,), torch.nan)
         error = root * rays.share.sqrt()[..., None] * rays.spread()[0] / PITCH_MM
         thin = task.design.shortfall(optics)
-        return torch.cat([error.reshape(-1), EDGE_WEIGHT * thin, MISS_WEIGHT * rays.missed.reshape(1)])
+        return torch.cat(
+            [error.reshape(-1), EDGE_WEIGHT * thin, MISS_WEIGHT * rays.missed.reshape(1)]
+        )
 
     return found
 

@@ -1,4 +1,5 @@
-"""Spots of the wall that the cameras look at, in the light they see it in: what a spot designer minimises."""
+"""Spots of the wall that the cameras look at, in the light they see it in: what a spot designer
+minimises."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,8 +17,9 @@ from codesign.lens.analysis.rays import source_rays
 class SpotRays:
     """Rays of F points of a wall on the film plane, all wavelengths of a point in one row.
 
-    position_mm: [F, N, 2]. slope: [F, N, 2], change of position per millimetre along the axis. share: [F, N] of the
-    point's light: spectrum times what the apertures let pass, sum 1. missed: [] sum over rays of how far they failed.
+    position_mm: [F, N, 2]. slope: [F, N, 2], change of position per millimetre along the axis.
+    share: [F, N] of the point's light: spectrum times what the apertures let pass, sum 1. missed:
+    [] sum over rays of how far they failed.
     """
 
     position_mm: Tensor
@@ -38,8 +40,9 @@ class SpotRays:
     def best_focus_mm(self, weights: Sequence[float] | None = None) -> Tensor:
         """How far behind the film the weighted mean square spot is least, scalar mm: a closed form.
 
-        Straight rays make a squared spot a parabola in the film's place: its least is at -sum(d.s) / sum(s.s), with d
-        and s position and slope about the spot's mean. weights: [F], equal when None.
+        Straight rays make a squared spot a parabola in the film's place: its least is at -sum(d.s)
+        / sum(s.s), with d and s position and slope about the spot's mean. weights: [F], equal when
+        None.
         """
         position, slope = self.spread()
         share = self.share[..., None]
@@ -59,12 +62,14 @@ def spot_rays(
     light: lens.Spectrum,
     grid: int = 16,
 ) -> SpotRays:
-    """Rays from points of a wall across the axis, ``distance_m`` before the entrance pupil, to the film.
+    """Rays from points of a wall across the axis, ``distance_m`` before the entrance pupil, to the
+    film.
 
     Args:
       fields_rad: angles of the points' chief rays.
       grid: pupil cells across; one half of the pupil is traced, the other is its mirror image.
-    Gradient: positions and slopes to every lens tensor. Raises: DomainError when no ray of a point arrives.
+    Gradient: positions and slopes to every lens tensor. Raises: DomainError when no ray of a point
+      arrives.
     """
     pupil = pupil_grid(grid, optics.dtype)
     source = source_rays(optics, torch.tensor(fields_rad), pupil[pupil[:, 0] > 0], distance_m)
@@ -101,7 +106,8 @@ def refocused(
     light: lens.Spectrum,
     weights: Sequence[float] | None = None,
 ) -> lens.GeoLens:
-    """The lens with its film at ``SpotRays.best_focus_mm`` of points of the wall; see ``spot_rays``."""
+    """The lens with its film at ``SpotRays.best_focus_mm`` of points of the wall; see
+    ``spot_rays``."""
     shift = spot_rays(optics, fields_rad, distance_m, light).best_focus_mm(weights)
     return optics.replace(
         thickness_mm=torch.cat([optics.thickness_mm[:-1], (optics.thickness_mm[-1] + shift)[None]])

@@ -1,4 +1,5 @@
-"""Event layers and flow estimators of lens_opt by name, and which of them make no sense together."""
+"""Event layers and flow estimators of lens_opt by name, and which of them make no sense
+together."""
 
 from pathlib import Path
 from typing import Any
@@ -21,10 +22,11 @@ def event_layer(name: str) -> events.EventLayer:
 
 
 def estimator(name: str, train: bool, objective: str, weights: int, seed: int) -> Any:
-    """The flow stage of that name, or from a network file; its weights ask for gradients only when trained.
+    """The flow stage of that name, or from a network file; its weights ask for gradients only when
+    trained.
 
-    Raises: DomainError for what does not go together, with the reason; FileFormatError for a file that is no
-      network.
+    Raises: DomainError for what does not go together, with the reason; FileFormatError for a file
+      that is no network.
     """
     if train and name == "closed-form":
         raise DomainError(
@@ -45,11 +47,15 @@ def estimator(name: str, train: bool, objective: str, weights: int, seed: int) -
             )
         return WEIGHTS[name].with_weights(weights, seed=seed)
     if name != "refiner" and not Path(name).is_file():
-        raise DomainError(f"--flow {name} is neither a network file nor one of {', '.join(ESTIMATORS)}.")
+        raise DomainError(
+            f"--flow {name} is neither a network file nor one of {', '.join(ESTIMATORS)}."
+        )
     network = flow.load(name)
     return network.requires_grad_(train)
 
 
 def weights_of(stage: Any) -> list[nn.Parameter]:
     """The weights of a flow stage that are trained."""
-    return [p for p in stage.parameters() if p.requires_grad] if isinstance(stage, nn.Module) else []
+    return (
+        [p for p in stage.parameters() if p.requires_grad] if isinstance(stage, nn.Module) else []
+    )

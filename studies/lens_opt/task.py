@@ -1,5 +1,5 @@
-"""What the lens studies optimise and judge: a lens on a DAVIS346-like sensor, three field windows, textured
-walls, random motions."""
+"""What the lens studies optimise and judge: a lens on a DAVIS346-like sensor, three field windows,
+textured walls, random motions."""
 
 import math
 from collections.abc import Callable
@@ -64,11 +64,11 @@ def log_error(every_px: int = 8) -> Callable[..., Tensor]:
 
 @dataclass(frozen=True)
 class LensTask:
-    """What a lens is designed for, and from where: the design variables around the detuned start (variables = 0),
-    which is in best focus.
+    """What a lens is designed for, and from where: the design variables around the detuned start
+    (variables = 0), which is in best focus.
 
-    nominal: the published lens scaled to the sensor and focused on the wall. defocused: the detuned lens with the
-      focus error that its curvature errors make.
+    nominal: the published lens scaled to the sensor and focused on the wall. defocused: the detuned
+      lens with the focus error that its curvature errors make.
     """
 
     nominal: lens.GeoLens
@@ -81,7 +81,9 @@ class LensTask:
         return make_design(optics, self.fields_rad, PITCH_MM, self.design)
 
     def camera(self, optics, samples: int, seed: int = 0) -> render.Camera:
-        return render.Camera(optics, WINDOW_PX, WINDOW_PX, PITCH_MM, samples, seed, film(), spectrum=LIGHT)
+        return render.Camera(
+            optics, WINDOW_PX, WINDOW_PX, PITCH_MM, samples, seed, film(), spectrum=LIGHT
+        )
 
     def rms_spot_um(self, optics) -> torch.Tensor:
         """RMS spot of points of the wall at the three fields, all wavelengths together, [3] um."""
@@ -90,31 +92,41 @@ class LensTask:
     def system(self, camera, layer, flow, objective: str = "flow", every_px: int = 8) -> System:
         """System of a camera (or what makes one), an event stage and a flow stage.
 
-        objective: "flow" (mean log angular error over the windows) or "edge" (the seed project's). every_px:
-          spacing of the pixels whose flow counts.
+        objective: "flow" (mean log angular error over the windows) or "edge" (the seed project's).
+          every_px: spacing of the pixels whose flow counts.
         """
-        found = {"flow": log_error(every_px), "edge": lambda volume: edge_objective(volume)}[objective]
+        found = {"flow": log_error(every_px), "edge": lambda volume: edge_objective(volume)}[
+            objective
+        ]
         return System(
-            camera=camera, events=layer, flow=flow, objectives={objective: found}, bins=bins_of(flow)
+            camera=camera,
+            events=layer,
+            flow=flow,
+            objectives={objective: found},
+            bins=bins_of(flow),
         )
 
     def judge(self, optics, case: Batch, flow, samples: int = 32) -> dict[str, float]:
-        """Errors of a lens on one case with hard events: the physical sensor with true timestamps, no
-        surrogate anywhere.
+        """Errors of a lens on one case with hard events: the physical sensor with true timestamps,
+        no surrogate anywhere.
 
-        Returns: dict of flow_error_mrad, edge_energy, events_per_pixel, and the flow error of each window,
-          flow_error_mrad_field_0 and so on.
+        Returns: dict of flow_error_mrad, edge_energy, events_per_pixel, and the flow error of each
+          window, flow_error_mrad_field_0 and so on.
         """
         hard = HardSensor(SENSOR, bins_of(flow))
         with torch.no_grad():
             seen = self.system(self.camera(optics, samples), hard, flow).begin(case)
-            error = angular_error_mrad(seen["field"], seen["camera"], seen["scene"], seen["T_world_cam"])
+            error = angular_error_mrad(
+                seen["field"], seen["camera"], seen["scene"], seen["T_world_cam"]
+            )
             counts = seen["volume"].counts
         return {
             "flow_error_mrad": float(error.mean()),
             "edge_energy": float(edge_energy(seen["volume"])),
             "events_per_pixel": float(counts.sum()) / counts[:, 0, 0].numel(),
-            **{f"flow_error_mrad_field_{h:g}": float(e) for h, e in zip(FIELDS, error, strict=True)},
+            **{
+                f"flow_error_mrad_field_{h:g}": float(e) for h, e in zip(FIELDS, error, strict=True)
+            },
         }
 
 
@@ -140,20 +152,22 @@ def bins_of(flow) -> int:
 
 
 def make_task(source, seed, detuned_px=1.5):
-    """Load a lens, scale it so that its published field fills the sensor's diagonal, focus it on the wall, and
-    detune its curvatures by ``seed``.
+    """Load a lens, scale it so that its published field fills the sensor's diagonal, focus it on
+    the wall, and detune its curvatures by ``seed``.
 
     Args:
       source: catalogue name or file.
-      detuned_px: mean RMS spot of the detuned lens in pixels, at its best focus (above one, so that the flow
-        suffers).
+      detuned_px: mean RMS spot of the detuned lens in pixels, at its best focus (above one, so that
+        the flow suffers).
     """
     published = lens.load(source)
     half_field = math.radians(published.half_field_deg or NO_FIELD_DEG)
     nominal = published.scaled(
         HALF_DIAGONAL_MM / (float(published.first_order().efl_mm.detach()) * math.tan(half_field))
     ).freeze()
-    fields = tuple(math.atan(h * HALF_DIAGONAL_MM / float(nominal.first_order().efl_mm)) for h in FIELDS)
+    fields = tuple(
+        math.atan(h * HALF_DIAGONAL_MM / float(nominal.first_order().efl_mm)) for h in FIELDS
+    )
     nominal = in_focus(nominal, fields).freeze()
     published_px = float(mean_spot_mm(nominal, fields)) / PITCH_MM
     if published_px > 0.5 * detuned_px:
@@ -164,7 +178,8 @@ def make_task(source, seed, detuned_px=1.5):
     around = make_design(nominal, fields, PITCH_MM, floor_share=FLOOR_SHARE)
     defocused = _detuned(around, fields, detuned_px * PITCH_MM, torch.Generator().manual_seed(seed))
     start = in_focus(defocused, fields)
-    # the start is within its limits: where it is thinner than the published lens allows, they give way to it
+    # the start is within its limits: where it is thinner than the published lens allows, they give
+    # way to it
     floors = replace(
         around,
         floor_mm=torch.minimum(around.floor_mm, FLOOR_SHARE * start.thickness_mm),
@@ -174,8 +189,8 @@ def make_task(source, seed, detuned_px=1.5):
 
 
 def _detuned(around, fields, target_mm, generator):
-    """Detuned so that the spot at best focus has the target; where a direction changes little but the focus, or makes
-    a lens without edges, another is drawn."""
+    """Detuned so that the spot at best focus has the target; where a direction changes little but
+    the focus, or makes a lens without edges, another is drawn."""
 
     def spot_in_focus(made):
         rays = spot_rays(made, fields, DISTANCE_M, LIGHT, grid=8)
@@ -206,17 +221,19 @@ def in_focus(optics, fields_rad):
 
 
 def make_worlds(names):
-    """A wall per texture name: photographs at 3 mm a texel (about a pixel) or, as "name:2", twice as coarse;
-    band-limited "speckle-SEED".
+    """A wall per texture name: photographs at 3 mm a texel (about a pixel) or, as "name:2", twice
+    as coarse; band-limited "speckle-SEED".
 
-    Coarse detail survives strong blur and fine detail judges weak blur: with both, the error falls all the
-    way to focus.
+    Coarse detail survives strong blur and fine detail judges weak blur: with both, the error falls
+    all the way to focus.
     """
     found = []
     for entry in names:
         name, _, zoom = entry.partition(":")
         pattern = (
-            textures.speckle(int(name.split("-")[1])) if name.startswith("speckle-") else textures.photo(name)
+            textures.speckle(int(name.split("-")[1]))
+            if name.startswith("speckle-")
+            else textures.photo(name)
         )
         found.append(worlds.wall(textures.shrunk(pattern, 2), texel_m=0.003 * float(zoom or 1)))
     return found
@@ -232,4 +249,6 @@ def draw_case(pool, seed, frames=9):
         (float(place[0]), -DISTANCE_M, float(place[1])), (float(place[0]), 0.0, float(place[1]))
     )
     t_s = torch.linspace(0, DURATION_S, frames, dtype=torch.float64)
-    return Batch(trajectories.body_twist(start, MOTION * motion / DURATION_S, t_s), t_s, world, seed)
+    return Batch(
+        trajectories.body_twist(start, MOTION * motion / DURATION_S, t_s), t_s, world, seed
+    )

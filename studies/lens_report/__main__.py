@@ -1,9 +1,9 @@
-"""What a lens can do: first-order figures, Seidel sums, layout, spots, fans, wavefront, point spread, MTF,
-distortion and field curvature on one page.
+"""What a lens can do: first-order figures, Seidel sums, layout, spots, fans, wavefront, point
+spread, MTF, distortion and field curvature on one page.
 
-Any lens that `codesign.lens.load` reads. The object is at infinity, or at the distances of --at-m; apertures
-clip. Where a lens names no half field, the largest field up to 10 degrees whose chief ray and at least half of whose rays arrive is
-taken, and the page says so.
+Any lens that `codesign.lens.load` reads. The object is at infinity, or at the distances of --at-m;
+apertures clip. Where a lens names no half field, the largest field up to 10 degrees whose chief ray
+and at least half of whose rays arrive is taken, and the page says so.
 """
 
 import math
@@ -40,9 +40,11 @@ class Config(StudyConfig):
     wavelengths_um: tuple[float, ...] = lens_figures.VISIBLE_UM
     """Wavelengths of equal weight; the first is the reference."""
     at_m: tuple[float, ...] = ()
-    """Distances of the object, metres from the entrance pupil; pictures are those of the first. Left out: parallel light."""
+    """Distances of the object, metres from the entrance pupil; pictures are those of the first.
+    Left out: parallel light."""
     focus_m: float | None = None
-    """Distance of the axial point whose RMS spot is least on the film; the first of --at-m, or as in the lens file where that is left out too."""
+    """Distance of the axial point whose RMS spot is least on the film; the first of --at-m, or as
+    in the lens file where that is left out too."""
     blur_um: float = 20.0
     """Diameter of the blur that the depth of field allows, micrometres."""
 
@@ -50,7 +52,9 @@ class Config(StudyConfig):
 def study(run: Run[Config]) -> None:
     start = time.perf_counter()
     if not run.config.blur_um > 0:
-        raise DomainError(f"a blur of {run.config.blur_um:g} um cannot be; give a positive diameter.")
+        raise DomainError(
+            f"a blur of {run.config.blur_um:g} um cannot be; give a positive diameter."
+        )
     geo = lens.load(run.config.lens).requires_grad_(False)
     light = run.config.wavelengths_um
     quick = run.config.quick
@@ -84,7 +88,9 @@ def half_field(geo, wanted_deg, wavelength_um, at_m=math.inf):
     """Half field in degrees, and a sentence that says where it comes from."""
     if wanted_deg is not None:
         if not 0 < wanted_deg < 90:
-            raise DomainError(f"a half field of {wanted_deg} degrees cannot be; give one between 0 and 90.")
+            raise DomainError(
+                f"a half field of {wanted_deg} degrees cannot be; give one between 0 and 90."
+            )
         return wanted_deg, f"Half field {wanted_deg:g}°, as asked."
     if geo.half_field_deg is not None:
         return geo.half_field_deg, f"Half field {geo.half_field_deg:.4g}°, that of the lens."
@@ -126,7 +132,11 @@ def first_order(run, geo, light, half_deg, at_m):
     """Focal length, pupils and cardinal points."""
     f = geo.first_order(light[0])
     points = cardinal_points(geo, light[0])
-    run.card("Focal length", f"{float(f.efl_mm):.4g} mm", f"f/{float(f.fno):.3g} at {light[0] * 1e3:.0f} nm")
+    run.card(
+        "Focal length",
+        f"{float(f.efl_mm):.4g} mm",
+        f"f/{float(f.fno):.3g} at {light[0] * 1e3:.0f} nm",
+    )
     run.record(efl_mm=f.efl_mm, bfl_mm=f.bfl_mm, fno=f.fno)
     run.section("First order")
     scale = image_scale_mm(geo, vergence_per_mm(geo, at_m), light[0])
@@ -154,7 +164,10 @@ def first_order(run, geo, light, half_deg, at_m):
     )
     if len(light) > 1:
         colour = 1e3 * analysis.chromatic_focus_shift_mm(geo, light, light[0], at_m)
-        rows = [(f"{w * 1e3:.1f}", f"{float(shift):.4g}") for w, shift in zip(light, colour, strict=True)]
+        rows = [
+            (f"{w * 1e3:.1f}", f"{float(shift):.4g}")
+            for w, shift in zip(light, colour, strict=True)
+        ]
         run.table("Paraxial focus by wavelength", ("nm", "shift (µm)"), rows)
 
 
@@ -180,7 +193,9 @@ def seidel(run, geo, half_rad, wavelength_um, at_m):
             for label, row in zip(labels, [*columns, total], strict=True)
         ],
     )
-    run.record(**{f"seidel_{name}_waves": value for name, value in zip(NAMES, total[:5], strict=True)})
+    run.record(
+        **{f"seidel_{name}_waves": value for name, value in zip(NAMES, total[:5], strict=True)}
+    )
 
 
 def pictures(run, geo, fields, light, quick, at_m):
@@ -219,9 +234,13 @@ def pictures(run, geo, fields, light, quick, at_m):
         positions, weight = analysis.polychromatic_spot(geo, field, light, 32, True, at_m=at_m)
         shift = analysis.focus_shift_mm(geo, [field], light[0], at_m=at_m)[0]
         radius = 1e3 * float(analysis.spot_radius_mm(positions, weight))
-        distortion = float(analysis.distortion_percent(geo, [field], wavelength_um=light[0], at_m=at_m)[0])
+        distortion = float(
+            analysis.distortion_percent(geo, [field], wavelength_um=light[0], at_m=at_m)[0]
+        )
         passed = arrival(geo, field, light[0], at_m)
-        record_at(run, field, rms_spot_um=radius, distortion_percent=distortion, passed_share=passed)
+        record_at(
+            run, field, rms_spot_um=radius, distortion_percent=distortion, passed_share=passed
+        )
         foci = (f"{float(s):.4f}" for s in shift)
         rows.append((degrees(field), f"{radius:.2f}", f"{distortion:.3f}", *foci, f"{passed:.3f}"))
     run.table(
@@ -241,7 +260,8 @@ def record_at(run, field, **figures):
 def sharpness(run, geo, fields, light, quick, at_m):
     """Wavefront, point spread, MTF."""
     run.section(
-        "Wavefront", f"At {light[0] * 1e3:.0f} nm, against the sphere about the chief ray's image point."
+        "Wavefront",
+        f"At {light[0] * 1e3:.0f} nm, against the sphere about the chief ray's image point.",
     )
     run.figure(
         lens_figures.opd_maps(geo, fields, light[0], 48 if quick else 96, True, at_m),
@@ -268,7 +288,11 @@ def sharpness(run, geo, fields, light, quick, at_m):
     fno = float(geo.first_order(light[0]).fno.abs())
     airy = light[0] * 1e-3 * fno
     widest = max(
-        float(analysis.encircled_radius_mm(geo, field, 0.99, light, 48, True, about_chief=True, at_m=at_m))
+        float(
+            analysis.encircled_radius_mm(
+                geo, field, 0.99, light, 48, True, about_chief=True, at_m=at_m
+            )
+        )
         for field in fields
     )
     pixels = 64 if quick else 96
@@ -284,10 +308,14 @@ def sharpness(run, geo, fields, light, quick, at_m):
             psf = analysis.geometric_psf(geo, field, pixel, pixels, light, 256, True, at_m=at_m)
             psfs[f"{degrees(field)}, rays"] = psf
         else:
-            psf = analysis.psf_on_pixels(geo, field, pixel, pixels, light, MOST_CELLS, True, at_m=at_m)
+            psf = analysis.psf_on_pixels(
+                geo, field, pixel, pixels, light, MOST_CELLS, True, at_m=at_m
+            )
             psfs[f"{degrees(field)}, diffraction"] = psf
         if steep:
-            curve = ideal * analysis.geometric_mtf(geo, field, frequency, light, 96, True, at_m=at_m)
+            curve = ideal * analysis.geometric_mtf(
+                geo, field, frequency, light, 96, True, at_m=at_m
+            )
         else:
             cells = 256 if quick else MOST_CELLS
             curve = analysis.diffraction_mtf(geo, field, frequency, light, cells, True, at_m=at_m)

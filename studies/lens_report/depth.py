@@ -1,4 +1,5 @@
-"""The part of the lens report about the distance of the object: depth of field, hyperfocal distance, spots."""
+"""The part of the lens report about the distance of the object: depth of field, hyperfocal
+distance, spots."""
 
 import math
 
@@ -9,7 +10,8 @@ from codesign.report import lens_curves
 
 
 def depth(run, geo, fields, wavelength_um, distances):
-    """Depth of field of the film as it stands, hyperfocal distance, and spots at the distances asked for."""
+    """Depth of field of the film as it stands, hyperfocal distance, and spots at the distances
+    asked for."""
     blur_mm = run.config.blur_um * 1e-3
     run.section(
         "Over the distance",
@@ -44,7 +46,9 @@ def depth(run, geo, fields, wavelength_um, distances):
     except DomainError as error:
         refused.append(str(error))
     if limits:
-        run.table("Depth of field on the axis", ("rays", "near (m)", "far (m)", "sharpest (m)"), limits)
+        run.table(
+            "Depth of field on the axis", ("rays", "near (m)", "far (m)", "sharpest (m)"), limits
+        )
     run.text(" ".join(refused))
     sizes = (analysis.rms_spot_mm(geo, fields, wavelength_um, at_m=distances) * 1e3).tolist()
     run.table(

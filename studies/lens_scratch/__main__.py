@@ -1,11 +1,11 @@
-"""Design a triplet from plane plates: does it reach a published lens, from how many starts, and what does
-each method take?
+"""Design a triplet from plane plates: does it reach a published lens, from how many starts, and
+what does each method take?
 
-Three plates of N-SK16, F2 and N-SK16, plane but for radii of some two metres drawn from the seed, become a 50
-mm f/5 triplet of 40 degrees by real rays alone: ray errors in F, d and C and hinges on centres, edges, gaps,
-length and back focus, in one damped least-squares problem of 11 variables. The yardstick is the published
-Cooke triplet: success is a mean RMS spot within twice its own, over fields 0, 0.7 and 1 with the whole
-unvignetted pupil, every ray passing and every limit held.
+Three plates of N-SK16, F2 and N-SK16, plane but for radii of some two metres drawn from the seed,
+become a 50 mm f/5 triplet of 40 degrees by real rays alone: ray errors in F, d and C and hinges on
+centres, edges, gaps, length and back focus, in one damped least-squares problem of 11 variables.
+The yardstick is the published Cooke triplet: success is a mean RMS spot within twice its own, over
+fields 0, 0.7 and 1 with the whole unvignetted pupil, every ray passing and every limit held.
 """
 
 import math
@@ -112,7 +112,10 @@ def show(run, published, found):
         shown = {name: value for name, value in row.items() if name != "variables"}
         if v is not None:
             tight = [f"{c.name} ({c.state(TIGHT)})" for c in active(v.limits, TIGHT)]
-            shown |= {"mean spot (µm)": v.mean_um, "limits that bind or fail": "; ".join(tight) or "none"}
+            shown |= {
+                "mean spot (µm)": v.mean_um,
+                "limits that bind or fail": "; ".join(tight) or "none",
+            }
         rows.append(shown)
     run.table("Seeds", *table(rows))
     run.finish(
@@ -125,9 +128,13 @@ def show(run, published, found):
 def layouts(published, found):
     """Small layouts, the published lens first."""
     shown = [("published", published)]
-    shown += [(f"seed {row['seed']}: {v.mean_um:.1f} µm", v.geo) for row, v in found if v and v.rays_pass]
+    shown += [
+        (f"seed {row['seed']}: {v.mean_um:.1f} µm", v.geo) for row, v in found if v and v.rays_pass
+    ]
     count = math.ceil(len(shown) / 3)
-    figure, axes = plt.subplots(count, 3, figsize=(13, 2.6 * count), squeeze=False, layout="constrained")
+    figure, axes = plt.subplots(
+        count, 3, figsize=(13, 2.6 * count), squeeze=False, layout="constrained"
+    )
     for axis in axes.flat:
         axis.set_axis_off()
     for axis, (title, geo) in zip(axes.flat, shown, strict=False):

@@ -1,4 +1,5 @@
-"""A 50 mm f/5 triplet of 40 degrees from plane plates: variables, residuals, limits, and the judge."""
+"""A 50 mm f/5 triplet of 40 degrees from plane plates: variables, residuals, limits, and the
+judge."""
 
 import dataclasses
 import math
@@ -21,8 +22,8 @@ STOP = 3  # the rear of the middle element, as in the published lens
 LINES = ("F", "d", "C")
 JUDGED_FIELDS = (0.0, 0.7 * HALF_FIELD, HALF_FIELD)
 SPOT_UNIT_MM = 0.01  # an RMS spot of this size makes a residual of 1
-# of differences, 12 evaluations (the reverse mode needs a pass per ray): rays move by some 1e-5 mm, with
-# 1e-15 mm rounding
+# of differences, 12 evaluations (the reverse mode needs a pass per ray): rays move by some 1e-5 mm,
+# with 1e-15 mm rounding
 STEPS = torch.tensor([1e-7] * 5 + [1e-5] * 6, dtype=torch.float64)
 LIMITS = Limits(
     glass_centre_mm=1.0,
@@ -44,7 +45,8 @@ HALF_PUPIL = pupil_grid(8)[pupil_grid(8)[:, 0] > 0]  # the other half is its mir
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """A part of the way: shares of the aperture and of the field, the spectral lines, and the most steps."""
+    """A part of the way: shares of the aperture and of the field, the spectral lines, and the most
+    steps."""
 
     aperture: float
     field: float
@@ -54,8 +56,8 @@ class Stage:
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """What a design is worth: RMS spots in um at JUDGED_FIELDS, in F, d, C together; its limits; whether every
-    ray passes."""
+    """What a design is worth: RMS spots in um at JUDGED_FIELDS, in F, d, C together; its limits;
+    whether every ray passes."""
 
     geo: GeoLens
     spots_um: tuple[float, ...]
@@ -75,16 +77,20 @@ class Verdict:
 def _plates():
     """Three plane plates; thicknesses are put in later."""
     media = [Glass.named(GLASSES[i // 2]) if i % 2 == 0 else None for i in range(6)]
-    surfaces = [Surface(math.inf, 1.0, medium, 10.0, is_stop=i == STOP) for i, medium in enumerate(media)]
-    return GeoLens(surfaces, PUPIL_MM, name="from-scratch", half_field_deg=math.degrees(HALF_FIELD)).freeze()
+    surfaces = [
+        Surface(math.inf, 1.0, medium, 10.0, is_stop=i == STOP) for i, medium in enumerate(media)
+    ]
+    return GeoLens(
+        surfaces, PUPIL_MM, name="from-scratch", half_field_deg=math.degrees(HALF_FIELD)
+    ).freeze()
 
 
 PLATES = _plates()
 
 
 def draw_start(generator):
-    """Variables of plates that are plane but for radii of some two metres: glass 1.5 to 6 mm, air 1 to 12 mm,
-    in focus."""
+    """Variables of plates that are plane but for radii of some two metres: glass 1.5 to 6 mm, air 1
+    to 12 mm, in focus."""
     curvature = 5e-4 * torch.randn(5, generator=generator, dtype=torch.float64)
     low = torch.tensor([1.5, 1.0, 1.5, 1.0, 1.5], dtype=torch.float64)
     wide = torch.tensor([4.5, 11.0, 4.5, 11.0, 4.5], dtype=torch.float64)
@@ -93,19 +99,23 @@ def draw_start(generator):
 
 
 def build(variables):
-    """The lens at variables [11]: curvatures 1..5 (per mm), thicknesses 1..5 (mm), defocus (mm). Raises:
+    """The lens at variables [11]: curvatures 1..5 (per mm), thicknesses 1..5 (mm), defocus (mm).
+    Raises:
     DomainError when it has no focal length."""
     curvature = torch.cat([variables[:5], torch.zeros_like(variables[:1])])
     thickness = torch.cat([variables[5:10], torch.ones_like(variables[:1])])
-    held = hold_efl(PLATES.replace(curvature_per_mm=curvature, thickness_mm=thickness), EFL_MM, surface=5)
+    held = hold_efl(
+        PLATES.replace(curvature_per_mm=curvature, thickness_mm=thickness), EFL_MM, surface=5
+    )
     return focus_paraxial(held, defocus_mm=variables[10])
 
 
 def residuals_of(stage, fields=4):
-    """The function of variables to residuals of a stage: ray errors in F, d, C about each field's mean point,
-    failed rays, limits.
+    """The function of variables to residuals of a stage: ray errors in F, d, C about each field's
+    mean point, failed rays, limits.
 
-    The squares of the ray errors sum to the mean square spot over fields and lines, in units of SPOT_UNIT_MM.
+    The squares of the ray errors sum to the mean square spot over fields and lines, in units of
+    SPOT_UNIT_MM.
     """
     angles = [stage.field * HALF_FIELD * k / (fields - 1) for k in range(fields)]
     pupil = HALF_PUPIL * stage.aperture
@@ -141,8 +151,8 @@ def residuals_of(stage, fields=4):
 
 
 def polychromatic_spots_um(geo, lines=LINES, grid=32):
-    """RMS distance from the mean point of all rays of all lines, um, per judged field. Infinite where a ray
-    of the full pupil fails."""
+    """RMS distance from the mean point of all rays of all lines, um, per judged field. Infinite
+    where a ray of the full pupil fails."""
     with torch.no_grad():
         found = [lens.spots(geo, JUDGED_FIELDS, WAVELENGTH_UM[line], grid) for line in lines]
     position = torch.cat([p for p, _ in found], 1)
@@ -152,8 +162,8 @@ def polychromatic_spots_um(geo, lines=LINES, grid=32):
 
 
 def judge(variables):
-    """Verdict on variables, with semi-apertures sized by traced rays of the full field and pupil plus 5 %;
-    None when it is no lens at all."""
+    """Verdict on variables, with semi-apertures sized by traced rays of the full field and pupil
+    plus 5 %; None when it is no lens at all."""
     try:
         geo = build(variables)
         made = geo.replace(
@@ -163,4 +173,6 @@ def judge(variables):
         return None
     made.freeze()
     spots = polychromatic_spots_um(made)
-    return Verdict(made, spots, tuple(evaluate(made, JUDGED_LIMITS)), all(map(math.isfinite, spots)))
+    return Verdict(
+        made, spots, tuple(evaluate(made, JUDGED_LIMITS)), all(map(math.isfinite, spots))
+    )

@@ -1,9 +1,9 @@
-"""Data sets of a moving event camera: frames, events, optical flow, depth, poses and calibration along five
-families of trajectories.
+"""Data sets of a moving event camera: frames, events, optical flow, depth, poses and calibration
+along five families of trajectories.
 
-Every sequence is a folder with events and frames in HDF5 (laid out as in DSEC), flow as 16-bit PNG, poses as
-text, and the camera's calibration. A run that was stopped or killed goes on with --resume, and ends with the
-same bytes. The layout is described in docs/datasets.md.
+Every sequence is a folder with events and frames in HDF5 (laid out as in DSEC), flow as 16-bit PNG,
+poses as text, and the camera's calibration. A run that was stopped or killed goes on with --resume,
+and ends with the same bytes. The layout is described in docs/datasets.md.
 """
 
 import io
@@ -75,8 +75,8 @@ class Config(StudyConfig):
     shot_rate_hz: float = 0.1
     """Noise events per pixel and second."""
     chunk: int = 25
-    """Frames that are rendered, simulated and written together; what is lost at most when the run is
-    killed."""
+    """Frames that are rendered, simulated and written together; what is lost at most when the run
+    is killed."""
     flo: bool = False
     """Also write every flow as a Middlebury .flo file, exact to float32."""
 
@@ -103,10 +103,13 @@ def study(run: Run[Config]) -> None:
     config = checked(run.config)
     maker = Maker(config)
     names = [
-        f"sequence_{index:03d}_{FAMILIES[index % len(FAMILIES)]}" for index in range(config.trajectories)
+        f"sequence_{index:03d}_{FAMILIES[index % len(FAMILIES)]}"
+        for index in range(config.trajectories)
     ]
     folders = [run.folder / name for name in names]
-    ready = [maker.chunks if store.is_done(folder) else store.parts_done(folder) for folder in folders]
+    ready = [
+        maker.chunks if store.is_done(folder) else store.parts_done(folder) for folder in folders
+    ]
     resident_mb = []
     with run.progress(maker.chunks * len(names), "chunks", sum(ready)) as progress:
         for index, folder in enumerate(folders):
@@ -121,8 +124,12 @@ def study(run: Run[Config]) -> None:
     wall_s = time.perf_counter() - start
     write_atomic(run.folder / "manifest.json", store.manifest(run.folder, names).encode())
     if resident_mb:
-        run.record(session_resident_mb_first=resident_mb[0], session_resident_mb_last=resident_mb[-1])
-    fresh = min((maker.chunks * len(names) - sum(ready)) * maker.chunk_frames, config.frames * len(names))
+        run.record(
+            session_resident_mb_first=resident_mb[0], session_resident_mb_last=resident_mb[-1]
+        )
+    fresh = min(
+        (maker.chunks * len(names) - sum(ready)) * maker.chunk_frames, config.frames * len(names)
+    )
     pages.show(run, names, maker.clock.spent, wall_s, fresh)
 
 
@@ -137,20 +144,24 @@ def checked(config):
         ("seed", 0, 2**31),
     ):
         if not least <= getattr(config, name) <= most:
-            raise DomainError(f"--{name} is {getattr(config, name)}; {least} to {most} are possible.")
+            raise DomainError(
+                f"--{name} is {getattr(config, name)}; {least} to {most} are possible."
+            )
     if not (0 < config.rate_hz <= 1e5 and config.frames / config.rate_hz <= LONGEST_S):
         raise DomainError(
             f"--rate-hz is {config.rate_hz:g}: above 0, at most 100000, and such that {config.frames} "
             f"frames last at most {LONGEST_S:g} s."
         )
     if not 0.1 <= config.focal_length_mm <= 1000:
-        raise DomainError(f"--focal-length-mm is {config.focal_length_mm:g}; 0.1 to 1000 are possible.")
+        raise DomainError(
+            f"--focal-length-mm is {config.focal_length_mm:g}; 0.1 to 1000 are possible."
+        )
     return config
 
 
 def make_camera(config):
-    """The camera of a configuration: the lens scaled to its focal length, the film to FIELD_SHARE of its
-    field."""
+    """The camera of a configuration: the lens scaled to its focal length, the film to FIELD_SHARE
+    of its field."""
     geo = lens.load(config.lens)
     half_deg = geo.half_field_deg or (
         lens.half_field_deg(config.lens) if config.lens in catalogue.LENSES else None
@@ -168,7 +179,9 @@ def make_camera(config):
         "thin": geo.thin,
         "pinhole": lambda: lens.Pinhole(config.focal_length_mm),
     }
-    return Camera(levels[config.level](), config.size, config.size, pitch_mm, config.samples, config.seed)
+    return Camera(
+        levels[config.level](), config.size, config.size, pitch_mm, config.samples, config.seed
+    )
 
 
 class Maker:
@@ -197,7 +210,8 @@ class Maker:
         return images.reshape(-1, *self.camera.film.shape)
 
     def truth(self, poses, first, last):
-        """Depth, objects, segments and flow of frames first to last, by the names of store.FRAME_TYPES."""
+        """Depth, objects, segments and flow of frames first to last, by the names of
+        store.FRAME_TYPES."""
         step = max(1, PIXELS_PER_TRUTH // self.config.size**2)
         found = []
         for start in range(first, last, step):
@@ -206,7 +220,9 @@ class Maker:
             scene = at_frames(self.scene, some)
             truth = truth_of_frames(self.table, scene, poses[some], count, self.chief)
             now = at_frames(scene, slice(count))
-            segments = self.segments.at(self.chief, now, poses[start : start + count], truth.object_id)
+            segments = self.segments.at(
+                self.chief, now, poses[start : start + count], truth.object_id
+            )
             found.append(
                 {
                     "depth": truth.depth_m,
@@ -220,10 +236,12 @@ class Maker:
         return {name: torch.cat([part[name] for part in found]) for name in found[0]}
 
     def calibration(self, folder):
-        """camera.h5: the chief ray of every pixel, camera axes, and the matrix of the pinhole that it is near
-        the axis; lens.json for a traced lens."""
+        """camera.h5: the chief ray of every pixel, camera axes, and the matrix of the pinhole that
+        it is near the axis; lens.json for a traced lens."""
         film = self.camera.film
-        aside = torch.tensor([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]], dtype=torch.float64)
+        aside = torch.tensor(
+            [[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]], dtype=torch.float64
+        )
         beside = self.camera.chief_rays(film.middle_px + aside).direction.double()
         x = beside[:, 0] / beside[:, 2]
         y = beside[:, 1] / beside[:, 2]
@@ -287,14 +305,17 @@ class Sequence:
         with clock.on("flow files"):
             for k, (flow, valid) in enumerate(zip(truth["flow"], truth["valid"], strict=True)):
                 for kind in ("png", "flo") if maker.config.flo else ("png",):
-                    write_flow(self.folder / "flow" / "forward" / f"{first + k:06d}.{kind}", flow, valid)
+                    write_flow(
+                        self.folder / "flow" / "forward" / f"{first + k:06d}.{kind}", flow, valid
+                    )
         with clock.on("writing"):
             part = store.part_path(self.folder, chunk)
             store.write_part(part, {"frames": frames, **truth}, events, self.state)
         return len(events)
 
     def finish(self):
-        """Join the parts and write what describes the sequence; last of all the file that says so."""
+        """Join the parts and write what describes the sequence; last of all the file that says
+        so."""
         maker = self.maker
         with maker.clock.on("writing"):
             velocity = self.path.velocity(LEAD_S + self.t_s).detach()
@@ -307,8 +328,14 @@ class Sequence:
                 "# from_timestamp_us, to_timestamp_us",
                 *(f"{a}, {b}" for a, b in itertools.pairwise(us)),
             ]
-            write_atomic(self.folder / "flow" / "forward_timestamps.txt", ("\n".join(lines) + "\n").encode())
-            facts = {"family": self.family, **pages.statistics(self.folder), "segments": maker.segments.names}
+            write_atomic(
+                self.folder / "flow" / "forward_timestamps.txt", ("\n".join(lines) + "\n").encode()
+            )
+            facts = {
+                "family": self.family,
+                **pages.statistics(self.folder),
+                "segments": maker.segments.names,
+            }
             store.finish(self.folder, facts)
 
 

@@ -1,5 +1,5 @@
-"""What a data set looks like: statistics of its sequences, read back from their files, and a contact
-sheet."""
+"""What a data set looks like: statistics of its sequences, read back from their files, and a
+contact sheet."""
 
 import json
 
@@ -71,7 +71,9 @@ def statistics(folder):
 def _lengths(flow, valid):
     length = np.hypot(*flow)[valid]
     return (
-        (float(length.mean()), float(length.max()), float(valid.mean())) if length.size else (0.0, 0.0, 0.0)
+        (float(length.mean()), float(length.max()), float(valid.mean()))
+        if length.size
+        else (0.0, 0.0, 0.0)
     )
 
 
@@ -85,10 +87,18 @@ def show(run, names, spent, wall_s, frames_made):
     files = [path for folder in folders.values() for path in folder.rglob("*") if path.is_file()]
     disk_mb = sum(path.stat().st_size for path in files) / 1e6
     events, frames = (sum(row[name] for row in rows) for name in ("events", "frames"))
-    run.record(frames=frames, events=events, disk_mb=disk_mb, sequences=len(names), session_wall_s=wall_s)
-    run.record(**{f"session_{part.replace(' ', '_')}_s": seconds for part, seconds in spent.items()})
+    run.record(
+        frames=frames, events=events, disk_mb=disk_mb, sequences=len(names), session_wall_s=wall_s
+    )
+    run.record(
+        **{f"session_{part.replace(' ', '_')}_s": seconds for part, seconds in spent.items()}
+    )
     run.card("Frames", f"{frames}", f"in {len(names)} sequences")
-    run.card("Events", f"{events / 1e6:.2f} million", f"{events / max(frames - len(names), 1):.0f} per frame")
+    run.card(
+        "Events",
+        f"{events / 1e6:.2f} million",
+        f"{events / max(frames - len(names), 1):.0f} per frame",
+    )
     # else the figures of the session that made the last ones stay
     if frames_made:
         run.record(session_frames_per_s=frames_made / wall_s)
@@ -108,20 +118,26 @@ def show(run, names, spent, wall_s, frames_made):
     caption = "Of this session. Writing includes joining the parts and the statistics."
     run.table("Time", *table(times), caption)
     run.text("`manifest.json` holds the SHA-256 of every file; `docs/datasets.md` the layout.")
-    run.finish("Data set", f"{len(names)} sequences, {frames} frames and {events} events, {disk_mb:.0f} MB.")
+    run.finish(
+        "Data set",
+        f"{len(names)} sequences, {frames} frames and {events} events, {disk_mb:.0f} MB.",
+    )
 
 
 def _pictures(folder):
     """Images of the middle of a sequence by title."""
     with h5(folder / "frames.h5") as frames, h5(folder / "events.h5") as events:
         middle = (frames["frames"].shape[0] - 1) // 2
-        image, depth, flow, valid = (frames[name][middle] for name in ("frames", "depth", "flow", "valid"))
+        image, depth, flow, valid = (
+            frames[name][middle] for name in ("frames", "depth", "flow", "valid")
+        )
         t_s = frames["t_s"][middle : middle + SHOWN_FRAMES + 1]
         index = events["ms_to_idx"][()]
         first = int(index[int(t_s[0] * 1e3)])
         last = int(index[min(int(t_s[-1] * 1e3) + 1, len(index) - 1)])
         x, y, p, t = (
-            torch.from_numpy(events[f"events/{name}"][first:last].astype(np.int64)) for name in "xypt"
+            torch.from_numpy(events[f"events/{name}"][first:last].astype(np.int64))
+            for name in "xypt"
         )
     counts = to_counts(EventStream(t, x, y, 2 * p - 1, *image.shape), t_s).sum(0)
     return {

@@ -7,8 +7,8 @@ from codesign.render.moving import parts, views_of
 
 
 class Segments:
-    """Which shape of a scene lies under a pixel. names: "part/shape" in order of their numbers; a part that
-    is one surface has one segment."""
+    """Which shape of a scene lies under a pixel. names: "part/shape" in order of their numbers; a
+    part that is one surface has one segment."""
 
     def __init__(self, scene):
         self.names = []
@@ -29,7 +29,9 @@ class Segments:
         owner = object_id.flatten(1)
         found = torch.full(owner.shape, -1)
         cameras = views_of(scene, T_world_cam).cameras[:, :, None]
-        for number, ((part, shapes, first), pose) in enumerate(zip(self._parts, cameras, strict=True)):
+        for number, ((part, shapes, first), pose) in enumerate(
+            zip(self._parts, cameras, strict=True)
+        ):
             met = owner == number
             if not shapes or not bool(met.any()):
                 found = torch.where(met, first, found)
@@ -52,8 +54,13 @@ def _shape_of(part, shapes, origin_m, direction):
     import drjit as dr
 
     mi = part.mi
-    o, d = ([mi.Float(v.float().contiguous()) for v in values.unbind(1)] for values in (origin_m, direction))
-    met = part.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(*o), mi.Vector3f(*d)), coherent=True).shape
+    o, d = (
+        [mi.Float(v.float().contiguous()) for v in values.unbind(1)]
+        for values in (origin_m, direction)
+    )
+    met = part.scene.ray_intersect_preliminary(
+        mi.Ray3f(mi.Point3f(*o), mi.Vector3f(*d)), coherent=True
+    ).shape
     index = mi.Int32(0)
     for number, shape in enumerate(shapes):
         index = dr.select(met == mi.ShapePtr(shape), number, index)

@@ -1,9 +1,9 @@
-"""The files of a sequence: parts that are written one after the other, and what they are joined to at the
-end.
+"""The files of a sequence: parts that are written one after the other, and what they are joined to
+at the end.
 
-A part holds what a chunk of frames gave, and the sensor's state behind it, and appears whole or not at all; a
-run that was killed goes on behind the last one. Joined files depend on the parts alone, so they are the same
-to the last bit however often the run was killed.
+A part holds what a chunk of frames gave, and the sensor's state behind it, and appears whole or not
+at all; a run that was killed goes on behind the last one. Joined files depend on the parts alone,
+so they are the same to the last bit however often the run was killed.
 """
 
 import hashlib
@@ -55,13 +55,19 @@ def write_part(
     events: EventStream,
     state: SensorState,
 ):
-    """Store arrays per frame (named as in FRAME_TYPES), events, and the sensor's state after them."""
+    """Store arrays per frame (named as in FRAME_TYPES), events, and the sensor's state after
+    them."""
     content = io.BytesIO()
     generator = state.generator or torch.Generator()
     with h5(content, "w") as file:
         for name, kind in FRAME_TYPES.items():
             file[name] = arrays[name].cpu().numpy().astype(kind)
-        for name, values in (("x", events.x), ("y", events.y), ("p", events.p > 0), ("t", events.t_us)):
+        for name, values in (
+            ("x", events.x),
+            ("y", events.y),
+            ("p", events.p > 0),
+            ("t", events.t_us),
+        ):
             file[name] = values.cpu().numpy().astype(EVENT_TYPES[name])
         for name, tensor in state.tensors().items():
             file[f"state/{name}"] = tensor.contiguous().numpy()
@@ -71,8 +77,12 @@ def write_part(
 
 
 def read_state(path: Path):
-    """The sensor's state that a part ends with. Raises: FileFormatError when the part is damaged."""
-    with reading(f"'{path}'", "remove it and go on again with --resume"), h5(check_regular(path)) as file:
+    """The sensor's state that a part ends with. Raises: FileFormatError when the part is
+    damaged."""
+    with (
+        reading(f"'{path}'", "remove it and go on again with --resume"),
+        h5(check_regular(path)) as file,
+    ):
         stored = {name: values[()] for name, values in file["state"].items()}
         start_s, time_s = (float(stored.pop(name)) for name in ("start_s", "time_s"))
         generator = torch.Generator()
@@ -128,8 +138,11 @@ def is_done(folder: Path):
 
 
 def manifest(root: Path, sequences):
-    """Text of the manifest: SHA-256 and size of every file of the sequences, in order of their names."""
-    files = sorted(path for name in sequences for path in (root / name).rglob("*") if path.is_file())
+    """Text of the manifest: SHA-256 and size of every file of the sequences, in order of their
+    names."""
+    files = sorted(
+        path for name in sequences for path in (root / name).rglob("*") if path.is_file()
+    )
     entries = {
         path.relative_to(root).as_posix(): {"sha256": _sha256(path), "bytes": path.stat().st_size}
         for path in files
@@ -170,7 +183,9 @@ def _starts(t_us, count):
     found = np.zeros(count, np.uint64)
     edges = np.arange(count) * 1000
     for start in range(0, len(t_us), MOST_EVENTS_AT_ONCE):
-        found += np.searchsorted(t_us[start : start + MOST_EVENTS_AT_ONCE], edges, "left").astype(np.uint64)
+        found += np.searchsorted(t_us[start : start + MOST_EVENTS_AT_ONCE], edges, "left").astype(
+            np.uint64
+        )
     return found
 
 

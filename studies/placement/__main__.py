@@ -1,12 +1,12 @@
-"""Where to mount the camera on a robot: gradient steps in the six numbers of its pose, beside random
-search, CMA-ES and TPE at equal renders; with --look only the robot, what its camera sees, and what it is blind
-to.
+"""Where to mount the camera on a robot: gradient steps in the six numbers of its pose, beside
+random search, CMA-ES and TPE at equal renders; with --look only the robot, what its camera sees,
+and what it is blind to.
 
-A robot drives through its worlds and reads its velocity off event flow (scenes/robots/pair.py, or a robot of
-your own: --robot). The gradient is that of the error to be expected: from the covariance that the flow's
-estimator claims, flow beyond its reach, wrong depths, and what the robot covers of the picture. All searches
-begin at the same mounts, render as many samples, and are judged by single events of the hard sensor in worlds
-and drives that none of them saw.
+A robot drives through its worlds and reads its velocity off event flow (scenes/robots/pair.py, or a
+robot of your own: --robot). The gradient is that of the error to be expected: from the covariance
+that the flow's estimator claims, flow beyond its reach, wrong depths, and what the robot covers of
+the picture. All searches begin at the same mounts, render as many samples, and are judged by single
+events of the hard sensor in worlds and drives that none of them saw.
 """
 
 import sys
@@ -64,7 +64,8 @@ class Config(StudyConfig):
     judged_drives: int = 8
     """Drives in each."""
     look: bool = False
-    """Search nothing: draw the robot with its camera's view, and say what its mount keeps, sees and is blind to."""
+    """Search nothing: draw the robot with its camera's view, and say what its mount keeps, sees and
+    is blind to."""
 
 
 def study(run: Run[Config]) -> None:
@@ -76,7 +77,9 @@ def study(run: Run[Config]) -> None:
     pair = own_pair(size.robot) if size.robot else PAIRS[size.pair]()
     if size.robot:
         run.say(size_in_words(pair))
-    camera = traced_camera(pair, size.lens, size.focal_mm) if size.lens else pair.camera(pair.design)
+    camera = (
+        traced_camera(pair, size.lens, size.focal_mm) if size.lens else pair.camera(pair.design)
+    )
     if size.look:
         look(run, pair, camera)
         return
@@ -102,7 +105,9 @@ def checked(size: Config) -> None:
         )
     for name in ("seeds", "steps", "worlds", "per_world", "judged_worlds", "judged_drives"):
         if getattr(size, name) < 1:
-            raise DomainError(f"--{name.replace('_', '-')} is {getattr(size, name)}; at least 1 is needed.")
+            raise DomainError(
+                f"--{name.replace('_', '-')} is {getattr(size, name)}; at least 1 is needed."
+            )
     for name in ("per_world", "judged_drives"):
         if getattr(size, name) > DRIVES:
             raise DomainError(

@@ -18,8 +18,8 @@ DOWN = 0.5  # cosine with straight down from which on a face is one of the under
 
 @torch.no_grad()
 def controls(problem: Problem, mount: Tensor, samples: Samples) -> dict[str, float]:
-    """Mean bounded errors with single events: of a mount [4, 4] as it is, and with something taken away from
-    it."""
+    """Mean bounded errors with single events: of a mount [4, 4] as it is, and with something taken
+    away from it."""
     batch = problem.batch(samples)
     system = problem.system(mount, "sensor")
     run = system.begin(batch)
@@ -47,15 +47,18 @@ def controls(problem: Problem, mount: Tensor, samples: Samples) -> dict[str, flo
 
 
 def shuffled(volume: EventVolume) -> EventVolume:
-    """Every window's events at other pixels of it: as many, in the same bins, with no picture that moves."""
+    """Every window's events at other pixels of it: as many, in the same bins, with no picture that
+    moves."""
     height, width = volume.counts.shape[-2:]
     order = torch.randperm(height * width, generator=torch.Generator().manual_seed(0))
-    return replace(volume, counts=volume.counts.flatten(-2)[..., order].unflatten(-1, (height, width)))
+    return replace(
+        volume, counts=volume.counts.flatten(-2)[..., order].unflatten(-1, (height, width))
+    )
 
 
 def looking_back(problem: Problem) -> Tensor:
-    """T_body_cam [4, 4] of a camera before the middle of the robot's largest face that is not its underside,
-    so near that it sees nothing else."""
+    """T_body_cam [4, 4] of a camera before the middle of the robot's largest face that is not its
+    underside, so near that it sees nothing else."""
     meshes = problem.pair.bodies.values()
     faces = torch.cat([torch.as_tensor(mesh.vertices_m[mesh.faces]) for mesh in meshes]).double()
     across = torch.linalg.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])

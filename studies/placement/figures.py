@@ -31,8 +31,8 @@ def ways(
     errors: dict[str, Tensor],
     samples: int,
 ) -> Figure:
-    """Errors on unseen samples, and the best that a search saw of its own, over drives rendered; and of all
-    mounts looked at height, pitch and error, below the ways of the descents.
+    """Errors on unseen samples, and the best that a search saw of its own, over drives rendered;
+    and of all mounts looked at height, pitch and error, below the ways of the descents.
 
     errors: of the starts and of each search, [starts]. samples: drives that each rendered.
     """
@@ -46,7 +46,9 @@ def ways(
             best = [torch.cummin(trail.error, 0).values for trail in found]
             shortest = min(map(len, best))  # one that finds little that is allowed looks at less
             least = torch.stack([each[:shortest] for each in best]).quantile(0.5, 0).numpy()
-            left.plot(problem.samples * np.arange(1, shortest + 1), least, "--", color=colour, linewidth=1)
+            left.plot(
+                problem.samples * np.arange(1, shortest + 1), least, "--", color=colour, linewidth=1
+            )
     left.set(xlabel="drives rendered", ylabel="mean bounded error", ylim=(0, None))
     left.legend(fontsize="small")
     looked = [trail for name, found in trails.items() if name != "gradient" for trail in found]
@@ -71,11 +73,17 @@ def _pitch_and_height(problem: Problem, share: Tensor) -> tuple[np.ndarray, np.n
 
 
 def before_and_after(problem: Problem, mount: Tensor) -> Figure:
-    """Robot, frame, events and flow of an unseen drive, for the default mount and for one [4, 4]."""
+    """Robot, frame, events and flow of an unseen drive, for the default mount and for one
+    [4, 4]."""
     figure = plt.figure(figsize=(13, 6.4), layout="constrained")
     drives = problem.batch(fastest(problem))
     for row, pose in enumerate((problem.ranges.pose(problem.start), mount)):
-        draw_pair(figure.add_subplot(2, 4, 4 * row + 1, projection="3d"), problem.pair, problem.camera, pose)
+        draw_pair(
+            figure.add_subplot(2, 4, 4 * row + 1, projection="3d"),
+            problem.pair,
+            problem.camera,
+            pose,
+        )
         axes = [figure.add_subplot(2, 4, 4 * row + column) for column in (2, 3, 4)]
         with torch.no_grad():
             run = problem.system(pose, "sensor").begin(drives)
@@ -136,4 +144,6 @@ def _draw_frame(axis: Any, drives: Drives, camera: Camera, T_body_cam: Tensor) -
     frame = frames(whole, scene, pose)[0, 0].numpy()
     axis.imshow(np.clip(frame / 255, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
     for corner in camera.film.windows_px or ():
-        axis.add_patch(Rectangle(corner, WINDOW_PX, WINDOW_PX, fill=False, color="tab:red", linewidth=0.6))
+        axis.add_patch(
+            Rectangle(corner, WINDOW_PX, WINDOW_PX, fill=False, color="tab:red", linewidth=0.6)
+        )

@@ -1,5 +1,6 @@
-"""A robot with its camera before anything is searched: its size, what its camera sees, how much of that is
-the robot itself, whether the mount keeps what is required, and what motions it is blind to."""
+"""A robot with its camera before anything is searched: its size, what its camera sees, how much of
+that is the robot itself, whether the mount keeps what is required, and what motions it is blind
+to."""
 
 import math
 from typing import Any
@@ -55,7 +56,11 @@ def look(run: Run[Any], pair: RobotPair, camera: render.Camera) -> None:
         table = sight_table(camera, around)
         for attitude in ATTITUDES:
             label = attitude.replace(" ", "_")
-            finite = {name: table[attitude][name] for name in names if math.isfinite(table[attitude][name])}
+            finite = {
+                name: table[attitude][name]
+                for name in names
+                if math.isfinite(table[attitude][name])
+            }
             run.record(**{f"{label}_{name}": value for name, value in finite.items()})
         run.table(
             "Standard deviations from that place, by where the camera looks",
@@ -72,18 +77,23 @@ def look(run: Run[Any], pair: RobotPair, camera: render.Camera) -> None:
             ],
             "Blind to: worse than 0.1 m/s or 0.1 rad/s. Weakest motion: shares of the units in which it is hardest to see.",
         )
-    run.finish("A robot and its camera", f"What the camera of '{pair.name}' sees from its default mount.")
+    run.finish(
+        "A robot and its camera", f"What the camera of '{pair.name}' sees from its default mount."
+    )
 
 
 def size_in_words(pair: RobotPair) -> str:
     """How large a robot is, by which a wrong unit or axis is seen."""
     vertices = np.concatenate([mesh.vertices_m for mesh in pair.bodies.values()])
     length, width, height = vertices.max(0) - vertices.min(0)
-    return f"'{pair.name}' is {length:.2f} m long (x), {width:.2f} wide (y) and {height:.2f} high (z)."
+    return (
+        f"'{pair.name}' is {length:.2f} m long (x), {width:.2f} wide (y) and {height:.2f} high (z)."
+    )
 
 
 def surroundings(pair: RobotPair, pose: Tensor) -> Surroundings:
-    """Flat ground, as far below a mount [4, 4] as it is in the middle of the pair's first drives."""
+    """Flat ground, as far below a mount [4, 4] as it is in the middle of the pair's first
+    drives."""
     T_world_body = torch.eye(4, dtype=torch.float64)
     T_world_body[2, 3] = pair.drive(0, 12)[0][:, robot_pair.FRAMES // 2, 2, 3].mean()
     x, y, z = pose[:3, 3].tolist()
@@ -97,8 +107,8 @@ def what_it_tells(
     pose: Tensor,
     marked: str,
 ) -> bool:
-    """Show what a mount [4, 4] is blind to over flat ground, and all other directions there; False where it
-    is too low."""
+    """Show what a mount [4, 4] is blind to over flat ground, and all other directions there; False
+    where it is too low."""
     around = surroundings(pair, pose)
     height = float(pose[2, 3] + around.T_world_body[2, 3])
     if height <= LEAST_HEIGHT_M:

@@ -1,5 +1,5 @@
-"""What a race for a mount came to on unseen samples: errors, ratios with intervals, metrics and the raw
-table."""
+"""What a race for a mount came to on unseen samples: errors, ratios with intervals, metrics and the
+raw table."""
 
 import csv
 import io
@@ -21,8 +21,8 @@ INTERVAL = 0.9
 
 @dataclass(frozen=True)
 class Paired:
-    """Ratio of errors, ours over theirs, over paired starts: median and interval of resampled starts; how
-    many below 1."""
+    """Ratio of errors, ours over theirs, over paired starts: median and interval of resampled
+    starts; how many below 1."""
 
     median: float
     low: float
@@ -43,16 +43,16 @@ def paired(ours: Tensor, theirs: Tensor) -> Paired:
 
 
 def over_worlds(ours: Tensor, theirs: Tensor, worlds: int) -> tuple[float, float, float]:
-    """Ratio of mean errors [N], world after world, ours over theirs; and its interval over resampled
-    worlds."""
+    """Ratio of mean errors [N], world after world, ours over theirs; and its interval over
+    resampled worlds."""
     means = (errors.unflatten(0, (worlds, -1)).mean(1) for errors in (ours, theirs))
     found = ratio_of_means(*means, level=INTERVAL, draws=RESAMPLED)
     return found.value, found.low, found.high
 
 
 def standard_error(errors: Tensor, worlds: int) -> float:
-    """Of the mean of errors [N], world after world: of the worlds' means, since drives in one world err
-    alike; of one world's drives where there is one."""
+    """Of the mean of errors [N], world after world: of the worlds' means, since drives in one world
+    err alike; of one world's drives where there is one."""
     means = errors.unflatten(0, (worlds, -1)).mean(1) if worlds > 1 else errors
     return float(means.std() / math.sqrt(len(means))) if len(means) > 1 else 0.0
 
@@ -94,7 +94,8 @@ class Outcome:
 
     @cached_property
     def best(self) -> int | None:
-        """Number of the descent that training samples choose; None: they choose the pair's own mount."""
+        """Number of the descent that training samples choose; None: they choose the pair's own
+        mount."""
         return self.race.chosen(self.starts)
 
     @property
@@ -105,7 +106,9 @@ class Outcome:
     @property
     def share(self) -> Tensor:
         """The mount [6] that is the answer."""
-        return self.race.problem.start if self.best is None else self.race.answer(self.best, GRADIENT)
+        return (
+            self.race.problem.start if self.best is None else self.race.answer(self.best, GRADIENT)
+        )
 
     @property
     def pose(self) -> Tensor:
@@ -124,7 +127,8 @@ class Outcome:
 
     @property
     def over_default(self) -> tuple[float, float, float]:
-        """Ratio of the answer's error to that of the pair's own mount, and its interval over worlds."""
+        """Ratio of the answer's error to that of the pair's own mount, and its interval over
+        worlds."""
         return over_worlds(self.answered, self.judged[0, "default"], len(self.unseen.numbers))
 
     def metrics(self) -> dict[str, float | int]:
@@ -162,7 +166,10 @@ class Outcome:
             elif name != "default":
                 share, samples = race.answer(number, name), race.samples(number, name)
             numbers = [f"{value:.5f}" for value in problem.ranges.numbers(share).tolist()]
-            told = [f"{float(errors.mean()):.5f}", f"{standard_error(errors, len(self.unseen.numbers)):.5f}"]
+            told = [
+                f"{float(errors.mean()):.5f}",
+                f"{standard_error(errors, len(self.unseen.numbers)):.5f}",
+            ]
             seed = race.run.config.seed + number
             writer.writerow([problem.pair.name, seed, name, *numbers, samples, *told])
         return text.getvalue()

@@ -1,5 +1,5 @@
-"""The page of a placement: the answer in one sentence, searches beside one another, the robot before and
-after, what its place is blind to, controls, and the mount handed over."""
+"""The page of a placement: the answer in one sentence, searches beside one another, the robot
+before and after, what its place is blind to, controls, and the mount handed over."""
 
 import math
 from typing import Any
@@ -23,10 +23,14 @@ def report(run: Run[Any], outcome: Outcome) -> None:
     """Metrics, raw table, hand-over and page."""
     write_atomic(run.path("race.csv"), outcome.table().encode())
     run.record(**outcome.metrics())
-    run.card("error of the answer", f"{outcome.error:.3f}", f"default mount: {outcome.default_error:.3f}")
+    run.card(
+        "error of the answer", f"{outcome.error:.3f}", f"default mount: {outcome.default_error:.3f}"
+    )
     for name, beside in outcome.rivals.items():
         run.card(
-            f"gradient over {name}", f"{beside.median:.2f}", f"ahead {beside.ahead} of {beside.count} starts"
+            f"gradient over {name}",
+            f"{beside.median:.2f}",
+            f"ahead {beside.ahead} of {beside.count} starts",
         )
     searches(run, outcome)
     seen(run, outcome)
@@ -52,7 +56,9 @@ def answer(outcome: Outcome) -> str:
         return f"The place found for the camera of '{name}', {where}, is no better than its default mount: {beside}"
     ratio, low, high = outcome.over_default
     resampled = "groups of drives" if outcome.unseen.pair.one_world else "worlds"
-    interval = f" ({low:.2f} to {high:.2f}, {INTERVAL:.0%} of resampled {resampled})" if worlds > 1 else ""
+    interval = (
+        f" ({low:.2f} to {high:.2f}, {INTERVAL:.0%} of resampled {resampled})" if worlds > 1 else ""
+    )
     sits = "belongs at" if high < 1 else "may be better off at"
     return (
         f"The camera of '{name}' {sits} {where}: its error there is {ratio:.2f}{interval} times that at its default mount, "
@@ -85,9 +91,13 @@ def searches(run: Run[Any], outcome: Outcome) -> None:
     rows: list[list[Any]] = []
     for name, values in outcome.errors.items():
         over = str(outcome.rivals[name]) if name in outcome.rivals else None
-        rows.append([name, float(values.quantile(0.5)), float(values.min()), float(values.max()), over])
+        rows.append(
+            [name, float(values.quantile(0.5)), float(values.min()), float(values.max()), over]
+        )
     rows.append(["default mount", outcome.default_error, None, None, None])
-    run.table("Errors on unseen samples", ("search", "median", "best", "worst", "gradient over it"), rows)
+    run.table(
+        "Errors on unseen samples", ("search", "median", "best", "worst", "gradient over it"), rows
+    )
     trails = {
         name: [race.trail(number, name) for number in range(outcome.starts)]
         for name in (GRADIENT, *outcome.rivals)

@@ -1,5 +1,5 @@
-"""What a search for a mount looks at: a pair of robot and world, a pool of its training worlds and drives,
-and the requirements of the mount. A mount is six shares of the pair's ranges."""
+"""What a search for a mount looks at: a pair of robot and world, a pool of its training worlds and
+drives, and the requirements of the mount. A mount is six shares of the pair's ranges."""
 
 import math
 from collections.abc import Sequence
@@ -30,8 +30,8 @@ DRIVES = 48  # of every world that draws are made from
 
 @dataclass(frozen=True)
 class Samples:
-    """Drives in ``numbers`` of worlds, the same ``which`` of each, and the seed of film samples and sensor
-    noise."""
+    """Drives in ``numbers`` of worlds, the same ``which`` of each, and the seed of film samples and
+    sensor noise."""
 
     numbers: tuple[int, ...]
     which: tuple[int, ...]
@@ -42,8 +42,8 @@ class Samples:
 class Seen:
     """What is seen of N drives from one mount.
 
-    read: by the depth that the estimator believes in. surfaces: the same with true depths. true_rows: [N, P,
-      2, 6].
+    read: by the depth that the estimator believes in. surfaces: the same with true depths.
+      true_rows: [N, P, 2, 6].
     flow_px: [N, P, 2], true. covered: [N, windows] by the robot.
     """
 
@@ -56,8 +56,8 @@ class Seen:
 
 @dataclass
 class Problem:
-    """pair: robot and worlds. numbers: of the worlds that draws are made from. per_world: drives in each of
-    ``spread`` worlds of a draw. camera: in place of the pair's own."""
+    """pair: robot and worlds. numbers: of the worlds that draws are made from. per_world: drives in
+    each of ``spread`` worlds of a draw. camera: in place of the pair's own."""
 
     pair: RobotPair
     numbers: Sequence[int]
@@ -91,7 +91,9 @@ class Problem:
         """Samples of that number: other worlds and drives for each, until all have been seen."""
         turns, part = divmod(number, max(1, len(self.numbers) // self.spread))
         order = torch.randperm(len(self.numbers), generator=torch.Generator().manual_seed(turns))
-        drives = torch.randperm(DRIVES, generator=torch.Generator().manual_seed(number))[: self.per_world]
+        drives = torch.randperm(DRIVES, generator=torch.Generator().manual_seed(number))[
+            : self.per_world
+        ]
         chosen = order[part * self.spread : (part + 1) * self.spread].tolist()
         return Samples(tuple(self.numbers[k] for k in chosen), tuple(drives.tolist()), number)
 
@@ -113,7 +115,9 @@ class Problem:
             scenes.append(render.MovingScene(world, {"body": (self._body, driven[which])}))
             poses.append(driven[which])
             twists.append(twist[which])
-        return Drives(torch.stack(poses), times(), tuple(scenes), samples.seed, twist=torch.cat(twists))
+        return Drives(
+            torch.stack(poses), times(), tuple(scenes), samples.seed, twist=torch.cat(twists)
+        )
 
     @cached_property
     def own_body(self) -> OwnBody:
@@ -146,7 +150,8 @@ class Problem:
         return float(self.judged(self.ranges.pose(share), samples).bounded().mean())
 
     def error(self, share: Tensor, samples: Samples) -> float:
-        """What searches without gradients minimise: the same and the penalty of what is required."""
+        """What searches without gradients minimise: the same and the penalty of what is
+        required."""
         return self.bounded(share, samples) + self.penalty_of(share)
 
     @torch.no_grad()
@@ -162,14 +167,15 @@ class Problem:
     def expected_around(
         self, share: Tensor, samples: Samples, step: float, learn: bool = False
     ) -> tuple[Tensor, Tensor]:
-        """Mean bounded error to be expected of a mount [6], and its differences [6] over a step to both
-        sides.
+        """Mean bounded error to be expected of a mount [6], and its differences [6] over a step to
+        both sides.
 
-        Pictures are taken of the mount itself alone. From the others there is the geometry, with its edges:
-        surfaces, their true flow, what the robot covers; how well flow is told there is carried over by the
-        trend (``mount.PrecisionTrend.carried``). At a wall of the cube the step ends there. learn: take these
-        samples into the trend of the flow's precision. What is expected is by errors of flow, not by single
-        frames, whose texture would make its slope noise.
+        Pictures are taken of the mount itself alone. From the others there is the geometry, with
+        its edges:
+        surfaces, their true flow, what the robot covers; how well flow is told there is carried
+        over by the trend (``mount.PrecisionTrend.carried``). At a wall of the cube the step ends
+        there. learn: take these samples into the trend of the flow's precision. What is expected is
+        by errors of flow, not by single frames, whose texture would make its slope noise.
         """
         batch = self.batch(samples)
         pose = self.ranges.pose(share)
@@ -185,22 +191,31 @@ class Problem:
         return value, torch.where(self.ranges.held, 0.0, rise / width)
 
     def _carried(self, field, here, samples, poses):
-        """Mean bounded errors [M] to be expected of mounts [M, 4, 4], what was told from one of them carried
-        over."""
+        """Mean bounded errors [M] to be expected of mounts [M, 4, 4], what was told from one of
+        them carried over."""
         worlds, each = len(samples.numbers), len(samples.which)
         batch = self.scenes(replace(samples, which=samples.which * len(poses)))
-        which = torch.arange(worlds * each).reshape(worlds, 1, each).expand(-1, len(poses), -1).flatten()
-        there = self._seen(of_bodies(field, which, worlds * each), batch, poses.repeat_interleave(each, 0))
+        which = (
+            torch.arange(worlds * each)
+            .reshape(worlds, 1, each)
+            .expand(-1, len(poses), -1)
+            .flatten()
+        )
+        there = self._seen(
+            of_bodies(field, which, worlds * each), batch, poses.repeat_interleave(each, 0)
+        )
         told = self.trend.told(here.surfaces, here.flow_px, here.covered)
         told_there = self.trend.told(there.surfaces, there.flow_px, there.covered)
         read = self.trend.carried(
             of_bodies(here.read, which, worlds * each), told[which], there.read, told_there
         )
-        return self._bounded(read, there, batch.twist).reshape(worlds, len(poses), each).mean((0, 2))
+        return (
+            self._bounded(read, there, batch.twist).reshape(worlds, len(poses), each).mean((0, 2))
+        )
 
     def _seen(self, field, batch, T_body_cam):
-        """What flow in the windows of a batch is of, from a mount [4, 4], or from one for each drive of a
-        world."""
+        """What flow in the windows of a batch is of, from a mount [4, 4], or from one for each
+        drive of a world."""
         T_world_cam = batch.T_world_body @ T_body_cam[..., None, :, :]
         estimator = self._system.estimate
         given = (field, self.camera, batch.scene, T_body_cam, T_world_cam, batch.t_s)
@@ -220,7 +235,8 @@ class Problem:
 
 
 def of_bodies(parts, which, count):
-    """A dataclass of tensors over ``count`` bodies, or their windows, of the bodies ``which`` alone."""
+    """A dataclass of tensors over ``count`` bodies, or their windows, of the bodies ``which``
+    alone."""
     found = {}
     for each in fields(parts):
         value = getattr(parts, each.name)
@@ -234,7 +250,8 @@ def traced_camera(pair: RobotPair, name: str, focal_mm: float | None = None) -> 
 
     Args:
       name: in the catalogue, or a lens file.
-      focal_mm: to which the lens is scaled; None: that of the pair's design. The lens is focused where the
+      focal_mm: to which the lens is scaled; None: that of the pair's design. The lens is focused
+        where the
     pair's is. Raises: as ``lens.load``; DomainError for a focal length that is not positive.
     """
     design = pair.design

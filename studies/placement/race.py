@@ -1,5 +1,5 @@
-"""The searches for a mount from the same starts at equal renders, what each ends with, and its error in
-worlds that none saw; all of it kept in the run's state."""
+"""The searches for a mount from the same starts at equal renders, what each ends with, and its
+error in worlds that none saw; all of it kept in the run's state."""
 
 import hashlib
 from collections.abc import Callable, Sequence
@@ -28,22 +28,30 @@ WORST = 1.0
 def feasible(problem: Problem, count: int, seed: int, first: Sequence[Tensor] = ()) -> list[Tensor]:
     """Mounts [6] to start from: those given, and others spread at random over what is allowed."""
     if bool(problem.ranges.held.all()):
-        raise DomainError("equal bounds hold all six numbers of the mount; widen what is to be searched.")
+        raise DomainError(
+            "equal bounds hold all six numbers of the mount; widen what is to be searched."
+        )
     found = list(first)[:count]
     more = count - len(found)
     return [
         *found,
-        *(starts(problem.ranges, more, problem.requirements, problem.camera, seed=seed) if more else ()),
+        *(
+            starts(problem.ranges, more, problem.requirements, problem.camera, seed=seed)
+            if more
+            else ()
+        ),
     ]
 
 
 def kept(problem: Problem, share: Tensor) -> bool:
-    """Whether a mount keeps every requirement, by the hard answer; the cheap ones are asked first."""
+    """Whether a mount keeps every requirement, by the hard answer; the cheap ones are asked
+    first."""
     return first_missed(problem.requirements, problem.ranges.pose(share), problem.camera) is None
 
 
 def fingerprints(pair: RobotPair) -> dict[str, str]:
-    """What a user may have changed since a run was begun: the robot's page, and the files of which it was made."""
+    """What a user may have changed since a run was begun: the robot's page, and the files of which
+    it was made."""
     contents = {"the robot's page": pair.page.encode()} | {
         f"'{path}'": path.read_bytes() for path in pair.files
     }
@@ -62,7 +70,8 @@ def check_same(stored: dict[str, Any], now: dict[str, Any]) -> None:
 
 
 class Race:
-    """Finished searches, kept in the run's state: a resumed run makes only those that are missing."""
+    """Finished searches, kept in the run's state: a resumed run makes only those that are
+    missing."""
 
     def __init__(self, run: Run[Any], problem: Problem):
         self.run = run
@@ -91,7 +100,9 @@ class Race:
         problem.trend = PrecisionTrend()
 
         def slope(share, step):
-            error, gradient = problem.expected_around(share, problem.draw(first + step), STEP, learn=True)
+            error, gradient = problem.expected_around(
+                share, problem.draw(first + step), STEP, learn=True
+            )
             at = share.clone().requires_grad_()
             penalty = problem.penalty(problem.ranges.pose(at))
             (push,) = torch.autograd.grad(penalty, at)
@@ -101,10 +112,11 @@ class Race:
         self._made(number, GRADIENT, steps, lambda advance: descend(slope, start, steps, advance))
 
     def search(self, number: int, name: str, start: Tensor) -> None:
-        """A search without gradients at as many samples as the descent rendered, all on the same ones.
+        """A search without gradients at as many samples as the descent rendered, all on the same
+        ones.
 
-        Of mounts that do not keep what is required nothing is rendered: they are told to be worse than any
-        other.
+        Of mounts that do not keep what is required nothing is rendered: they are told to be worse
+        than any other.
         """
         problem, seed = self.problem, self.run.config.seed + number
         samples = problem.draw(1000 * seed)
@@ -121,7 +133,12 @@ class Race:
 
         def make(advance):
             trail = SEARCHES[name](
-                lambda part: problem.error(whole(part), samples), start[free], count, seed, advance, refused
+                lambda part: problem.error(whole(part), samples),
+                start[free],
+                count,
+                seed,
+                advance,
+                refused,
             )
             return Trail(whole(trail.share), trail.error)
 
@@ -142,13 +159,15 @@ class Race:
         self.save()
 
     def answer(self, number: int, name: str) -> Tensor:
-        """The mount [6] that a search ends with: the descent's mean of its end, or the last before it that
-        keeps what is required; of the others the best that does."""
+        """The mount [6] that a search ends with: the descent's mean of its end, or the last before
+        it that keeps what is required; of the others the best that does."""
         trail = self.trail(number, name)
         order = trail.error.argsort().tolist()
         if name == GRADIENT:
             order = range(len(trail.error) - 1, -1, -1)
-        return next((trail.share[k] for k in order if kept(self.problem, trail.share[k])), trail.share[0])
+        return next(
+            (trail.share[k] for k in order if kept(self.problem, trail.share[k])), trail.share[0]
+        )
 
     def judge(self, unseen: Problem, starts: list[Tensor]) -> dict[tuple[int, str], Tensor]:
         """Bounded errors [N] of starts and answers, on the same unseen samples with single events.
@@ -174,8 +193,9 @@ class Race:
         return found
 
     def chosen(self, count: int) -> int | None:
-        """Number of the descent whose answer errs least on training samples, None where the pair's own mount
-        errs less than all of them: what is judged on unseen samples has not been chosen by them."""
+        """Number of the descent whose answer errs least on training samples, None where the pair's
+        own mount errs less than all of them: what is judged on unseen samples has not been chosen
+        by them."""
         if "chosen" not in self.tensors:
             problem = self.problem
             draws = [problem.draw(-1 - k) for k in range(FINAL_DRAWS)]

@@ -1,9 +1,9 @@
-"""Searches over the cube of shares from 0 to 1 in which ``mount.MountRanges`` puts mounts: descent along
-gradients that are noisy but right in the mean, and searches without gradients.
+"""Searches over the cube of shares from 0 to 1 in which ``mount.MountRanges`` puts mounts: descent
+along gradients that are noisy but right in the mean, and searches without gradients.
 
-A search without gradients is a generator that gives a point and is sent its error, so that budget, bounds and
-records are the same for all: ``count`` points, one call of the judge each, the start first. What can be
-refused without a look costs none. The same seed and judge give the same points.
+A search without gradients is a generator that gives a point and is sent its error, so that budget,
+bounds and records are the same for all: ``count`` points, one call of the judge each, the start
+first. What can be refused without a look costs none. The same seed and judge give the same points.
 """
 
 import math
@@ -28,7 +28,8 @@ optuna = optional("optuna", "search", "the search TPE")
 MOST_REFUSED = 100
 # of CMA-ES: a quarter of the cube, as its authors advise
 SIGMA = 0.25
-# of the descent: lengths of the first and the last step, and the end of the way whose mean is the answer
+# of the descent: lengths of the first and the last step, and the end of the way whose mean is the
+# answer
 FIRST_LENGTH = 0.15
 LAST_LENGTH = 0.02
 MOMENTUM = 0.7
@@ -57,10 +58,11 @@ def descend(
     """Normalised momentum descent in the cube, its steps ever shorter.
 
     Args:
-      slope: (share [V], number of the step) -> value and gradient [V], of other samples in every step.
+      slope: (share [V], number of the step) -> value and gradient [V], of other samples in every
+        step.
       start: [V].
-    Returns: Trail of the points whose slopes were asked for, and last the mean of the end of the way, which
-      is the answer and has the error of the last step. Raises: NonFiniteError.
+    Returns: Trail of the points whose slopes were asked for, and last the mean of the end of the
+      way, which is the answer and has the error of the last step. Raises: NonFiniteError.
     """
     here = start.detach().clone()
     pace = torch.zeros_like(here)
@@ -88,8 +90,8 @@ def descend(
 class Search:
     """A search by its proposals.
 
-    propose: (start [V], seed) -> generator of points [V] without end, the start first, sent the error of
-      each.
+    propose: (start [V], seed) -> generator of points [V] without end, the start first, sent the
+      error of each.
     library: module that it needs, None for none.
     """
 
@@ -112,8 +114,8 @@ class Search:
           start: [V] shares in 0..1.
           seed: from 0.
           advance: called with each error.
-          refused: share [V] -> what the search is told of a point that needs no look, None for others; after
-            MOST_REFUSED times ``count`` of them the search ends.
+          refused: share [V] -> what the search is told of a point that needs no look, None for
+            others; after MOST_REFUSED times ``count`` of them the search ends.
         Returns: Trail of the points looked at; the first is the start.
         Raises: NonFiniteError where the judge's error is not finite.
         """
@@ -150,8 +152,8 @@ def uniform(start: Tensor, seed: int) -> Proposals:
 
 
 def evolved(start: Tensor, seed: int) -> Proposals:
-    """CMA-ES about the start (which it only looks at first, so that all searches do); when it has ended,
-    again from a random point with twice the population.
+    """CMA-ES about the start (which it only looks at first, so that all searches do); when it has
+    ended, again from a random point with twice the population.
 
     Source: pycma, Hansen, Akimoto and Baudis, 2019; restarts of Auger and Hansen, CEC 2005.
     """
@@ -184,7 +186,9 @@ def estimated(start: Tensor, seed: int) -> Proposals:
     said = optuna.logging.get_verbosity()
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     try:
-        study = optuna.create_study(sampler=optuna.samplers.TPESampler(multivariate=True, seed=seed))
+        study = optuna.create_study(
+            sampler=optuna.samplers.TPESampler(multivariate=True, seed=seed)
+        )
     finally:
         optuna.logging.set_verbosity(said)
     study.enqueue_trial(dict(zip(names, start.tolist(), strict=True)))
@@ -204,8 +208,8 @@ SEARCHES: dict[str, Search] = {
 def available(names: Iterable[str]) -> dict[str, Search]:
     """The searches of these names.
 
-    Raises: DomainError for a name that is not there; MissingPackageError where the library of one is not
-      installed.
+    Raises: DomainError for a name that is not there; MissingPackageError where the library of one
+      is not installed.
     """
     found = {}
     for name in names:

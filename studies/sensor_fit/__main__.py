@@ -1,9 +1,10 @@
-"""Fit an event sensor to a recording of a real camera, and say how true its events are where it was not
-fitted.
+"""Fit an event sensor to a recording of a real camera, and say how true its events are where it was
+not fitted.
 
-Events are simulated from the recording's own frames, at mid-exposure times. Thresholds, dark offset, blur,
-low-pass and noise are fitted by gradient to the events of the first half and judged on those of the second,
-beside the ideal sensor and v2e's default one. The fitted sensor is saved as sensor.json.
+Events are simulated from the recording's own frames, at mid-exposure times. Thresholds, dark
+offset, blur, low-pass and noise are fitted by gradient to the events of the first half and judged
+on those of the second, beside the ideal sensor and v2e's default one. The fitted sensor is saved as
+sensor.json.
 """
 
 import math
@@ -28,8 +29,8 @@ LABELS = {"ideal": "ideal sensor, θ 0.2", "v2e": "v2e's default sensor", "fitte
 class Config(StudyConfig):
     QUICK: ClassVar = {"steps": 6}
     recording: Path | None = None
-    """File with frames and events, .npz or .aedat4; ../shared/data/davis346_newton_cradle/demo-01.npz beside
-    the repository when left out."""
+    """File with frames and events, .npz or .aedat4;
+    ../shared/data/davis346_newton_cradle/demo-01.npz beside the repository when left out."""
     steps: int = 60
     """Steps of the gradient descent."""
 
@@ -57,7 +58,8 @@ def study(run: Run[Config]) -> None:
 
 
 def fitted(run, recording, recorded):
-    """FittedSensor of the first intervals, whose counts are ``recorded``; a stopped fit goes on exactly."""
+    """FittedSensor of the first intervals, whose counts are ``recorded``; a stopped fit goes on
+    exactly."""
     seen = slice(0, len(recorded) + 1)
     sensor = FittedSensor()
     fit = Fit(sensor, recording.frames[seen], recording.mid_s[seen], recorded, run.config.steps)
@@ -77,14 +79,18 @@ def fitted(run, recording, recorded):
 def judge(simulated, recorded):
     """Figures by name of simulated counts against recorded ones, [T, 2, H, W] both, ON first.
 
-    rate_factor: exp of the root mean square log of the ratios by interval and polarity: 1.2 is 20 % off in a
-      typical interval.
+    rate_factor: exp of the root mean square log of the ratios by interval and polarity: 1.2 is 20 %
+      off in a typical interval.
     Raises: DomainError when nothing was recorded in one polarity.
     """
     totals = recorded.double().sum((0, 2, 3))
     if bool((totals == 0).any()):
-        raise DomainError("no event of one polarity was recorded in the second half; record for longer.")
-    signed = torch.stack([(counts[:, 0] - counts[:, 1]).flatten() for counts in (simulated, recorded)])
+        raise DomainError(
+            "no event of one polarity was recorded in the second half; record for longer."
+        )
+    signed = torch.stack(
+        [(counts[:, 0] - counts[:, 1]).flatten() for counts in (simulated, recorded)]
+    )
     on, off = (simulated.double().sum((0, 2, 3)) / totals).tolist()
     # one event more, so that a silent interval has a ratio
     ratios = (simulated.double().sum((2, 3)) + 1) / (recorded.double().sum((2, 3)) + 1)
@@ -108,16 +114,24 @@ def show(run, recording, sensor, simulated, figures):
         "Correlation per pixel and interval; events simulated over recorded. 'Rates off by': factor by which "
         "the events of an interval and polarity are typically too many or too few.",
     )
-    totals = torch.stack([counts.sum((2, 3)) for counts in (recorded, simulated["fitted"])], 2).flatten(1)
+    totals = torch.stack(
+        [counts.sum((2, 3)) for counts in (recorded, simulated["fitted"])], 2
+    ).flatten(1)
     run.table(
         "Events by interval",
         ("interval", "half", "ON recorded", "ON fitted", "OFF recorded", "OFF fitted"),
-        [(k, "first" if k < half else "second", *row) for k, row in enumerate(totals.long().tolist())],
+        [
+            (k, "first" if k < half else "second", *row)
+            for k, row in enumerate(totals.long().tolist())
+        ],
     )
     run.table(
         "Fitted sensor (sensor.json)",
         ("parameter", "start", "fitted"),
-        [(name, START[name], f"{float(value.detach()):.3g}") for name, value in sensor.values().items()],
+        [
+            (name, START[name], f"{float(value.detach()):.3g}")
+            for name, value in sensor.values().items()
+        ],
     )
     run.figure(
         maps(recorded, simulated, half),

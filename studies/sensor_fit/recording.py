@@ -20,8 +20,8 @@ ENTRIES = ("t", "x", "y", "p", "frames", "exposure")
 class Recording:
     """Frames and events of one camera.
 
-    frames: [T, H, W] float32, 0 to 255. mid_s: [T] float64, middle of each frame's exposure. exposure_s:
-      length of the first frame's exposure.
+    frames: [T, H, W] float32, 0 to 255. mid_s: [T] float64, middle of each frame's exposure.
+      exposure_s: length of the first frame's exposure.
     stream: EventStream on the same clock.
     """
 
@@ -46,11 +46,11 @@ def load(path):
     """Read a recording.
 
     Args:
-      path: .aedat4 with frames, or .npz with t (us), x, y, p (0 or 1), frames [T, H, W] uint8 and exposure
-        [T, 2] (us, start and end).
+      path: .aedat4 with frames, or .npz with t (us), x, y, p (0 or 1), frames [T, H, W] uint8 and
+        exposure [T, 2] (us, start and end).
     Returns: Recording.
-    Raises: FileFormatError when the file is missing or of another kind; ShapeError for fewer than five frames
-      or frames of another size than the events'.
+    Raises: FileFormatError when the file is missing or of another kind; ShapeError for fewer than
+      five frames or frames of another size than the events'.
     """
     path = Path(path)
     if not path.is_file():
@@ -58,7 +58,9 @@ def load(path):
             f"the recording is not there ('{path}'); name an .aedat4 or .npz file with frames and events by "
             "--recording."
         )
-    frames, exposure_us, stream = _read_aedat4(path) if path.suffix == ".aedat4" else _read_npz(path)
+    frames, exposure_us, stream = (
+        _read_aedat4(path) if path.suffix == ".aedat4" else _read_npz(path)
+    )
     if len(frames) < 5:
         raise ShapeError(
             f"'{path}' has {len(frames)} frame(s); at least 5 are needed, so that either half has two "
@@ -70,7 +72,9 @@ def load(path):
             f"{[stream.height_px, stream.width_px]}; one camera is needed."
         )
     exposure_s = exposure_us.double() * 1e-6
-    return Recording(frames.float(), exposure_s.mean(1), float(exposure_s[0, 1] - exposure_s[0, 0]), stream)
+    return Recording(
+        frames.float(), exposure_s.mean(1), float(exposure_s[0, 1] - exposure_s[0, 0]), stream
+    )
 
 
 def _read_npz(path):
@@ -89,9 +93,13 @@ def _read_aedat4(path):
     stream = events.read(path)
     # epoch times to times since the start
     start_us = min(int(stream.t_us.min()), int(recorded.exposure_start_us.min()))
-    exposure_us = torch.stack((recorded.exposure_start_us, recorded.exposure_end_us), dim=1) - start_us
+    exposure_us = (
+        torch.stack((recorded.exposure_start_us, recorded.exposure_end_us), dim=1) - start_us
+    )
     return (
         recorded.frames,
         exposure_us,
-        EventStream(stream.t_us - start_us, stream.x, stream.y, stream.p, stream.height_px, stream.width_px),
+        EventStream(
+            stream.t_us - start_us, stream.x, stream.y, stream.p, stream.height_px, stream.width_px
+        ),
     )

@@ -1,5 +1,5 @@
-"""The sensor that is fitted: dark offset, blur, low-pass, two thresholds on a memorised level, and noise that
-fades with light."""
+"""The sensor that is fitted: dark offset, blur, low-pass, two thresholds on a memorised level, and
+noise that fades with light."""
 
 import json
 from pathlib import Path
@@ -27,12 +27,14 @@ START = {
 
 
 class FittedSensor(torch.nn.Module):
-    """Sensor that is fitted: an event layer with learnt thresholds, and what stands before and behind it.
+    """Sensor that is fitted: an event layer with learnt thresholds, and what stands before and
+    behind it.
 
-    ``values()`` are: theta_on, theta_off (natural log units), dark_offset (units of the 0-255 scale),
-    blur_odds (share s of the blurred picture as s/(1-s)), time_constant_s, noise_on_hz, noise_off_hz (events
-    per pixel and second in the dark). A unit step of a parameter is a tenth of its value.
-    Frames are [T, H, W] float32 on the 0-255 scale, t_s their times [T] float64, counts [T-1, 2, H, W].
+    ``values()`` are: theta_on, theta_off (natural log units), dark_offset
+    (units of the 0-255 scale), blur_odds (share s of the blurred picture as s/(1-s)),
+    time_constant_s, noise_on_hz, noise_off_hz (events per pixel and second in the dark). A unit
+    step of a parameter is a tenth of its value. Frames are [T, H, W] float32 on the 0-255 scale,
+    t_s their times [T] float64, counts [T-1, 2, H, W].
     """
 
     def __init__(self, **start: float):
@@ -47,9 +49,11 @@ class FittedSensor(torch.nn.Module):
         return {name: part[name] for part in (self.pixel.learnt, self.others) for name in part}
 
     def levels(self, frames, t_s):
-        """Level that the comparators see, [T, H, W]: low-pass of ln((1 - s) sharp + s blurred + dark_offset).
+        """Level that the comparators see, [T, H, W]: low-pass of ln((1 - s) sharp + s blurred +
+        dark_offset).
 
-        ``events.simulate(levels, t_s, SensorModel(theta_on, theta_off), log_input=True)`` gives a stream.
+        ``events.simulate(levels, t_s, SensorModel(theta_on, theta_off), log_input=True)`` gives a
+        stream.
         """
         share = self.others["blur_odds"] / (1 + self.others["blur_odds"])
         picture = torch.lerp(frames, blur(frames), share.to(frames))
@@ -61,10 +65,11 @@ class FittedSensor(torch.nn.Module):
         return self.pixel(self.levels(frames, t_s), t_s)
 
     def noise(self, frames, t_s):
-        """Expected noise events per interval: rate in the dark times (d/(I + d))^2 with the dark offset d.
+        """Expected noise events per interval: rate in the dark times (d/(I + d))^2 with the dark
+        offset d.
 
-        A disturbance of the photocurrent moves the level by its share of I + d; the square stands for its
-        power.
+        A disturbance of the photocurrent moves the level by its share of I + d; the square stands
+        for its power.
         """
         now = self.values()
         fade = (now["dark_offset"] / (blur(frames[:-1]) + now["dark_offset"])).square()
@@ -78,7 +83,9 @@ class FittedSensor(torch.nn.Module):
     @torch.no_grad()
     def draw(self, frames, t_s, generator):
         """One hard outcome: signal and Poisson noise."""
-        return self.signal(frames, t_s) + torch.poisson(self.noise(frames, t_s).float(), generator=generator)
+        return self.signal(frames, t_s) + torch.poisson(
+            self.noise(frames, t_s).float(), generator=generator
+        )
 
     def save(self, path):
         """Write the values as JSON."""
@@ -102,12 +109,12 @@ def blur(frames):
 
 
 def match(simulated, recorded):
-    """What the fit makes small: 1 - correlation of the signed counts, plus the mean squared log ratio of the
-    event numbers per interval and polarity.
+    """What the fit makes small: 1 - correlation of the signed counts, plus the mean squared log
+    ratio of the event numbers per interval and polarity.
 
-    The correlation does not see a common factor of the counts and the ratio sees little else, so neither is
-    paid for with the other. A squared error or a likelihood makes counts too few where edges are predicted a
-    pixel off (figures in docs/sensor_fit.md).
+    The correlation does not see a common factor of the counts and the ratio sees little else, so
+    neither is paid for with the other. A squared error or a likelihood makes counts too few where
+    edges are predicted a pixel off (figures in docs/sensor_fit.md).
     """
     signed, truth = (counts[:, 0] - counts[:, 1] for counts in (simulated, recorded))
     signed = signed - signed.mean()
@@ -119,7 +126,8 @@ def match(simulated, recorded):
 
 
 class Fit:
-    """Adam on a sensor's parameters, step by step; ``state`` and ``restore`` go on with it exactly."""
+    """Adam on a sensor's parameters, step by step; ``state`` and ``restore`` go on with it
+    exactly."""
 
     def __init__(self, sensor, frames, t_s, recorded, steps):
         self.sensor = sensor
@@ -143,7 +151,9 @@ class Fit:
     def state(self):
         """Tensors and numbers to go on from."""
         moments = self.optimiser.state_dict()["state"]
-        tensors = {f"{index}/{name}": value for index, of in moments.items() for name, value in of.items()}
+        tensors = {
+            f"{index}/{name}": value for index, of in moments.items() for name, value in of.items()
+        }
         return {**tensors, **self.sensor.state_dict()}, {"losses": self.losses}
 
     def restore(self, tensors, numbers):

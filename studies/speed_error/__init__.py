@@ -12,9 +12,10 @@ Name = Literal["levels", "lens", "render", "psf", "light", "events", "spiking", 
 class Config(StudyConfig):
     QUICK: ClassVar = {"repeats": 3, "rounds": 1}
     stages: tuple[Name, ...] = ("levels",)
-    """What is measured: levels (every stage's cheaper and finer ways on one small scene); lens (ray tracing
-    beside optiland), render, psf (frames by point spread functions), light (emissive, baked, path), events,
-    spiking (beside snnTorch and norse), flow (estimators), placement (a step of it)."""
+    """What is measured: levels (every stage's cheaper and finer ways on one small scene); lens (ray
+    tracing beside optiland), render, psf (frames by point spread functions), light
+    (emissive, baked, path), events, spiking (beside snnTorch and norse), flow (estimators),
+    placement (a step of it)."""
     repeats: int = 7
     """Timed repeats of each thing; at least 3."""
     rounds: int = 2

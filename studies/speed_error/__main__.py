@@ -1,11 +1,12 @@
-"""What does every stage cost, and how far is it off? Times, memory and errors, beside peers that are
-installed.
+"""What does every stage cost, and how far is it off? Times, memory and errors, beside peers that
+are installed.
 
     python -m studies.speed_error --stages lens events flow
 
-measures those stages, one after the other, on one page; see --stages for what there is. Times are medians;
-the processor's stand beside the clock's, since machines are shared. What is compared is measured in turns, in
-the same run. Peers: pip install "codesign[bench]" (`make lens-bench`, `make srm-bench`).
+measures those stages, one after the other, on one page; see --stages for what there is. Times are
+medians; the processor's stand beside the clock's, since machines are shared. What is compared is
+measured in turns, in the same run. Peers: pip install "codesign[bench]" (`make lens-bench`, `make
+srm-bench`).
 """
 
 import sys

@@ -36,8 +36,8 @@ SIZE_PX = 256
 SIZES_PX = (128, 256, 512, 1024)
 SMALL = (64, 32)  # pixels a side and number of windows, as loops that design a lens take them
 BOTH = ("forward", "forward_backward")
-# of the processor time of the published width's forward pass, 119 ms where these were asked for; the small
-# windows: a third of what the closed form took before it ran on kernels of its own
+# of the processor time of the published width's forward pass, 119 ms where these were asked for;
+# the small windows: a third of what the closed form took before it ran on kernels of its own
 ASKED_FLOW = {
     (REFINER, "forward", SIZE_PX, 1): 1 / 10,
     (CLOSED, "forward", SIZE_PX, 1): 25 / 119,
@@ -49,15 +49,23 @@ ASKED_GROWTH = 0.2
 
 ASKED_CPU_S = 0.6
 BOX_HALF_M = (0.05, 0.05, 0.05)
-PARTS = {"rays": "lens", "frames": "render", "volume": "events", "field": "flow", "estimate": "estimate"}
+PARTS = {
+    "rays": "lens",
+    "frames": "render",
+    "volume": "events",
+    "field": "flow",
+    "estimate": "estimate",
+}
 GROUND = "ground"
 
 
 def flow_stage(run: Run[Config]) -> list[Asked]:
-    """Closed form, refiner, plain and spiking networks at 256 x 256 pixels, the closed form on 32 windows of
-    64 x 64 pixels, and how cost grows with size. One call in float32 by one thread (two spin while they wait
-    for each other, which counts as processor time), each in processes of its own, in turns. Backward:
-    gradient of volume and weights. Peak: memory of the first call beyond what was in use. Networks are
+    """Closed form, refiner, plain and spiking networks at 256 x 256 pixels, the closed form on 32
+    windows of 64 x 64 pixels, and how cost grows with size. One call in float32 by one thread (two
+    spin while they wait for each other, which counts as processor time), each in processes of its
+    own, in turns. Backward:
+    gradient of volume and weights. Peak: memory of the first call beyond what was in use. Networks
+    are
     untrained: the same arithmetic."""
     config = run.config
     sizes = SIZES_PX[:2] if config.quick else SIZES_PX
@@ -132,7 +140,9 @@ def flow(case: tuple[str, str, int, int], repeats: int, seed: int) -> dict[str, 
         counts = volume.counts.detach().requires_grad_()
         field = estimate(EventVolume(counts, volume.centroid_s, volume.collected_s))
         # confidences have weights that the flow does not use
-        return torch.autograd.grad(field.flow_px.square().sum(), (counts, *learned), allow_unused=True)
+        return torch.autograd.grad(
+            field.flow_px.square().sum(), (counts, *learned), allow_unused=True
+        )
 
     # what the first call loads
     work(scattered(64, bins, seed))
@@ -141,7 +151,8 @@ def flow(case: tuple[str, str, int, int], repeats: int, seed: int) -> dict[str, 
 
 
 def scattered(size_px: int, bins: int, seed: int, windows: int = 1) -> EventVolume:
-    """One event in 20 bins and pixels at random: what a call costs hardly depends on where they are."""
+    """One event in 20 bins and pixels at random: what a call costs hardly depends on where they
+    are."""
     mean = torch.full((windows, 2, bins, size_px, size_px), 0.05)
     spacing = 0.05 / bins
     return EventVolume(
@@ -152,10 +163,10 @@ def scattered(size_px: int, bins: int, seed: int, windows: int = 1) -> EventVolu
 
 
 def placement_stage(run: Run[Config]) -> list[Asked]:
-    """A step of a placement, forward and backward to lens, mount and thresholds: twelve drives before nine
-    windows of 32 x 32, eight rays a pixel, for the three pairs of robot and world, with the robot in
-    view, and for flat ground through a pinhole. Medians of processor seconds; the first step, which
-    compiles, is left out."""
+    """A step of a placement, forward and backward to lens, mount and thresholds: twelve drives
+    before nine windows of 32 x 32, eight rays a pixel, for the three pairs of robot and world, with
+    the robot in view, and for flat ground through a pinhole. Medians of processor seconds; the
+    first step, which compiles, is left out."""
 
     def costs(pair):
         case = case_of(pair, run.config.seed)
@@ -168,8 +179,8 @@ def placement_stage(run: Run[Config]) -> list[Asked]:
 
 
 def case_of(name: str, seed: int, worlds_of: int = 3, drives: int = 4) -> tuple[System, Batch, Any]:
-    """A pair at its own design, everything learnable; or, of the name "ground", the drives of the outdoor
-    rover over one textured ground, without a body, through a pinhole."""
+    """A pair at its own design, everything learnable; or, of the name "ground", the drives of the
+    outdoor rover over one textured ground, without a body, through a pinhole."""
     pair: Any = PAIRS["outdoors" if name == GROUND else name]()
     batch = pair.batch(robot_pair.training(worlds_of), drives, seed)
     design = pair.design
@@ -186,8 +197,9 @@ def case_of(name: str, seed: int, worlds_of: int = 3, drives: int = 4) -> tuple[
 
 
 def one_step(system: System, batch: Batch, pair: Any) -> dict[str, float]:
-    """Processor seconds of one step: "forward", then by part both ways together, and "step" for all. Forward
-    parts are timed as each is asked for, backward ones as gradients arrive at the junctions between them."""
+    """Processor seconds of one step: "forward", then by part both ways together, and "step" for
+    all. Forward parts are timed as each is asked for, backward ones as gradients arrive at the
+    junctions between them."""
     system.zero_grad()
     passed = system.begin(batch)
     clock = [time.process_time()]
@@ -206,7 +218,9 @@ def one_step(system: System, batch: Batch, pair: Any) -> dict[str, float]:
     }
     for name, tensors in junctions.items():
         for tensor in tensors:
-            tensor.register_hook(lambda grad, name=name: arrived.__setitem__(name, time.process_time()))
+            tensor.register_hook(
+                lambda grad, name=name: arrived.__setitem__(name, time.process_time())
+            )
     begun = time.process_time()
     loss.backward()
     ended = time.process_time()

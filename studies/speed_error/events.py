@@ -58,8 +58,9 @@ TAU_R = 1.0
 
 
 def stage(run: Run[Config]) -> list[Asked]:
-    """Million pixels per second of a drifting texture at 1,000 frames per second, at two speeds: what a pixel
-    costs depends on how often it fires. Copies: time over that of a copy of the frames in memory."""
+    """Million pixels per second of a drifting texture at 1,000 frames per second, at two speeds:
+    what a pixel costs depends on how often it fires. Copies: time over that of a copy of the frames
+    in memory."""
     config = run.config
     sizes = list(SIZES)[:1] if config.quick else list(SIZES)
     given = {"repeats": config.repeats, "seed": config.seed}
@@ -77,7 +78,8 @@ def stage(run: Run[Config]) -> list[Asked]:
 
 
 def texture(height: int, width: int, count: int, speed_px: float, seed: int) -> torch.Tensor:
-    """[T, H, W] frames 20 to 220 of a smooth random texture that drifts along x by ``speed_px`` per frame."""
+    """[T, H, W] frames 20 to 220 of a smooth random texture that drifts along x by ``speed_px`` per
+    frame."""
     generator = torch.Generator().manual_seed(seed)
     wide = width // 4 + 8 + int(count * speed_px) // 4
     coarse = torch.rand(1, 1, height // 4 + 2, wide, generator=generator)
@@ -120,7 +122,8 @@ def timed(size: str, pace: float, repeats: int, seed: int) -> list[dict[str, obj
 
 
 def stream(run: Run[Config], count: int, chunk: int = 500) -> None:
-    """Memory in use while frames of 32 x 32 pixels go through a sensor with all noise; events are dropped."""
+    """Memory in use while frames of 32 x 32 pixels go through a sensor with all noise; events are
+    dropped."""
     frames = texture(32, 32, chunk, 0.05, run.config.seed)
     state = events.SensorState()
     memory = []
@@ -133,14 +136,17 @@ def stream(run: Run[Config], count: int, chunk: int = 500) -> None:
     run.record(stream_growth_mb=max(memory) - memory[len(memory) // 10])
     at = np.linspace(0, count, len(memory))
     chart = Panel({"memory": (at, memory)}, "frames", "memory in use, MB")
-    run.figure(panels(chart, width=6), "memory", f"{count:,} frames, {chunk} at a time, through a sensor.")
+    run.figure(
+        panels(chart, width=6), "memory", f"{count:,} frames, {chunk} at a time, through a sensor."
+    )
 
 
 def spiking_stage(run: Run[Config]) -> list[Asked]:
-    """The spike response layer beside a convolution of 77 taps, snnTorch's and norse's two-state cells, on
-    2 x 128 x 128 pixels in float32; every layer in processes of its own, in turns. Copies: time over
-    that of a copy of input, spikes and potential. Peak: memory of the first call beyond what was in
-    use. The convolution is SLAYER's: finite kernels, a sequential reset, no gradient through it."""
+    """The spike response layer beside a convolution of 77 taps, snnTorch's and norse's two-state
+    cells, on 2 x 128 x 128 pixels in float32; every layer in processes of its own, in turns.
+    Copies: time over that of a copy of input, spikes and potential. Peak: memory of the first call
+    beyond what was in use. The convolution is SLAYER's: finite kernels, a sequential reset, no
+    gradient through it."""
     config = run.config
     layers = [name for name in SPIKING if name not in PEERS or name in installed(PEERS)]
     steps = STEPS[:1] if config.quick else STEPS
@@ -165,8 +171,8 @@ def spiking_stage(run: Run[Config]) -> list[Asked]:
 
 
 def spiking(layer: str, kind: str, steps: int, repeats: int, seed: int) -> dict[str, float]:
-    """Cost of one layer, of the drive's gradient too, and of copies; the convolution, which takes seconds, is
-    called twice."""
+    """Cost of one layer, of the drive's gradient too, and of copies; the convolution, which takes
+    seconds, is called twice."""
     torch.set_num_threads(2)
     generator = torch.Generator().manual_seed(seed)
     drive, seeds = torch.rand(2, steps, *PIXELS, generator=generator)
@@ -201,8 +207,8 @@ def taps(tau: float, amplitude: float, cut: float = 0.01) -> torch.Tensor:
 
 
 class SequentialReset(torch.autograd.Function):
-    """SLAYER's spike function: threshold, add the reset kernel to the steps to come; backward multiplies by
-    the surrogate."""
+    """SLAYER's spike function: threshold, add the reset kernel to the steps to come; backward
+    multiplies by the surrogate."""
 
     @staticmethod
     def forward(ctx, response, reset):
@@ -224,8 +230,8 @@ class SequentialReset(torch.autograd.Function):
 
 
 def convolution(drive):
-    """The layer by a 77-tap convolution over time and the sequential reset, in torch; time is last while
-    convolving, as SLAYER lays its tensors out (and 5 times faster)."""
+    """The layer by a 77-tap convolution over time and the sequential reset, in torch; time is last
+    while convolving, as SLAYER lays its tensors out (and 5 times faster)."""
     kernel = taps(TAU_S, 1.0)
     rows = drive.reshape(drive.shape[0], -1).T.unsqueeze(1)
     padded = torch.nn.functional.pad(rows, (kernel.numel() - 1, 0))
@@ -235,7 +241,8 @@ def convolution(drive):
 
 
 def snntorch_cell(drive):
-    """snnTorch's two-state cell (synaptic current and membrane, reset by subtraction), step by step."""
+    """snnTorch's two-state cell (synaptic current and membrane, reset by subtraction), step by
+    step."""
     import snntorch  # pyright: ignore[reportMissingImports]
 
     decay = math.exp(-1 / TAU_S)

@@ -33,11 +33,13 @@ TOLERANCE = 0.05
 
 
 def render_stage(run: Run[Config]) -> list[Asked]:
-    """A step: 20 frames of 96 x 96 pixels, 8 samples, of the room through a triplet, with gradients to
-    curvatures, thicknesses and a pose twist; the first, which compiles, is left out."""
+    """A step: 20 frames of 96 x 96 pixels, 8 samples, of the room through a triplet, with gradients
+    to curvatures, thicknesses and a pose twist; the first, which compiles, is left out."""
     count = 2 * WARM if run.config.quick else 200
     scene = worlds.room(objects=False)
-    poses = trajectories.translation(pose.look_at(*START), (0.2, 0.05, 0.1), trajectories.times(20, 100.0))
+    poses = trajectories.translation(
+        pose.look_at(*START), (0.2, 0.05, 0.1), trajectories.times(20, 100.0)
+    )
     geo = lens.load("cooke-triplet", torch.float32).freeze("conic", "asphere", "index_offset")
     camera = render.Camera(geo, SIZE_PX, SIZE_PX, 0.15, SAMPLES, run.config.seed)
     twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
@@ -75,12 +77,12 @@ def render_stage(run: Run[Config]) -> list[Asked]:
 
 
 def psf_stage(run: Run[Config]) -> list[Asked]:
-    """Frames by point spread functions: lenses of 11 mm on a 346 x 260 sensor of 18.5 um. Errors are RMS
-    differences from many traced samples over the picture's contrast, in percent, beside those of traced
-    frames of 64 samples (their noise) and of the thin lens; the reference's own noise is estimated from
-    its halves.
-    Times: processor time of traced frames over that of the level, with everything of the lens ready (rays,
-    map), and with the gradient to lens and poses, which makes both anew."""
+    """Frames by point spread functions: lenses of 11 mm on a 346 x 260 sensor of 18.5 um. Errors
+    are RMS differences from many traced samples over the picture's contrast, in percent, beside
+    those of traced frames of 64 samples (their noise) and of the thin lens; the reference's own
+    noise is estimated from its halves.
+    Times: processor time of traced frames over that of the level, with everything of the lens ready
+    (rays, map), and with the gradient to lens and poses, which makes both anew."""
     scenes = views()
     every = lenses()
     count = 2 if run.config.quick else 4
@@ -137,7 +139,9 @@ def views():
         EDGES[0]: (worlds.room(), (0.1, -0.2, 1.0), (0.0, 1.2, 0.3)),
         EDGES[1]: (worlds.tabletop(), *worlds.VIEWS["tabletop"]),
     }
-    return {name: (scene, pose.look_at(*at).reshape(1, 4, 4)) for name, (scene, *at) in found.items()}
+    return {
+        name: (scene, pose.look_at(*at).reshape(1, 4, 4)) for name, (scene, *at) in found.items()
+    }
 
 
 def camera_of(optics, seed=0):
@@ -147,7 +151,9 @@ def camera_of(optics, seed=0):
 @torch.no_grad()
 def psf_errors(optics, scene, at, count):
     """Errors in percent, and the pictures."""
-    every = torch.stack([render.frames(camera_of(optics, k + 1), scene, at)[0] for k in range(count)])
+    every = torch.stack(
+        [render.frames(camera_of(optics, k + 1), scene, at)[0] for k in range(count)]
+    )
     truth = every.mean(0)
     camera = camera_of(optics)
     by_psf = render.psf_frames(camera, scene, at, render.psf_map(camera, NEAREST_M))[0]
@@ -180,18 +186,24 @@ def psf_times(optics, scene, at, repeats):
 
     back_psf = back(lambda c, p: render.psf_frames(c, scene, p, render.psf_map(c, NEAREST_M)))
     back_traced = back(lambda c, p: render.frames(c, scene, p))
-    return {"ready": traced / by_psf, "with_gradients": back_traced / back_psf, "by_psf_cpu_s": by_psf}
+    return {
+        "ready": traced / by_psf,
+        "with_gradients": back_traced / back_psf,
+        "by_psf_cpu_s": by_psf,
+    }
 
 
 def light_stage(run: Run[Config]) -> list[Asked]:
-    """Worlds by their levels of light: emissive (pictures as radiance), baked (Lambertian light worked out
-    once), path (paths traced for every camera ray). The error of a level is against the next finer one of the
-    same world: shares of the radiance, the largest over the frames. After gain: one brightness factor per
-    frame is forgiven, as by a sensor of log intensity. RMS errors have the reference's noise taken out, the
-    percentile has not."""
+    """Worlds by their levels of light: emissive (pictures as radiance), baked (Lambertian light
+    worked out once), path (paths traced for every camera ray). The error of a level is against the
+    next finer one of the same world: shares of the radiance, the largest over the frames. After
+    gain: one brightness factor per frame is forgiven, as by a sensor of log intensity. RMS errors
+    have the reference's noise taken out, the percentile has not."""
     quick = run.config.quick
     width, frames, paths, texels = (48, 1, 4, 8) if quick else (96, 3, 24, 64)
-    camera = render.Camera(lens.Pinhole(8.0), width, width * 3 // 4, 6.4 / width, 4, run.config.seed)
+    camera = render.Camera(
+        lens.Pinhole(8.0), width, width * 3 // 4, 6.4 / width, 4, run.config.seed
+    )
     options = {
         "emissive": {},
         "baked": {"samples": texels, "seed": run.config.seed},
@@ -209,23 +221,29 @@ def light_stage(run: Run[Config]) -> list[Asked]:
     choices = "\n".join(dict.fromkeys(column(rows, "choice")))
     run.text(f"The cheapest level within {TOLERANCE:g} after gain:\n\n{choices}")
     if shown:
-        run.figure(pictures(shown, side=2.5), "worlds", "First frame of each world and level.", dpi=110)
+        run.figure(
+            pictures(shown, side=2.5), "worlds", "First frame of each world and level.", dpi=110
+        )
     baked = column(select(rows, level="baked"), "rms_after_gain")
     return [Asked("light: baked against path after gain, largest RMS", max(baked))]
 
 
 def light_levels(name, camera, options, frames, shown):
-    """Rows of a world's levels, seen by a camera that moves 5 cm to its right and turns by a degree per
-    frame."""
+    """Rows of a world's levels, seen by a camera that moves 5 cm to its right and turns by a degree
+    per frame."""
     make = worlds.WORLDS[name]
     twist = torch.tensor([0.05, 0, 0, 0, math.radians(1), 0], dtype=torch.float64)
-    poses = pose.look_at(*worlds.VIEWS[name]) @ pose.se3_exp(torch.arange(frames).double()[:, None] * twist)
+    poses = pose.look_at(*worlds.VIEWS[name]) @ pose.se3_exp(
+        torch.arange(frames).double()[:, None] * twist
+    )
     several = "light" in inspect.signature(make).parameters
     scenes = {}
     made = {}
     for level in options if several else ("emissive",):
         start = time.process_time()
-        scenes[level] = make(light=_with(build.LEVELS[level], options[level])) if several else make()
+        scenes[level] = (
+            make(light=_with(build.LEVELS[level], options[level])) if several else make()
+        )
         made[level] = time.process_time() - start
     choice = light.choose(scenes, camera, poses, TOLERANCE, after_gain=True)
     reason = choice.reason if several else "emissive: the only level it has."
@@ -237,7 +255,9 @@ def light_levels(name, camera, options, frames, shown):
             row[part] = float(getattr(error, part).max()) if error else None
         rows.append(row | {"choice": f"- **{name}**: {reason}"})
         with torch.no_grad():
-            shown.setdefault(name, {})[level] = render.frames(camera, scenes[level], poses[:1])[0].numpy()
+            shown.setdefault(name, {})[level] = render.frames(camera, scenes[level], poses[:1])[
+                0
+            ].numpy()
     return rows
 
 

@@ -1,8 +1,8 @@
 """Stage "lens": speed, memory and error of ray tracing, and analysis functions, beside optiland's
 (pip install "codesign[bench]").
 
-Every tracer gets the same double Gauss (indices of the d line), the same rays, and, going backward, a seed
-of ones on all image positions; gradients reach all curved radii and all distances.
+Every tracer gets the same double Gauss (indices of the d line), the same rays, and, going backward,
+a seed of ones on all image positions; gradients reach all curved radii and all distances.
 """
 
 import math
@@ -45,12 +45,13 @@ LOOKED_AT = 256
 
 
 def stage(run: Run[Config]) -> list[Asked]:
-    """Rays through a double Gauss of eleven surfaces, d line, each tracer in processes of its own, in turns.
-    Memory: peak of the first call above what was in use. Error: largest, of 256 rays, against our trace in
-    float64, which the tests hold to 3e-14 mm. Analyses: float64, one thread, in turns in one process; three
-    fields and lines of 800 rays, fans of 65 rays, wavefronts of 64 cells, point spreads of 128 cells
-    padded to 512; a design step is the merit of three fields and its gradient to all curvatures and
-    distances."""
+    """Rays through a double Gauss of eleven surfaces, d line, each tracer in processes of its own,
+    in turns.
+    Memory: peak of the first call above what was in use. Error: largest, of 256 rays, against our
+    trace in float64, which the tests hold to 3e-14 mm. Analyses: float64, one thread, in turns in
+    one process; three fields and lines of 800 rays, fans of 65 rays, wavefronts of 64 cells, point
+    spreads of 128 cells padded to 512; a design step is the merit of three fields and its gradient
+    to all curvatures and distances."""
     config = run.config
     peer = bool(installed({"optiland": "optiland"}))
     count = 100_000 if config.quick else 1_000_000
@@ -72,7 +73,9 @@ def stage(run: Run[Config]) -> list[Asked]:
         )
         what = f"{precision} {kind}, optiland with torch"
         figures.append(Asked(f"{what}: time over ours", wall_s[1] / wall_s[0], least=least))
-        figures.append(Asked(f"{what}: our memory over its", peak_mb[0] / peak_mb[1], most=ASKED_MEMORY))
+        figures.append(
+            Asked(f"{what}: our memory over its", peak_mb[0] / peak_mb[1], most=ASKED_MEMORY)
+        )
     given = {"rounds": 3 if config.quick else 11}
     rows = sweep(run, analyses, "analyses", processes=1, given=given, backend=("torch", "numpy"))
     tabulate(run, "Analyses against optiland, medians", rows, "work", "backend", prefix="analysis")
@@ -98,14 +101,17 @@ def tracing(
     found = cost(work, repeats)
     few, where = (part[:LOOKED_AT].double() for part in (origin, direction))
     with torch.no_grad():
-        truth = double_gauss().trace(few, where / where.norm(dim=1, keepdim=True)).position_mm[:, :2]
+        truth = (
+            double_gauss().trace(few, where / where.norm(dim=1, keepdim=True)).position_mm[:, :2]
+        )
     error = float((work()[:LOOKED_AT, :2].double() - truth).abs().max())
     speed = SURFACES * count / found["wall_s"] / 1e6
     return found | {"million_ray_surfaces_per_s": speed, "error_mm": error}
 
 
 def rays(count: int, precision: str, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Origins and directions [N, 3] of parallel rays over a square of 20 mm, 5.7 degrees off the axis."""
+    """Origins and directions [N, 3] of parallel rays over a square of 20 mm, 5.7 degrees off the
+    axis."""
     across = np.random.default_rng(seed).uniform(-10, 10, (count, 2))
     origin = np.concatenate([across, np.full((count, 1), -5.0)], 1)
     direction = np.tile([0.0, 0.1, 0.99**0.5], (count, 1))
@@ -114,11 +120,14 @@ def rays(count: int, precision: str, seed: int) -> tuple[torch.Tensor, torch.Ten
 
 def double_gauss(precision: str = "float64") -> lens.GeoLens:
     """The published lens; its curvatures and distances ask for gradients."""
-    return lens.load("double-gauss", getattr(torch, precision)).freeze("conic", "asphere", "index_offset")
+    return lens.load("double-gauss", getattr(torch, precision)).freeze(
+        "conic", "asphere", "index_offset"
+    )
 
 
 def trace_by_us(precision, kind, origin, direction) -> Callable[[], torch.Tensor]:
-    """A function that traces the rays once, or goes back to all that the lens learns; returns positions."""
+    """A function that traces the rays once, or goes back to all that the lens learns; returns
+    positions."""
     geo = double_gauss(precision)
     seeds = torch.ones_like(origin)
 
@@ -160,8 +169,8 @@ def trace_by_optiland(precision, kind, origin, direction) -> Callable[[], torch.
 
 
 def analyses(backend: str, rounds: int) -> list[dict[str, Any]]:
-    """Rows (work, ours and the peer's median processor time, ratios), in turns. Both have the same double
-    Gauss, fields and wavelengths, and as many rays (at least as many on our side)."""
+    """Rows (work, ours and the peer's median processor time, ratios), in turns. Both have the same
+    double Gauss, fields and wavelengths, and as many rays (at least as many on our side)."""
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     drjit.set_thread_count(1)
@@ -170,7 +179,11 @@ def analyses(backend: str, rounds: int) -> list[dict[str, Any]]:
     for name, peer in optiland_analyses(backend).items():
         found = turns({"ours": ours[name], "peer": peer}, rounds, warm=0 if rounds > 1 else 1)
         ours_s, peer_s = found["ours"], found["peer"]
-        cpu = {"ours_ms": 1e3 * ours_s.cpu, "peer_ms": 1e3 * peer_s.cpu, "ratio": peer_s.cpu / ours_s.cpu}
+        cpu = {
+            "ours_ms": 1e3 * ours_s.cpu,
+            "peer_ms": 1e3 * peer_s.cpu,
+            "ratio": peer_s.cpu / ours_s.cpu,
+        }
         rows.append({"work": name, **cpu, "wall_ratio": peer_s.wall / ours_s.wall})
     return rows
 
@@ -198,13 +211,17 @@ def our_analyses() -> dict[str, Callable[[], Any]]:
             analysis.ray_fan(geo, f, lens.WAVELENGTH_UM[k], FAN_RAYS) for f in fields for k in LINES
         ],
         "wavefront": lambda: analysis.wavefront(geo, fields[2], grid=OPD_GRID).waves.std(),
-        "psf": lambda: analysis.diffraction_psf(geo, fields[0], grid=PSF_GRID, padding=PADDED // PSF_GRID),
+        "psf": lambda: analysis.diffraction_psf(
+            geo, fields[0], grid=PSF_GRID, padding=PADDED // PSF_GRID
+        ),
         "mtf": lambda: [analysis.diffraction_mtf(geo, f, frequency, grid=PSF_GRID) for f in fields],
         "seidel": lambda: seidel_sums(geo, half).total,
         "distortion": lambda: analysis.distortion_percent(geo, line),
         "field_curvature": lambda: analysis.focus_shift_mm(geo, line),
     }
-    return {name: torch.no_grad()(work) for name, work in still.items()} | {"design_step": design_step}
+    return {name: torch.no_grad()(work) for name, work in still.items()} | {
+        "design_step": design_step
+    }
 
 
 def optiland_analyses(backend: str) -> dict[str, Callable[[], Any]]:
@@ -236,11 +253,15 @@ def optiland_analyses(backend: str) -> dict[str, Callable[[], Any]]:
         "spot": spot,
         "fan": lambda: peer.RayFan(optic, num_points=FAN_RAYS),
         "wavefront": wavefront,
-        "psf": lambda: FFTPSF(optic, (0, 0), "primary", num_rays=PSF_GRID, grid_size=PADDED).psf.max(),
+        "psf": lambda: FFTPSF(
+            optic, (0, 0), "primary", num_rays=PSF_GRID, grid_size=PADDED
+        ).psf.max(),
         "mtf": lambda: FFTMTF(optic, num_rays=PSF_GRID, grid_size=PADDED).mtf,
         "seidel": seidel,
         "distortion": lambda: peer.Distortion(optic, wavelengths="primary", num_points=POINTS).data,
-        "field_curvature": lambda: peer.FieldCurvature(optic, wavelengths="primary", num_points=POINTS).data,
+        "field_curvature": lambda: (
+            peer.FieldCurvature(optic, wavelengths="primary", num_points=POINTS).data
+        ),
     }
     return works | ({"design_step": optiland_design_step(be)} if backend == "torch" else {})
 

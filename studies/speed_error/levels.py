@@ -29,8 +29,8 @@ SENSOR = events.SensorModel(THETA, THETA)
 
 @dataclass(frozen=True)
 class Part:
-    """A stage of the chain: ways to compute it from cheap to fine, the error of what one returns, what that
-    error measures, and how much of it is tolerated."""
+    """A stage of the chain: ways to compute it from cheap to fine, the error of what one returns,
+    what that error measures, and how much of it is tolerated."""
 
     levels: Mapping[str, Callable[[], Any]]
     error: Callable[[Any], float]
@@ -58,10 +58,14 @@ class Setup:
         """A Mitsuba wall whose bitmap holds the analytic texture at 2.5 mm per texel."""
         texel_m = 0.0025
         half_m = 1.5
-        at = (torch.arange(round(2 * half_m / texel_m), dtype=torch.float64) + 0.5) * texel_m - half_m
+        at = (
+            torch.arange(round(2 * half_m / texel_m), dtype=torch.float64) + 0.5
+        ) * texel_m - half_m
         frequency, amplitude, phase = self.waves
         total = torch.zeros(at.numel(), at.numel(), dtype=torch.float64)
-        for (fx, fy), a, shift in zip(frequency.tolist(), amplitude.tolist(), phase.tolist(), strict=True):
+        for (fx, fy), a, shift in zip(
+            frequency.tolist(), amplitude.tolist(), phase.tolist(), strict=True
+        ):
             total += a * (2 * torch.pi * (fx * at[None] + fy * at[:, None]) + shift).cos()
         # the first row of a bitmap is the top
         return worlds.wall(100 * total.exp().flip(0).numpy(), texel_m, half_m)
@@ -96,7 +100,9 @@ class Setup:
     def true_flow(self):
         """[1, 2, H, W] px over the whole interval, through the traced lens."""
         ends = self.path(60)[1][[0, -1]]
-        return render.true_flow(self.camera(lens.load("cooke-triplet").freeze(), 1), self.wall, ends)[0]
+        return render.true_flow(
+            self.camera(lens.load("cooke-triplet").freeze(), 1), self.wall, ends
+        )[0]
 
     def volume(self, bins):
         return events.from_stream(self.stream, 0, round(DURATION_S * 1e6), bins)
@@ -124,7 +130,9 @@ def stage(run: Run[Config]) -> list[Asked]:
         tabulate(run, name.capitalize(), levels, "part", "level")
         run.text(f"**{best['level']}** {verdict} an error of {part.tolerance:g} {figures}.")
         floor = min([part.tolerance, *(row["error"] for row in levels if row["error"] > 0)]) / 5
-        points = {row["level"]: ([1e3 * row["cpu_s"]], [max(row["error"], floor)]) for row in levels}
+        points = {
+            row["level"]: ([1e3 * row["cpu_s"]], [max(row["error"], floor)]) for row in levels
+        }
         chart = Panel(points, "processor time, ms (median)", "error", "xy", [part.tolerance])
         caption = f"Error: {part.measure}. Dashed: the tolerance. A level without error stands at the bottom."
         run.figure(panels(chart, width=7), f"speed_error_{plain(name)}", caption)
@@ -132,10 +140,11 @@ def stage(run: Run[Config]) -> list[Asked]:
 
 
 def cheapest(levels: list[dict[str, Any]], tolerance: float) -> tuple[dict[str, Any], bool]:
-    """The level of least processor time whose error is within ``tolerance``; where none is, the one of
-    least error.
+    """The level of least processor time whose error is within ``tolerance``; where none is, the one
+    of least error.
 
-    Returns: the level, and whether it is within the tolerance. Raises: DomainError when there is no level.
+    Returns: the level, and whether it is within the tolerance. Raises: DomainError when there is no
+      level.
     """
     if not levels:
         raise DomainError("there is no level to choose from; give at least one.")
@@ -172,7 +181,9 @@ def parts(setup: Setup) -> dict[str, Part]:
     }
     binned = {f"{n} bins": lambda n=n: flow.estimate_lk(setup.volume(n)) for n in range(2, 10)}
     models = {
-        f"{model}, {len(blurs)} levels": partial(flow.estimate_lk, setup.volume(5), model, levels_px=blurs)
+        f"{model}, {len(blurs)} levels": partial(
+            flow.estimate_lk, setup.volume(5), model, levels_px=blurs
+        )
         for model in ("constant", "affine", "quadratic")
         for blurs in ((1.0,), (2.0, 1.0), (4.0, 2.0, 1.0))
     }
@@ -189,8 +200,12 @@ def parts(setup: Setup) -> dict[str, Part]:
     return {
         "lens": Part(through, _off(through["traced"]()), f"{of_frames}the traced lens", 0.05),
         "sampling": Part(sampled, _off(setup.frames(samples=256)), f"{of_frames}256 samples", 0.01),
-        "scene": Part(seen, _off(seen["analytic, float64"]()), f"{of_frames}analytic float64", 0.01),
-        "events": Part(counted, wrong, f"wrong counts per true one, hard events at {FINEST_HZ} fps", 0.1),
+        "scene": Part(
+            seen, _off(seen["analytic, float64"]()), f"{of_frames}analytic float64", 0.01
+        ),
+        "events": Part(
+            counted, wrong, f"wrong counts per true one, hard events at {FINEST_HZ} fps", 0.1
+        ),
         "time bins": Part(binned, endpoint, f"affine, {of_flow}", 0.5),
         "flow": Part(models, endpoint, f"5 bins, {of_flow}", 0.5),
     }

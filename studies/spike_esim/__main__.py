@@ -1,8 +1,8 @@
-"""Do learnt generators make the events of a physical sensor: the spiking network of the thesis, ESIM, and
-ours?
+"""Do learnt generators make the events of a physical sensor: the spiking network of the thesis,
+ESIM, and ours?
 
-Trained on rendered sequences with hard events of a noisy, slow, unequal sensor; judged on motions and worlds
-never seen by van Rossum distance, number, rates over time, flicker and delay. With
+Trained on rendered sequences with hard events of a noisy, slow, unequal sensor; judged on motions
+and worlds never seen by van Rossum distance, number, rates over time, flicker and delay. With
 --classes instead by what a classifier that is trained on their events makes of the sensor's
 (docs/event_classes.md).
 """
@@ -67,9 +67,11 @@ class Config(StudyConfig):
     frames: int = 200
     """Frames of every rendered sequence, at 500 per second."""
     steps: int = 160
-    """Optimisation steps of our generator; the thesis network gets half as many from either of two starts."""
+    """Optimisation steps of our generator; the thesis network gets half as many from either of two
+    starts."""
     seeds: int = 5
-    """Classifiers of each generator, each with training pictures, noise and first weights of its own."""
+    """Classifiers of each generator, each with training pictures, noise and first weights of its
+    own."""
     training: int = 800
     """Pictures that a classifier is trained on."""
     test: int = 1000
@@ -95,7 +97,10 @@ def compare(run):
     made, ours, theta = generators(run, training)
     on, off = ours.thetas().tolist()
     run.record(
-        esim_theta=theta, ours_theta_on=on, ours_theta_off=off, ours_refractory_s=float(ours.refractory_s())
+        esim_theta=theta,
+        ours_theta_on=on,
+        ours_theta_off=off,
+        ours_refractory_s=float(ours.refractory_s()),
     )
     ours.save(run.path("spike_esim.npz"))
     draws = 100 if run.config.quick else 1000
@@ -106,11 +111,16 @@ def compare(run):
         for key, title in TITLES.items():
             found = judge.judge(list(zip(counts[key], some, strict=True)), draws, run.config.seed)
             for figure, value in found.items():
-                interval = value if isinstance(value, Interval) else Interval(value, value, value, 1)
+                interval = (
+                    value if isinstance(value, Interval) else Interval(value, value, value, 1)
+                )
                 run.record(**interval.metrics(f"unseen_{name}_{key}_{figure}"))
             rows.append({"generator": title, **found})
         run.table(f"Unseen {name}", *table(rows), CAPTION)
-        shown = {"physical sensor": some[0].counts, **{TITLES[key]: counts[key][0] for key in TITLES}}
+        shown = {
+            "physical sensor": some[0].counts,
+            **{TITLES[key]: counts[key][0] for key in TITLES},
+        }
         show(run, f"unseen_{name}", shown, some[0].dt_s)
         of = {row["generator"]: row["loss"].value for row in rows}
         lead.append(f"unseen {name} {of[TITLES['ours']]:.3f} (ESIM {of[TITLES['esim']]:.3f})")
@@ -144,7 +154,9 @@ def swept(ours, sequences):
     rows = []
     for factor in FACTORS:
         theta_on, theta_off = factor * SENSOR.theta_on, factor * SENSOR.theta_off
-        sensor = replace(SENSOR, theta_on=theta_on, theta_off=theta_off, shot_rate_hz=0.0, leak_rate_hz=0.0)
+        sensor = replace(
+            SENSOR, theta_on=theta_on, theta_off=theta_off, shot_rate_hz=0.0, leak_rate_hz=0.0
+        )
         made = wanted = 0.0
         for k, one in enumerate(sequences):
             draw = torch.Generator().manual_seed(k)
@@ -155,19 +167,24 @@ def swept(ours, sequences):
 
 
 def show(run, name, shown, dt_s):
-    """Figures of counts by title: pictures of 30 ms at three times, rates of the whole picture and behind a
-    median, and of random patches. The first of ``shown`` is the target."""
+    """Figures of counts by title: pictures of 30 ms at three times, rates of the whole picture and
+    behind a median, and of random patches. The first of ``shown`` is the target."""
     steps = round(PICTURE_S / dt_s)
     rows = {}
     for quarter in (1, 2, 3):
-        parts = {title: counts[len(counts) * quarter // 4 :][:steps] for title, counts in shown.items()}
+        parts = {
+            title: counts[len(counts) * quarter // 4 :][:steps] for title, counts in shown.items()
+        }
         rows[f"{quarter} / 4"] = {
             title: events.picture(part.sum(0), 3.0).numpy() for title, part in parts.items()
         }
     run.figure(pictures(rows), f"{name}_pictures", "Events of 30 ms. Red ON, blue OFF.")
 
     def chart(rates, label):
-        times = {title: 1e3 * judge.BIN_S * (torch.arange(len(rate)) + 0.5) for title, rate in rates.items()}
+        times = {
+            title: 1e3 * judge.BIN_S * (torch.arange(len(rate)) + 0.5)
+            for title, rate in rates.items()
+        }
         series = {title: (times[title], rate) for title, rate in rates.items()}
         return Panel(series, "time, ms", f"{label} events of 10 ms")
 
@@ -187,10 +204,10 @@ def show(run, name, shown, dt_s):
     busy = next(iter(cells.values())).sum(1).nonzero()[:, 0]
     draw = torch.Generator().manual_seed(run.config.seed)
     chosen = busy[torch.randperm(len(busy), generator=draw)[:PATCHES]].tolist()
-    charts = [chart({title: cell[at] for title, cell in cells.items()}, f"patch {at}:") for at in chosen]
-    caption = (
-        f"Random patches of {judge.CELL_PX} x {judge.CELL_PX} px in which the sensor has events, ON and OFF."
-    )
+    charts = [
+        chart({title: cell[at] for title, cell in cells.items()}, f"patch {at}:") for at in chosen
+    ]
+    caption = f"Random patches of {judge.CELL_PX} x {judge.CELL_PX} px in which the sensor has events, ON and OFF."
     run.figure(panels(*charts, width=3), f"{name}_patches", caption)
 
 

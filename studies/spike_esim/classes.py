@@ -1,6 +1,6 @@
-"""Do emulated events train a classifier for a real sensor? Digits moved by saccades, seen as video by
-generators of events and as they move by a physical sensor; a small network is trained on the events of each
-and tested on the sensor's.
+"""Do emulated events train a classifier for a real sensor? Digits moved by saccades, seen as video
+by generators of events and as they move by a physical sensor; a small network is trained on the
+events of each and tested on the sensor's.
 """
 
 import math
@@ -29,7 +29,12 @@ SENSOR_HZ = 1000.0
 SENSOR = replace(events.PRESETS["noisy"], theta_on=0.18, theta_off=0.22, refractory_s=1e-3)
 NOMINAL_THETA = 0.2  # mean of the sensor's own
 THETAS = (0.05, 0.07, 0.1, NOMINAL_THETA, 0.3, 0.45)
-ASKED = (("spike_esim", "esim_best"), ("spike_esim", "esim"), ("esim_best", "naive_best"), ("esim", "naive"))
+ASKED = (
+    ("spike_esim", "esim_best"),
+    ("spike_esim", "esim"),
+    ("esim_best", "naive_best"),
+    ("esim", "naive"),
+)
 
 
 class Block(nn.Module):
@@ -50,8 +55,9 @@ def _conv(inputs, outputs, size, stride):
 
 
 def train(voxels, labels, epochs, seed, device="cpu"):
-    """A classifier of voxels [N, 2, bins, H, W] as class scores [N, CLASSES], all of it drawn from the seed.
-    Nothing is normalised per recording: how many events there are is part of what is learnt."""
+    """A classifier of voxels [N, 2, bins, H, W] as class scores [N, CLASSES], all of it drawn from
+    the seed. Nothing is normalised per recording: how many events there are is part of what is
+    learnt."""
     generator = torch.Generator().manual_seed(seed)
     voxels = voxels.flatten(1, 2)
     blocks = nn.Sequential(*_conv(voxels.shape[1], 16, 5, 2), nn.ReLU(), Block(16), Block(32))
@@ -83,14 +89,16 @@ def train(voxels, labels, epochs, seed, device="cpu"):
 @torch.no_grad()
 def predict(net, voxels, device="cpu"):
     """Most likely class of every recording, [N] int64."""
-    return torch.cat([net(part.flatten(1, 2).to(device)).argmax(1).cpu() for part in voxels.split(500)])
+    return torch.cat(
+        [net(part.flatten(1, 2).to(device)).argmax(1).cpu() for part in voxels.split(500)]
+    )
 
 
 @dataclass(frozen=True)
 class Source:
-    """A generator of events. make: from frames [T, N, H, W], times and a torch.Generator to an EventStream
-    of the pictures stacked on one tall sensor, or to counts [T-1, 2, N, H, W]. physical: whether it sees the
-    motion itself."""
+    """A generator of events. make: from frames [T, N, H, W], times and a torch.Generator to an
+    EventStream of the pictures stacked on one tall sensor, or to counts [T-1, 2, N, H, W].
+    physical: whether it sees the motion itself."""
 
     label: str
     make: Any
@@ -124,12 +132,14 @@ SOURCES = {
 
 
 def record(config, tiles, source, purpose):
-    """Voxels [N, 2, BINS, 32, 32] of what a source makes of moved pictures. purpose: part of the seed of its
-    noise."""
+    """Voxels [N, 2, BINS, 32, 32] of what a source makes of moved pictures. purpose: part of the
+    seed of its noise."""
     t_s = frame_times(SENSOR_HZ if source.physical else config.video_hz)
     generator = torch.Generator().manual_seed(config.seed + purpose)
     parts = tiles.split(AT_ONCE)
-    return torch.cat([voxels_of(source.make(frames(part, t_s), t_s, generator), t_s, BINS) for part in parts])
+    return torch.cat(
+        [voxels_of(source.make(frames(part, t_s), t_s, generator), t_s, BINS) for part in parts]
+    )
 
 
 def voxels_of(made, t_s, bins):
@@ -159,10 +169,12 @@ def fitted(run, store, tiles):
     def mean(seen):
         return ours(seen, video_s)[0] + ours.expected_noise(seen, video_s)
 
-    # convolutions learn slowly, single numbers fast; the thesis: van Rossum loss alone, Adam at 0.01
+    # convolutions learn slowly, single numbers fast; the thesis: van Rossum loss alone, Adam at
+    # 0.01
     rates = {"branch": 3e-3, "prefilter": 3e-3, "noise_rate": 0.1}
     of_ours = [
-        {"params": [p], "lr": rates.get(name.split(".")[0], 3e-2)} for name, p in ours.named_parameters()
+        {"params": [p], "lr": rates.get(name.split(".")[0], 3e-2)}
+        for name, p in ours.named_parameters()
     ]
     of_thesis = [{"params": list(thesis.parameters()), "lr": 0.01}]
 
@@ -176,7 +188,11 @@ def fitted(run, store, tiles):
                 return objective(found, wanted, float(video_s[1]), weight, block_steps=6)
 
             descend(
-                torch.optim.Adam(groups), loss, steps, advance, [lambda step: 1 - step / steps] * len(groups)
+                torch.optim.Adam(groups),
+                loss,
+                steps,
+                advance,
+                [lambda step: 1 - step / steps] * len(groups),
             )
 
         store.module(f"fit_{key}", net, steps, train)
@@ -185,8 +201,12 @@ def fitted(run, store, tiles):
     fit("spike_esim", ours, of_ours, mean, 0.1)
     return {
         "thesis": Source("thesis network, fitted", lambda seen, *_: spikes_of(thesis, seen)),
-        "spike_esim_quiet": Source("Spike-ESIM, its noise left out", lambda seen, t_s, _: ours(seen, t_s)[0]),
-        "spike_esim": Source("Spike-ESIM, fitted (ours)", lambda seen, *given: ours.draw(seen, *given)[0]),
+        "spike_esim_quiet": Source(
+            "Spike-ESIM, its noise left out", lambda seen, t_s, _: ours(seen, t_s)[0]
+        ),
+        "spike_esim": Source(
+            "Spike-ESIM, fitted (ours)", lambda seen, *given: ours.draw(seen, *given)[0]
+        ),
     }
 
 
@@ -196,15 +216,21 @@ def spikes_of(network, seen):
 
 
 def tall(pictures):
-    """Pictures [T, N, H, W] on one sensor [T, N (H + 1), W], a dark row below each, so that a 3x3 filter of
-    changes sees none of its neighbour."""
+    """Pictures [T, N, H, W] on one sensor [T, N (H + 1), W], a dark row below each, so that a 3x3
+    filter of changes sees none of its neighbour."""
     return F.pad(pictures, (0, 0, 0, 1)).flatten(1, 2)
 
 
 def study(run):
     """Train on every source with every seed, test on the physical sensor, write the page."""
     config = run.config
-    least = {"seeds": 2, "training": 2 * CLASSES, "test": CLASSES, "calibration": CLASSES, "epochs": 1}
+    least = {
+        "seeds": 2,
+        "training": 2 * CLASSES,
+        "test": CLASSES,
+        "calibration": CLASSES,
+        "epochs": 1,
+    }
     for name, number in least.items():
         if getattr(config, name) < number:
             raise DomainError(f"{name} is {getattr(config, name)}; at least {number} are needed.")
@@ -218,7 +244,9 @@ def study(run):
         net = train(voxels, of, config.epochs, config.seed + seed, run.device)
         found = {"accuracy": accuracy(run, net, heard, labels)}
         if seed == 0:
-            found["own_events_accuracy"] = accuracy(run, net, record(config, tiles, source, TEST), labels)
+            found["own_events_accuracy"] = accuracy(
+                run, net, record(config, tiles, source, TEST), labels
+            )
             found["events_per_picture"] = float(voxels.sum() / len(voxels))
         return found
 
@@ -237,8 +265,8 @@ def calibration(config):
 
 
 def best_thresholds(run):
-    """Naive and ESIM, each with the threshold whose events train the best classifier of the calibration
-    recordings."""
+    """Naive and ESIM, each with the threshold whose events train the best classifier of the
+    calibration recordings."""
     config = run.config
     tiles, labels = calibration(config)
     heard = record(config, tiles, PHYSICAL, CALIBRATION)
@@ -265,16 +293,26 @@ def show(run, sources, rows, tiles):
     means = {key: student(values) for key, values in right.items()}
     gains = {(a, b): student(right[a] - right[b]) for a, b in ASKED}
     order = sorted(sources, key=lambda key: -means[key].value)
-    for name, mean in {**means, **{f"{a}_over_{b}": gain for (a, b), gain in gains.items()}}.items():
-        run.record(**{f"{name}_mean": mean.value, f"{name}_low": mean.low, f"{name}_high": mean.high})
+    for name, mean in {
+        **means,
+        **{f"{a}_over_{b}": gain for (a, b), gain in gains.items()},
+    }.items():
+        run.record(
+            **{f"{name}_mean": mean.value, f"{name}_low": mean.low, f"{name}_high": mean.high}
+        )
     first = {row["source"]: row for row in select(rows, seed=0)}
     run.record(
         **metrics(
-            [{k: v for k, v in row.items() if k not in ("seed", "accuracy")} for row in first.values()],
+            [
+                {k: v for k, v in row.items() if k not in ("seed", "accuracy")}
+                for row in first.values()
+            ],
             "source",
         )
     )
-    shown = [{**first[key], "source": sources[key].label, "mean": f"{means[key]:.1%}"} for key in order]
+    shown = [
+        {**first[key], "source": sources[key].label, "mean": f"{means[key]:.1%}"} for key in order
+    ]
     titles = {
         "source": "trained on events of",
         "mean": "physical events",
@@ -294,7 +332,9 @@ def show(run, sources, rows, tiles):
     grid = {}
     for key in order:
         t_s = frame_times(SENSOR_HZ if sources[key].physical else run.config.video_hz)
-        made = sources[key].make(frames(tiles, t_s), t_s, torch.Generator().manual_seed(run.config.seed))
+        made = sources[key].make(
+            frames(tiles, t_s), t_s, torch.Generator().manual_seed(run.config.seed)
+        )
         if isinstance(made, EventStream):
             made = events.to_counts(made, t_s).unflatten(2, (CLASSES, -1))
         leg = made[: (len(t_s) - 1) // 3].sum(0)
@@ -303,5 +343,6 @@ def show(run, sources, rows, tiles):
     run.figure(pictures(grid, signed=map(str, range(CLASSES)), side=1), "events", caption)
     best = ", ".join(f"{sources[key].label} {means[key].value:.1%}" for key in order[:4])
     run.finish(
-        "Emulated events for a real sensor's classifier", f"Accuracy on a physical sensor's events: {best}."
+        "Emulated events for a real sensor's classifier",
+        f"Accuracy on a physical sensor's events: {best}.",
     )

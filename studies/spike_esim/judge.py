@@ -27,7 +27,9 @@ def judge(pairs, resamples, seed):
     return {
         "loss": loss,
         "rate_ratio": rate,
-        "rate_correlation": correlation(*([binned(x, dt_s) for x in side] for side in (found, target))),
+        "rate_correlation": correlation(
+            *([binned(x, dt_s) for x in side] for side in (found, target))
+        ),
         "cell_correlation": correlation(*cells),
         "flicker_ratio": power[0] / power[1],
         "delay_s": dt_s * delay(found, target, round(LAGS_S / dt_s)),
@@ -41,34 +43,47 @@ def distance(pairs):
 
 
 def intervals(pairs, resamples, seed):
-    """``distance``, and events over the target's: Interval each, 95 %, blocks of pixels drawn again."""
+    """``distance``, and events over the target's: Interval each, 95 %, blocks of pixels drawn
+    again."""
     found, silence, made, wanted = block_sums(pairs)
-    return [ratio_of_means(*pair, draws=resamples, seed=seed) for pair in ((found, silence), (made, wanted))]
+    return [
+        ratio_of_means(*pair, draws=resamples, seed=seed)
+        for pair in ((found, silence), (made, wanted))
+    ]
 
 
 def block_sums(pairs):
-    """[4, blocks]: squared van Rossum responses of the error and of silence, events and those of the
-    target."""
+    """[4, blocks]: squared van Rossum responses of the error and of silence, events and those of
+    the target."""
     sums = []
     for found, sequence in pairs:
         target = sequence.counts
         errors = (found - target, target)
-        responses = [events.alpha_response(error, tau_s=TAU_S, dt=sequence.dt_s)[0] for error in errors]
-        pictures = [x.sum((0, 1)) for x in (*(response.square() for response in responses), found, target)]
+        responses = [
+            events.alpha_response(error, tau_s=TAU_S, dt=sequence.dt_s)[0] for error in errors
+        ]
+        pictures = [
+            x.sum((0, 1)) for x in (*(response.square() for response in responses), found, target)
+        ]
         sums.append(F.avg_pool2d(torch.stack(pictures), BLOCK_PX).flatten(1) * BLOCK_PX**2)
     return torch.cat(sums, 1).double()
 
 
 def binned(counts, dt_s, side_px=None):
-    """Events per bin, polarity and cell, [bins, 2, h, w]; one cell is the whole picture when side_px is None.
-    What fills no bin or cell is left out."""
+    """Events per bin, polarity and cell, [bins, 2, h, w]; one cell is the whole picture when
+    side_px is None. What fills no bin or cell is left out."""
     steps = max(1, round(BIN_S / dt_s))
     sums = counts[: len(counts) // steps * steps].unflatten(0, (-1, steps)).sum(1)
-    return sums.sum((-2, -1), keepdim=True) if side_px is None else F.avg_pool2d(sums, side_px) * side_px**2
+    return (
+        sums.sum((-2, -1), keepdim=True)
+        if side_px is None
+        else F.avg_pool2d(sums, side_px) * side_px**2
+    )
 
 
 def filtered(counts, dt_s):
-    """Pictures of one bin each behind a median of 5 x 5 px, [bins, 2, H, W]: lone events vanish, edges stay."""
+    """Pictures of one bin each behind a median of 5 x 5 px, [bins, 2, H, W]: lone events vanish,
+    edges stay."""
     steps = max(1, round(BIN_S / dt_s))
     pictures = counts[: len(counts) // steps * steps].unflatten(0, (-1, steps)).sum(1)
     wide = F.pad(pictures, (MEDIAN_PX // 2,) * 4, mode="replicate")
@@ -93,12 +108,15 @@ def flicker(counts, dt_s):
 
 
 def delay(found, target, most):
-    """Steps by which the events of cells come later than the target's, where they correlate best."""
+    """Steps by which the events of cells come later than the target's, where they correlate
+    best."""
 
     def aligned(lag):
         windows = slice(max(lag, 0), min(lag, 0) or None), slice(max(-lag, 0), min(-lag, 0) or None)
         sides = zip((found, target), windows, strict=True)
-        return [torch.cat([F.avg_pool2d(x[at], CELL_PX).flatten() for x in side]) for side, at in sides]
+        return [
+            torch.cat([F.avg_pool2d(x[at], CELL_PX).flatten() for x in side]) for side, at in sides
+        ]
 
     return max(range(-most, most + 1), key=lambda lag: _pearson(*aligned(lag)))
 

@@ -1,5 +1,5 @@
-"""What is raced, trained on rendered sequences with the hard events of a physical sensor: the spiking
-network of the thesis, ESIM with its best threshold, and Spike-ESIM."""
+"""What is raced, trained on rendered sequences with the hard events of a physical sensor: the
+spiking network of the thesis, ESIM with its best threshold, and Spike-ESIM."""
 
 import math
 from dataclasses import dataclass
@@ -16,22 +16,25 @@ from studies.spike_esim.judge import TAU_S, distance
 
 RATE_HZ = 500.0
 RENDERED_TOGETHER = 40
-# what an ideal sensor lacks, all at once: unequal thresholds that scatter, bandwidth, leak, noise, dead time
+# what an ideal sensor lacks, all at once: unequal thresholds that scatter, bandwidth, leak, noise,
+# dead time
 SENSOR = SensorModel(0.18, 0.22, theta_sigma=0.03, cutoff_hz=60.0, leak_rate_hz=0.1, leak_jitter=0.1,
                      rate_cov_decades=0.1, shot_rate_hz=0.5, refractory_s=1e-3)  # fmt: skip
 THETAS = [0.12 * 1.15**k for k in range(18)]  # 0.12 to 1.3
 CROP_PX = 32
 BATCH = 2
-# of potentials of the busiest sequence at the threshold when training starts: the better by training loss is
-# kept
+# of potentials of the busiest sequence at the threshold when training starts: the better by
+# training loss is kept
 SHARES = (0.01, 0.04)
-# frames are divided by it for the thesis network: weights of the order of 1, as its step of Adam supposes
+# frames are divided by it for the thesis network: weights of the order of 1, as its step of Adam
+# supposes
 LIGHT = 32.0
 
 
 @dataclass(frozen=True)
 class Sequence:
-    """frames: [T, H, W], 0-255 scale. t_s: [T] float64. counts: [T-1, 2, H, W] of the physical sensor. again:
+    """frames: [T, H, W], 0-255 scale. t_s: [T] float64. counts: [T-1, 2, H, W] of the physical
+    sensor. again:
     the same with another draw of thresholds and noise. name: world and motion."""
 
     name: str
@@ -60,7 +63,8 @@ def rendered(world, family, seed, frames):
 
 
 class Store:
-    """Tensors by name, written after each training, so that a stopped run goes on behind the last one."""
+    """Tensors by name, written after each training, so that a stopped run goes on behind the last
+    one."""
 
     def __init__(self, run):
         stored = run.load_state() if run.resumed else None
@@ -76,7 +80,8 @@ class Store:
         return {n.removeprefix(start): x for n, x in self.tensors.items() if n.startswith(start)}
 
     def module(self, key, module, steps, train):
-        """``module`` after ``train(module, advance)`` of so many steps; it takes no gradient any more."""
+        """``module`` after ``train(module, advance)`` of so many steps; it takes no gradient any
+        more."""
 
         def trained():
             with self.run.progress(steps, f"training {key}") as progress:
@@ -105,7 +110,11 @@ def generators(run, sequences):
     def draw(sequence):
         return ours.draw(sequence.frames, sequence.t_s, torch.Generator().manual_seed(0))[0]
 
-    made |= {"esim": partial(esim, theta=theta), "ours": draw, "sensor": lambda sequence: sequence.again}
+    made |= {
+        "esim": partial(esim, theta=theta),
+        "ours": draw,
+        "sensor": lambda sequence: sequence.again,
+    }
     return made, ours, theta
 
 
@@ -120,8 +129,8 @@ def esim(sequence, theta):
 
 
 def _thesis(store, sequences, steps, seed):
-    """The network of the thesis from the better of two starts, trained the thesis's way: Adam at 0.01,
-    van Rossum loss alone, one sequence after the other."""
+    """The network of the thesis from the better of two starts, trained the thesis's way: Adam at
+    0.01, van Rossum loss alone, one sequence after the other."""
 
     def spikes(network, sequence):
         return network(sequence.frames / LIGHT)[0]
@@ -147,8 +156,8 @@ def _thesis(store, sequences, steps, seed):
 
 
 def descend(optimiser, loss, steps, advance, paces=None, clip=math.inf):
-    """Follow the gradient of ``loss()``; paces: one function a group of parameters, from step to share of
-    its rate."""
+    """Follow the gradient of ``loss()``; paces: one function a group of parameters, from step to
+    share of its rate."""
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, paces or (lambda step: 1.0))
     for _ in range(steps):
         value = loss()
@@ -173,8 +182,8 @@ def objective(found, target, dt_s, count_weight=0.1, block_steps=8):
 
 
 def train_ours(model, sequences, steps, generator, advance):
-    """Adam, its step falling as a half cosine to a twentieth; convolutions learn slowly, single numbers
-    fast, and noise, which remains when the signal is learnt, in the second half."""
+    """Adam, its step falling as a half cosine to a twentieth; convolutions learn slowly, single
+    numbers fast, and noise, which remains when the signal is learnt, in the second half."""
 
     def loss():
         frames, t_s, counts = crops(sequences, generator)
@@ -194,8 +203,8 @@ def train_ours(model, sequences, steps, generator, advance):
 
 
 def crops(sequences, generator, batch=BATCH):
-    """Random squares out of random sequences: frames [T, B, h, w], t_s [T], counts [T-1, 2, B, h, w]. A
-    batch without any event has no relative loss; then another is drawn."""
+    """Random squares out of random sequences: frames [T, B, h, w], t_s [T], counts
+    [T-1, 2, B, h, w]. A batch without any event has no relative loss; then another is drawn."""
     while True:
         frames, counts = [], []
         for _ in range(batch):
@@ -210,14 +219,18 @@ def crops(sequences, generator, batch=BATCH):
 
 @torch.no_grad()
 def calibrate(model, sequences, rounds=3):
-    """Scale the thresholds until the generator gives as many events as the target, noise included: squared
-    errors favour too few events where an edge is predicted beside its place."""
+    """Scale the thresholds until the generator gives as many events as the target, noise included:
+    squared errors favour too few events where an edge is predicted beside its place."""
     target = sum(sequence.counts.sum((0, 2, 3)).double() for sequence in sequences)
     for _ in range(rounds):
         found = torch.zeros(2, dtype=torch.float64)
         for sequence in sequences:
             counts = model(sequence.frames, sequence.t_s)[0]
-            found += (counts + model.expected_noise(sequence.frames, sequence.t_s)).sum((0, 2, 3)).double()
+            found += (
+                (counts + model.expected_noise(sequence.frames, sequence.t_s))
+                .sum((0, 2, 3))
+                .double()
+            )
         # events go as 1/theta for a steady change and as 1/theta^2 for a random walk
         model.log_gain.add_(0.7 * (found / target).log())
 

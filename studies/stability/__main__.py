@@ -1,9 +1,10 @@
 """Hard cases: what theory expects of values and gradients, and what is seen.
 
-Flat and black scenes, rays that are lost, poses that do not move, images without events, flows too small to
-see, thresholds at both ends of their range, one pixel, strong surfaces, far objects; and gradients of random
-lenses whose coincidences (equal neighbours, flats, zeros) leave a surface without effect but not without a
-derivative. A miss is listed and shown, not hidden, and does not make the study fail.
+Flat and black scenes, rays that are lost, poses that do not move, images without events, flows too
+small to see, thresholds at both ends of their range, one pixel, strong surfaces, far objects; and
+gradients of random lenses whose coincidences (equal neighbours, flats, zeros) leave a surface
+without effect but not without a derivative. A miss is listed and shown, not hidden, and does not
+make the study fail.
 """
 
 import sys
@@ -35,7 +36,12 @@ def judge(case: Callable[[], Iterable[Check]]) -> list[dict[str, object]]:
         for check in case():
             figures = {"off_by": check.off, "allowed": check.allowed, "passed": check.passed}
             rows.append(
-                {"what": check.what, "expected": _text(check.expected), "seen": _text(check.seen), **figures}
+                {
+                    "what": check.what,
+                    "expected": _text(check.expected),
+                    "seen": _text(check.seen),
+                    **figures,
+                }
             )
     except (CodesignError, RuntimeError, ArithmeticError, ValueError) as error:
         said = f"stopped: {' '.join(str(error).split())[:160]}"
@@ -54,7 +60,11 @@ def study(run: Run[Config]) -> None:
     rows = sweep(run, judge, "hard cases", case=CASES)
     missed = [name for name in CASES if not all(row["passed"] for row in select(rows, case=name))]
     run.record(cases_total=len(CASES), cases_passed=len(CASES) - len(missed))
-    run.record(**metrics([{k: v for k, v in row.items() if k != "allowed"} for row in rows], "case", "what"))
+    run.record(
+        **metrics(
+            [{k: v for k, v in row.items() if k != "allowed"} for row in rows], "case", "what"
+        )
+    )
     run.card("Cases passed", f"{len(CASES) - len(missed)} of {len(CASES)}", ", ".join(missed))
     run.section("Cases")
     run.table("Expected and seen", *table(rows))
@@ -73,7 +83,9 @@ def random_systems(run: Run[Config]) -> list[str]:
     worst = max(errors.values())
     run.record(gradient_systems=count, gradient_relative_error=worst)
     run.record(**{f"gradient_relative_error_{name}": error for name, error in errors.items()})
-    run.card("Gradients of random lenses", f"{worst:.1e}", f"worst relative error of {count} lenses")
+    run.card(
+        "Gradients of random lenses", f"{worst:.1e}", f"worst relative error of {count} lenses"
+    )
     run.section("Gradients")
     run.table(
         "Worst relative error of a gradient",

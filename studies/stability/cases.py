@@ -17,7 +17,8 @@ THETA = 0.2
 
 @dataclass(frozen=True)
 class Check:
-    """Something that theory knows: values that stand beside what is seen, and how far apart they may be."""
+    """Something that theory knows: values that stand beside what is seen, and how far apart they
+    may be."""
 
     what: str
     expected: torch.Tensor | float
@@ -51,16 +52,20 @@ def black_frames():
     yield Check("events", 0, events.memory(frames, THETA, THETA)[0].sum())
     linear = math.log(20) / 20
     yield Check(
-        "slope of the linear part", linear, torch.autograd.grad(events.lin_log(frames).sum(), frames)[0]
+        "slope of the linear part",
+        linear,
+        torch.autograd.grad(events.lin_log(frames).sum(), frames)[0],
     )
     slope = torch.autograd.grad((soft[:, 0] - soft[:, 1])[-1].sum(), frames)[0][-1]
     yield Check("the same per threshold", linear / THETA, slope)
 
 
 def total_reflection():
-    """The deficit n^2 (h c)^2 - 1 has the slope 2 n^2 h^2 c in the curvature c = -1/10 of the second
-    surface."""
-    geo = lens.GeoLens([lens.Surface(math.inf, 5.0, GLASS, 99.0), lens.Surface(-10.0, 10.0, None, 9.9)], 4.0)
+    """The deficit n^2 (h c)^2 - 1 has the slope 2 n^2 h^2 c in the curvature c = -1/10 of the
+    second surface."""
+    geo = lens.GeoLens(
+        [lens.Surface(math.inf, 5.0, GLASS, 99.0), lens.Surface(-10.0, 10.0, None, 9.9)], 4.0
+    )
     out = geo.trace(_f64([(8.0, 0.0, -5.0)]), _f64([AHEAD]))
     yield Check("status", int(lens.Status.TOTAL_REFLECTION), int(out.status))
     yield Check("weight", 0, out.weight)
@@ -71,7 +76,9 @@ def total_reflection():
 
 def all_rays_lost():
     """Deficits (h c)^2 - 1."""
-    geo = lens.GeoLens([lens.Surface(10.0, 5.0, GLASS, 9.0), lens.Surface(math.inf, 10.0, None, 9.0)], 4.0)
+    geo = lens.GeoLens(
+        [lens.Surface(10.0, 5.0, GLASS, 9.0), lens.Surface(math.inf, 10.0, None, 9.0)], 4.0
+    )
     out = geo.trace(_f64([(20.0, 0.0, -5.0), (0.0, 15.0, -5.0)]), _f64([AHEAD, AHEAD]))
     yield Check("weights", 0, out.weight)
     yield Check("deficits", _f64([3.0, 1.25]), out.deficit, 1e-6)
@@ -118,8 +125,8 @@ def zero_events():
 
 
 def tiny_flow():
-    """A pattern that moves 5e-4 px over the interval: the smooth volume gives that flow, not zero and not
-    noise. All of it brightens, so that events come whatever the motion."""
+    """A pattern that moves 5e-4 px over the interval: the smooth volume gives that flow, not zero
+    and not noise. All of it brightens, so that events come whatever the motion."""
     motion = torch.tensor(5e-4, dtype=torch.float64, requires_grad=True)
     x = torch.arange(48, dtype=torch.float64)
     t_s = torch.linspace(0, 0.1, 11, dtype=torch.float64)
@@ -137,12 +144,14 @@ def tiny_flow():
     rest = motion.detach()
     difference = (estimate(rest + 1e-3) - estimate(rest - 1e-3)) / 2e-3
     yield Check("slope over differences", 1, slope / difference, 0.01)
-    yield Check("change over slope times motion", 1, (found - estimate(0 * rest)) / (slope * motion), 0.01)
+    yield Check(
+        "change over slope times motion", 1, (found - estimate(0 * rest)) / (slope * motion), 0.01
+    )
 
 
 def smallest_threshold():
-    """Frames 100 to 200: ln(2)/1e-3 = 693 events; slope 1/(200 · 1e-3) to the last frame, 0 to those
-    between."""
+    """Frames 100 to 200: ln(2)/1e-3 = 693 events; slope 1/(200 · 1e-3) to the last frame, 0 to
+    those between."""
     total, slope = _ramp(1e-3)
     yield Check("events", 693, total)
     yield Check("slopes to the later frames", _f64([0, 0, 0, 5]), slope[1:])
@@ -156,13 +165,15 @@ def largest_threshold():
 
 
 def one_pixel():
-    """One pixel of one sample looks along the axis: its value and its motion are those of the texture at one
-    point; 10 mm at 2 m behind 20 mm focal length and 0.5 mm pixels."""
+    """One pixel of one sample looks along the axis: its value and its motion are those of the
+    texture at one point; 10 mm at 2 m behind 20 mm focal length and 0.5 mm pixels."""
     world = _plane()
     twist = _twist()
     image = _render(world, twist, size_px=1, samples=1, count=1)
     value = 100 * (world.amplitude * world.phase.cos()).sum().exp()
-    slope = -value * (world.amplitude * world.phase.sin() * 2 * torch.pi * world.frequency[:, 0]).sum()
+    slope = (
+        -value * (world.amplitude * world.phase.sin() * 2 * torch.pi * world.frequency[:, 0]).sum()
+    )
     yield Check("radiance", value, image)
     yield Check("slope per metre", slope, torch.autograd.grad(image.sum(), twist)[0][0])
     camera = render.Camera(lens.Pinhole(20.0), 1, 1, 0.5, 1, 0)
@@ -184,11 +195,14 @@ def static_camera():
 
 
 def turning_point():
-    """A camera that goes and comes back: hard counts balance to within one event per pixel. ON - OFF moves by
-    whole multiples of 1/C per log level (all pixels are above 20), and not with a common brightening."""
+    """A camera that goes and comes back: hard counts balance to within one event per pixel. ON -
+    OFF moves by whole multiples of 1/C per log level (all pixels are above 20), and not with a
+    common brightening."""
     theta = 0.05
     t_s = trajectories.times(21, 200.0)
-    path = trajectories.Swinging(torch.eye(4, dtype=torch.float64), (0.0, 1.0, 0.0), 0.05, 10.0)(t_s)
+    path = trajectories.Swinging(torch.eye(4, dtype=torch.float64), (0.0, 1.0, 0.0), 0.05, 10.0)(
+        t_s
+    )
     camera = render.Camera(lens.Pinhole(20.0), 8, 8, 0.5, 4, 0)
     images = render.frames(camera, _plane(), path).requires_grad_()
     counts, level = events.memory(images, theta, theta)
@@ -203,11 +217,14 @@ def turning_point():
 
 
 def strong_surfaces():
-    """A ball lens: rays meet its second half beyond the centre. Paraxial focus R n / (2 (n - 1)) from the
-    centre (Hecht, Optics, ch. 6)."""
+    """A ball lens: rays meet its second half beyond the centre. Paraxial focus R n / (2 (n - 1))
+    from the centre (Hecht, Optics, ch. 6)."""
     height = 1e-4
     focus_mm = 1.5 * 5.0 / (2 * 0.5)
-    surfaces = [lens.Surface(5.0, 10.0, GLASS, 4.99), lens.Surface(-5.0, focus_mm - 5.0, None, 4.99)]
+    surfaces = [
+        lens.Surface(5.0, 10.0, GLASS, 4.99),
+        lens.Surface(-5.0, focus_mm - 5.0, None, 4.99),
+    ]
     ball = lens.GeoLens(surfaces, 2.0)
     beside = _f64([(4.0, 0.0, -9.0)])
     out = ball.trace(torch.cat([_f64([(height, 0, -9.0)]), beside]), _f64([AHEAD, AHEAD]))
@@ -216,17 +233,22 @@ def strong_surfaces():
     (slope,) = torch.autograd.grad(out.position_mm[1, 0], ball.curvature_per_mm)
 
     def landing(curvature):
-        return ball.replace(curvature_per_mm=curvature).trace(beside, _f64([AHEAD])).position_mm[0, 0]
+        return (
+            ball.replace(curvature_per_mm=curvature).trace(beside, _f64([AHEAD])).position_mm[0, 0]
+        )
 
     truth = _differences(landing, ball.curvature_per_mm.detach(), 1e-7)
     yield Check(
-        "derivative 0.8 R off the axis, over differences", 0, (slope - truth).norm() / truth.norm(), 1e-6
+        "derivative 0.8 R off the axis, over differences",
+        0,
+        (slope - truth).norm() / truth.norm(),
+        1e-6,
     )
 
 
 def far_object():
-    """A parallel beam that starts 10 km away in float32 lands where float64 puts it from 5 mm away, and moves
-    alike with the curvatures."""
+    """A parallel beam that starts 10 km away in float32 lands where float64 puts it from 5 mm away,
+    and moves alike with the curvatures."""
     near = _f64([(x, y, -5.0) for x, y in ((0.0, 0.0), (2.0, 0.0), (0.0, -3.0), (1.5, 2.5))])
 
     def traced(dtype, origin):
@@ -267,7 +289,9 @@ def _f64(rows):
 def _plane(amplitude=0.3):
     stand = torch.eye(4, dtype=torch.float64)
     stand[2, 3] = 2.0
-    return render.TexturedPlane([[3.0, 1.0], [-2.0, 4.0]], [amplitude, amplitude], [0.3, 1.1], 100.0, stand)
+    return render.TexturedPlane(
+        [[3.0, 1.0], [-2.0, 4.0]], [amplitude, amplitude], [0.3, 1.1], 100.0, stand
+    )
 
 
 def _poses(twist, count=3, twist_per_frame=(0.01, 0.0, 0.0, 0.0, 0.0, 0.0)):
@@ -294,7 +318,8 @@ def _differences(function, at, step):
 
 
 def _ramp(theta):
-    """Memory counts of a brightening pixel (frames 100 to 200), their sum, and its slopes to the frames."""
+    """Memory counts of a brightening pixel (frames 100 to 200), their sum, and its slopes to the
+    frames."""
     frames = torch.linspace(100, 200, 5, dtype=torch.float64).reshape(5, 1, 1).requires_grad_()
     total = events.memory(frames, theta, theta)[0].sum()
     return total, torch.autograd.grad(total, frames)[0].flatten()

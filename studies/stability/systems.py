@@ -1,10 +1,12 @@
-"""Random lenses full of coincidences (equal neighbours, flats, concentric surfaces, zeros), and their
-gradients against differences of a trace in extended precision that shares nothing with the kernel.
+"""Random lenses full of coincidences (equal neighbours, flats, concentric surfaces, zeros), and
+their gradients against differences of a trace in extended precision that shares nothing with the
+kernel.
 
-A kernel that leaves out what has no effect today must not leave out its derivative. The trace here leaves out
-nothing: every surface is a conic with a polynomial, decentred and tilted by matrices, diffracts, and is
-found by Newton's steps on its sag. Differences are central and extrapolated (Richardson), so they err
-by the fourth power of a step of 1e-4 and by rounding of 1e-19 over it.
+A kernel that leaves out what has no effect today must not leave out its derivative. The trace here
+leaves out
+nothing: every surface is a conic with a polynomial, decentred and tilted by matrices, diffracts,
+and is found by Newton's steps on its sag. Differences are central and extrapolated (Richardson), so
+they err by the fourth power of a step of 1e-4 and by rounding of 1e-19 over it.
 """
 
 import math
@@ -39,8 +41,8 @@ STEPS = {  # per column, so that each moves rays by 1e-4 to 1e-3 mm
 WAVELENGTH_UM = 0.5875618
 RAYS = 6
 NEWTON_STEPS = 12
-# g: glass, e: the same glass as before, o: other glass of the same index, a: air, s: flat stop in air,
-# m: mirror
+# g: glass, e: the same glass as before, o: other glass of the same index, a: air, s: flat stop in
+# air, m: mirror
 FORMS = ("gasge", "geaso", "sgega", "goagae", "gamsga")
 real = np.longdouble
 
@@ -109,7 +111,9 @@ def _surfaces(generator, form):
                 () if letter == "m" else tuple(asphere),
                 is_stop=letter == "s",
                 mirror=letter == "m",
-                phase=None if letter == "m" or not diffracts else Phase(tuple(phase), order=1 + (i % 2)),
+                phase=None
+                if letter == "m" or not diffracts
+                else Phase(tuple(phase), order=1 + (i % 2)),
                 decentre_mm=(uniform(-0.1, 0.1), uniform(-0.1, 0.1)) if moved else (0.0, 0.0),
                 tilt_deg=(uniform(-1, 1), uniform(-1, 1)) if moved else (0.0, 0.0),
             )
@@ -118,7 +122,8 @@ def _surfaces(generator, form):
 
 
 def gradients(system: System, kinds: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Gradient of the system's scalar to each of ``kinds`` by the toolkit; the other tensors ask for none."""
+    """Gradient of the system's scalar to each of ``kinds`` by the toolkit; the other tensors ask
+    for none."""
     geo = system.lens.freeze()
     leaves = {name: getattr(geo, name).detach().clone().requires_grad_() for name in kinds}
     if not any(leaf.numel() for leaf in leaves.values()):
@@ -141,7 +146,9 @@ def differences(system: System) -> dict[str, np.ndarray]:
                     if other == name:
                         value.reshape(-1)[place] += factor * _step(name, place)
                     variants[other].append(value)
-    values = _scalar(system, {name: np.stack(rows) for name, rows in variants.items()}).reshape(-1, 4)
+    values = _scalar(system, {name: np.stack(rows) for name, rows in variants.items()}).reshape(
+        -1, 4
+    )
     near = (values[:, 0] - values[:, 1]) / 2
     far = (values[:, 2] - values[:, 3]) / 4
     slopes = (4 * near - far) / 3
@@ -161,16 +168,19 @@ def _step(name, place):
 
 
 def worst_error(found: dict[str, np.ndarray], truth: dict[str, np.ndarray]) -> dict[str, float]:
-    """Largest relative error of each kind's gradients. Entries below 1/1000 of a kind's largest count
-    relative to that, and those that change the scalar by less than 1e-9 over a step of the differences
-    relative to 1e-9: the conic between equal glasses has none, and the differences only their rounding."""
+    """Largest relative error of each kind's gradients. Entries below 1/1000 of a kind's largest
+    count relative to that, and those that change the scalar by less than 1e-9 over a step of the
+    differences relative to 1e-9: the conic between equal glasses has none, and the differences only
+    their rounding."""
     errors = {}
     for name, value in found.items():
         wanted = truth[name]
         if name == "index_offset":  # rows of air and of mirrors, which the trace here lets vary
             wanted = np.where(truth["glass"], wanted, 0)
         least = max(1e-3 * np.abs(wanted).max(initial=0.0), 1e-9 / max(STEPS[name]))
-        errors[name] = float(np.max(np.abs(value - wanted) / np.maximum(np.abs(wanted), least), initial=0.0))
+        errors[name] = float(
+            np.max(np.abs(value - wanted) / np.maximum(np.abs(wanted), least), initial=0.0)
+        )
     return errors
 
 
@@ -195,7 +205,13 @@ def _numbers(geo):
     found = {name: getattr(geo, name).detach().numpy().astype(real)[None][0] for name in KINDS}
     medium = [1.0]
     for surface in geo.surfaces:
-        at = medium[-1] if surface.mirror else surface.medium.index(WAVELENGTH_UM) if surface.medium else 1.0
+        at = (
+            medium[-1]
+            if surface.mirror
+            else surface.medium.index(WAVELENGTH_UM)
+            if surface.medium
+            else 1.0
+        )
         medium.append(at)
     return found | {"index": np.array(medium, real)}
 
@@ -203,7 +219,10 @@ def _numbers(geo):
 def _scalar(system, numbers):
     """The scalar of each variant [V] of the numbers (each [V, ...], or without V)."""
     geo = system.lens
-    n = {name: value if value.ndim > geo_ndim(name) else value[None] for name, value in numbers.items()}
+    n = {
+        name: value if value.ndim > geo_ndim(name) else value[None]
+        for name, value in numbers.items()
+    }
     V = n["index"].shape[0]
     o = np.broadcast_to(system.origin_mm.numpy().astype(real), (V, RAYS, 3)).copy()
     d = np.broadcast_to(system.direction.numpy().astype(real), (V, RAYS, 3)).copy()
@@ -244,8 +263,12 @@ def _scalar(system, numbers):
             added, slope = _polynomial(o, n["phase"][:, i])
             length = length + waves * added
             across = before * (d - along * normal)
-            grating = waves * np.stack([slope * o[..., 0], slope * o[..., 1], np.zeros_like(slope)], -1)
-            across = (across + grating - (grating * normal).sum(-1, keepdims=True) * normal) / behind
+            grating = waves * np.stack(
+                [slope * o[..., 0], slope * o[..., 1], np.zeros_like(slope)], -1
+            )
+            across = (
+                across + grating - (grating * normal).sum(-1, keepdims=True) * normal
+            ) / behind
             d = across + np.sqrt(1 - (across * across).sum(-1, keepdims=True)) * normal
         back = turn.transpose(0, 2, 1)
         o = o @ back + shift
@@ -270,8 +293,12 @@ def _turn(tilt):
     """[V, 3, 3] matrices Rx Ry, by which rows of vectors are multiplied to get components along the
     turned axes."""
     (a, b), zero, one = tilt.T, np.zeros_like(tilt[:, 0]), np.ones_like(tilt[:, 0])
-    about_x = np.stack([one, zero, zero, zero, np.cos(a), -np.sin(a), zero, np.sin(a), np.cos(a)], 1)
-    about_y = np.stack([np.cos(b), zero, np.sin(b), zero, one, zero, -np.sin(b), zero, np.cos(b)], 1)
+    about_x = np.stack(
+        [one, zero, zero, zero, np.cos(a), -np.sin(a), zero, np.sin(a), np.cos(a)], 1
+    )
+    about_y = np.stack(
+        [np.cos(b), zero, np.sin(b), zero, one, zero, -np.sin(b), zero, np.cos(b)], 1
+    )
     return about_x.reshape(-1, 3, 3) @ about_y.reshape(-1, 3, 3)
 
 

@@ -1,10 +1,10 @@
 """Train a flow network on events rendered on the fly, or on a data set.
 
-The budget is processor time (--cpu-minutes, all threads, making the data included) or a number of steps
-(--steps). With --steps the result depends on the options and the seed alone, and a resumed run gives the same
-numbers bit for bit on the same machine and number of threads. Several processes share every batch: torchrun
---nproc-per-node 2 -m studies.train_flow ... With --race the refiner, networks of its size and your
-own are trained alike, and judged side by side.
+The budget is processor time (--cpu-minutes, all threads, making the data included) or a number of
+steps (--steps). With --steps the result depends on the options and the seed alone, and a resumed
+run gives the same numbers bit for bit on the same machine and number of threads. Several processes
+share every batch: torchrun --nproc-per-node 2 -m studies.train_flow ... With --race the refiner,
+networks of its size and your own are trained alike, and judged side by side.
 """
 
 import os
@@ -37,7 +37,8 @@ class Config(StudyConfig):
         "save_every": 6,
     }
     network: str = "refiner"
-    """Which network: refiner, flownet-events, spike-flownet, ecn or idnet, or module:Class of your own."""
+    """Which network: refiner, flownet-events, spike-flownet, ecn or idnet, or module:Class of your
+    own."""
     options: tuple[str, ...] = ()
     """Arguments of the network's constructor, name=number."""
     weights: int = 0
@@ -55,7 +56,8 @@ class Config(StudyConfig):
     loss: Literal["supervised", "contrast", "photometric"] = "supervised"
     """What is made small."""
     unit: Literal["px", "motion"] = "motion"
-    """Errors count in pixels, or as shares of the window's own root mean square flow (supervised)."""
+    """Errors count in pixels, or as shares of the window's own root mean square flow
+    (supervised)."""
     claim_weight: float = 0.3
     """Weight of the likelihood that teaches a network its confidence (supervised)."""
     smoothness: float = 0.1
@@ -63,8 +65,8 @@ class Config(StudyConfig):
     steps: int | None = None
     """Number of steps; reproducible."""
     cpu_minutes: float | None = None
-    """Processor time to spend, minutes; 20 without --steps. With --steps: the run stops there even if steps
-    are left."""
+    """Processor time to spend, minutes; 20 without --steps. With --steps: the run stops there even
+    if steps are left."""
     batch: int = 16
     """Windows per step, over all processes."""
     height_px: int = 64
@@ -74,18 +76,20 @@ class Config(StudyConfig):
     bins: int = 8
     """Time bins of the windows."""
     reuse: int = 16
-    """Times that windows are shown, turned and mirrored in between; making them costs more than a step."""
+    """Times that windows are shown, turned and mirrored in between; making them costs more than a
+    step."""
     learning_rate: float = 2e-3
     """Largest step of AdamW."""
     weight_decay: float = 1e-4
     """Decay of AdamW."""
     warm_up: float = 0.05
-    """Share of the budget over which the step grows; then it falls as a half cosine to a hundredth."""
+    """Share of the budget over which the step grows; then it falls as a half cosine to a
+    hundredth."""
     clip: float = 1.0
     """Longest gradient; longer ones are shortened to it, and counted."""
     average: float = 0.998
-    """Decay per step of a running average of the weights, which is then what is judged and kept; 0 for
-    none."""
+    """Decay per step of a running average of the weights, which is then what is judged and kept; 0
+    for none."""
     validate_on: tuple[str, ...] = ()
     """Sets to judge on; all when left out."""
     validate_every: int = 1000
@@ -145,7 +149,8 @@ def follow():
 
 
 def begin(config, folder, resumed, ranks):
-    """Job, device and clock of this process; every unfit option, file or data set is refused here."""
+    """Job, device and clock of this process; every unfit option, file or data set is refused
+    here."""
     torch.set_num_threads(config.threads or os.cpu_count() or 1)
     ranks = ranks.on(config.device)
     clock = Clock()
@@ -174,12 +179,14 @@ def budget(config):
 
 
 def run_here(arguments=None):
-    """Exit code of this process: the first one runs the study; the others follow it, and end here."""
+    """Exit code of this process: the first one runs the study; the others follow it, and end
+    here."""
     if place()[0] == 0:
         return main(study, Config, arguments)
     code = follow()
     sys.stdout.flush()
-    # threads of the connection may still be ending, and the interpreter's own end aborts on them now and then
+    # threads of the connection may still be ending, and the interpreter's own end aborts on them
+    # now and then
     os._exit(code)
 
 

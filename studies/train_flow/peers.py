@@ -1,5 +1,6 @@
 """Two published networks that the refiner is raced with: ECN, small and evenly cascaded, and IDNet,
-recurrent, which deblurs. ``--network`` and files know them as "ecn" and "idnet" where this is imported."""
+recurrent, which deblurs. ``--network`` and files know them as "ecn" and "idnet" where this is
+imported."""
 
 from typing import ClassVar
 
@@ -19,20 +20,22 @@ STATE = 4  # channels of IDNet's recurrent state over the width
 
 
 class ECN(Baseline):
-    """Four encoding steps that each keep what came before, pooled and changed a little, and add as many new
-    channels; one residual block; four decoding steps that give them back and each add to the flow.
+    """Four encoding steps that each keep what came before, pooled and changed a little, and add as
+    many new channels; one residual block; four decoding steps that give them back and each add to
+    the flow.
 
     Args:
       bins: bins of the volumes, >= 2.
-      width: channels that every encoding step adds, 16 for the published 0.15 million weights; every
-        layer takes the nearest multiple of 4.
+      width: channels that every encoding step adds, 16 for the published 0.15 million weights;
+        every layer takes the nearest multiple of 4.
       hidden: channels inside the residual block, a multiple of 4; None for twice ``width``.
       seed: of the first weights.
     Gradient: counts and weights; smooth, so any order.
     Raises: ShapeError, DomainError.
-    Source: Ye, Mitrokhin, Fermueller, Yorke, Aloimonos, Unsupervised learning of dense optical flow,
-      depth and egomotion with event-based sensors, IROS 2020, sec. III: the network of flow alone, with group
-      normalisation in place of feature decorrelation, and all bins in place of a time image.
+    Source: Ye, Mitrokhin, Fermueller, Yorke, Aloimonos, Unsupervised learning of dense optical
+      flow, depth and egomotion with event-based sensors, IROS 2020, sec. III: the network of flow
+      alone, with group normalisation in place of feature decorrelation, and all bins in place of a
+      time image.
     """
 
     INSIDE: ClassVar[float] = 2.0
@@ -49,7 +52,8 @@ class ECN(Baseline):
         kept = [channels(width, factor) for factor in (3, 2, 1, 0.5)]
         skips = [*reversed(sizes[:3]), 0]
         self.encoder = nn.ModuleList(
-            nn.Conv2d(a, b, 3, 2, 1, bias=False) for a, b in zip([2 * bins, *sizes], sizes, strict=False)
+            nn.Conv2d(a, b, 3, 2, 1, bias=False)
+            for a, b in zip([2 * bins, *sizes], sizes, strict=False)
         )
         self.encoder_norms = nn.ModuleList(nn.GroupNorm(GROUPS, size) for size in sizes)
         self.residual = nn.Sequential(
@@ -94,23 +98,24 @@ def _with_channels(image, count):
 
 
 class IDNet(Baseline):
-    """Iterative deblurring: the bins are moved back along the flow so far, an encoder and a recurrent unit
-    read them in turn, and the last state says what to add to the flow; again with the same weights.
+    """Iterative deblurring: the bins are moved back along the flow so far, an encoder and a
+    recurrent unit read them in turn, and the last state says what to add to the flow; again with
+    the same weights.
 
     Args:
       bins: bins of the volumes, >= 2.
       width: channels of the first layer, four times as many in the recurrent state; 32 for the
-        published small network of some 1.4 million weights; every layer takes the nearest multiple of
-        4.
+        published small network of some 1.4 million weights; every layer takes the nearest multiple
+        of 4.
       hidden: channels inside the head, a multiple of 4; None for 8 times ``width``.
       iterations: >= 1, 4 as published.
       seed: of the first weights.
     Gradient: counts and weights; piecewise smooth, as bilinear lookups and rectifiers are.
     Raises: ShapeError, DomainError.
-    Source: Wu, Paredes-Valles, de Croon, Lightweight event-based optical flow estimation via iterative
-      deblurring, ICRA 2024, sec. III: without correlation volumes, flow at 1/8 resolution brought to
-      all pixels by learnt means of nine cells. Here bins are moved in place of single events, and the
-      state starts at 0.
+    Source: Wu, Paredes-Valles, de Croon, Lightweight event-based optical flow estimation via
+      iterative deblurring, ICRA 2024, sec. III: without correlation volumes, flow at 1/8 resolution
+      brought to all pixels by learnt means of nine cells. Here bins are moved in place of single
+      events, and the state starts at 0.
     """
 
     STRIDE: ClassVar[int] = 8  # of the cells on which flow is found
@@ -165,8 +170,8 @@ class IDNet(Baseline):
         return found
 
     def _read(self, read):
-        """State [B, S, h, w] of a gated recurrent unit (Ballas et al., ICLR 2016) after all bins [B, T, S, h,
-        w]."""
+        """State [B, S, h, w] of a gated recurrent unit (Ballas et al., ICLR 2016) after all bins
+        [B, T, S, h, w]."""
         state = torch.zeros_like(read[:, 0])
         for seen in read.unbind(1):
             update, reset = self.gates(torch.cat([state, seen], 1)).sigmoid().chunk(2, 1)

@@ -1,5 +1,5 @@
-"""The refiner against a plain, a spiking, a cascaded and a deblurring network of as many weights, and
-networks of your own: the same windows, the same budget, several seeds.
+"""The refiner against a plain, a spiking, a cascaded and a deblurring network of as many weights,
+and networks of your own: the same windows, the same budget, several seeds.
 
 Every training is a run of this study in a folder below; those that are done are kept when the race
 goes on with --resume. Then all networks are judged on the same windows.
@@ -45,7 +45,8 @@ def race(run):
     wanted = [(network, seed) for seed in config.seeds for network in names]
     _train(run, wanted)
     networks = {
-        job: flow.load(_folder(run, *job) / "network.safetensors", kinds.get(job[0])) for job in wanted
+        job: flow.load(_folder(run, *job) / "network.safetensors", kinds.get(job[0]))
+        for job in wanted
     }
     _show(run, names, networks, _judged(run, networks))
 
@@ -76,7 +77,9 @@ def _train(run, wanted):
 
 
 def _trained(job, command, children):
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as child:
+    with subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    ) as child:
         children.append(child)
         said = child.communicate()[1].strip().splitlines()[-1:] or ["no word"]
     if child.returncode != 0:
@@ -110,7 +113,10 @@ def _command(run, network, seed):
     }
     if network in NAMES and network != "refiner":
         options["weights"] = config.weights or sum(p.numel() for p in Refiner().parameters())
-    return [*start, *(word for name, value in options.items() for word in (f"--{name}", str(value)))]
+    return [
+        *start,
+        *(word for name, value in options.items() for word in (f"--{name}", str(value))),
+    ]
 
 
 def _judged(run, networks):
@@ -136,9 +142,13 @@ def _show(run, names, networks, found):
     rows = []
     met = 0
     for name, scores in found.items():
-        ratios = {network: [scores[network, seed].ratio for seed in config.seeds] for network in names}
+        ratios = {
+            network: [scores[network, seed].ratio for seed in config.seeds] for network in names
+        }
         shares = [
-            max(ours / theirs for ours, theirs in zip(ratios["refiner"], ratios[rival], strict=True))
+            max(
+                ours / theirs for ours, theirs in zip(ratios["refiner"], ratios[rival], strict=True)
+            )
             for rival in rivals
         ]
         met += sum(share <= ASKED for share in shares)
@@ -148,15 +158,22 @@ def _show(run, names, networks, found):
         closed = scores["closed form"]
         run.record(
             **{f"{name}_closed_form_ratio": closed.ratio, f"{name}_windows": closed.windows},
-            **{f"{name}_refiner_over_{_key(r)}_worst": s for r, s in zip(rivals, shares, strict=True)},
+            **{
+                f"{name}_refiner_over_{_key(r)}_worst": s
+                for r, s in zip(rivals, shares, strict=True)
+            },
         )
         spread = [f"{min(values):.3f} to {max(values):.3f}" for values in ratios.values()]
         rows.append([name.replace("_", " "), closed.windows, closed.ratio, *spread, *shares])
     asked = len(rivals) * len(rows)
-    weights = {name: sum(p.numel() for p in networks[name, config.seeds[0]].parameters()) for name in names}
+    weights = {
+        name: sum(p.numel() for p in networks[name, config.seeds[0]].parameters()) for name in names
+    }
     run.record(**{f"{_key(name)}_weights": number for name, number in weights.items()})
     run.record(shares_met=met, shares_asked=asked)
-    run.card(f"At most {ASKED:g} of a rival's error", f"{met} of {asked}", "sets and rivals, worst seed")
+    run.card(
+        f"At most {ASKED:g} of a rival's error", f"{met} of {asked}", "sets and rivals, worst seed"
+    )
     columns = ["set", "windows", "closed form", *names.values()]
     run.table(
         "Endpoint error over that of zero flow",
@@ -164,7 +181,10 @@ def _show(run, names, networks, found):
         rows,
         f"Least to largest of {len(config.seeds)} seeds. Asked: at most {ASKED:g} of every rival.",
     )
-    rates = [[label, weights[name], RATES.get(name, config.learning_rate)] for name, label in names.items()]
+    rates = [
+        [label, weights[name], RATES.get(name, config.learning_rate)]
+        for name, label in names.items()
+    ]
     run.table("Networks", ["network", "weights", "learning rate"], rates)
     run.finish(
         "Refiner against networks of its size",

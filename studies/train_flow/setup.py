@@ -28,7 +28,8 @@ from codesign.train.batches import probe
 from scenes.windows.sets import TRAINING, VALIDATION, Shape
 from studies.train_flow import peers  # noqa: F401  which networks files know
 
-# the last window in so many of a data set is judged on: whole stretches, since neighbours look alike
+# the last window in so many of a data set is judged on: whole stretches, since neighbours look
+# alike
 HELD_OUT = 10
 # share of the windows on which a network that refines begins from another flow than its own
 FOREIGN = 0.2
@@ -154,7 +155,8 @@ def prepare(config, folder, resumed, ranks, clock):
 
 
 def build_network(config):
-    """A fresh network, its weights drawn from the run's seed; the global random numbers stay as they were.
+    """A fresh network, its weights drawn from the run's seed; the global random numbers stay as
+    they were.
 
     Raises: DomainError for an unknown name or option.
     """
@@ -179,7 +181,9 @@ def build_network(config):
                 )
             return kind.with_weights(config.weights, **options)
         except TypeError as error:
-            raise DomainError(f"network '{config.network}' does not take these options ({error}).") from error
+            raise DomainError(
+                f"network '{config.network}' does not take these options ({error})."
+            ) from error
 
 
 def named_class(name):
@@ -225,13 +229,15 @@ def start(network, config):
 
 
 def sources(config, shape):
-    """Training parts, and sources to judge on with the number of windows they have (None: as many as
-    wanted)."""
+    """Training parts, and sources to judge on with the number of windows they have
+    (None: as many as wanted)."""
     if config.data is None:
         check_names("mix", (config.mix,), TRAINING)
         check_names("validate-on", config.validate_on, VALIDATION)
         chosen = config.validate_on or VALIDATION
-        return TRAINING[config.mix](shape, config.seed), {name: VALIDATION[name](shape, 0) for name in chosen}
+        return TRAINING[config.mix](shape, config.seed), {
+            name: VALIDATION[name](shape, 0) for name in chosen
+        }
     whole = open_windows(
         config.data,
         config.bins,

@@ -25,7 +25,8 @@ RECENT = 50  # steps over which the shown loss is averaged
 
 
 class Watch:
-    """Context around the training of a run; call ``after_step`` after each step, ``finish`` at the end."""
+    """Context around the training of a run; call ``after_step`` after each step, ``finish`` at the
+    end."""
 
     def __init__(self, run, job, clock):
         self.run = run
@@ -45,7 +46,9 @@ class Watch:
     def __enter__(self):
         by_step = self.config.steps is not None
         self._units = self.job.progress.step if by_step else 0
-        total, what = (self.config.steps, "training") if by_step else (100, "training, % of the budget")
+        total, what = (
+            (self.config.steps, "training") if by_step else (100, "training, % of the budget")
+        )
         self._bar = self.run.progress(total, what, done=self._units)
         self._bar.__enter__()
         return self
@@ -71,7 +74,9 @@ class Watch:
 
     def save(self):
         """Write the checkpoint."""
-        training.save(self.run.path("checkpoint"), self.job.learner, self.job.progress, self.job.facts)
+        training.save(
+            self.run.path("checkpoint"), self.job.learner, self.job.progress, self.job.facts
+        )
 
     def validate(self):
         """Judge the network on the first windows of every set, and keep the figures."""
@@ -182,7 +187,11 @@ def show(run, job, scores):
         f"{progress.validation_s / 60:.2f} min validation (not part of the budget). Gradients shortened in "
         f"{progress.clipped} of {progress.step} steps.",
     )
-    run.figure(curves(progress), "curves", "Loss and gradient norm (running means), and validation by step.")
+    run.figure(
+        curves(progress),
+        "curves",
+        "Loss and gradient norm (running means), and validation by step.",
+    )
     run.figure(
         pictures(job, scores),
         "flows",
@@ -201,14 +210,19 @@ def curves(progress):
     width = max(1, min(RECENT, progress.step // 5))
     at = np.arange(width, progress.step + 1)
     charts = [
-        Panel({label: (at, np.convolve(values, np.ones(width) / width, "valid"))}, "step", label, "y")
+        Panel(
+            {label: (at, np.convolve(values, np.ones(width) / width, "valid"))}, "step", label, "y"
+        )
         for label, values in (("loss", progress.loss), ("gradient norm", progress.norm))
     ]
     series = {}
     for name in [name for entry in progress.validation[-1:] for name in entry if name != "step"]:
         entries = [entry for entry in progress.validation if name in entry]
         for key, label in (("ratio", name), ("closed_form_ratio", f"{name}, closed form")):
-            series[label] = [entry["step"] for entry in entries], [entry[name][key] for entry in entries]
+            series[label] = (
+                [entry["step"] for entry in entries],
+                [entry[name][key] for entry in entries],
+            )
     if series:
         charts.append(Panel(series, "step", "error over zero flow's"))
     return panels(*charts)

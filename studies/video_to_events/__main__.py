@@ -1,12 +1,13 @@
-"""Events of an event camera that looks at a video, a folder of pictures, a stack of arrays, or a raw
-recording.
+"""Events of an event camera that looks at a video, a folder of pictures, a stack of arrays, or a
+raw recording.
 
-Time: t of the events is that of the frames: of the container, of --fps, or of --timestamps. Light: digital
-  values are taken as intensities, as v2e does; --linear undoes the sRGB gamma first. Colour becomes luminance
-  (0.2126 red, 0.7152 green, 0.0722 blue).
-Memory: frames are read, simulated and stored in chunks, so memory does not grow with the video. Event files
-  are written whole at the end, which takes 0.05 GB of memory per million events (0.13 GB for .raw), and 13 MB
-  of disk until then; with --events and no name nothing grows. See docs/event_views.md.
+Time: t of the events is that of the frames: of the container, of --fps, or of --timestamps. Light:
+  digital values are taken as intensities, as v2e does; --linear undoes the sRGB gamma first. Colour
+  becomes luminance (0.2126 red, 0.7152 green, 0.0722 blue).
+Memory: frames are read, simulated and stored in chunks, so memory does not grow with the video.
+  Event files are written whole at the end, which takes 0.05 GB of memory per million events
+  (0.13 GB for .raw), and 13 MB of disk until then; with --events and no name nothing grows. See
+  docs/event_views.md.
 """
 
 import math
@@ -54,7 +55,10 @@ def study(run: Run[Options]) -> None:
     chunks = math.ceil((last - first) / size)
     done = (state.next_frame - first) // size
     saved = time.monotonic()
-    with closing(source.read(state.next_frame)) as frames, run.progress(chunks, "chunks", done) as progress:
+    with (
+        closing(source.read(state.next_frame)) as frames,
+        run.progress(chunks, "chunks", done) as progress,
+    ):
         while state.next_frame < last:
             start = time.perf_counter()
             index = slice(state.next_frame, min(state.next_frame + size, last))
@@ -78,8 +82,8 @@ def study(run: Run[Options]) -> None:
 
 
 def check_outputs(run, config, height, width):
-    """Write and remove a file of one event in every format asked for, so that one that cannot be is told now
-    and not after the simulation; likewise what the preview needs."""
+    """Write and remove a file of one event in every format asked for, so that one that cannot be is
+    told now and not after the simulation; likewise what the preview needs."""
     zero = torch.zeros(1, dtype=torch.int64)
     if config.preview:
         require("imageio_ffmpeg", "video", "a preview (--no-preview leaves it out)")

@@ -1,4 +1,5 @@
-"""What the sensor sees of an input, and when: times of the frames, and light from digital values."""
+"""What the sensor sees of an input, and when: times of the frames, and light from digital
+values."""
 
 from decimal import Decimal, InvalidOperation
 
@@ -21,8 +22,8 @@ def frame_times(config, source, most=None):
       config: the options of the study.
       source: FrameSource.
       most: use no more frames than that.
-    Returns: t_s [count] float64 seconds, index of the first frame used and of the one behind the last, and a
-      sentence about the clock.
+    Returns: t_s [count] float64 seconds, index of the first frame used and of the one behind the
+      last, and a sentence about the clock.
     Raises: DomainError when there are no times, two kinds of them, times that do not increase by a
       microsecond or more, or fewer than two frames left.
     """
@@ -67,11 +68,11 @@ def frame_times(config, source, most=None):
 
 
 def read_times(path, unit, count):
-    """[count] float64 seconds from a text file of one number per line; empty lines and lines that begin with
-    # are left out.
+    """[count] float64 seconds from a text file of one number per line; empty lines and lines that
+    begin with # are left out.
 
-    Numbers are read as decimals, so whole microseconds and nanoseconds of epoch times become the nearest
-    float.
+    Numbers are read as decimals, so whole microseconds and nanoseconds of epoch times become the
+    nearest float.
     """
     times = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -108,11 +109,12 @@ class Light:
         self.tables = {}
 
     def __call__(self, frames, first):
-        """Intensity [N, H, W] float32 of ``frames``, a list of [H, W] or [H, W, 3] arrays, the first of which
-        has number ``first``.
+        """Intensity [N, H, W] float32 of ``frames``, a list of [H, W] or [H, W, 3] arrays, the
+        first of which has number ``first``.
 
-        Red, green and blue are weighted as in BT.709, after the gamma is undone where that is asked for. A
-        new size is reached by bilinear interpolation that averages all pixels it covers, on intensities.
+        Red, green and blue are weighted as in BT.709, after the gamma is undone where that is asked
+        for. A new size is reached by bilinear interpolation that averages all pixels it covers, on
+        intensities.
         Raises: DomainError naming the frame that holds NaN, infinity or a negative value.
         """
         values = np.stack(frames)
@@ -128,7 +130,9 @@ class Light:
             light = light @ torch.tensor(LUMINANCE, device=light.device)
         if self.size is not None and self.size != (light.shape[2], light.shape[1]):
             size = self.size[::-1]
-            light = interpolate(light[:, None], size, mode="bilinear", antialias=True, align_corners=False)
+            light = interpolate(
+                light[:, None], size, mode="bilinear", antialias=True, align_corners=False
+            )
             light = light[:, 0].clamp_(min=0)
         return light
 
@@ -148,12 +152,14 @@ class Light:
 
 
 def pieces(max_displacement_px, before, before_s, seen, t_s):
-    """What the sensor sees of a chunk: frames [n, H, W] and their times, piece by piece, with frames between
-    in the memory of one interval. The pieces of all chunks together do not depend on where the chunks begin.
+    """What the sensor sees of a chunk: frames [n, H, W] and their times, piece by piece, with
+    frames between in the memory of one interval. The pieces of all chunks together do not depend on
+    where the chunks begin.
 
     Args:
       max_displacement_px: see ``events.upsample``; None: the frames as they are, in one piece.
-      before, before_s: last frame [H, W] of the chunk before and its time; None for the first chunk.
+      before, before_s: last frame [H, W] of the chunk before and its time; None for the first
+        chunk.
       seen: [N, H, W] frames of the chunk.
       t_s: [N] seconds.
     """
@@ -166,5 +172,9 @@ def pieces(max_displacement_px, before, before_s, seen, t_s):
     first, first_s = next(made)
     for frames, times_s in made:
         if before is None:  # a sensor wants two frames at first
-            frames, times_s, before = torch.cat((first, frames)), torch.cat((first_s, times_s)), first
+            frames, times_s, before = (
+                torch.cat((first, frames)),
+                torch.cat((first_s, times_s)),
+                first,
+            )
         yield frames, times_s

@@ -1,5 +1,5 @@
-"""What a run of video_to_events shows: warnings, figures of the events on disk drawn piece by piece, two
-videos, metrics, and the page."""
+"""What a run of video_to_events shows: warnings, figures of the events on disk drawn piece by
+piece, two videos, metrics, and the page."""
 
 import dataclasses
 import math
@@ -33,8 +33,8 @@ SHOWN = 4
 
 @dataclass(frozen=True)
 class View:
-    """What there is to show: the run and its options, frames and how to see them, events, t_s of the frames
-    used, and the number of the first of them."""
+    """What there is to show: the run and its options, frames and how to see them, events, t_s of
+    the frames used, and the number of the first of them."""
 
     run: Run[Any]
     config: Any
@@ -74,8 +74,11 @@ class View:
         return zip(pairwise(ends), pairwise(edges), strict=True)
 
     def streams(self):
-        """For every picture of the videos: the stream of its events, and its start and end, microseconds."""
-        for (a, b), (start_us, end_us) in self.slices(max(1, round(self.duration_s / self.exposure_s))):
+        """For every picture of the videos: the stream of its events, and its start and end,
+        microseconds."""
+        for (a, b), (start_us, end_us) in self.slices(
+            max(1, round(self.duration_s / self.exposure_s))
+        ):
             yield self.log.read(a, b), start_us, end_us
 
 
@@ -105,8 +108,14 @@ def write_page(view, state, sensor, clock, written):
         largest_value=state.largest,
     )
     run.card("Events", f"{state.events:,}", f"{state.on:,} ON, {off:,} OFF")
-    run.card("Rate", f"{short(rate_hz)}events/s", f"{short(rate_hz / pixels)}events per pixel and second")
-    run.card("Frames", f"{frames}", f"{view.log.width_px} x {view.log.height_px}, {seconds(view.duration_s)}")
+    run.card(
+        "Rate", f"{short(rate_hz)}events/s", f"{short(rate_hz / pixels)}events per pixel and second"
+    )
+    run.card(
+        "Frames",
+        f"{frames}",
+        f"{view.log.width_px} x {view.log.height_px}, {seconds(view.duration_s)}",
+    )
     run.card("Speed", f"{speed:.1f} Mpixel/s", f"{state.seconds:.1f} s, decoding included")
     slow = state.large_share > WORRYING
     run.section("Is the video fast enough?")
@@ -133,7 +142,11 @@ def write_page(view, state, sensor, clock, written):
     values = [(name, str(value)) for name, value in dataclasses.asdict(sensor).items()]
     run.table(f"Sensor: {view.config.preset}", ("parameter", "value"), values)
     if written:
-        run.table("Event files", ("file", "MB"), [(path.name, path.stat().st_size / 1e6) for path in written])
+        run.table(
+            "Event files",
+            ("file", "MB"),
+            [(path.name, path.stat().st_size / 1e6) for path in written],
+        )
     lead = (
         f"{state.events:,} events from {frames} frames of `{view.source.path.name}`, "
         f"{seconds(view.duration_s)}."
@@ -262,7 +275,8 @@ def trace_pictures(view):
 
 
 def rates_over_time(view):
-    """Middle of equal parts of the time, seconds [K], and events per second in them, [K, 2], ON first."""
+    """Middle of equal parts of the time, seconds [K], and events per second in them, [K, 2], ON
+    first."""
     rows = []
     middle_s = []
     for (a, b), (start_us, end_us) in view.slices(min(RATE_BINS, len(view.t_s) - 1)):

@@ -1,5 +1,5 @@
-"""What a run of video_to_events keeps, so that an interrupted one ends with the same events: the events so
-far, how far it has come, and how far pixels step from frame to frame."""
+"""What a run of video_to_events keeps, so that an interrupted one ends with the same events: the
+events so far, how far it has come, and how far pixels step from frame to frame."""
 
 from bisect import bisect_right
 from dataclasses import dataclass, field
@@ -20,8 +20,8 @@ WORRYING = 0.1  # share of the moving pixels
 
 
 class EventLog:
-    """A file of events in order of time, appended to while they are made and read in pieces: memory stays
-    flat.
+    """A file of events in order of time, appended to while they are made and read in pieces: memory
+    stays flat.
 
     path: the file.
     count: events in it that count; later ones, written before a run was killed, are cut off.
@@ -70,7 +70,10 @@ class EventLog:
     def positions(self, times_us):
         """For each time, the number of events at or before it."""
         every = range(self.count)
-        return [bisect_right(every, time, key=lambda k: self._records(k, 1)["t"][0]) for time in times_us]
+        return [
+            bisect_right(every, time, key=lambda k: self._records(k, 1)["t"][0])
+            for time in times_us
+        ]
 
     def _records(self, first, count):
         # no memory map, whose pages would count as memory of the process
@@ -91,8 +94,8 @@ class Progress:
     simulated: frames that the sensor saw, those put between with them.
     largest: digital value seen.
     seconds: time spent.
-    histogram: [LARGEST + 1] int64; entry n counts pixels and intervals whose level moved by n to n + 1
-      thresholds.
+    histogram: [LARGEST + 1] int64; entry n counts pixels and intervals whose level moved by n to n
+      + 1 thresholds.
     before: [H, W] the last frame seen.
     """
 
@@ -108,7 +111,8 @@ class Progress:
     before: Tensor | None = None
 
     def add(self, frames, found, thetas):
-        """Take in frames [N, H, W] and their events; steps are counted in whole thresholds (ON, OFF)."""
+        """Take in frames [N, H, W] and their events; steps are counted in whole thresholds
+        (ON, OFF)."""
         self.events += len(found)
         self.on += int((found.p > 0).sum())
         self.simulated += len(frames)
@@ -122,17 +126,20 @@ class Progress:
 
     @property
     def large_share(self):
-        """Share of steps beyond LARGE thresholds among those that make events, of one threshold and more."""
+        """Share of steps beyond LARGE thresholds among those that make events, of one threshold and
+        more."""
         return float(self.histogram[LARGE:].sum() / self.histogram[1:].sum().clamp(min=1))
 
     @property
     def remedy(self):
-        """By which factor the frame rate would have to grow so that nine in ten moving pixels step at most
-        LARGE thresholds; 1 where they do."""
+        """By which factor the frame rate would have to grow so that nine in ten moving pixels step
+        at most LARGE thresholds; 1 where they do."""
         moving = self.histogram[1:].cumsum(0)
         if not int(moving[-1]):
             return 1.0
-        step = 2 + int(torch.searchsorted(moving, int(0.9 * int(moving[-1])) + 1).clamp(max=len(moving) - 1))
+        step = 2 + int(
+            torch.searchsorted(moving, int(0.9 * int(moving[-1])) + 1).clamp(max=len(moving) - 1)
+        )
         return max(1.0, step / LARGE)
 
     def save(self, run):
@@ -151,8 +158,8 @@ class Progress:
 
     @classmethod
     def load(cls, run, first_frame, seed, facts):
-        """The state an earlier session stored, or a fresh one. Raises: FileFormatError when the input is no
-        longer the one of the run."""
+        """The state an earlier session stored, or a fresh one. Raises: FileFormatError when the
+        input is no longer the one of the run."""
         generator = torch.Generator().manual_seed(seed)
         sensor = SensorState(generator=generator)
         stored = run.load_state()

@@ -1,6 +1,8 @@
-"""Makes the subset of reference values in this folder from the whole set: ``python tests/data/make.py FOLDER``.
+"""Makes the subset of reference values in this folder from the whole set:
+``python tests/data/make.py FOLDER``.
 
-FOLDER holds lens/, events/ and srm/ as README.md describes them. Numbers are chosen and packed, never changed.
+FOLDER holds lens/, events/ and srm/ as README.md describes them. Numbers are chosen and packed,
+never changed.
 """
 
 import json
@@ -23,8 +25,8 @@ def log_level(frames):
 
 
 def counts_before_dead_time(frames, t_s, given):
-    """Larger of the ON and OFF counts [T, H, W] that v2e's comparator sees, by its equations without noise,
-    written out; the largest of a frame says in how many slots its events are put."""
+    """Larger of the ON and OFF counts [T, H, W] that v2e's comparator sees, by its equations
+    without noise, written out; the largest of a frame says in how many slots its events are put."""
     seen = np.zeros(frames.shape, np.int64)
     theta_on, theta_off = np.float32(given["pos_thres"]), np.float32(given["neg_thres"])
     level = log_level(frames)
@@ -58,8 +60,8 @@ def counts_before_dead_time(frames, t_s, given):
 
 
 def chosen_pixels(frames, t_s, settings):
-    """Flat numbers of SIDE x SIDE pixels that hold, in every frame and configuration, one with the most events
-    of all: its number of slots is then that of the whole. The rest are drawn."""
+    """Flat numbers of SIDE x SIDE pixels that hold, in every frame and configuration, one with the
+    most events of all: its number of slots is then that of the whole. The rest are drawn."""
     needed = []
     for given in settings:
         seen = counts_before_dead_time(frames, t_s, given).reshape(len(frames), -1)
@@ -109,11 +111,14 @@ def events(source, target):
         np.savez_compressed(target / f"seq_{sequence}.npz", frames=kept, t=t_s)
         for configuration, data in emulated.items():
             np.savez_compressed(
-                target / f"v2e_{sequence}_{configuration}.npz", **only(data, pixels, frames.shape[2])
+                target / f"v2e_{sequence}_{configuration}.npz",
+                **only(data, pixels, frames.shape[2]),
             )
         name = f"esimpy_fixedalias_{sequence}_ideal_eps1e-3.npz"
         if (source / name).exists():
-            np.savez_compressed(target / name, **only(np.load(source / name), pixels, frames.shape[2]))
+            np.savez_compressed(
+                target / name, **only(np.load(source / name), pixels, frames.shape[2])
+            )
     statistics = json.loads((source / "v2e_stats.json").read_text())
     (target / "v2e_stats.json").write_text(json.dumps(statistics, separators=(",", ":")) + "\n")
 

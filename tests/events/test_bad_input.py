@@ -1,5 +1,5 @@
-"""Wrong calls of the event package, as somebody makes who meets it for the first time: each gets one sentence
-that names what was given. Plain types and signs of single arguments are the doors'
+"""Wrong calls of the event package, as somebody makes who meets it for the first time: each gets
+one sentence that names what was given. Plain types and signs of single arguments are the doors'
 (``tests/test_doors.py``)."""
 
 import math
@@ -153,7 +153,10 @@ WRONG = [
     (lambda: events.from_stream(STREAM, 5, 2, 2), "t1_us must be a whole number >= 6"),
     (lambda: events.surface_from_stream(STREAM, [5, 5], 1.0), "whole microseconds"),
     (lambda: events.decay(COUNTS, T_S, 1e-200), "tau_s must be .*, got 1e-200"),
-    (lambda: events.decay_from_stream(STREAM, [10], 0.1, start=(COUNTS[0], 2**40)), "the trace is of"),
+    (
+        lambda: events.decay_from_stream(STREAM, [10], 0.1, start=(COUNTS[0], 2**40)),
+        "the trace is of",
+    ),
     (
         lambda: events.decay_from_stream(STREAM, [10], 0.1, start=(torch.zeros(2, 6, 4), 0)),
         r"to go on with must be \[2, 4, 6\]",
@@ -169,15 +172,23 @@ WRONG = [
     # sensors
     (lambda: events.simulate(FRAMES[:, 0], T_S, SENSOR), "H, W"),
     (lambda: events.simulate(FRAMES, T_S, "noisy"), "events.PRESETS"),
-    (lambda: events.simulate(FRAMES, T_S, SENSOR, 3), "the generator must be a Generator, got an int"),
+    (
+        lambda: events.simulate(FRAMES, T_S, SENSOR, 3),
+        "the generator must be a Generator, got an int",
+    ),
     (lambda: events.dense_counts(FRAMES, T_S, SensorModel(timing="v2e")), "interpolated"),
     (lambda: SensorModel(theta_on=torch.tensor(0.2)), "events.sensor_counts"),
     (lambda: SensorModel(photoreceptor_noise=True), "needs cutoff_hz and shot_rate_hz"),
     (lambda: events.simulate(FRAMES, T_S, SensorModel(**UNSTABLE)), "unstable"),
     (lambda: SensorModel(hot_pixel_share=2.0), "0 to 1"),
-    (lambda: events.sensor_counts(FRAMES, T_S, SENSOR, leak_rate_hz=T_S[1]), "'leak_rate_hz' cannot carry"),
     (
-        lambda: events.sensor_counts(FRAMES, T_S, SENSOR, refractory_s=torch.tensor(0.0, requires_grad=True)),
+        lambda: events.sensor_counts(FRAMES, T_S, SENSOR, leak_rate_hz=T_S[1]),
+        "'leak_rate_hz' cannot carry",
+    ),
+    (
+        lambda: events.sensor_counts(
+            FRAMES, T_S, SENSOR, refractory_s=torch.tensor(0.0, requires_grad=True)
+        ),
         "0, which switches it off",
     ),
     # functions of frames
@@ -185,8 +196,14 @@ WRONG = [
     (lambda: events.memory(FRAMES, 0.2, 0.2, state=FRAMES[0].double()), "must be float32"),
     (lambda: events.memory(FRAMES, 0.2, 0.2, gradient="mean"), "'exact', 'play'"),
     (lambda: events.one_pole(FRAMES, torch.ones(3, 1, 1)), "one per interval"),
-    (lambda: events.one_pole(FRAMES, torch.ones(4, 1, 1), torch.zeros(6)), r"must be \[4, 6\], got \[6\]"),
-    (lambda: events.upsample(FRAMES.roll((3, 5), (1, 2)), T_S, max_steps=1), "max_steps = 1: record faster"),
+    (
+        lambda: events.one_pole(FRAMES, torch.ones(4, 1, 1), torch.zeros(6)),
+        r"must be \[4, 6\], got \[6\]",
+    ),
+    (
+        lambda: events.upsample(FRAMES.roll((3, 5), (1, 2)), T_S, max_steps=1),
+        "max_steps = 1: record faster",
+    ),
     (lambda: streamed(FRAMES, [0.0]), "there is no time 1"),
     (lambda: streamed([FRAMES[0], FRAMES[1, 1:]], T_S[:2]), "frame 1"),
     (lambda: streamed(FRAMES, [0.1, 0.0, 0.2, 0.3, 0.4]), r"frame 1 must be .* > 0\.1, got 0\.0"),
@@ -195,9 +212,15 @@ WRONG = [
     (lambda: layer("memory", spread=0.1), "no option 'spread'; its options are learn, log_input"),
     (lambda: layer("srm", steps=0), "steps must be a whole number from 1 .*, got 0"),
     (lambda: layer("memory", learn="theta_on"), "learn is 'theta_on'"),
-    (lambda: layer("memory", learn=("refractory_s",)), "cannot learn 'refractory_s'.*the layer 'physical'"),
+    (
+        lambda: layer("memory", learn=("refractory_s",)),
+        "cannot learn 'refractory_s'.*the layer 'physical'",
+    ),
     (lambda: layer("physical", learn=("cutoff_hz",)), "switched off"),
-    (lambda: layer("expected", SensorModel(theta_sigma=0.03), learn=("theta_sigma",)), "no gradient in the"),
+    (
+        lambda: layer("expected", SensorModel(theta_sigma=0.03), learn=("theta_sigma",)),
+        "no gradient in the",
+    ),
     (lambda: layer("memory")(FRAMES.expand(2, 5, 4, 6), T_S, [GENERATOR]), "batch of 2"),
     (lambda: layer("memory").finely(FRAMES, T_S, 1e-12), r"1e-12 s would hold .* of one call"),
     (lambda: going_on(generator=GENERATOR), "leave the generator out"),
@@ -211,7 +234,10 @@ WRONG = [
     (lambda: events.drive_scale(FRAMES, theta=0.7, share=1.0), "share"),
     (lambda: events.Laplace(0.0, 1.0), "alpha"),
     (lambda: events.Triangular(1.0, math.inf), "beta"),
-    (lambda: events.FastSigmoid(1.0, 1.0).torch_density(torch.ones(2, dtype=torch.int64)), "real numbers"),
+    (
+        lambda: events.FastSigmoid(1.0, 1.0).torch_density(torch.ones(2, dtype=torch.int64)),
+        "real numbers",
+    ),
     (lambda: torch.autograd.functional.hessian(potential, FRAMES[:2, :2, :1]), "second derivative"),
     (lambda: OURS(FRAMES[:, 0], T_S), "H, W"),
     (lambda: OURS(FRAMES, T_S[:3]), r"\[5\]"),
@@ -277,7 +303,9 @@ def test_a_state_that_a_simpler_sensor_began(more, words):
 
 @pytest.mark.parametrize("name", [name for name in events.LAYERS if name != "physical"])
 def test_what_a_layer_leaves_out_of_its_sensor_is_named(name):
-    with pytest.warns(UserWarning, match="knows no leak_rate_hz, refractory_s: the sensor is taken without"):
+    with pytest.warns(
+        UserWarning, match="knows no leak_rate_hz, refractory_s: the sensor is taken without"
+    ):
         layer(name, events.PRESETS["default"])
     # warns of nothing: warnings are errors here
     layer(name, SensorModel(theta_sigma=0.03, shot_rate_hz=1.0))

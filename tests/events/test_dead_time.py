@@ -1,5 +1,5 @@
-"""Mean counts behind a dead time against the recursion written out in torch, in value and gradient, every
-phase written out, a closed form, and differences of the hard sensor."""
+"""Mean counts behind a dead time against the recursion written out in torch, in value and gradient,
+every phase written out, a closed form, and differences of the hard sensor."""
 
 import math
 
@@ -17,16 +17,16 @@ D = torch.float64
 
 
 def behind(signed, interval_s, dead_s):
-    """Kept counts [T, 2, P] of thresholds of 1 and a level whose play counts these [T, P], OFF negative;
-    where there is none, it rests in the middle of its play."""
+    """Kept counts [T, 2, P] of thresholds of 1 and a level whose play counts these [T, P], OFF
+    negative; where there is none, it rests in the middle of its play."""
     middle = torch.cat((torch.zeros_like(signed[:1]), signed)).cumsum(0)
     level = middle + torch.cat((torch.zeros_like(signed[:1]), signed.sign() / 2))
     return mean_counts(level, middle[0], (torch.ones((), dtype=D),) * 2, interval_s, dead_s)[0]
 
 
 def every_phase(signed, interval_s, dead_s, phases):
-    """The same mean by its definition: an event wherever the signed count passes i + u, one after the other,
-    for many u."""
+    """The same mean by its definition: an event wherever the signed count passes i + u, one after
+    the other, for many u."""
     ends = interval_s.cumsum(0)
     place = torch.zeros_like(signed[0])
     phase = ((torch.arange(phases, dtype=D) + 0.5) / phases)[:, None].expand(-1, signed.shape[-1])
@@ -58,8 +58,8 @@ def test_kept_counts_are_the_mean_over_every_phase(seed):
     dead_s = 5e-3 + 15e-3 * torch.rand((), generator=generator, dtype=D)
     truth = every_phase(counts, lengths, float(dead_s), 100)
     kept = behind(counts, lengths, dead_s)
-    # groups are a third of a count wide and mixed within: at most an eighth of an event too early or late on
-    # average, which hardly adds up over time
+    # groups are a third of a count wide and mixed within: at most an eighth of an event too early
+    # or late on average, which hardly adds up over time
     apart = (kept - truth).cumsum(0).sum(1)
     assert float(apart.square().mean().sqrt()) < 0.125
     assert float(kept.sum()) == pytest.approx(float(truth.sum()), rel=0.02)
@@ -114,11 +114,16 @@ def written_out(level, centre, thetas, interval_s, dead_s):
         early = torch.where(begins, border, filled(end)) - filled(start)
         early = early * at_most_one(1 - (begun - free))
         begun = torch.where(begins, rows[-1] + early, begun)
-        late = torch.where(begins, at_most_one(filled(end) - border), 0) * at_most_one(1 - (begun - free))
+        late = torch.where(begins, at_most_one(filled(end) - border), 0) * at_most_one(
+            1 - (begun - free)
+        )
         rows.append(rows[-1] + early + late)
         passed = (early + late).mean(0)
         on, off = kept[interval]
-        kept[interval] = [on + torch.where(rise > 0, passed, 0), off + torch.where(fall > 0, passed, 0)]
+        kept[interval] = [
+            on + torch.where(rise > 0, passed, 0),
+            off + torch.where(fall > 0, passed, 0),
+        ]
         position = position + ahead * total
     return torch.stack([torch.stack(pair) for pair in kept]), centre, position
 
@@ -128,7 +133,9 @@ def looked(rows, times_s, when_s):
     if when_s <= times_s[0] or len(rows) == 1:
         return rows[0]
     at = int((times_s[: len(rows) - 1] <= when_s).sum()) - 1
-    return rows[at] + (rows[at + 1] - rows[at]) * ((when_s - times_s[at]) / (times_s[at + 1] - times_s[at]))
+    return rows[at] + (rows[at + 1] - rows[at]) * (
+        (when_s - times_s[at]) / (times_s[at + 1] - times_s[at])
+    )
 
 
 def at_most_one(share):
@@ -142,8 +149,8 @@ def filled(place):
     return whole + at_most_one((place - whole) / WIDTH)
 
 
-# intervals longer than parts, several blocks, a look over many rows, one interval, a dead time beyond the
-# window
+# intervals longer than parts, several blocks, a look over many rows, one interval, a dead time
+# beyond the window
 @pytest.mark.parametrize(
     ("frames", "interval_ms", "dead_ms"),
     [(30, 4, 20), (25, 4, 2), (150, 1, 5), (90, 1, 45), (1, 1, 5), (12, 1, 1000)],
@@ -166,7 +173,9 @@ def test_the_kernel_is_the_recursion_written_out(frames, interval_ms, dead_ms, g
         position = after.position if counts is mean_counts else after - after.detach().floor()
         outputs = kept, centre, position
         weigh = torch.Generator().manual_seed(1)
-        loss = sum((one * torch.randn(one.shape, generator=weigh, dtype=D)).sum() for one in outputs)
+        loss = sum(
+            (one * torch.randn(one.shape, generator=weigh, dtype=D)).sum() for one in outputs
+        )
         found.append([*outputs, *torch.autograd.grad(loss, leaves, materialize_grads=True)])
     for kernel, torch_form in zip(*found, strict=True):
         # a look whose weight is near 1/step = 1e3 to 1e4 per second magnifies rounding
@@ -186,10 +195,10 @@ def hard_mean(level, t_s, sensor, beginnings=32):
     return total / beginnings
 
 
-# cosine and scale measured: dead time 1.00/0.89. A group mixes the phases of a third of a count, which takes
-# up
-# to an eighth of the slope to the dead time; a threshold moved alone leaves the other behind, and the play's
-# width is then a long-run mean only. The bounds are below what was asked (0.97, 0.9).
+# cosine and scale measured: dead time 1.00/0.89. A group mixes the phases of a third of a count,
+# which takes up to an eighth of the slope to the dead time; a threshold moved alone leaves the
+# other behind, and the play's width is then a long-run mean only. The bounds are below what was
+# asked (0.97, 0.9).
 @pytest.mark.filterwarnings("ignore:rate x dead time is above 2")
 @pytest.mark.parametrize(
     ("name", "dead_s", "thetas", "fastest_hz", "cosine", "low"),
@@ -225,7 +234,8 @@ def test_gradients_follow_differences_of_hard_counts_over_beginnings(
         slopes = [torch.autograd.grad(one, s, retain_graph=True)[0] for one in counted(s, layer)]
         found = found + torch.stack(slopes) / 4
     ends = [
-        counted(s, lambda level, values: hard_mean(level, t_s, SensorModel(**values))) for s in (1.0, -1.0)
+        counted(s, lambda level, values: hard_mean(level, t_s, SensorModel(**values)))
+        for s in (1.0, -1.0)
     ]
     truth = (ends[0] - ends[1]) / 2
     found_cosine, found_scale = cosine_and_scale(found, truth)
@@ -233,7 +243,9 @@ def test_gradients_follow_differences_of_hard_counts_over_beginnings(
     assert low < found_scale < 1.1
 
 
-def test_without_gradients_the_counts_are_the_hard_sensor_s_and_no_mean_is_computed(monkeypatch, generator):
+def test_without_gradients_the_counts_are_the_hard_sensor_s_and_no_mean_is_computed(
+    monkeypatch, generator
+):
     sensor = SensorModel(0.15, 0.15, refractory_s=0.004)
     t_s = torch.arange(40) * 1e-3
     level = (0.1 * torch.randn(40, 8, generator=generator)).cumsum(0)
@@ -242,7 +254,9 @@ def test_without_gradients_the_counts_are_the_hard_sensor_s_and_no_mean_is_compu
     plain, _ = sensor_counts(level, t_s, sensor, log_input=True)
     torch.testing.assert_close(plain, wanted, rtol=0, atol=1e-6)  # n + (s - s) rounds
     with torch.no_grad():
-        assert torch.equal(sensor_counts(level.requires_grad_(), t_s, sensor, log_input=True)[0], plain)
+        assert torch.equal(
+            sensor_counts(level.requires_grad_(), t_s, sensor, log_input=True)[0], plain
+        )
 
 
 @pytest.mark.parametrize(("dead_s", "learnt"), [(4e-3, True), (8e-3, True), (8e-3, False)])
@@ -259,4 +273,8 @@ def test_gradients_to_thresholds_behind_a_long_dead_time_are_warned_of(dead_s, l
 
 def test_a_dead_time_over_too_many_intervals_is_refused():
     with pytest.raises(DomainError, match="reaches over 3000 intervals"):
-        behind(torch.full((3100, 1), 0.1, dtype=D), torch.full((3100,), 1e-3, dtype=D), torch.tensor(3.0))
+        behind(
+            torch.full((3100, 1), 0.1, dtype=D),
+            torch.full((3100,), 1e-3, dtype=D),
+            torch.tensor(3.0),
+        )

@@ -1,5 +1,5 @@
-"""When events come between two frames, against curves known in closed form and the hard sensor at 10 kHz; a
-sensor that ran before its window, against the closed form of a ramp."""
+"""When events come between two frames, against curves known in closed form and the hard sensor at
+10 kHz; a sensor that ran before its window, against the closed form of a ramp."""
 
 import math
 from dataclasses import replace
@@ -29,15 +29,20 @@ def times(intervals):
 
 PHASE, SECOND, OFFSET = torch.rand(3, 4000, generator=torch.Generator().manual_seed(3), dtype=D)
 # pixels of like phase together, [4, N]: over all of them a shift in time changes nothing
-GROUPS = torch.cat([torch.stack((x.sin(), x.cos())) for x in (PHASE * 2 * math.pi, SECOND * 2 * math.pi)])
+GROUPS = torch.cat(
+    [torch.stack((x.sin(), x.cos())) for x in (PHASE * 2 * math.pi, SECOND * 2 * math.pi)]
+)
 
 
 def waves(intervals, amplitude=0.0, shift=0.0):
-    """[T, 1, N] levels: two waves per pixel with phases of its own, the faster with six samples per period
-    where there are eight intervals. Pixels begin anywhere in their thresholds, so a sum of many is a mean
-    over beginnings."""
+    """[T, 1, N] levels: two waves per pixel with phases of its own, the faster with six samples per
+    period where there are eight intervals. Pixels begin anywhere in their thresholds, so a sum of
+    many is a mean over beginnings."""
     turn = (times(intervals)[:, None] + 0.02 * shift) * 2 * math.pi
-    level = 0.5 * (13.3 * turn + PHASE * 2 * math.pi).sin() + 0.7 * (4.1 * turn + SECOND * 2 * math.pi).sin()
+    level = (
+        0.5 * (13.3 * turn + PHASE * 2 * math.pi).sin()
+        + 0.7 * (4.1 * turn + SECOND * 2 * math.pi).sin()
+    )
     return (4 + C * OFFSET + (1 + amplitude) * level)[:, None]
 
 
@@ -51,7 +56,10 @@ def way(move, intervals):
 def steered(found, level, move):
     """Derivatives of numbers by a move of the level that they come from."""
     tangent = way(move, len(level) - 1)
-    slopes = [(torch.autograd.grad(x, level, retain_graph=True)[0] * tangent).sum() for x in found.flatten()]
+    slopes = [
+        (torch.autograd.grad(x, level, retain_graph=True)[0] * tangent).sum()
+        for x in found.flatten()
+    ]
     return torch.stack(slopes)
 
 
@@ -60,7 +68,9 @@ def difference(move):
     """Derivative of the stream's volume, event by event, the mean over beginnings."""
     ends = []
     for sign in (1, -1):
-        stream = events.simulate(waves(1000, **{move: sign * STEP}), times(1000), SENSOR, log_input=True)
+        stream = events.simulate(
+            waves(1000, **{move: sign * STEP}), times(1000), SENSOR, log_input=True
+        )
         found = events.from_stream(stream, 0, round(SPAN_S * 1e6), BINS, dtype=D).counts[0, :, :, 0]
         ends.append((found @ GROUPS.T).flatten())
     return (ends[0] - ends[1]) / (2 * STEP)
@@ -70,7 +80,9 @@ def difference(move):
 @pytest.mark.parametrize("name", ["memory", "counts", "physical"])
 def test_eight_intervals_steer_a_volume_as_the_stream_at_10_khz_does(name, move):
     level = waves(8).requires_grad_()
-    volume = events.layer(name, SENSOR, log_input=True).volume(level, times(8), BINS).counts[0, :, :, 0]
+    volume = (
+        events.layer(name, SENSOR, log_input=True).volume(level, times(8), BINS).counts[0, :, :, 0]
+    )
     cosine, scale = cosine_and_scale(steered(volume @ GROUPS.T, level, move), difference(move))
     # what is asked of eight intervals
     assert cosine >= 0.97
@@ -81,16 +93,20 @@ def test_events_of_one_long_interval_lie_where_the_level_crosses():
     level = torch.tensor([4.0, 4.0 + 20.5 * C], dtype=D).reshape(2, 1, 1)
     t_s = torch.tensor([0.0, SPAN_S], dtype=D)
     volume = (
-        events.layer("memory", SENSOR, log_input=True).volume(level, t_s, BINS).counts[0, 0, :, 0, 0].detach()
+        events.layer("memory", SENSOR, log_input=True)
+        .volume(level, t_s, BINS)
+        .counts[0, 0, :, 0, 0]
+        .detach()
     )
     crossing = torch.arange(1, 21, dtype=D) / 20.5 * (BINS - 1)  # in node spacings
     nodes = torch.arange(BINS, dtype=D)
     truth = (1 - (crossing - nodes[:, None]).abs()).clamp(min=0).sum(1)
     assert float(volume.sum()) == 20
-    # four parts from node to node: an event lies at most an eighth of that from its place, early as often as
-    # late
+    # four parts from node to node: an event lies at most an eighth of that from its place, early as
+    # often as late
     assert abs(float(nodes @ (volume - truth))) < 20 / 8 / 4
-    # a node shares the events of both spacings beside it, and so does one part's worth of them at most
+    # a node shares the events of both spacings beside it, and so does one part's worth of them at
+    # most
     assert float((volume - truth).abs().max()) < 20.5 / (4 * (BINS - 1)) / 4
 
 
@@ -115,7 +131,9 @@ def test_smooth_curves_between_frames_are_met_to_the_third_order(log_input):
     assert errors[0] / errors[1] > 7
 
 
-def test_a_step_rings_by_seven_percent_of_it_beside_and_nowhere_else_and_has_its_gradient(generator):
+def test_a_step_rings_by_seven_percent_of_it_beside_and_nowhere_else_and_has_its_gradient(
+    generator,
+):
     level = torch.tensor([1.0, 1.0, 1.0, 3.0, 3.0, 3.0], dtype=D).reshape(-1, 1)
     found, times_s = finer(level, torch.arange(6.0), 1 / 96, log_input=True)
     assert bool((found[times_s <= 1] == 1).all())
@@ -130,7 +148,11 @@ def test_a_step_rings_by_seven_percent_of_it_beside_and_nowhere_else_and_has_its
 
 @pytest.mark.parametrize(
     "t_s",
-    [torch.linspace(0, 0.1, 17), 10 + torch.arange(17) / 100, 1.7e9 + torch.arange(17, dtype=D) / 1000],
+    [
+        torch.linspace(0, 0.1, 17),
+        10 + torch.arange(17) / 100,
+        1.7e9 + torch.arange(17, dtype=D) / 1000,
+    ],
 )
 def test_rounded_times_make_no_part_more(t_s, generator):
     # 17 frames are four intervals from one node of five bins to the next, in exact times
@@ -152,7 +174,9 @@ def test_every_layer_gives_volumes_from_few_frames(name):
     torch.testing.assert_close(volume.counts.sum((0, 2)), counts.sum((0, 1)))
     if not layer.refines:  # events of an interval come evenly
         halves = counts.unflatten(1, (8, 2))
-        torch.testing.assert_close(halves, (layer(level, times(8)) / 2)[:, :, None].expand_as(halves))
+        torch.testing.assert_close(
+            halves, (layer(level, times(8)) / 2)[:, :, None].expand_as(halves)
+        )
 
 
 def test_a_system_asks_a_layer_for_its_volume_and_sets_plain_counts_at_middles():
@@ -181,8 +205,9 @@ STEADY = RATE * WINDOW_S / 0.2
 
 
 def ramps(lead_s, slope=1.0):
-    """Frames [1, T, 1, 200] and times: log levels that rise by RATE, up to one event's time after the first
-    frame, so that all phases of the threshold are alike often; without a lead all begin with the window."""
+    """Frames [1, T, 1, 200] and times: log levels that rise by RATE, up to one event's time after
+    the first frame, so that all phases of the threshold are alike often; without a lead all begin
+    with the window."""
     t_s = START_S + torch.linspace(-lead_s, WINDOW_S, 61, dtype=D)
     delay_s = torch.linspace(0, 0.2 / RATE, 201, dtype=D)[:-1] * (lead_s > 0)
     since_s = (t_s[:, None] - START_S + lead_s - delay_s).clamp(min=0)
@@ -191,8 +216,8 @@ def ramps(lead_s, slope=1.0):
 
 @pytest.mark.parametrize("hard", [False, True])
 def test_the_steady_rate_of_a_ramp_is_read_after_the_lead(hard):
-    """Events of a window are its rise over the threshold; a sensor that begins with the window counts whole
-    ones."""
+    """Events of a window are its rise over the threshold; a sensor that begins with the window
+    counts whole ones."""
 
     def volume(sensor, lead_s):
         made = events.Settled(events.layer("memory", sensor), lead_s)
@@ -207,8 +232,9 @@ def test_the_steady_rate_of_a_ramp_is_read_after_the_lead(hard):
     rates = found.counts[0, 0].mean((1, 2)) / found.collected_s
     assert rates.tolist() == pytest.approx([RATE / 0.2] * 5, rel=0.12)
     assert float(volume(IDEAL, 0.0).counts.sum()) / 200 == pytest.approx(math.floor(STEADY))
-    # behind a low pass the first events come later still; after the lead what is left is that its time
-    # constant, which goes as one over the light, is shorter at the end of the ramp than at its beginning
+    # behind a low pass the first events come later still; after the lead what is left is that its
+    # time constant, which goes as one over the light, is shorter at the end of the ramp than at its
+    # beginning
     slow = replace(IDEAL, cutoff_hz=100.0)
     assert float(volume(slow, 0.0).counts.sum()) / 200 <= STEADY - 0.5
     assert STEADY < float(volume(slow, 0.02).counts.sum()) / 200 < STEADY + 0.2

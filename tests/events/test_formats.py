@@ -1,5 +1,6 @@
-"""Event files of every format: exact round trips, one file through both doors, damage and limits that end in
-a sentence. Bit layouts: test_formats_layouts.py; mutants of whole files: tests/hostile."""
+"""Event files of every format: exact round trips, one file through both doors, damage and limits
+that end in a sentence. Bit layouts: test_formats_layouts.py; mutants of whole files:
+tests/hostile."""
 
 import io
 import zipfile
@@ -49,7 +50,9 @@ DAVIS = {"height_px": 260, "width_px": 346}
         ("e.CSV", 5000, 2**50, {}),
     ],
 )
-def test_events_come_back_exactly_with_the_size_of_the_sensor(tmp_path, name, first_us, span_us, options):
+def test_events_come_back_exactly_with_the_size_of_the_sensor(
+    tmp_path, name, first_us, span_us, options
+):
     # which text has no place for
     told = {"height_px": 480, "width_px": 640} if name == "e.CSV" else {}
     for count in (30_000, 1, 0):
@@ -64,7 +67,10 @@ EVENTS = [[7, 1_400_000, 2_000_000], [3, 0, 9], [0, 5, 2], [-1, 1, 1]]  # t_us, 
 T_US = np.array(EVENTS[0])
 ON = np.array([0, 1, 1])
 NPZ = {"t_us": T_US, "x": EVENTS[1], "y": EVENTS[2], "p": EVENTS[3], "height_px": 6, "width_px": 10}
-DSEC = {f"events/{name}": values for name, values in zip("txyp", (T_US - 5, *EVENTS[1:3], ON), strict=True)}
+DSEC = {
+    f"events/{name}": values
+    for name, values in zip("txyp", (T_US - 5, *EVENTS[1:3], ON), strict=True)
+}
 
 
 def in_arrays(**values):
@@ -112,20 +118,32 @@ def test_one_file_gives_the_same_numbers_through_both_doors(name, tmp_path):
     path.write_bytes(SAME[name])
     stream, held = read(path), read_recording(path)
     assert [getattr(stream, field).tolist() for field in FIELDS] == EVENTS
-    assert [held.t_us.tolist(), held.x.tolist(), held.y.tolist(), (2 * held.on - 1).tolist()] == EVENTS
+    assert [
+        held.t_us.tolist(),
+        held.x.tolist(),
+        held.y.tolist(),
+        (2 * held.on - 1).tolist(),
+    ] == EVENTS
     assert (stream.height_px, stream.width_px) == (6, 10)  # told, or the smallest that holds them
     told = name in ("with_size.txt", "own.npz", "mvsec.hdf5")
     assert (held.height_px, held.width_px) == ((6, 10) if told else (180, 240))
     window = held.window(1_400_000, 2_000_000)
-    assert [getattr(window, field).tolist() for field in FIELDS] == [column[1:] for column in EVENTS]
+    assert [getattr(window, field).tolist() for field in FIELDS] == [
+        column[1:] for column in EVENTS
+    ]
 
 
 def test_recordings_of_cameras_are_the_same_through_both_doors(shared):
-    for name in ("data/davis346_newton_cradle/demo-01.npz", "data/prophesee_gen3_vga/faery_evt2.npz"):
+    for name in (
+        "data/davis346_newton_cradle/demo-01.npz",
+        "data/prophesee_gen3_vga/faery_evt2.npz",
+    ):
         with np.load(shared(name)) as file:
             t_us, x, y, p = (file[key].astype(np.int64) for key in "txyp")
         stream, held = read(shared(name)), read_recording(shared(name))
-        for found, true in zip((held.t_us, held.x, held.y, held.on), (t_us, x, y, p > 0), strict=True):
+        for found, true in zip(
+            (held.t_us, held.x, held.y, held.on), (t_us, x, y, p > 0), strict=True
+        ):
             assert np.array_equal(found, true)
         assert np.array_equal(stream.t_us.numpy(), t_us)
         assert int((stream.x * stream.p).sum()) == int((x * (2 * (p > 0) - 1)).sum())
@@ -158,7 +176,9 @@ def test_csv_is_written_as_the_text_it_says(tmp_path):
 
 def dsec(**change):
     """Bytes of a DSEC file with some datasets changed, None: left out."""
-    changed = {{"t": "events/t", "x": "events/x", "p": "events/p"}.get(k, k): v for k, v in change.items()}
+    changed = {
+        {"t": "events/t", "x": "events/x", "p": "events/p"}.get(k, k): v for k, v in change.items()
+    }
     return in_hdf5({k: v for k, v in (DSEC | {"t_offset": 5} | changed).items() if v is not None})
 
 
@@ -167,8 +187,8 @@ def npz(**change):
 
 
 def short_blocks(packing, shorten):
-    """DSEC of blocks that unpack to too little: both end the process when HDF5 unpacks them, since the
-    missing bytes lie beyond its buffer."""
+    """DSEC of blocks that unpack to too little: both end the process when HDF5 unpacks them, since
+    the missing bytes lie beyond its buffer."""
 
     def fill(file):
         for name in "txyp":
@@ -252,7 +272,11 @@ DAMAGED = [
     ("e.h5", in_hdf5({}, linked), "link to another"),
     ("e.h5", in_hdf5(DSEC | {"events/x": None}, virtual), "other files"),
     ("e.h5", in_hdf5(DSEC | {"t_offset": 5}, compression="lzf"), "filters"),
-    ("e.h5", short_blocks({"compression": "gzip"}, lambda _: zlib.compress(b"short")), "does not unpack"),
+    (
+        "e.h5",
+        short_blocks({"compression": "gzip"}, lambda _: zlib.compress(b"short")),
+        "does not unpack",
+    ),
     (
         "e.h5",
         short_blocks(dict(hdf5plugin.Blosc()), lambda data: data[:4] + b"\x40\0\0\0" + data[8:]),
@@ -264,7 +288,11 @@ DAMAGED = [
     ("e.raw", b"% evt 3.0\n% format EVT2\n% end\n", r"2\.0.*3\.0"),
     ("e.raw", b"% evt 3.0\n% endianness big\n% end\n", "big"),
     ("e.raw", b"% evt 3.0\n% geometry 640\n% end\n", "WIDTHxHEIGHT"),
-    ("e.raw", b"% evt 3.0\n% format EVT3;height=4;width=5\n% geometry 4x5\n% end\n", "two sensor sizes"),
+    (
+        "e.raw",
+        b"% evt 3.0\n% format EVT3;height=4;width=5\n% geometry 4x5\n% end\n",
+        "two sensor sizes",
+    ),
     ("e.raw", b"% evt 3.0\n% geometry 9000x5\n% end\n", "from 1 to 2048"),
     ("e.raw", b"% evt 3.0\n% evt 2.0\n% end\n", "twice"),
     ("e.raw", b"% evt \xff\n% end\n", "ASCII"),
@@ -289,9 +317,17 @@ DAMAGED = [
     ("e.dat", dat((5000, 1, 1, 1), (3999, 2, 1, 1)), "event 1: it lies 1001 us before"),
     ("e.dat", dat().replace(b"Width 640", b"Width -6"), "Width as '-6'"),
     ("e.aedat4", lambda data: data[1:] + b"x", "does not start with"),
-    ("e.aedat4", lambda data: data.replace(b'<dv version="2.0">', b"<!DOCTYPE dv     >"), "document type"),
+    (
+        "e.aedat4",
+        lambda data: data.replace(b'<dv version="2.0">', b"<!DOCTYPE dv     >"),
+        "document type",
+    ),
     ("e.aedat4", lambda data: data.replace(b"</dv>", b"</dw>"), "XML cannot be read"),
-    ("e.aedat4", lambda data: data.replace(b"EVTS</attr>", b"FRME</attr>"), "0 streams of kind EVTS"),
+    (
+        "e.aedat4",
+        lambda data: data.replace(b"EVTS</attr>", b"FRME</attr>"),
+        "0 streams of kind EVTS",
+    ),
     ("e.aedat4", lambda data: data.replace(b">346<", b">-46<"), "whole numbers"),
     ("e.aedat4", lambda data: data[:-20], "damaged"),
     ("e.aedat4", lambda data: data[: 14 + 32] + b"\x09" + data[14 + 33 :], "compression 9"),
@@ -334,7 +370,12 @@ ONE = stream_of((0, 1, 1, 1))
         ("e.raw", ONE, {"evt": 4}, "evt=4"),
         ("e.raw", ONE, {"t0_us": 1}, "times less t0_us 1 span -1"),
         ("e.dat", ONE, {"evt": 3}, "evt=3"),
-        ("e.dat", stream_of((2**32, 1, 1, 1)), {}, "times span 4294967296.*0 to 4294967295; pass .* t0_us"),
+        (
+            "e.dat",
+            stream_of((2**32, 1, 1, 1)),
+            {},
+            "times span 4294967296.*0 to 4294967295; pass .* t0_us",
+        ),
         ("e.dat", stream_of((0, 1, 1, 1), width_px=2**14 + 1), {}, "16384 x 16384"),
         ("e.dat", ONE, {"t0_us": 1.0}, "t0_us is 1.0"),
         ("e.dat", ONE, {"t0_us": 2**63}, "t0_us is 9223372036854775808"),
@@ -343,7 +384,9 @@ ONE = stream_of((0, 1, 1, 1))
         ("e.aedat2", stream_of((2**31, 1, 1, 1), **DAVIS), {}, "holds 0 to 2147483647"),
     ],
 )
-def test_streams_a_format_cannot_hold_leave_the_earlier_file(tmp_path, name, stream, options, words):
+def test_streams_a_format_cannot_hold_leave_the_earlier_file(
+    tmp_path, name, stream, options, words
+):
     path = tmp_path / name
     if path.parent.exists():
         path.write_bytes(b"earlier")
@@ -355,7 +398,11 @@ def test_streams_a_format_cannot_hold_leave_the_earlier_file(tmp_path, name, str
 @pytest.mark.parametrize(
     ("name", "options", "words"),
     [
-        ("seconds.csv", {"width_px": 9}, "line 3.*x = 9; the sensor has 9 pixels there by the options"),
+        (
+            "seconds.csv",
+            {"width_px": 9},
+            "line 3.*x = 9; the sensor has 9 pixels there by the options",
+        ),
         ("seconds.csv", {"height_px": 5}, "line 2.*y = 5"),
         ("own.npz", {"width_px": 3}, "width_px 10 by the file, but 3"),
         ("mvsec.hdf5", {"width_px": 11}, "width_px 10 by its frames, but 11"),

@@ -1,5 +1,5 @@
-"""Event files against recordings that another program decoded, and against the published layouts, bit by
-bit."""
+"""Event files against recordings that another program decoded, and against the published layouts,
+bit by bit."""
 
 import struct
 import subprocess
@@ -49,7 +49,9 @@ def test_a_recording_decodes_as_another_program_decodes_it(shared, name, size, s
     start_us = int(truth["t0_us"]) if start_us is None else start_us
     order = np.lexsort((truth["p"], truth["x"], truth["y"], truth["t"]))
     assert (events.height_px, events.width_px) == size
-    for found, wanted in zip((events.t_us - start_us, events.x, events.y, events.p > 0), "txyp", strict=True):
+    for found, wanted in zip(
+        (events.t_us - start_us, events.x, events.y, events.p > 0), "txyp", strict=True
+    ):
         assert np.array_equal(found.numpy(), truth[wanted][order])
     if path.suffix == ".aedat4":
         recorded = read_frames(path)
@@ -103,7 +105,11 @@ FULL = (0x8, 0xFFF), (0x6, 0xFFF), OFF_5
             evt2(0x8FFFFFFF, evt2_event(63, 5, 1, 0), 0x80000000, evt2_event(2, 6, 1, 1)),
             [(2**34 - 1, 5, 1, -1), (2**34 + 2, 6, 1, 1)],
         ),
-        ("e.dat", dat((2**32 - 1, 5, 1, 0), (2, 6, 1, 1)), [(2**32 - 1, 5, 1, -1), (2**32 + 2, 6, 1, 1)]),
+        (
+            "e.dat",
+            dat((2**32 - 1, 5, 1, 0), (2, 6, 1, 1)),
+            [(2**32 - 1, 5, 1, -1), (2**32 + 2, 6, 1, 1)],
+        ),
         (
             "e.dat",
             dat((5000, 1, 1, 1), (4000, 2, 1, 1), (5000, 0, 1, 1)),
@@ -140,8 +146,8 @@ def test_what_is_written_is_what_the_layout_says(tmp_path):
     "times_us", [[0, 2**24 - 1, 2**24], [4094 * 4096, 2**26 + 5], [2**32 + 9], [2**23, 2**36]]
 )
 def test_every_way_of_counting_loops_of_evt3_gives_the_written_times(tmp_path, times_us):
-    """The strictest reader, faery, counts a loop only from 4095 to 0 and passes over jumps of 4094 or more;
-    Prophesee's takes the first time-high word, less one, off all times."""
+    """The strictest reader, faery, counts a loop only from 4095 to 0 and passes over jumps of 4094
+    or more; Prophesee's takes the first time-high word, less one, off all times."""
     write(tmp_path / "e.raw", stream_of(*((t_us, 1, 1, 1) for t_us in times_us)))
     high, low, loops, found = 0, 0, 0, []
     words = words_of(tmp_path / "e.raw", "<u2")
@@ -201,8 +207,8 @@ def test_sizes_come_from_the_header_the_caller_or_the_events(tmp_path):
 
 
 def blocks(data):
-    """(header, packets as (place, bytes), table) of an AEDAT 4.0 file, by the published layout; nothing is
-    decompressed."""
+    """(header, packets as (place, bytes), table) of an AEDAT 4.0 file, by the published layout;
+    nothing is decompressed."""
     at = start = 18 + struct.unpack_from("<I", data, 14)[0]
     table_at = struct.unpack_from("<q", data, 14 + 40)[0]
     packets = []
@@ -216,7 +222,11 @@ def blocks(data):
 def test_packets_and_header_are_laid_out_as_in_the_recording(shared, tmp_path):
     header, packets, _ = blocks(shared("data/davis346_newton_cradle/demo-01.aedat4").read_bytes())
     first = lz4.frame.decompress(packets[0][1])
-    layout = {"names": list("txyp"), "formats": ["<i8", "<i2", "<i2", "?"], "offsets": [0, 8, 10, 12]}
+    layout = {
+        "names": list("txyp"),
+        "formats": ["<i8", "<i2", "<i2", "?"],
+        "offsets": [0, 8, 10, 12],
+    }
     events = np.frombuffer(first, np.dtype(layout | {"itemsize": 16}), offset=32)
     ties = events[np.lexsort((events["p"], events["x"], events["y"], events["t"]))]
     t_us, x, y, p = (torch.from_numpy(ties[name].astype(np.int64)) for name in "txyp")
@@ -227,8 +237,8 @@ def test_packets_and_header_are_laid_out_as_in_the_recording(shared, tmp_path):
     # compression do not
     assert written_header[4:40] == header[4:40]
     assert b'<attr key="sizeX" type="int">346</attr>' in written_header
-    # the table at the end, walked by hand: root 28, its vector at 40, one entry, whose shared slots begin at
-    # 18
+    # the table at the end, walked by hand: root 28, its vector at 40, one entry, whose shared slots
+    # begin at 18
     table = lz4.frame.decompress(table)
     assert struct.unpack_from("<II4s", table) == (len(table) - 4, 28, b"FTAB")
     assert struct.unpack_from("<II", table, 40)[0] == 1
@@ -247,7 +257,13 @@ def test_every_compression_and_a_missing_table_are_read(tmp_path):
     write(path, stream)
     data = path.read_bytes()
     body = lz4.frame.decompress(blocks(data)[1][0][1])
-    packers = (bytes, lz4.frame.compress, lz4.frame.compress, zstandard.compress, zstandard.compress)
+    packers = (
+        bytes,
+        lz4.frame.compress,
+        lz4.frame.compress,
+        zstandard.compress,
+        zstandard.compress,
+    )
     for code, pack in enumerate(packers):
         path.write_bytes(packed_aedat4(data, code, pack(body)))
         assert same(stream, read(path))
@@ -257,7 +273,9 @@ def test_every_compression_and_a_missing_table_are_read(tmp_path):
     ("extension", "height_px", "width_px", "chip"),
     [(".aedat2", 260, 346, b"DAVIS346"), (".aedat", 180, 240, b"DAVIS240C")],
 )
-def test_aedat2_holds_mirrored_addresses_and_big_endian_times(tmp_path, extension, height_px, width_px, chip):
+def test_aedat2_holds_mirrored_addresses_and_big_endian_times(
+    tmp_path, extension, height_px, width_px, chip
+):
     path = tmp_path / f"e{extension}"
     stream = random_stream(1000, height_px, width_px, 2**31 - 1)
     write(path, stream)
@@ -268,7 +286,9 @@ def test_aedat2_holds_mirrored_addresses_and_big_endian_times(tmp_path, extensio
     t_us, address = t_us[(address >> 10 & 1) == 0], address[(address >> 10 & 1) == 0]
     # jAER: x = width - 1 - column bits, y counts from the bottom
     found = (t_us, width_px - 1 - (address >> 12 & 0x3FF), height_px - 1 - (address >> 22 & 0x1FF))
-    assert all(np.array_equal(a, b) for a, b in zip(found, (stream.t_us, stream.x, stream.y), strict=True))
+    assert all(
+        np.array_equal(a, b) for a, b in zip(found, (stream.t_us, stream.x, stream.y), strict=True)
+    )
     assert np.array_equal(address >> 11 & 1, stream.p > 0)
     assert not (address >> 31).any()
 
@@ -313,7 +333,9 @@ SINCE_US = (STREAM.t_us - EPOCH_US).numpy()
     ],
 )
 def test_published_hdf5_files_are_read(tmp_path, packing):
-    assert same(read(dsec(tmp_path / "e.h5", SINCE_US, **packing), height_px=480, width_px=640), STREAM)
+    assert same(
+        read(dsec(tmp_path / "e.h5", SINCE_US, **packing), height_px=480, width_px=640), STREAM
+    )
 
 
 def test_hdf5_that_is_written_follows_the_layout(tmp_path):
@@ -321,7 +343,14 @@ def test_hdf5_that_is_written_follows_the_layout(tmp_path):
     with h5py.File(tmp_path / "e.h5") as file:
         names = ("events/t", "events/x", "events/y", "events/p", "t_offset", "ms_to_idx")
         found = [np.asarray(file[name]) for name in names]
-    assert [str(one.dtype) for one in found] == ["uint32", "uint16", "uint16", "uint8", "int64", "uint64"]
+    assert [str(one.dtype) for one in found] == [
+        "uint32",
+        "uint16",
+        "uint16",
+        "uint8",
+        "int64",
+        "uint64",
+    ]
     since_us, x, y, on, offset_us, index = found
     assert int(offset_us) == int(STREAM.t_us[0])
     wanted = (SINCE_US - SINCE_US[0], STREAM.x, STREAM.y, STREAM.p > 0)
@@ -337,7 +366,13 @@ def test_a_window_is_the_events_between_two_times(tmp_path, monkeypatch, indexed
     if not indexed:  # a little disorder, which an index of milliseconds cannot hold
         times[1::7] = np.maximum(times[1::7] - 400, 0)
     events = hdf5.Hdf5Events(dsec(tmp_path / "e.h5", times, indexed))
-    for t0_us, t1_us in ((0, 0), (11_999, 12_000), (7_300, 21_450), (39_000, 60_000), (-50, 40_000)):
+    for t0_us, t1_us in (
+        (0, 0),
+        (11_999, 12_000),
+        (7_300, 21_450),
+        (39_000, 60_000),
+        (-50, 40_000),
+    ):
         inside = (times >= t0_us) & (times <= t1_us)
         columns = (STREAM.x[inside], STREAM.y[inside], STREAM.p[inside])
         truth = ordered(torch.from_numpy(times[inside] + EPOCH_US), *columns, 480, 640)
@@ -393,5 +428,7 @@ def test_a_full_disk_is_an_error_and_never_the_end_of_the_process(tmp_path):
     values = np.random.default_rng(1).integers(0, 1000, 5000)
     for name, opened in (("ours", new_hdf5), ("theirs", lambda path: h5py.File(path, "w"))):
         with opened(tmp_path / name) as file:
-            file.create_dataset("a", data=values, chunks=(512,), compression="gzip", track_times=False)
+            file.create_dataset(
+                "a", data=values, chunks=(512,), compression="gzip", track_times=False
+            )
     assert (tmp_path / "ours").read_bytes() == (tmp_path / "theirs").read_bytes()

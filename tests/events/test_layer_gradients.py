@@ -1,6 +1,7 @@
-"""Gradients of every event layer against the account that its docstring gives of itself, written out for one
-pixel of the worst clip (black, saturated, beyond the film, at the joint of the front end, still); those to
-the sensor against differences of hard counts; the two smooth baselines against closed forms and means."""
+"""Gradients of every event layer against the account that its docstring gives of itself, written
+out for one pixel of the worst clip (black, saturated, beyond the film, at the joint of the front
+end, still); those to the sensor against differences of hard counts; the two smooth baselines
+against closed forms and means."""
 
 import math
 
@@ -29,24 +30,29 @@ SPREAD = 0.15
 
 
 def filtered(frames, cutoff_hz):
-    """Lin-log level behind the photoreceptor's low-pass, exact for levels that are linear between frames."""
+    """Lin-log level behind the photoreceptor's low-pass, exact for levels that are linear between
+    frames."""
     level = torch.where(frames <= 20, frames * math.log(20) / 20, frames.clamp(min=20).log())
     seen = [level[0]]
     for k in range(1, len(frames)):
         a = 2 * math.pi * cutoff_hz * (0.5 * (frames[k] + frames[k - 1]) + 20) / 275 * STEP_S
         rise = level[k] - level[k - 1]
-        seen.append(level[k] + (seen[-1] - level[k - 1]) * torch.exp(-a) - rise * (1 - torch.exp(-a)) / a)
+        seen.append(
+            level[k] + (seen[-1] - level[k - 1]) * torch.exp(-a) - rise * (1 - torch.exp(-a)) / a
+        )
     return torch.stack(seen)
 
 
 def by_steps(of_pair):
     """The account of a layer that looks at the two frames of a step alone."""
-    return lambda seen, on, off: torch.stack([of_pair(seen.diff() / on), of_pair(-seen.diff() / off)], 1)
+    return lambda seen, on, off: torch.stack(
+        [of_pair(seen.diff() / on), of_pair(-seen.diff() / off)], 1
+    )
 
 
 def by_memory(step):
-    """The account of a layer that memorises a level: step(way, thetas) gives two counts and the level's
-    move."""
+    """The account of a layer that memorises a level: step(way, thetas) gives two counts and the
+    level's move."""
 
     def account(seen, on, off):
         memorised = seen[0]
@@ -63,7 +69,9 @@ def by_memory(step):
 def dense_step(way, thetas):
     units = [way / thetas[0] - 1, -way / thetas[1] - 1]
     slopes = [(5 / (1 + 5 * u.abs()) ** 2).detach() for u in units]
-    fired = [(u >= 0).to(u) + slope * (u - u.detach()) for u, slope in zip(units, slopes, strict=True)]
+    fired = [
+        (u >= 0).to(u) + slope * (u - u.detach()) for u, slope in zip(units, slopes, strict=True)
+    ]
     return fired, (fired[0] + fired[1]) * way
 
 
@@ -75,7 +83,9 @@ def expected_step(way, thetas):
         place = (((sign * way).clamp(min=1e-300) / theta).log() - k.log()) / SPREAD
         pair.append(torch.special.ndtr(place).sum())
         if sign * way > 0:
-            moved = sign * theta * math.exp(SPREAD**2 / 2) * torch.special.ndtr(place - SPREAD).sum()
+            moved = (
+                sign * theta * math.exp(SPREAD**2 / 2) * torch.special.ndtr(place - SPREAD).sum()
+            )
     return pair, moved
 
 
@@ -87,8 +97,8 @@ def physical(seen, on, off):
 
 
 def srm(seen, on, off):
-    """The slopes of the memory layer for a level that leaves its play by a threshold per step at most; of
-    equal thresholds."""
+    """The slopes of the memory layer for a level that leaves its play by a threshold per step at
+    most; of equal thresholds."""
     half = (on + off) / 4
     centre = seen[0]
     held = [seen[0]]
@@ -113,10 +123,14 @@ ACCOUNTS = {
 
 
 @pytest.mark.parametrize("kind", LAYERS)
-def test_values_and_gradients_of_every_layer_on_the_worst_clip_are_those_of_its_account(kind, generator):
+def test_values_and_gradients_of_every_layer_on_the_worst_clip_are_those_of_its_account(
+    kind, generator
+):
     clip = torch.tensor(SLOWER_CLIP if kind == "srm" else CLIP, dtype=D)
     theta_off = 0.2 if kind == "srm" else 0.25
-    sensor = SensorModel(0.2, theta_off, cutoff_hz=50.0, refractory_s=DEAD_S if kind == "physical" else 0.0)
+    sensor = SensorModel(
+        0.2, theta_off, cutoff_hz=50.0, refractory_s=DEAD_S if kind == "physical" else 0.0
+    )
     names = ("theta_on", "theta_off", "cutoff_hz")
     learnt = layer(kind, sensor, learn=names)
     frames = clip[:, None, None].expand(-1, 2, 3).clone().requires_grad_()
@@ -131,8 +145,11 @@ def test_values_and_gradients_of_every_layer_on_the_worst_clip_are_those_of_its_
     pair = ACCOUNTS[kind](filtered(pixel, values[2]), values[0], values[1])
     if kind not in ("srm", "physical"):  # whose accounts are of slopes alone
         torch.testing.assert_close(found, pair[..., None, None].expand_as(found))
-    truth, *by_values = torch.autograd.grad((pair * weights).sum(), [pixel, *values], allow_unused=True)
-    # the low-pass leaves a^5 / 720 out of a series for paces a below 0.05: 4e-8 of a step in the derivative
+    truth, *by_values = torch.autograd.grad(
+        (pair * weights).sum(), [pixel, *values], allow_unused=True
+    )
+    # the low-pass leaves a^5 / 720 out of a series for paces a below 0.05: 4e-8 of a step in the
+    # derivative
     expanded = truth[:, None, None].expand_as(by_frames)
     torch.testing.assert_close(by_frames, expanded, rtol=1e-6, atol=1e-9 * float(truth.abs().max()))
     for mine, slope, value in zip(by_variables, by_values, values, strict=True):
@@ -156,8 +173,9 @@ def moving_pattern(fps=240, size=36):
     return 4.2 + sum(waves), t_s
 
 
-# cosine and scale of the gradient of pooled counts against differences of the hard sensor's: the bounds leave
-# room for another seed, not for a missing term (a threshold gradient without memory has scale below 0.5)
+# cosine and scale of the gradient of pooled counts against differences of the hard sensor's: the
+# bounds leave room for another seed, not for a missing term (a threshold gradient without memory
+# has scale below 0.5)
 @pytest.mark.parametrize(
     ("name", "sensor", "step", "cosine", "scales"),
     [
@@ -167,17 +185,23 @@ def moving_pattern(fps=240, size=36):
         ("cutoff_hz", SensorModel(0.1, 0.1, cutoff_hz=20.0), 0.2, 0.87, (0.65, 1.1)),
     ],
 )
-def test_gradients_to_the_sensor_follow_differences_of_hard_counts(name, sensor, step, cosine, scales):
+def test_gradients_to_the_sensor_follow_differences_of_hard_counts(
+    name, sensor, step, cosine, scales
+):
     level, t_s = moving_pattern()
     before = getattr(sensor, name)
 
     def pooled(value):
         source = seeded(1)
-        counts, _ = sensor_counts(level, t_s, sensor, generator=source, log_input=True, **{name: value})
+        counts, _ = sensor_counts(
+            level, t_s, sensor, generator=source, log_input=True, **{name: value}
+        )
         return counts[:56].reshape(4, 14, 2, 3, 12, 3, 12).sum((1, 4, 6)).flatten()
 
     value = torch.tensor(before, dtype=D, requires_grad=True)
-    slope = torch.stack([torch.autograd.grad(c, value, retain_graph=True)[0] for c in pooled(value)])
+    slope = torch.stack(
+        [torch.autograd.grad(c, value, retain_graph=True)[0] for c in pooled(value)]
+    )
     ends = [pooled(torch.tensor(before * (1 + sign * step), dtype=D)) for sign in (1, -1)]
     difference = (ends[0] - ends[1]) / (2 * step * before)
     found_cosine, scale = cosine_and_scale(slope, difference)
@@ -187,12 +211,15 @@ def test_gradients_to_the_sensor_follow_differences_of_hard_counts(name, sensor,
 
 @pytest.mark.parametrize("spread", [0.05, 0.4])
 def test_expected_counts_are_means_over_thresholds(spread):
-    # hard counts of one step, 200,000 drawn thresholds each: standard error below 0.4 % of the spread
+    # hard counts of one step, 200,000 drawn thresholds each: standard error below 0.4 % of the
+    # spread
     steps = torch.tensor([0.0, 0.05, 0.1, 0.19, 0.21, 0.5, 1.5, 3.0, -0.3, -2.0], dtype=D)
     level = torch.stack((torch.zeros_like(steps), steps))
     drawn = torch.exp(spread * torch.randn(200_000, 1, generator=seeded(2), dtype=D))
     counts, reference = expected(level, 0.2, 0.25, spread, log_input=True)
-    hard, after = memory(level[:, None].expand(2, 200_000, 10), 0.2 * drawn, 0.25 * drawn, log_input=True)
+    hard, after = memory(
+        level[:, None].expand(2, 200_000, 10), 0.2 * drawn, 0.25 * drawn, log_input=True
+    )
     for found, sample in ((counts[0], hard[0]), (reference, after[0])):
         error = 4 * sample.std(-2) / math.sqrt(200_000) + 1e-5
         assert bool(((found - sample.mean(-2)).abs() <= error).all())
@@ -212,7 +239,9 @@ def test_expected_counts_stay_smooth_through_the_series_end():
 
 def test_frame_difference_caps_at_one_and_forgets():
     # per pixel: a slow ramp (never seen), one step of 1.1 (one event), exactly -theta, below -theta
-    level = torch.tensor([[0.0, 0, 0, 0], [0.15, 1.1, -0.25, -0.24], [0.3, 1.1, -0.5, -0.48]], dtype=D)
+    level = torch.tensor(
+        [[0.0, 0, 0, 0], [0.15, 1.1, -0.25, -0.24], [0.3, 1.1, -0.5, -0.48]], dtype=D
+    )
     found = naive(level[:, None], [0.0, 0.01, 0.02], 0.25, log_input=True)
     assert (found.height_px, found.width_px) == (1, 4)
     rows = torch.stack((found.t_us, found.x, found.y, found.p), dim=1).tolist()

@@ -1,5 +1,5 @@
-"""What every event layer keeps: it is its function, batches are their samples, chunks are the whole, values
-and gradients; noise, learnt values, and the same on a CUDA device."""
+"""What every event layer keeps: it is its function, batches are their samples, chunks are the
+whole, values and gradients; noise, learnt values, and the same on a CUDA device."""
 
 import math
 
@@ -36,8 +36,8 @@ def drifting(*shape, frames=30, seed=1, dtype=D):
 
 
 def clear(name):
-    """A layer without noise whose sensor is learnt; thresholds near enough for the play's gradient, which
-    chunks carry on."""
+    """A layer without noise whose sensor is learnt; thresholds near enough for the play's gradient,
+    which chunks carry on."""
     dead_s = 3e-3 if name == "physical" else 0.0
     options = {"steps": 2} if name == "srm" else {}
     sensor = SensorModel(0.18, 0.2, cutoff_hz=60.0, refractory_s=dead_s)
@@ -46,7 +46,8 @@ def clear(name):
 
 
 def spikes_of_steps(frames, theta_on, theta_off):
-    """The spike response layer, written out: it follows the level by at most one threshold per frame."""
+    """The spike response layer, written out: it follows the level by at most one threshold per
+    frame."""
     level = events.lin_log(frames)
     reference = level[0].clone()
     counts = []
@@ -87,7 +88,9 @@ def test_a_layer_is_its_function(name, dtype):
 @pytest.mark.parametrize("name", LAYERS)
 def test_a_layer_is_silent_before_a_still_scene(name, dtype):
     frames, t_s = drifting(6, 5, dtype=dtype)
-    still = layer(name, SensorModel(theta_sigma=0.03, cutoff_hz=30.0))(frames[:1].expand(5, 6, 5), t_s[:5])
+    still = layer(name, SensorModel(theta_sigma=0.03, cutoff_hz=30.0))(
+        frames[:1].expand(5, 6, 5), t_s[:5]
+    )
     ghosts = 1 / (1 + math.exp(5)) if name == "sigmoid" else 0.0
     torch.testing.assert_close(still, torch.full_like(still, ghosts), rtol=1e-6, atol=0)
 
@@ -113,7 +116,9 @@ def test_a_batch_is_its_samples_and_chunks_are_the_whole(name):
     torch.testing.assert_close(counts.flatten(0, 1), torch.stack(singles), rtol=1e-12, atol=1e-12)
     assert torch.equal(together.get_state(), alone.get_state())
     each = made(frames, t_s, [seeded(k) for k in range(6)])
-    torch.testing.assert_close(each[1, 2], made(frames[1, 2], t_s, seeded(5)), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(
+        each[1, 2], made(frames[1, 2], t_s, seeded(5)), rtol=1e-12, atol=1e-12
+    )
     for given in (frames, frames[0, 0]):
         state, parts = None, []
         for start, stop in ((0, 4), (4, 5), (5, 12)):
@@ -137,7 +142,9 @@ def test_gradients_of_batches_and_chunks_are_those_of_samples_and_the_whole(name
     assert float(whole[0].abs().sum()) > 0.1
     for loss in (samples, chunks):
         for mine, wanted in zip(torch.autograd.grad(loss, inputs), whole, strict=True):
-            torch.testing.assert_close(mine, wanted, rtol=1e-7, atol=1e-9 * float(wanted.abs().max()))
+            torch.testing.assert_close(
+                mine, wanted, rtol=1e-7, atol=1e-9 * float(wanted.abs().max())
+            )
 
 
 def test_noise_is_that_of_the_drawing_functions():
@@ -192,7 +199,9 @@ def test_a_comparator_of_ones_own_fits():
 
         def __call__(self, frames, theta_on, theta_off, state, log_input):
             step = frames.diff(dim=0)
-            return torch.stack((step.clamp(min=0) / theta_on, (-step).clamp(min=0) / theta_off), 1), None
+            return torch.stack(
+                (step.clamp(min=0) / theta_on, (-step).clamp(min=0) / theta_off), 1
+            ), None
 
     frames, t_s = drifting(4, 5)
     own, ours = (
@@ -215,6 +224,8 @@ def test_a_cuda_device_gives_the_same(name):
         slopes = torch.autograd.grad((volume**2).sum(), [given, *made.parameters()])
         stream = events.simulate(given.detach(), t_s, NOISY, seeded(1))
         shares = events.from_stream(stream, 0, 16_000, 5).counts
-        results.append([counts.detach(), volume.detach(), *slopes, events.to_counts(stream, t_s), shares])
+        results.append(
+            [counts.detach(), volume.detach(), *slopes, events.to_counts(stream, t_s), shares]
+        )
     for first, second in zip(*results, strict=True):
         torch.testing.assert_close(first, second.cpu(), rtol=1e-9, atol=1e-9)

@@ -1,5 +1,6 @@
-"""The memory layer against the definition in plain numbers, a plain autograd loop, and the mean of hard
-counts over a pixel's beginnings, enumerated; closed forms of its exact gradient for unequal thresholds."""
+"""The memory layer against the definition in plain numbers, a plain autograd loop, and the mean of
+hard counts over a pixel's beginnings, enumerated; closed forms of its exact gradient for unequal
+thresholds."""
 
 import math
 
@@ -14,8 +15,8 @@ PAIRS_OF_THRESHOLDS = [(0.2, 0.2), (0.1, 0.3), (0.3, 0.1), (0.155, 0.172), (0.17
 
 
 def plain_loop(level, theta_on, theta_off, state=None):
-    """The same model as ordinary loops: whole counts forward, the play's slopes backward. Returns counts,
-    memorised level, centre of the play."""
+    """The same model as ordinary loops: whole counts forward, the play's slopes backward. Returns
+    counts, memorised level, centre of the play."""
     if state is None:
         level, state = level[1:], level[0]
     reference = state.detach()
@@ -42,14 +43,18 @@ def random_walk(frames=30, pixels=(5, 4), seed=0, size=0.3):
 @pytest.mark.parametrize(("shape", "with_state"), [((), False), ((5, 4), True)])
 def test_counts_and_all_gradients_equal_a_plain_autograd_loop(shape, with_state, generator):
     inputs = [random_walk()]
-    inputs += [theta + 0.05 * torch.rand(shape, generator=generator, dtype=D) for theta in (0.2, 0.3)]
+    inputs += [
+        theta + 0.05 * torch.rand(shape, generator=generator, dtype=D) for theta in (0.2, 0.3)
+    ]
     inputs += [torch.zeros(5, 4, dtype=D)] * with_state
     inputs = [one.requires_grad_() for one in inputs]
     state = inputs[3] if with_state else None
     counts, state = memory(*inputs[:3], state=state, log_input=True, gradient="play")
     truth, reference, centre = plain_loop(*inputs)
     torch.testing.assert_close(counts, truth, rtol=0, atol=1e-12)  # n + (s - s) rounds
-    torch.testing.assert_close(state.detach(), torch.stack((reference, centre)).detach(), rtol=0, atol=1e-13)
+    torch.testing.assert_close(
+        state.detach(), torch.stack((reference, centre)).detach(), rtol=0, atol=1e-13
+    )
     weights = [torch.randn(one.shape, generator=generator, dtype=D) for one in (counts, centre)]
     found = torch.autograd.grad((counts, state[1]), inputs, weights)
     expected = torch.autograd.grad((truth, centre), inputs, weights)
@@ -59,8 +64,8 @@ def test_counts_and_all_gradients_equal_a_plain_autograd_loop(shape, with_state,
 
 
 def mean_counts(level, theta_on, theta_off, beginnings=1 << 16):
-    """Counts [T-1, 2, ...] of paths [T, ...], the mean over a pixel's beginnings: its memorised level lies
-    evenly from theta_on/2 below the first level to theta_off/2 above it."""
+    """Counts [T-1, 2, ...] of paths [T, ...], the mean over a pixel's beginnings: its memorised
+    level lies evenly from theta_on/2 below the first level to theta_off/2 above it."""
     share = (torch.arange(beginnings, dtype=D) + 0.5) / beginnings
     begun = level[0, ..., None] - theta_on / 2 + share * (theta_on + theta_off) / 2
     later = level[1:, ..., None].expand(*[-1] * level.ndim, beginnings)
@@ -74,7 +79,8 @@ def gradient(level, theta_on, theta_off, weight, **options):
 
 
 def path(turns, steps, seed):
-    """[T] float64: straight stretches of a random length up to 0.8, each cut into ``steps`` random steps."""
+    """[T] float64: straight stretches of a random length up to 0.8, each cut into ``steps`` random
+    steps."""
     length = 0.1 + 0.7 * torch.rand(turns + 1, generator=seeded(seed), dtype=D)
     share = torch.rand(turns + 1, steps, generator=seeded(seed + 50), dtype=D) + 0.1
     sign = torch.tensor([1.0, -1.0], dtype=D).repeat(turns)[: turns + 1]
@@ -88,23 +94,28 @@ def test_the_gradient_of_random_turns_is_that_of_enumeration(theta_on, theta_off
     level = path(turns=3, steps=3, seed=seed)
     weight = torch.randn(len(level) - 1, 2, generator=seeded(100 + seed), dtype=D)
     slopes = gradient(level, theta_on, theta_off, weight, gradient="exact")
-    # the mean is piecewise linear in every level; its grid of beginnings leaves some 2e-5 of an event in each
-    # count, so that a difference over 4e-4 is good to some 0.1 where slopes are 5 to 20
+    # the mean is piecewise linear in every level; its grid of beginnings leaves some 2e-5 of an
+    # event in each count, so that a difference over 4e-4 is good to some 0.1 where slopes are 5 to
+    # 20
     step = 2e-4
     moves = step * torch.eye(len(level), dtype=D)
-    ends = [mean_counts(level[:, None] + sign * moves, theta_on, theta_off, 1 << 15) for sign in (1, -1)]
+    ends = [
+        mean_counts(level[:, None] + sign * moves, theta_on, theta_off, 1 << 15) for sign in (1, -1)
+    ]
     wanted = ((ends[0] - ends[1]) * weight[..., None]).sum((0, 1)) / (2 * step)
     torch.testing.assert_close(slopes, wanted, rtol=0, atol=0.3)
 
 
 @pytest.mark.parametrize("back", [0.05, 0.29, 0.31, 0.39, 0.41, 0.61, 0.65, 0.71])
 def test_the_way_back_after_a_long_rise_in_closed_form(back):
-    # 0.1 ON, 0.3 OFF, behind a rise of 2 the level difference lies evenly from 0 to 0.1: the way back is dead
-    # for 0.3, fires every pixel over the next 0.1, is dead for 0.2, and so on
+    # 0.1 ON, 0.3 OFF, behind a rise of 2 the level difference lies evenly from 0 to 0.1: the way
+    # back is dead for 0.3, fires every pixel over the next 0.1, is dead for 0.2, and so on
     level = torch.tensor([0.0, 2.0, 2.0 - back], dtype=D)
     weight = torch.tensor([[0.0, 0.0], [0.0, 1.0]], dtype=D)
     fires = any(0.3 * k < back < 0.3 * k + 0.1 for k in (1, 2))
-    assert float(gradient(level, 0.1, 0.3, weight)[2]) == pytest.approx(-10.0 if fires else 0.0, abs=1e-9)
+    assert float(gradient(level, 0.1, 0.3, weight)[2]) == pytest.approx(
+        -10.0 if fires else 0.0, abs=1e-9
+    )
 
 
 def test_a_hundred_turns_leave_most_of_the_gradient_that_five_pairs_can_carry(generator):
@@ -113,7 +124,9 @@ def test_a_hundred_turns_leave_most_of_the_gradient_that_five_pairs_can_carry(ge
     weight = torch.randn(99, 2, 16, generator=generator, dtype=D)
     counts, _ = memory(level, 0.17, 0.23, log_input=True, gradient="exact")
     slopes = (torch.autograd.grad(counts, level, weight)[0] * move).sum(0)
-    ends = [mean_counts(level.detach() + sign * 2e-3 * move, 0.17, 0.23, 1 << 12) for sign in (1, -1)]
+    ends = [
+        mean_counts(level.detach() + sign * 2e-3 * move, 0.17, 0.23, 1 << 12) for sign in (1, -1)
+    ]
     wanted = ((ends[0] - ends[1]) * weight).sum((0, 1)) / 4e-3
     # four seeds: 0.86 to 0.96, and 0.2 to 0.65 for the play
     assert cosine_and_scale(slopes, wanted)[0] > 0.85
@@ -128,7 +141,9 @@ def test_equal_thresholds_give_the_play_and_change_together_exactly(generator):
     counts, _ = memory(level[:, None], theta, theta, log_input=True)
     (slope,) = torch.autograd.grad((counts[:, :, 0] * weight).sum(), theta)
     ends = [mean_counts(level, theta, theta) for theta in (0.2005, 0.1995)]
-    assert float(slope) == pytest.approx(float(((ends[0] - ends[1]) * weight).sum()) / 1e-3, abs=0.1)
+    assert float(slope) == pytest.approx(
+        float(((ends[0] - ends[1]) * weight).sum()) / 1e-3, abs=0.1
+    )
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, D])
@@ -149,12 +164,13 @@ def test_a_shift_of_all_levels_changes_no_count_however_many_turns(dtype):
 def test_gradient_is_the_slope_of_the_mean_hard_count_behind_a_history(
     thetas, name, sections, error, history
 ):
-    """d(weighted counts)/d(contrast) of moving textures against differences of whole counts, 2000 phases;
-    of counts behind ``history`` intervals alone. The exact slopes are averaged over the step.
+    """d(weighted counts)/d(contrast) of moving textures against differences of whole counts, 2000
+    phases; of counts behind ``history`` intervals alone. The exact slopes are averaged over the
+    step.
 
-    Rounding leaves an error of half an event per pixel and end, evenly spread: 0.4/sqrt(2000) of an event
-    against slopes of some 10 events per unit times a step of 0.8: 0.2 %; that of the step's curvature
-    (turning points move with the phase only) is below it.
+    Rounding leaves an error of half an event per pixel and end, evenly spread: 0.4/sqrt(2000) of an
+    event against slopes of some 10 events per unit times a step of 0.8: 0.2 %; that of the step's
+    curvature (turning points move with the phase only) is below it.
     """
     phase = torch.rand(2000, generator=seeded(5), dtype=D) * 2 * math.pi
     time = torch.linspace(0, 1, 61, dtype=D)[:, None]
@@ -201,8 +217,8 @@ def test_thresholds_beyond_the_measured_ratio_and_second_derivatives_are_named()
 
 
 def test_float32_levels_beyond_any_film_still_add_up():
-    # float32 near ln(1e12) = 27.6 resolves 2e-6: counts over a long ramp stay whole and add up to the way
-    # within one
+    # float32 near ln(1e12) = 27.6 resolves 2e-6: counts over a long ramp stay whole and add up to
+    # the way within one
     frames = torch.logspace(6, 12, 200)[:, None, None]
     counts, state = memory(frames, 1e-3, 1e-3)
     way = float(lin_log(frames.double())[-1] - lin_log(frames.double())[0])

@@ -1,5 +1,5 @@
-"""The hard sensor without noise: the definition in plain numbers, closed forms, the published ESIM, and a
-sensor that changes during a recording written out pixel by pixel."""
+"""The hard sensor without noise: the definition in plain numbers, closed forms, the published ESIM,
+and a sensor that changes during a recording written out pixel by pixel."""
 
 import math
 from dataclasses import replace
@@ -10,7 +10,15 @@ import torch
 
 from codesign import events
 from codesign.errors import DomainError
-from codesign.events import SensorModel, SensorState, dense_counts, lin_log, memory, simulate, to_counts
+from codesign.events import (
+    SensorModel,
+    SensorState,
+    dense_counts,
+    lin_log,
+    memory,
+    simulate,
+    to_counts,
+)
 from codesign.events.stream import ordered
 
 D = torch.float64
@@ -19,10 +27,12 @@ DAY_S = 86_400.0
 
 @pytest.mark.parametrize("offset_s", [0.0, 1_700_000_000.0])
 def test_a_ramp_of_log_intensity_fires_at_known_microseconds(offset_s):
-    # level rises by 1 per 0.1 s from 3: crossing j at 0.02 j s; falls by 0.5 in the next 0.1 s from 4:
-    # reference 4, crossing j at 0.1 + 0.05 j
+    # level rises by 1 per 0.1 s from 3: crossing j at 0.02 j s; falls by 0.5 in the next 0.1 s from
+    # 4: reference 4, crossing j at 0.1 + 0.05 j
     level = torch.tensor([3.0, 4.0 + 1e-9, 3.5 - 1e-9], dtype=D)[:, None, None].expand(3, 1, 2)
-    stream = simulate(level.exp(), torch.tensor([0, 0.1, 0.2], dtype=D) + offset_s, SensorModel(0.2, 0.25))
+    stream = simulate(
+        level.exp(), torch.tensor([0, 0.1, 0.2], dtype=D) + offset_s, SensorModel(0.2, 0.25)
+    )
     truth = torch.tensor([20_000, 40_000, 60_000, 80_000, 100_000, 150_000, 200_000])
     for column in (0, 1):
         mine = stream.x == column
@@ -77,17 +87,22 @@ def test_counts_are_those_of_the_definition(values, theta):
     frames = torch.tensor(values, dtype=D)[:, None, None]  # a picture of one pixel
     t_s = torch.tensor([0.0, 1e-5, 0.3, 0.30001, 7.0, 7.5])[: len(frames)]  # far from uniform
     counts, _ = memory(frames, theta, theta)
-    # a level that meets a threshold to the last bit may count one frame later: at most one event per frame
-    # and polarity
+    # a level that meets a threshold to the last bit may count one frame later: at most one event
+    # per frame and polarity
     on, off = (counts.sum((0, 2, 3)) - torch.tensor(hard_total(values, theta))).tolist()
     assert max(abs(on), abs(off), abs(on - off)) <= 1
-    assert torch.equal(to_counts(simulate(frames, t_s, SensorModel(theta, theta)), t_s, dtype=D), counts)
+    assert torch.equal(
+        to_counts(simulate(frames, t_s, SensorModel(theta, theta)), t_s, dtype=D), counts
+    )
 
 
 def test_single_precision_keeps_the_times_of_long_ramps():
-    """Each event once rounded the memorised level alike: microseconds too early or late after some dozens."""
+    """Each event once rounded the memorised level alike: microseconds too early or late after some
+    dozens."""
     generator = torch.Generator().manual_seed(0)
-    speed = (5 + 5 * torch.rand(40, dtype=D, generator=generator)) * torch.tensor([1.0, -1.0]).repeat(20)
+    speed = (5 + 5 * torch.rand(40, dtype=D, generator=generator)) * torch.tensor(
+        [1.0, -1.0]
+    ).repeat(20)
     t_s = torch.arange(31, dtype=D) / 60
     frames = (7.5 + speed * (t_s[:, None] - 0.25)).exp().float()[:, None]
     stream = simulate(frames, t_s, SensorModel(0.05, 0.05))
@@ -95,14 +110,18 @@ def test_single_precision_keeps_the_times_of_long_ramps():
     for x in range(40):
         gone = np.abs(levels[:, x] - levels[0, x])
         truth_us = np.interp(0.05 * np.arange(1, int(gone[-1] / 0.05) + 1), gone, t_s.numpy()) * 1e6
-        # half a microsecond of rounding, and half a last digit of two levels below 16 at 5 per second: 0.2 us
+        # half a microsecond of rounding, and half a last digit of two levels below 16 at 5 per
+        # second: 0.2 us
         assert np.abs(stream.t_us[stream.x == x].numpy() - truth_us).max() < 0.75
 
 
 def test_a_leak_below_the_last_digit_of_a_level_still_leaks():
-    # 10 thresholds of 0.001 per second, 1e-7 per frame: half of what single precision tells at a level of 5.3
+    # 10 thresholds of 0.001 per second, 1e-7 per frame: half of what single precision tells at a
+    # level of 5.3
     t_s = torch.arange(25_001, dtype=D) / 1e5
-    stream = simulate(torch.full((25_001, 1, 1), 200.0), t_s, SensorModel(1e-3, 1e-3, leak_rate_hz=10.0))
+    stream = simulate(
+        torch.full((25_001, 1, 1), 200.0), t_s, SensorModel(1e-3, 1e-3, leak_rate_hz=10.0)
+    )
     assert stream.p.tolist() == [1, 1]
     # a last digit of the level: 48 us
     assert np.abs(stream.t_us.numpy() - np.array([100_000, 200_000])).max() <= 20
@@ -117,7 +136,9 @@ def test_a_leak_below_the_last_digit_of_a_level_still_leaks():
         (0.0, SensorModel(leak_rate_hz=1e6), 1e4),
     ],
 )
-def test_more_events_than_a_pixel_can_make_are_refused_instead_of_counted_for_ever(rise, sensor, gap_s):
+def test_more_events_than_a_pixel_can_make_are_refused_instead_of_counted_for_ever(
+    rise, sensor, gap_s
+):
     with pytest.raises(DomainError, match="would fire more than 1000000 events"):
         simulate(torch.tensor([0.0, rise])[:, None, None], [0.0, gap_s], sensor, log_input=True)
 
@@ -128,15 +149,16 @@ EPS = float(torch.finfo(torch.float32).eps)
 def slack_us(levels, t_s, t, x, y, theta):
     """How far in microseconds an event may lie from a float32 reference.
 
-    t = t_k + dt (r + C - L_k)/(L_k+1 - L_k), so a shift of the numerator moves it by dt/|L_k+1 - L_k| of it;
-    whole microseconds add half of one, and a whole one just behind a frame, where events are rounded up so
-    that none falls into the interval before. With |L| <= M a unit in the last place is at most eps M, a
-    rounding half of that. Each of the two has levels good to two units, has rounded the memorised level once
-    per event of the pixel so far and the threshold with it, and rounds what it divides (four times, numbers
-    no larger than the step and a threshold together).
+    t = t_k + dt (r + C - L_k)/(L_k+1 - L_k), so a shift of the numerator moves it by dt/|L_k+1 -
+    L_k| of it; whole microseconds add half of one, and a whole one just behind a frame, where
+    events are rounded up so that none falls into the interval before. With |L| <= M a unit in the
+    last place is at most eps M, a rounding half of that. Each of the two has levels good to two
+    units, has rounded the memorised level once per event of the pixel so far and the threshold with
+    it, and rounds what it divides (four times, numbers no larger than the step and a threshold
+    together).
 
-    Args: levels [T, H, W] float64. t_s: [T]. t, x, y: [N] of the reference. An event within 2 us of a frame
-      may belong to the interval on either side: the flatter one counts.
+    Args: levels [T, H, W] float64. t_s: [T]. t, x, y: [N] of the reference. An event within 2 us of
+      a frame may belong to the interval on either side: the flatter one counts.
     """
     pixel = y * levels.shape[2] + x
     order = np.lexsort((t, pixel))
@@ -175,7 +197,11 @@ def test_events_equal_the_published_algorithm_as_far_as_single_precision_tells(s
 
 
 BEGAN = SensorModel(
-    theta_sigma=0.03, leak_rate_hz=5.0, rate_cov_decades=0.2, hot_pixel_share=0.1, hot_pixel_rate_hz=40.0
+    theta_sigma=0.03,
+    leak_rate_hz=5.0,
+    rate_cov_decades=0.2,
+    hot_pixel_share=0.1,
+    hot_pixel_rate_hz=40.0,
 )
 CHANGES = [
     {"theta_on": 0.6, "theta_off": 0.5},
@@ -189,8 +215,9 @@ CHANGES = [
 
 
 def written_out(levels, t_s, sensors, cut, pixel, state):
-    """Events (t_us, p) of one pixel: level and leak linear in time, another sensor from frame ``cut`` on;
-    what falls into the dead time is dropped, the memorised level moving on all the same."""
+    """Events (t_us, p) of one pixel: level and leak linear in time, another sensor from frame
+    ``cut`` on; what falls into the dead time is dropped, the memorised level moving on all the
+    same."""
     memorised, last_s, found = levels[0], -1e6, []
     deviates = [float(one.flatten()[pixel]) for one in (state.deviate_on, state.deviate_off)]
     for k in range(1, len(t_s)):
@@ -283,7 +310,9 @@ def test_streams_are_sorted_as_python_sorts(generator):
 
 
 def test_counts_land_in_their_pixel_and_in_the_interval_that_ends_with_them():
-    t_us, x, y, p = (torch.tensor(one) for one in ([5, 6, 7, 7], [0, 2, 2, 2], [1, 0, 0, 0], [1, -1, 1, 1]))
+    t_us, x, y, p = (
+        torch.tensor(one) for one in ([5, 6, 7, 7], [0, 2, 2, 2], [1, 0, 0, 0], [1, -1, 1, 1])
+    )
     counts = to_counts(ordered(t_us, x, y, p, 2, 3), [0, 1e-5])
     assert counts.tolist() == [[[[0, 0, 2], [1, 0, 0]], [[0, 0, 1], [0, 0, 0]]]]
     t_us = torch.tensor([-1, 0, 1, 1000, 1001, 2000, 2001])

@@ -1,5 +1,5 @@
-"""Low-pass, leak, noise events, hot pixels and dead time of the interpolated sensor against differential
-equations and the laws of their randomness."""
+"""Low-pass, leak, noise events, hot pixels and dead time of the interpolated sensor against
+differential equations and the laws of their randomness."""
 
 import math
 
@@ -46,7 +46,9 @@ NOISY = {"theta_sigma": 0.02, "cutoff_hz": 50.0, "shot_rate_hz": 2.0, "photorece
 
 def clip(frames=30, dtype=torch.float32):
     drift = torch.randn(frames, 9, 8, generator=seeded(1), dtype=dtype).cumsum(0) * 0.1
-    return (4 + drift).exp(), torch.rand(frames, generator=seeded(1), dtype=D).add(0.2).cumsum(0) * 2e-3
+    return (4 + drift).exp(), torch.rand(frames, generator=seeded(1), dtype=D).add(0.2).cumsum(
+        0
+    ) * 2e-3
 
 
 @pytest.mark.parametrize("cutoff_hz", [0.01, 30.0, 2000.0])
@@ -55,7 +57,10 @@ def test_the_low_pass_of_sensor_and_layers_solves_its_differential_equation(cuto
     state = SensorState()
     simulate(frames, t_s, SensorModel(cutoff_hz=cutoff_hz), state=state)
     torch.testing.assert_close(
-        low_pass(lin_log(frames), frames, t_s.diff(), cutoff_hz)[-1], state.level, rtol=0, atol=1e-12
+        low_pass(lin_log(frames), frames, t_s.diff(), cutoff_hz)[-1],
+        state.level,
+        rtol=0,
+        atol=1e-12,
     )
     intensity = frames[:, 3, 4].numpy()
     level = np.log(intensity)
@@ -71,8 +76,13 @@ def test_the_low_pass_of_sensor_and_layers_solves_its_differential_equation(cuto
 @pytest.mark.parametrize("cutoff_hz", [40.0, 1e-4])  # the second is in the series for small paces
 def test_gradients_of_the_low_pass_are_differences_and_a_ramp_lags_by_its_time_constant(cutoff_hz):
     frames, t_s = clip(5, dtype=D)
-    inputs = frames[:, 0, :2].clone().requires_grad_(), torch.tensor(cutoff_hz, dtype=D, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda f, c: low_pass(f.log(), f, t_s.diff(), c), inputs, atol=1e-7)
+    inputs = (
+        frames[:, 0, :2].clone().requires_grad_(),
+        torch.tensor(cutoff_hz, dtype=D, requires_grad=True),
+    )
+    assert torch.autograd.gradcheck(
+        lambda f, c: low_pass(f.log(), f, t_s.diff(), c), inputs, atol=1e-7
+    )
     tau_s = 0.007
     ramp = one_pole(3 * t_s[:, None], t_s.diff()[:, None] / tau_s, 3 * t_s[:1])[:, 0]
     truth = 3 * (t_s - tau_s * (1 - torch.exp((t_s[0] - t_s) / tau_s)))
@@ -145,25 +155,33 @@ def test_thresholds_follow_a_clamped_normal_distribution():
     share = float((off == off.min()).double().mean())
     assert abs(share - below) < 5 * math.sqrt(below / 200_000)
     assert float(off.min()) == pytest.approx(0.01)
-    assert abs(float(((on - on.mean()) * (off - off.mean())).mean())) < 5 * 0.05**2 / math.sqrt(200_000)
+    assert abs(float(((on - on.mean()) * (off - off.mean())).mean())) < 5 * 0.05**2 / math.sqrt(
+        200_000
+    )
     assert torch.equal(draw_thresholds(sensor, (500, 400), seeded(3))[0].double(), on)
 
 
 def test_drawn_shot_counts_are_poisson_per_pixel_and_polarity():
     interval_s = torch.tensor([0.01, 0.03, 0.05])
-    counts = draw_shot_counts(SensorModel(shot_rate_hz=40.0), (200, 250), interval_s, seeded(4), dtype=D)
+    counts = draw_shot_counts(
+        SensorModel(shot_rate_hz=40.0), (200, 250), interval_s, seeded(4), dtype=D
+    )
     for k, expected in enumerate((0.2, 0.6, 1.0)):  # 20 Hz per polarity
         for found in counts[k]:
             assert abs(found.mean() - expected) < 5 * math.sqrt(expected / 50_000)
             # variance of the sample variance of a Poisson count: (m + 2 m^2)/n
-            assert abs(found.var() - expected) < 5 * math.sqrt((expected + 2 * expected**2) / 50_000)
+            assert abs(found.var() - expected) < 5 * math.sqrt(
+                (expected + 2 * expected**2) / 50_000
+            )
 
 
 @pytest.mark.parametrize("fps", [20, 1000])
 def test_noise_events_are_a_poisson_process_at_every_frame_rate(fps):
     # (I + 20)/275 = 0.4 at I = 90: 40 Hz * (1 - 0.3) = 28 Hz
     still = torch.full((fps + 1, 25, 80), 90.0)
-    events = simulate(still, torch.arange(fps + 1, dtype=D) / fps, SensorModel(shot_rate_hz=40.0), seeded(4))
+    events = simulate(
+        still, torch.arange(fps + 1, dtype=D) / fps, SensorModel(shot_rate_hz=40.0), seeded(4)
+    )
     expected = 28 * 2000
     assert abs(len(events) - expected) < 4 * math.sqrt(expected)
     assert abs(int(events.p.sum())) < 4 * math.sqrt(len(events))
@@ -172,7 +190,9 @@ def test_noise_events_are_a_poisson_process_at_every_frame_rate(fps):
     assert float(((histogram - len(events) / 20) ** 2 / (len(events) / 20)).sum()) < 45
     per_pixel = torch.bincount(events.y * 80 + events.x, minlength=2000).double()
     # Poisson: variance = mean
-    assert float(per_pixel.var() / per_pixel.mean()) == pytest.approx(1, abs=4 * math.sqrt(2 / 2000))
+    assert float(per_pixel.var() / per_pixel.mean()) == pytest.approx(
+        1, abs=4 * math.sqrt(2 / 2000)
+    )
     rank = np.lexsort((events.t_us, events.x, events.y))
     gap_s = np.diff(events.t_us.numpy()[rank]) * 1e-6
     gap_s = gap_s[np.diff((events.y * 80 + events.x).numpy()[rank]) == 0]
@@ -189,13 +209,17 @@ def test_noise_events_scale_with_thresholds_and_reset_the_memorised_level():
     expected = 15 * 0.7 * 2 * 0.2 / state.theta_on.double().flatten()  # per pixel, 2 s
     split = state.theta_on.flatten() < 0.2
     for half in (split, ~split):
-        assert abs(on[half].sum() - expected[half].sum()) < 4 * math.sqrt(float(expected[half].sum()))
+        assert abs(on[half].sum() - expected[half].sum()) < 4 * math.sqrt(
+            float(expected[half].sum())
+        )
     # a drift below every threshold: each noise event sets the memorised level to the level seen
     state = SensorState()
-    simulate(ramps(60, 0.19), [0.0, 1.0], SensorModel(shot_rate_hz=1e3), seeded(2), state, log_input=True)
+    simulate(
+        ramps(60, 0.19), [0.0, 1.0], SensorModel(shot_rate_hz=1e3), seeded(2), state, log_input=True
+    )
     rate_hz = 1e3 * (1 - 0.75 * (0.5 * (math.exp(4) + math.exp(4.19)) + 20) / 275)
-    # the last noise event lies 1/rate back on average, an exponential law: 1.7 % standard error of 3600
-    # pixels
+    # the last noise event lies 1/rate back on average, an exponential law: 1.7 % standard error of
+    # 3600 pixels
     assert float((state.level - state.reference).mean()) == pytest.approx(0.19 / rate_hz, rel=0.06)
 
 
@@ -213,9 +237,9 @@ def of_pixels(events):
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_noise_events_and_crossings_come_in_order_of_time(sign):
-    """Level 4 +- 1 per second: a threshold of 0.2 is crossed 0.2 s after the start, the last crossing or the
-    last noise event, which set the memorised level; so no pixel waits longer, and what comes earlier is
-    noise."""
+    """Level 4 +- 1 per second: a threshold of 0.2 is crossed 0.2 s after the start, the last
+    crossing or the last noise event, which set the memorised level; so no pixel waits longer, and
+    what comes earlier is noise."""
     rate_hz = 2.0
     sensor = SensorModel(shot_rate_hz=rate_hz)
     events = simulate(ramps(60, sign), [0.0, 1.0], sensor, seeded(6), log_input=True)
@@ -235,8 +259,8 @@ def test_noise_events_and_crossings_come_in_order_of_time(sign):
 
 
 def test_noise_events_start_no_dead_time():
-    """Level 4 + 1 per second and a dead time of 0.3 s: the first crossing comes 0.2 s after the start or
-    after the noise event that set the memorised level, and no crossing came before it."""
+    """Level 4 + 1 per second and a dead time of 0.3 s: the first crossing comes 0.2 s after the
+    start or after the noise event that set the memorised level, and no crossing came before it."""
     sensor = SensorModel(shot_rate_hz=3.0, refractory_s=0.3)
     events = simulate(ramps(80, 1), [0.0, 1.0], sensor, seeded(6), log_input=True)
     seen = 0
@@ -251,9 +275,9 @@ def test_noise_events_start_no_dead_time():
 
 @pytest.mark.parametrize("timing", ["interpolated", "v2e"])
 def test_photoreceptor_noise_grows_to_its_strength_and_fades_as_the_photoreceptor(timing):
-    """A first-order process from 0: of the variance ``noise_level`` squared, 1 - q^2k is there after k
-    frames, and q = exp(-2 pi f dt) of the noise is left after one, for v2e the first two terms of its series.
-    40,000 pixels: 0.35 % standard error of a deviation."""
+    """A first-order process from 0: of the variance ``noise_level`` squared, 1 - q^2k is there
+    after k frames, and q = exp(-2 pi f dt) of the noise is left after one, for v2e the first two
+    terms of its series. 40,000 pixels: 0.35 % standard error of a deviation."""
     sensor = SensorModel(cutoff_hz=60.0, shot_rate_hz=5.0, photoreceptor_noise=True, timing=timing)
     state = SensorState(generator=seeded(1))
     pace = 2 * math.pi * 60.0 * 2e-3
@@ -300,12 +324,16 @@ def test_normal_numbers_follow_their_law_and_neighbours_are_uncorrelated():
     count = 1 << 20
     arr = backend.arrays("cpu", torch.float32)
     even = uniform(arr, hashed(dr.arange(arr.UInt32, count))).torch().double()
-    normals = [value.torch().double() for value in normal_pair(dr, arr, dr.arange(arr.UInt32, count))]
+    normals = [
+        value.torch().double() for value in normal_pair(dr, arr, dr.arange(arr.UInt32, count))
+    ]
     error = 4 / math.sqrt(count)
     assert 0 < float(even.min()) < float(even.max()) < 1
     for normal in normals:
         for power, moment, spread in ((1, 0, 1), (2, 1, 2), (4, 3, 96)):
-            assert float((normal**power).mean()) == pytest.approx(moment, abs=error * math.sqrt(spread))
+            assert float((normal**power).mean()) == pytest.approx(
+                moment, abs=error * math.sqrt(spread)
+            )
     flat = even - even.mean()
     for lag in (1, 2, 16, 346):
         assert abs(float((flat[lag:] * flat[:-lag]).mean() / flat.var())) < error

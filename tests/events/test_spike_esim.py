@@ -1,5 +1,5 @@
-"""Spike-ESIM against the hard sensor, the network of the thesis against an independent case, closed forms of
-their parts and losses, chunks against the whole."""
+"""Spike-ESIM against the hard sensor, the network of the thesis against an independent case, closed
+forms of their parts and losses, chunks against the whole."""
 
 import math
 from pathlib import Path
@@ -23,12 +23,17 @@ D = torch.float64
 
 def clip(frames=40, side=12, seed=0, dtype=D, step=0.15):
     """Smooth random pictures that change by about a threshold every few frames."""
-    draw = torch.randn(frames, side, side, generator=torch.Generator().manual_seed(seed), dtype=dtype)
-    return (3.5 + (step * draw).cumsum(0)).clamp(0.1, 5.5).exp(), torch.arange(frames, dtype=D) / 500
+    draw = torch.randn(
+        frames, side, side, generator=torch.Generator().manual_seed(seed), dtype=dtype
+    )
+    return (3.5 + (step * draw).cumsum(0)).clamp(0.1, 5.5).exp(), torch.arange(
+        frames, dtype=D
+    ) / 500
 
 
 def levels(frames):
-    """Log levels, picture by picture as the generators take them: a logarithm may round by its place."""
+    """Log levels, picture by picture as the generators take them: a logarithm may round by its
+    place."""
     return torch.stack([lin_log(picture[None])[0] for picture in frames])
 
 
@@ -38,12 +43,15 @@ def disturbed(**options):
     draw = torch.Generator().manual_seed(1)
     with torch.no_grad():
         for parameter in model.parameters():
-            parameter.add_(0.05 * torch.randn(parameter.shape, generator=draw, dtype=parameter.dtype))
+            parameter.add_(
+                0.05 * torch.randn(parameter.shape, generator=draw, dtype=parameter.dtype)
+            )
         model.bandwidth.gate.fill_(0.6)
     return model
 
 
-# a spiking comparator is the ideal sensor where no step holds two events, here at most a threshold of 8 sigma
+# a spiking comparator is the ideal sensor where no step holds two events, here at most a threshold
+# of 8 sigma
 @pytest.mark.bits
 @pytest.mark.parametrize(
     ("options", "step"),
@@ -88,9 +96,9 @@ def test_batches_are_sequences_of_their_own_and_a_still_scene_gives_nothing():
     other, _ = clip(seed=2)
     model = disturbed()
     together, _ = model(torch.stack((one, other), 1), t_s)
-    # a convolution of two pictures may round differently from one of one: levels of at most 6 and sums of at
-    # most 54 products, 6 * 54 * 2e-16 = 1e-13, against thresholds of 0.2. Of 1e4 events hardly one stands so
-    # near to its threshold that it comes a frame later
+    # a convolution of two pictures may round differently from one of one: levels of at most 6 and
+    # sums of at most 54 products, 6 * 54 * 2e-16 = 1e-13, against thresholds of 0.2. Of 1e4 events
+    # hardly one stands so near to its threshold that it comes a frame later
     for index, frames in enumerate((one, other)):
         alone, _ = model(frames, t_s)
         moved = (together[:, :, index] - alone).cumsum(0)
@@ -122,7 +130,9 @@ def test_bandwidth_tone_and_scaled_thresholds_are_those_of_the_hard_sensor(chang
     model = SpikeEsim(0.2, 0.25)
     with torch.no_grad():
         change(model)
-        moved = (model(frames, t_s, **options)[0] - events.dense_counts(frames, t_s, sensor)).cumsum(0)
+        moved = (
+            model(frames, t_s, **options)[0] - events.dense_counts(frames, t_s, sensor)
+        ).cumsum(0)
     # rounding (1e-14) moves an event by a frame, and loses none
     assert moved.abs().max() <= 1
     assert int((moved != 0).sum()) <= 3
@@ -137,7 +147,9 @@ def test_levels_have_exact_gradients_in_every_parameter():
     model.forward = lambda frames, t_s: model._levels(frames, t_s, None)[0]
 
     def levels(*values):
-        return torch.func.functional_call(model, dict(zip(names, values, strict=True)), (frames, t_s))
+        return torch.func.functional_call(
+            model, dict(zip(names, values, strict=True)), (frames, t_s)
+        )
 
     assert torch.autograd.gradcheck(levels, values, atol=1e-6)
 
@@ -151,7 +163,9 @@ def test_drawn_noise_is_poisson_of_the_expected_rate():
     t_s = torch.arange(201, dtype=D) / 500
     # (117.5 + 20)/275 = 1/2
     expected = torch.tensor([30.0, 10.0], dtype=D) * math.exp(-2.0 * 0.5) / 500
-    torch.testing.assert_close(model.expected_noise(frames, t_s)[0, :, 0, 0], expected, rtol=1e-6, atol=0)
+    torch.testing.assert_close(
+        model.expected_noise(frames, t_s)[0, :, 0, 0], expected, rtol=1e-6, atol=0
+    )
     # a still scene: nothing but noise
     counts, _ = model.draw(frames, t_s, torch.Generator().manual_seed(0))
     for found, mean in zip(counts.unbind(1), expected.tolist(), strict=True):
@@ -181,15 +195,17 @@ def test_saved_generators_come_back(tmp_path):
 
 def test_the_generator_that_comes_along_has_learnt_its_sensor():
     model = SpikeEsim.load(Path(spiking.__file__).parent / "spike_esim_rendered.npz")
-    # it was trained on hard events of a sensor with thresholds 0.18 and 0.22 and 1 ms dead time; tone and
-    # bandwidth trade with thresholds by some percent
+    # it was trained on hard events of a sensor with thresholds 0.18 and 0.22 and 1 ms dead time;
+    # tone and bandwidth trade with thresholds by some percent
     assert model.thetas().tolist() == pytest.approx([0.18, 0.22], rel=0.1)
     assert model.refractory_s().item() == pytest.approx(1e-3, rel=0.2)
     frames, t_s = clip(frames=60, side=24, dtype=torch.float32)
     found, _ = model(frames, t_s)
-    target = events.dense_counts(frames, t_s, SensorModel(0.18, 0.22, cutoff_hz=60.0, refractory_s=1e-3))
-    # white changes from frame to frame are nothing it was trained on; an ideal sensor gives three times the
-    # events
+    target = events.dense_counts(
+        frames, t_s, SensorModel(0.18, 0.22, cutoff_hz=60.0, refractory_s=1e-3)
+    )
+    # white changes from frame to frame are nothing it was trained on; an ideal sensor gives three
+    # times the events
     assert float(found.detach().sum() / target.sum()) == pytest.approx(1, abs=0.25)
 
 
@@ -246,7 +262,9 @@ def test_losses_have_their_closed_forms():
     h, dt = 0.1, 2e-3
     q = math.exp(-2 * h)
     truth = 0.5 * dt * h**2 * math.e**2 * q * (1 + q) / (1 - q) ** 3  # sum of k^2 q^k
-    assert float(van_rossum(found, 0 * found, tau_s=dt / h, dt=dt)) == pytest.approx(truth, rel=1e-12)
+    assert float(van_rossum(found, 0 * found, tau_s=dt / h, dt=dt)) == pytest.approx(
+        truth, rel=1e-12
+    )
     target, found = torch.zeros(2, 4, 2, 4, 4, dtype=D)
     target[0, 0, 0, 0] = 3  # block (0, 0, 0) of ON holds 3
     found[1, 0, 1, 1] = 1  # the same block: 1 against 3, (1 - 3)^2/(3 + 1) = 1

@@ -1,4 +1,5 @@
-"""The spike response layer against finite kernels written out in torch, and independently computed cases."""
+"""The spike response layer against finite kernels written out in torch, and independently computed
+cases."""
 
 import math
 import warnings
@@ -80,7 +81,9 @@ def test_recursion_equals_the_finite_kernels_step_by_step(kernel, response):
             )
         else:
             spikes, potential = by_kernels(drive, **given, **options, scale=1.5)
-        loss = (spikes * noise(60, 2, 3, seed=1)).sum() + (potential * noise(60, 2, 3, seed=2)).sum()
+        loss = (spikes * noise(60, 2, 3, seed=1)).sum() + (
+            potential * noise(60, 2, 3, seed=2)
+        ).sum()
         inputs = [drive, *given.values()]
         grads = torch.autograd.grad(loss, inputs, allow_unused=True, materialize_grads=True)
         found.append([spikes.round(), potential, *grads])
@@ -171,12 +174,15 @@ def test_gradient_through_the_reset_explodes_in_full_and_not_when_bounded():
         spikes, _, _ = srm(drive, through_reset=through_reset, **settings)
         return torch.autograd.grad(spikes[-1].sum(), drive)[0]
 
-    # the adjoint grows backwards by z with (1 - w)^2 = -c w, w = exp(-1/2) / z, c = 4 e / 2 / 0.7: z = 3.4
+    # the adjoint grows backwards by z with (1 - w)^2 = -c w, w = exp(-1/2) / z, c = 4 e / 2 / 0.7:
+    # z = 3.4
     with pytest.warns(RuntimeWarning, match="not below 1"):
         assert 3.2**190 < last("full")[:10].abs().max() < 3.5**199
-    # each pass through the reset multiplies by at most 0.9, and the first gradient is at most 1/alpha
+    # each pass through the reset multiplies by at most 0.9, and the first gradient is at most
+    # 1/alpha
     assert float(last("bounded").abs().sum()) <= 1 / 0.7 / (1 - 0.9)
-    # below the bound the two are one function: sum of |nu| is 4 e h a / (1 - a)^2 = 21.3 for h = 1/2
+    # below the bound the two are one function: sum of |nu| is 4 e h a / (1 - a)^2 = 21.3 for h =
+    # 1/2
     settings["surrogate"] = Laplace(24.0, 0.3)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -185,7 +191,12 @@ def test_gradient_through_the_reset_explodes_in_full_and_not_when_bounded():
 
 def test_ties_spike_and_one_pixel_needs_no_axis():
     drive = torch.tensor([0.5, 0.25, 0.0], dtype=D)
-    settings = {"theta": torch.tensor(0.5), "kernel": "step", "reset_scale": 0.0, "response": "step"}
+    settings = {
+        "theta": torch.tensor(0.5),
+        "kernel": "step",
+        "reset_scale": 0.0,
+        "response": "step",
+    }
     assert srm(drive, **settings)[0].tolist() == [1, 1, 1]
     # 0.5 - 1 ulp, then 0.75, then a sum that stays
     below = torch.nextafter(drive, torch.zeros_like(drive))
@@ -196,8 +207,11 @@ def test_ties_spike_and_one_pixel_needs_no_axis():
 def test_drive_scale_brings_the_asked_share_to_threshold(response, tau_s):
     drive = (noise(400, 30) - 0.3) * 1e-5
     factor = drive_scale(drive, theta=0.7, tau_s=tau_s, response=response, share=0.1)
-    # without reset the share of spikes is the asked one, to one value in 12000 that may round to either side
-    free = srm(drive * factor, theta=0.7, tau_s=tau_s, kernel="step", response=response, reset_scale=0.0)[0]
+    # without reset the share of spikes is the asked one, to one value in 12000 that may round to
+    # either side
+    free = srm(
+        drive * factor, theta=0.7, tau_s=tau_s, kernel="step", response=response, reset_scale=0.0
+    )[0]
     assert abs(float(free.mean()) - 0.1) <= 1.5 / 12_000
 
 
@@ -217,7 +231,11 @@ MEAN = FADING | {"gradient": "mean"}
             {"drive": torch.tensor([0.0, math.nan, 0.0])[:, None]},
             r"drive must be finite, .* in 1 of 3 .*\[1, 0\]",
         ),
-        (FADING, {"drive": DRIVE - math.inf, "gradient": "mean"}, "drive must be finite, .* in 6 of 6"),
+        (
+            FADING,
+            {"drive": DRIVE - math.inf, "gradient": "mean"},
+            "drive must be finite, .* in 6 of 6",
+        ),
         (PLAIN, {"theta": torch.tensor([1.0, math.nan])[:, None]}, "theta spans"),
         (PLAIN, {"theta": torch.ones(4)}, "theta has shape"),
         (PLAIN, {"response": "alpha"}, "tau_s must be .* got None"),
@@ -226,8 +244,16 @@ MEAN = FADING | {"gradient": "mean"}
         (PLAIN, {"surrogate": "laplace"}, "surrogate"),
         (PLAIN, {"coupled": True, "drive": torch.zeros(3, 3)}, "coupled"),
         (PLAIN, {"state": torch.zeros(2, 2)}, "SrmState"),
-        (PLAIN, {"state": SrmState(torch.zeros(0, 2, 1, dtype=D), torch.zeros(1, 2, 1))}, "state.reset"),
-        (PLAIN, {"state": SrmState(torch.zeros(0, 2, 1, dtype=D), noise(2, 2, 1) * math.nan)}, "state.reset"),
+        (
+            PLAIN,
+            {"state": SrmState(torch.zeros(0, 2, 1, dtype=D), torch.zeros(1, 2, 1))},
+            "state.reset",
+        ),
+        (
+            PLAIN,
+            {"state": SrmState(torch.zeros(0, 2, 1, dtype=D), noise(2, 2, 1) * math.nan)},
+            "state.reset",
+        ),
         (MEAN, {"kernel": "step"}, "goes with a reset that fades"),
         (MEAN, {"coupled": True}, "goes with coupled=False"),
         (MEAN, {"smooth": True}, "smooth is True, which gradient 'mean' has no use for"),
@@ -276,7 +302,9 @@ def test_a_surrogate_is_a_density_of_its_height_and_its_integral_rises_from_zero
     slope = (surrogate.torch_integral(x + step) - surrogate.torch_integral(x - step)) / (2 * step)
     # differences: rounding 1e-16 / 2e-6, curvature beyond 1e-11
     assert (slope - surrogate.torch_density(x)).abs().max() < 1e-9
-    assert float(surrogate.torch_density(torch.zeros(1, dtype=D))) == pytest.approx(1 / 1.4, rel=1e-15)
+    assert float(surrogate.torch_density(torch.zeros(1, dtype=D))) == pytest.approx(
+        1 / 1.4, rel=1e-15
+    )
     ends = kind.unit(width=0.3).torch_integral(torch.tensor([-1e9, 0.0, 1e9], dtype=D))
     assert ends.tolist() == pytest.approx([0, 0.5, 1], abs=1e-9)
     if kind is Laplace:  # as published
@@ -295,7 +323,8 @@ def steps_first(array):
 def test_spikes_potentials_and_gradients_equal_the_reference(shared, case):
     data = np.load(shared(f"refs/srm/{case}.npz"))
     arrays = {
-        name: steps_first(data[name]) for name in ("drive", "spikes", "u", "g", "spikes_nocarry", "psp")
+        name: steps_first(data[name])
+        for name in ("drive", "spikes", "u", "g", "spikes_nocarry", "psp")
     }
     numbers = {"theta": "theta", "tau_r": "tau_r", "dt": "Ts", "reset_scale": "scale"}
     settings = {name: float(data[key]) for name, key in numbers.items()}
@@ -311,7 +340,9 @@ def test_spikes_potentials_and_gradients_equal_the_reference(shared, case):
     parts = arrays["drive"].split(int(data["chunk"]))
     forgetful = torch.cat([srm(part, **settings)[0] for part in parts])
     assert torch.equal(forgetful, arrays["spikes_nocarry"])
-    response, state = alpha_response(arrays["spikes"], tau_s=float(data["tau_s"]), dt=float(data["Ts"]))
+    response, state = alpha_response(
+        arrays["spikes"], tau_s=float(data["tau_s"]), dt=float(data["Ts"])
+    )
     assert (response - arrays["psp"]).abs().max() <= 1e-12
     # sums of up to 100 spikes
     assert (state.response - torch.from_numpy(data["psp_state"])).abs().max() <= 1e-11

@@ -1,6 +1,6 @@
-"""The gradients "mean" and "play" of the spike response layer: the mean of a fading reset against recursions
-written out, that of a memorised level against hard counts over enumerated beginnings, both against
-differences."""
+"""The gradients "mean" and "play" of the spike response layer: the mean of a fading reset against
+recursions written out, that of a memorised level against hard counts over enumerated beginnings,
+both against differences."""
 
 import doctest
 import itertools
@@ -34,7 +34,8 @@ def mean_spikes(kind, response, theta, a, m, pace, start):
 
 
 def drawn(kind, ages=4, steps=7, lanes=3):
-    """Response, theta, decay, amplitude, pace and start of pixels, of which some spike and some rest."""
+    """Response, theta, decay, amplitude, pace and start of pixels, of which some spike and some
+    rest."""
     generator = seeded()
     ranges = ((-0.1, 0.6), (0.3, 0.6), (-0.5, -0.3), (0.15, 0.3), (0.2, 1.5))
     response, a, m, theta, pace = (
@@ -103,8 +104,8 @@ def test_the_mean_is_that_of_noisy_neurons_where_only_the_last_spike_counts():
             chance *= 1 - math.exp(-rate) if spike else math.exp(-rate)
             reset = a * reset + spike
         truth += chance * np.array(history)
-    # a shift of the potential of 1e-4 * 2 theta, in each of the steps before, at a slope of less than 1/(4
-    # WIDTH theta)
+    # a shift of the potential of 1e-4 * 2 theta, in each of the steps before, at a slope of less
+    # than 1/(4 WIDTH theta)
     np.testing.assert_allclose(mean[:, 0], truth, rtol=0, atol=steps * 1e-4 * 2 / (4 * WIDTH))
 
 
@@ -163,11 +164,14 @@ def test_pixels_of_a_batch_have_gradients_of_their_own():
 
 @pytest.mark.parametrize("kernel", ["exp", "slayer"])
 def test_the_mean_points_to_where_hard_spikes_go(kernel):
-    """What a change of contrast does to sums over groups of like pixels and sixths of the time, from 32
-    beginnings: the last spike lies three time constants back on average. Measured: cosines of 0.995 and
-    0.994, beside 0.990 and 0.963 of a surrogate; scales of 0.95 and 0.99."""
+    """What a change of contrast does to sums over groups of like pixels and sixths of the time,
+    from 32
+    beginnings: the last spike lies three time constants back on average. Measured: cosines of 0.995
+    and 0.994, beside 0.990 and 0.963 of a surrogate; scales of 0.95 and 0.99."""
     turn, pace = torch.rand(2, 320, generator=seeded(), dtype=D)
-    wave = 0.1 * (2 * math.pi * (turn + torch.arange(60, dtype=D)[:, None] / (20 + 20 * pace))).sin()
+    wave = (
+        0.1 * (2 * math.pi * (turn + torch.arange(60, dtype=D)[:, None] / (20 + 20 * pace))).sin()
+    )
     group = torch.nn.functional.one_hot((turn * 8).long()).to(D)
 
     def sixths(drive, **options):
@@ -180,7 +184,9 @@ def test_the_mean_points_to_where_hard_spikes_go(kernel):
         reset = torch.stack((left, age * 3.0 * left)) if kernel == "slayer" else left[None]
         return events.SrmState(torch.zeros(2, 320, dtype=D), reset)
 
-    truth = sum(sixths(1.3 * wave, state=begun(k)) - sixths(0.7 * wave, state=begun(k)) for k in range(32))
+    truth = sum(
+        sixths(1.3 * wave, state=begun(k)) - sixths(0.7 * wave, state=begun(k)) for k in range(32)
+    )
     truth = (truth @ group / 32).flatten()
 
     def beside_truth(**options):
@@ -200,12 +206,14 @@ def test_the_mean_points_to_where_hard_spikes_go(kernel):
 
 
 def walk(seed, frames=24, pixels=6, size=0.25):
-    """Levels [frames, pixels]; most steps are below the threshold, some are two or three of them."""
+    """Levels [frames, pixels]; most steps are below the threshold, some are two or three of
+    them."""
     return (size * torch.randn(frames, pixels, generator=seeded(seed), dtype=D)).cumsum(0)
 
 
 def hard(level, beginnings):
-    """Mean counts [T-1, 2, N] of a level [T, N] that begins evenly over half a threshold either way."""
+    """Mean counts [T-1, 2, N] of a level [T, N] that begins evenly over half a threshold either
+    way."""
     place = (torch.arange(beginnings, dtype=D) + 0.5) / beginnings - 0.5
     memorised = level[0][:, None] + THETA * place
     found = []
@@ -234,7 +242,8 @@ def test_the_gradient_of_the_play_is_that_of_the_mean_over_beginnings():
         (by_level,) = torch.autograd.grad((layer_of()(level) * weights).sum(), level)
         slope += (by_level * way).sum(0) / sections
     truth = ((hard(first + way, 20000) - hard(first, 20000)) * weights).sum((0, 1))
-    # a kink inside a section moves it by at most its share of a slope of 1/C times the way, some 40 of them
+    # a kink inside a section moves it by at most its share of a slope of 1/C times the way, some 40
+    # of them
     torch.testing.assert_close(slope, truth, rtol=0, atol=40 * 0.5 / sections)
     assert float(truth.abs().max()) > 0.5
 
@@ -255,7 +264,9 @@ def test_the_slope_to_the_threshold_is_that_of_the_mean():
     # by scaling: counts of (level, C) are those of (level / C, 1)
     up, down = (hard(level * THETA / c, wide)[:, 0].sum() for c in (THETA * 1.0005, THETA * 0.9995))
     # neither side has a kink here; the even beginnings leave 24 * 6 / wide of either sum
-    assert float(slope) == pytest.approx(float(up - down) / (0.001 * THETA), abs=2 * 144 / wide / 2e-4)
+    assert float(slope) == pytest.approx(
+        float(up - down) / (0.001 * THETA), abs=2 * 144 / wide / 2e-4
+    )
 
 
 def test_enough_steps_per_frame_give_the_counts_and_gradients_of_the_memory_layer():

@@ -1,5 +1,5 @@
-"""Upsampling of video against closed forms: flow of known motions, moving patterns, occlusion, still scenes, and
-the events they make."""
+"""Upsampling of video against closed forms: flow of known motions, moving patterns, occlusion,
+still scenes, and the events they make."""
 
 import math
 
@@ -17,13 +17,19 @@ D = torch.float64
 
 
 def moving(shifts, height=48, width=64):
-    """[T, H, W] of smooth light on the 0-255 scale, periods of 9 to 23 px, moved by each (x, y) of ``shifts``,
-    pixels."""
-    y, x = torch.meshgrid(torch.arange(height, dtype=D), torch.arange(width, dtype=D), indexing="ij")
+    """[T, H, W] of smooth light on the 0-255 scale, periods of 9 to 23 px, moved by each (x, y) of
+    ``shifts``, pixels."""
+    y, x = torch.meshgrid(
+        torch.arange(height, dtype=D), torch.arange(width, dtype=D), indexing="ij"
+    )
     frames = []
     for dx, dy in shifts:
         a, b = x - dx, y - dy
-        waves = (0.7 * a + 0.2 * b).sin() + (0.27 * a - 0.31 * b + 1).sin() + (0.1 * a + 0.55 * b + 2).sin()
+        waves = (
+            (0.7 * a + 0.2 * b).sin()
+            + (0.27 * a - 0.31 * b + 1).sin()
+            + (0.1 * a + 0.55 * b + 2).sin()
+        )
         frames.append(90 * torch.exp(0.25 * waves))
     return torch.stack(frames).float()
 
@@ -35,9 +41,9 @@ def test_a_moving_pattern_is_where_it_should_be_in_between(shift):
     share = t_s / 0.01
     truth = moving([(s * shift[0], s * shift[1]) for s in share.tolist()])
     straight = frames[0] + share[:, None, None].float() * (frames[1] - frames[0])
-    # Light of period 9 px and more: the cubic kernel is off by at most 0.5 % of the swing (30) there, and 0.1
-    # px of wrong flow by 0.1 * 2 pi / 9 of it, 2; the straight line between the frames, the control, is off
-    # by more than ten times that.
+    # Light of period 9 px and more: the cubic kernel is off by at most 0.5 % of the swing (30)
+    # there, and 0.1 px of wrong flow by 0.1 * 2 pi / 9 of it, 2; the straight line between the
+    # frames, the control, is off by more than ten times that.
     error, blended = ((x - truth)[:, 8:-8, 8:-8].square().mean().sqrt() for x in (made, straight))
     assert error < 2
     assert blended > 10 * error
@@ -74,35 +80,37 @@ def test_a_still_video_stays_bit_for_bit_and_makes_no_event(generator):
 
 
 def test_light_that_grows_is_shared_evenly_and_kept_within_the_bound():
-    # nothing moves: between the frames intensity is a straight line, by conservation of the weights; ln 2 in
-    # steps of at most 0.1 takes ten: the first of n equal steps of intensity is ln(1 + 1/n), 0.095 at n = 10
-    # and 0.105 at 9
+    # nothing moves: between the frames intensity is a straight line, by conservation of the
+    # weights; ln 2 in steps of at most 0.1 takes ten: the first of n equal steps of intensity is
+    # ln(1 + 1/n), 0.095 at n = 10 and 0.105 at 9
     frames = torch.tensor([100.0, 200.0])[:, None, None].expand(2, 24, 32)
     made, t_s = upsample(frames, [0.0, 1.0], max_log_change=0.1)
     assert len(made) == 11
-    # rounding of the pyramid moves even light by 1e-4 px, and the outermost pixels lose that share of the
-    # weight of one frame, of a quarter of 100
+    # rounding of the pyramid moves even light by 1e-4 px, and the outermost pixels lose that share
+    # of the weight of one frame, of a quarter of 100
     truth = (100 + 100 * t_s.float())[:, None, None].expand_as(made)
     torch.testing.assert_close(made, truth, rtol=0, atol=0.005)
     assert float(lin_log(made).diff(dim=0).abs().max()) <= 0.1
 
 
 def test_what_a_moving_square_hides_and_bares_is_background():
-    # a textured square passes 8 px before a still, textured wall; in the middle the strips beside it show
-    # wall, that one of the frames still or already shows
+    # a textured square passes 8 px before a still, textured wall; in the middle the strips beside
+    # it show wall, that one of the frames still or already shows
     wall = moving([(0, 0)], 64, 96)[0]
     square = 2.2 * moving([(5, 11)], 64, 96)[0]
     masks = torch.zeros(3, 64, 96, dtype=torch.bool)
     for mask, shift in zip(masks, (0, 4, 8), strict=True):
         mask[16:48, 32 + shift : 64 + shift] = True
-    frames = [torch.where(m, square.roll(s, 1), wall) for m, s in zip(masks, (0, 4, 8), strict=True)]
+    frames = [
+        torch.where(m, square.roll(s, 1), wall) for m, s in zip(masks, (0, 4, 8), strict=True)
+    ]
     # 8 px and what the flow errs by, in steps of at most 4.5 px: two steps
     made, t_s = upsample(torch.stack((frames[0], frames[2])), [0.0, 1.0], max_displacement_px=4.5)
     assert t_s.tolist() == [0.0, 0.5, 1.0]
     wrong = (made[1] - frames[1]).abs()
     strips = masks[0] ^ masks[2]
-    # blending shows half of each in the strips; one pixel of 16 there may be at a wrongly placed edge (a
-    # boundary off by a pixel of 4 + 4 in a row)
+    # blending shows half of each in the strips; one pixel of 16 there may be at a wrongly placed
+    # edge (a boundary off by a pixel of 4 + 4 in a row)
     blended = ((frames[0] + frames[2]) / 2 - frames[1]).abs()
     assert float(wrong[strips].mean()) < 0.25 * float(blended[strips].mean())
     assert float(wrong[~strips].mean()) < 0.5
@@ -113,18 +121,20 @@ def test_events_of_the_upsampled_video_are_those_of_the_true_one():
     t_s = torch.arange(65, dtype=D) / 1000
     kept = frames[::16], t_s[::16]
     made = upsample(*kept, max_displacement_px=0.5)
-    truth, found, control = (simulate(*each, SensorModel(0.1, 0.1)) for each in ((frames, t_s), made, kept))
-    # 4.3 px between frames, half of the finest period: a straight line loses what rises and falls within; at
-    # 0.5 px a sinusoid of 9 px is cut by 1 - cos(pi 0.5 / 9) = 1.5 % at its peaks, and borders, 1/8 of the
-    # picture, are unknown for up to half of the motion
+    truth, found, control = (
+        simulate(*each, SensorModel(0.1, 0.1)) for each in ((frames, t_s), made, kept)
+    )
+    # 4.3 px between frames, half of the finest period: a straight line loses what rises and falls
+    # within; at 0.5 px a sinusoid of 9 px is cut by 1 - cos(pi 0.5 / 9) = 1.5 % at its peaks, and
+    # borders, 1/8 of the picture, are unknown for up to half of the motion
     assert len(control) < 0.8 * len(truth)
     for polarity in (-1, 1):
         assert 0.9 < int((found.p == polarity).sum()) / int((truth.p == polarity).sum()) < 1.1
 
 
 def test_a_rendered_room_gives_truer_events_upsampled_than_kept():
-    """7.5 px between the frames kept: docs/upsampling.md has 0.15 wrong counts per true event in 4 x 4 px and
-    5 ms, 0.69 of the kept frames alone, at twice the resolution."""
+    """7.5 px between the frames kept: docs/upsampling.md has 0.15 wrong counts per true event in 4
+    x 4 px and 5 ms, 0.69 of the kept frames alone, at twice the resolution."""
     camera = render.Camera(lens.Pinhole(5.0), 72, 54, 10 * math.tan(math.radians(22.5)) / 72, 16)
     start = pose.look_at(*worlds.VIEWS["room"])
     scene = worlds.room()
@@ -134,7 +144,9 @@ def test_a_rendered_room_gives_truer_events_upsampled_than_kept():
         return trajectories.translation(start, way, torch.linspace(0, 1, count, dtype=D))
 
     with torch.no_grad():
-        far_px = float(render.true_flow(camera, scene, moved(0.05, 2))[0].norm(dim=1).quantile(0.95))
+        far_px = float(
+            render.true_flow(camera, scene, moved(0.05, 2))[0].norm(dim=1).quantile(0.95)
+        )
         frames = render.frames(camera, scene, moved(0.05 * 15 / far_px, 41))
     t_s = torch.arange(41, dtype=D) / 1000
 
@@ -167,8 +179,8 @@ def test_flow_of_a_rolled_texture_is_the_roll_both_ways(shift, gain):
     for flow, sign in zip(flows, (1, -1), strict=True):
         # what leaves on one side enters on the other: no flow there
         error = (flow - sign * truth)[:, 14:-14, 14:-14].norm(dim=0)
-        # total variation takes lambda^-1 / contrast off peaks: hundredths of a pixel for log contrast 0.5;
-        # 0.1 px is asked of it
+        # total variation takes lambda^-1 / contrast off peaks: hundredths of a pixel for log
+        # contrast 0.5; 0.1 px is asked of it
         assert float(error.mean()) < 0.1
 
 
@@ -178,7 +190,9 @@ def test_matches_find_a_small_thing_that_jumps_far():
     frames[0, 20:26, 20:26] = frames[1, 20:26, 29:35] = 4 * textured(6, 6, 2)
     flow = with_matches(frames[:, None].log(), torch.zeros(2, 2, 60, 60))[0]
     # a window of 3 x 3 lies inside
-    assert torch.equal(flow[:, 21:25, 21:25], torch.tensor([9.0, 0.0])[:, None, None].expand(2, 4, 4))
+    assert torch.equal(
+        flow[:, 21:25, 21:25], torch.tensor([9.0, 0.0])[:, None, None].expand(2, 4, 4)
+    )
     # elsewhere, but for what one frame hides, nothing moves
     flow[:, 18:28, 18:37] = 0
     assert not flow.any()
@@ -201,23 +215,24 @@ def test_what_leaves_the_picture_is_blended_where_it_stands_and_holes_are_filled
     far = torch.full((2, 2, 20, 24), 1000.0)
     made = between(first, second, far, visibility(far), 0.25)
     torch.testing.assert_close(made, 0.75 * first + 0.25 * second)
-    # a picture that grows fivefold from its middle leaves four of five rows and columns empty, filled from
-    # their neighbours: a slope stays a slope
+    # a picture that grows fivefold from its middle leaves four of five rows and columns empty,
+    # filled from their neighbours: a slope stays a slope
     y, x = torch.meshgrid(torch.arange(41.0), torch.arange(41.0), indexing="ij")
     grows = 4 * torch.stack((x - 20, y - 20))
     # at share 1 the first frame's flow has carried all the way
     flows = torch.stack((grows, -grows / 5))
     truth = 30 + (x - 20) / 5
     made = between(10 + x, truth, flows, visibility(flows), 0.999)
-    # the slope of 0.2 per px there is met to a fifth of a pixel of the growing frame, and Keys' 0.05 px
+    # the slope of 0.2 per px there is met to a fifth of a pixel of the growing frame, and Keys'
+    # 0.05 px
     assert float((made - truth)[8:-8, 8:-8].abs().max()) < 0.05
 
 
 def test_gradients_of_a_frame_between_are_those_of_differences():
     frames = [textured(9, 11, seed).double().requires_grad_() for seed in (7, 8)]
     flows = torch.tensor([1.3, -1.2], dtype=D)[:, None, None, None].expand(2, 2, 9, 11)
-    # piecewise linear: central differences are exact but for rounding away from the kinks, which a texture
-    # meets with probability 0
+    # piecewise linear: central differences are exact but for rounding away from the kinks, which a
+    # texture meets with probability 0
     assert torch.autograd.gradcheck(
         lambda a, b: between(a, b, flows, visibility(flows), 0.4), frames, eps=1e-4, atol=1e-8
     )

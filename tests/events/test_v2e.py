@@ -1,4 +1,5 @@
-"""The sensor against the recorded events of v2e itself, and the statistics of its noise for both timings."""
+"""The sensor against the recorded events of v2e itself, and the statistics of its noise for both
+timings."""
 
 import json
 import math
@@ -7,7 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.events import SensorModel, SensorState, concatenate, lin_log, memory, simulate, to_counts
+from codesign.events import (
+    SensorModel,
+    SensorState,
+    concatenate,
+    lin_log,
+    memory,
+    simulate,
+    to_counts,
+)
 from codesign.events.stream import ordered
 from tests.event_streams import rows, same
 
@@ -58,7 +67,9 @@ def test_every_event_of_v2e_to_the_microsecond(shared, sequence, configuration):
     frames, t_s, truth, data = recorded(shared, sequence, configuration)
     sensor = sensor_of(json.loads(str(data["params"])), "v2e")
     state = SensorState()
-    parts = [simulate(frames[a:b], t_s[a:b], sensor, state=state) for a, b in ((0, 2), (2, 3), (3, 120))]
+    parts = [
+        simulate(frames[a:b], t_s[a:b], sensor, state=state) for a, b in ((0, 2), (2, 3), (3, 120))
+    ]
     assert same(concatenate(parts), truth)
     assert np.array_equal(state.reference.numpy(), data["base_log_frame"])
     assert np.array_equal(state.level.numpy(), data["lp_log_frame"])
@@ -75,12 +86,14 @@ def test_counts_of_the_interpolated_sensor_equal_v2e_in_every_pixel_and_frame(
     given = json.loads(str(data["params"]))
     thetas = given["pos_thres"], given["neg_thres"]
     # v2e rounds the double-precision log level to 1e-8 and goes on in single precision
-    counts, memorised = memory(((lin_log(frames) * 1e8).round() / 1e8).float(), *thetas, log_input=True)
+    counts, memorised = memory(
+        ((lin_log(frames) * 1e8).round() / 1e8).float(), *thetas, log_input=True
+    )
     assert torch.equal(counts, truth)
     assert torch.equal(memorised[0], torch.from_numpy(data["base_log_frame"]))
     assert torch.equal(to_counts(simulate(frames.float(), t_s, SensorModel(*thetas)), t_s), truth)
-    # in double precision a level that meets a threshold to 1e-7 may count a frame later: a handful of events
-    # in 1e5
+    # in double precision a level that meets a threshold to 1e-7 may count a frame later: a handful
+    # of events in 1e5
     moved = to_counts(simulate(frames, t_s, SensorModel(*thetas)), t_s) - truth
     assert moved.cumsum(0).abs().max() <= 1
     assert int((moved != 0).sum()) <= 1e-4 * len(stream)
@@ -92,33 +105,41 @@ def test_noise_rates_are_those_of_v2e(shared, timing, case):
     truth = json.loads(shared("refs/events/v2e_stats.json").read_text())[case]
     frames = torch.full((truth["frames"], *truth["shape"]), float(truth["dn"]))
     t_s = torch.arange(truth["frames"], dtype=D) * truth["dt"]
-    events = simulate(frames, t_s, sensor_of(truth["params"], timing), torch.Generator().manual_seed(7))
+    events = simulate(
+        frames, t_s, sensor_of(truth["params"], timing), torch.Generator().manual_seed(7)
+    )
     for polarity, name in ((1, "on"), (-1, "off")):
         pixels = (events.y * 64 + events.x)[events.p == polarity]
         per_pixel = torch.bincount(pixels, minlength=4096).double() / float(t_s[-1])
-        # both are samples: their 95 % intervals add as squares; 1.7 of it is passed once in a thousand
+        # both are samples: their 95 % intervals add as squares; 1.7 of it is passed once in a
+        # thousand
         interval = math.hypot(truth[name]["ci95"], 1.96 * float(per_pixel.std()) / 64)
         assert abs(float(per_pixel.mean()) - truth[name]["mean_hz"]) <= 1.7 * interval + 1e-9
-        # standard error of a deviation: at most 2 % here (4096 pixels, tails of the log-normal included), of
-        # two samples
+        # standard error of a deviation: at most 2 % here (4096 pixels, tails of the log-normal
+        # included), of two samples
         assert float(per_pixel.std()) == pytest.approx(truth[name]["pix_std"], rel=0.09, abs=1e-9)
 
 
 @pytest.mark.parametrize("timing", ["v2e", "interpolated"])
 @pytest.mark.parametrize("sigma", [0.03, 0.05])
 def test_counts_under_mismatch_are_those_of_v2e(shared, timing, sigma):
-    truth = json.loads(shared("refs/events/v2e_stats.json").read_text())[f"grating40_counts_sigma{sigma:g}"]
+    truth = json.loads(shared("refs/events/v2e_stats.json").read_text())[
+        f"grating40_counts_sigma{sigma:g}"
+    ]
     sensor = SensorModel(theta_sigma=sigma, timing=timing)
-    # v2e's recorded sequence "grating" in closed form (to 1e-12): 17.3 px and 12.7 Hz at 0.35 rad, 1 kHz
+    # v2e's recorded sequence "grating" in closed form (to 1e-12): 17.3 px and 12.7 Hz at 0.35 rad,
+    # 1 kHz
     t, y, x = torch.meshgrid(*(torch.arange(n, dtype=D) for n in (40, 64, 64)), indexing="ij")
     along = x * math.cos(0.35) + y * math.sin(0.35)
     frames = 127.5 + 100.3 * torch.sin(2 * math.pi * (along / 17.3 - 12.7e-3 * t))
     t_s = t[:, 0, 0] * 1e-3
-    streams = [simulate(frames, t_s, sensor, torch.Generator().manual_seed(seed)) for seed in range(5)]
+    streams = [
+        simulate(frames, t_s, sensor, torch.Generator().manual_seed(seed)) for seed in range(5)
+    ]
     for polarity, name in ((1, "on"), (-1, "off")):
         mean = np.mean([int((stream.p == polarity).sum()) for stream in streams])
-        # means of five seeds each: their difference has sd * sqrt(2/5); 3.3 of it is passed once in a
-        # thousand
+        # means of five seeds each: their difference has sd * sqrt(2/5); 3.3 of it is passed once in
+        # a thousand
         assert abs(mean - truth[f"{name}_mean"]) <= 3.3 * truth[f"{name}_sd"] * math.sqrt(2 / 5)
 
 
@@ -129,15 +150,17 @@ def test_slots_keep_microseconds_at_epoch_times_and_late(start_s, gap_s):
     frames = torch.tensor([50.0, 80.0, 50.0, 120.0])[:, None, None]
     events = simulate(frames, start_s + torch.arange(4, dtype=D) * gap_s, SensorModel(timing="v2e"))
     # ln 1.6 = 0.47: two of 0.2, back by two, then ln 2.4 = 0.875: four
-    slots = [(k + (i + 1) / n, p) for k, (n, p) in enumerate(((2, 1), (2, -1), (4, 1))) for i in range(n)]
+    slots = [
+        (k + (i + 1) / n, p) for k, (n, p) in enumerate(((2, 1), (2, -1), (4, 1))) for i in range(n)
+    ]
     for (t_us, _, _, p), (slot, sign) in zip(rows(events), slots, strict=True):
         assert abs(t_us - round(start_s * 1e6) - round(slot * gap_s * 1e6)) <= 1
         assert p == sign
 
 
 def test_a_noise_event_of_either_polarity_resets_the_memorised_level():
-    # a rise of 0.15 below the threshold of 0.2: whatever fires is noise, and where nothing fires the
-    # memorised level stays where it was
+    # a rise of 0.15 below the threshold of 0.2: whatever fires is noise, and where nothing fires
+    # the memorised level stays where it was
     frames = torch.tensor([80.0, 80.0 * math.exp(0.15)])[:, None, None].expand(2, 40, 50)
     state = SensorState()
     sensor = SensorModel(shot_rate_hz=1.0, timing="v2e")

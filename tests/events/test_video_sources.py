@@ -43,7 +43,8 @@ def random_frames(kind, *shape):
 
 
 def check_frames(path, truth, white=None, t_s=None):
-    """That a source gives these frames from any one on, and says their number, size, white and times."""
+    """That a source gives these frames from any one on, and says their number, size, white and
+    times."""
     source = open_frames(path)
     assert (source.count, source.height_px, source.width_px) == truth.shape[:3]
     assert source.white == (white or np.iinfo(truth.dtype).max)
@@ -82,9 +83,11 @@ def test_a_lossless_video_of_ten_bits_comes_back_with_all_of_them(tmp_path):
     ffmpeg(*raw, *lossless, given=gray.astype("<u2").tobytes())
     found = np.stack(list(open_frames(tmp_path / "ten.mkv").read(0)))
     assert found.dtype == np.uint16
-    # full scale to full scale, to two steps of the ten bits: the converter works with tables of limited
-    # precision
-    np.testing.assert_allclose(found / 65535, np.repeat(gray[..., None], 3, -1) / 1023, atol=2 / 1023)
+    # full scale to full scale, to two steps of the ten bits: the converter works with tables of
+    # limited precision
+    np.testing.assert_allclose(
+        found / 65535, np.repeat(gray[..., None], 3, -1) / 1023, atol=2 / 1023
+    )
 
 
 @pytest.mark.parametrize(
@@ -167,7 +170,11 @@ NO_SOURCES = [
     ("text.mp4", b"this is no video", "as a video"),
     ("empty", {}, "0 picture"),
     ("one", {"a.png": GRAY}, "1 picture"),
-    ("sizes", {"a.png": COLOUR, "b.png": np.zeros((5, 5, 3), np.uint8)}, "frame 1.*5 x 5 pixels.*5 x 4"),
+    (
+        "sizes",
+        {"a.png": COLOUR, "b.png": np.zeros((5, 5, 3), np.uint8)},
+        "frame 1.*5 x 5 pixels.*5 x 4",
+    ),
     ("kinds", {"a.png": COLOUR, "b.png": GRAY}, "frame 1"),
     ("depths", {"a.png": GRAY, "b.png": GRAY.astype(np.uint16)}, "16 bits"),
     ("torn", {"a.png": GRAY, "b.png": DEEP[:20]}, "cannot be read"),
@@ -198,7 +205,9 @@ def put(path, content):
         iio.imwrite(path, content)
 
 
-@pytest.mark.parametrize(("name", "content", "words"), NO_SOURCES, ids=[name for name, *_ in NO_SOURCES])
+@pytest.mark.parametrize(
+    ("name", "content", "words"), NO_SOURCES, ids=[name for name, *_ in NO_SOURCES]
+)
 def test_what_is_no_source_is_refused_with_a_reason(tmp_path, name, content, words):
     if content is not None:
         put(tmp_path / name, content)

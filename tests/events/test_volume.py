@@ -29,14 +29,18 @@ def at_one_pixel(*t_us):
 
 @pytest.mark.parametrize("bins", [1, 2, 5])
 @pytest.mark.parametrize("batch", [(), (2, 2)])
-def test_counts_are_conserved_and_centroids_are_mean_times_also_of_uneven_frames(bins, batch, generator):
+def test_counts_are_conserved_and_centroids_are_mean_times_also_of_uneven_frames(
+    bins, batch, generator
+):
     steps_s = 0.005 + 0.01 * torch.rand(19, generator=generator, dtype=D)
     edges_s = 7 + torch.cat((torch.zeros(1, dtype=D), steps_s.cumsum(0)))
     counts = torch.randint(0, 4, (19, 2, *batch, 4, 6), generator=generator).double()
     flat = counts.reshape(19, 2, -1, 4, 6)
     volume = from_counts(counts, edges_s, bins)
     assert volume.counts.shape == (flat.shape[2], 2, bins, 4, 6)
-    torch.testing.assert_close(volume.counts.sum(2), flat.sum(0).transpose(0, 1), rtol=1e-13, atol=1e-13)
+    torch.testing.assert_close(
+        volume.counts.sum(2), flat.sum(0).transpose(0, 1), rtol=1e-13, atol=1e-13
+    )
     # shares of each interval's middle between the two nearest nodes
     middle_s = (edges_s[1:] + edges_s[:-1]) / 2 - 7
     place = middle_s / (edges_s[-1] - 7) * (bins - 1)
@@ -44,7 +48,9 @@ def test_counts_are_conserved_and_centroids_are_mean_times_also_of_uneven_frames
     torch.testing.assert_close(volume.counts, torch.einsum("kt,tpnyx->npkyx", share, flat))
     # even rate: each interval holds events in proportion to its length
     mass = share * steps_s
-    torch.testing.assert_close(volume.centroid_s, (mass @ middle_s) / mass.sum(1), rtol=1e-12, atol=0)
+    torch.testing.assert_close(
+        volume.centroid_s, (mass @ middle_s) / mass.sum(1), rtol=1e-12, atol=0
+    )
 
 
 @pytest.mark.parametrize("bins", [1, 2, 5])
@@ -89,7 +95,9 @@ def by_hand(stream, at_us, last_only):
         for t_us, x, y, p in rows(stream):
             if t_us <= time_us:
                 faded = math.exp(-(time_us - t_us) / (1e6 * TAU_S))
-                found[k, int(p < 0), y, x] = faded + (0 if last_only else found[k, int(p < 0), y, x])
+                found[k, int(p < 0), y, x] = faded + (
+                    0 if last_only else found[k, int(p < 0), y, x]
+                )
     return found
 
 
@@ -121,7 +129,9 @@ def test_whole_counts_give_the_surface_of_events_at_the_middles_of_their_interva
     truth = by_hand(stream, times_us[1:].tolist(), True)
     t_s = times_us.to(D) * 1e-6
     # twelve products and roots of float64
-    torch.testing.assert_close(surface_from_counts(counts.to(D), t_s, TAU_S), truth, rtol=1e-12, atol=0)
+    torch.testing.assert_close(
+        surface_from_counts(counts.to(D), t_s, TAU_S), truth, rtol=1e-12, atol=0
+    )
 
 
 def test_a_share_of_an_event_mixes_the_surfaces_with_and_without_it():

@@ -1,6 +1,6 @@
-"""What every network that flow is compared with promises besides test_estimators (emptiness around an image changes nothing, a
-budget of weights, the same network from its configuration and its file), and of each its arithmetic
-written out."""
+"""What every network that flow is compared with promises besides test_estimators (emptiness around
+an image changes nothing, a budget of weights, the same network from its configuration and its
+file), and of each its arithmetic written out."""
 
 import numpy as np
 import pytest
@@ -37,17 +37,21 @@ def small(network, **options):
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("size", [(21, 37), (16, 16), (1, 2)])
 def test_any_size_is_padded_with_emptiness_and_cropped_back(network, size):
-    # the pixels keep their places: the same events in the corner of a larger empty image, already a multiple
-    # of the stride
+    # the pixels keep their places: the same events in the corner of a larger empty image, already a
+    # multiple of the stride
     height, width = size
     net = small(network)
     counts = busy(1, height, width)
-    large = torch.zeros(1, 2, BINS, height + -height % net.STRIDE, width + -width % net.STRIDE, dtype=D)
+    large = torch.zeros(
+        1, 2, BINS, height + -height % net.STRIDE, width + -width % net.STRIDE, dtype=D
+    )
     large[..., :height, :width] = counts
     found = net.predictions(as_volume(counts))
     for a, b in zip(found, net.predictions(as_volume(large)), strict=True):
         assert a.flow_px.shape == (1, 2, height, width)
-        torch.testing.assert_close(a.flow_px, b.flow_px[..., :height, :width], rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(
+            a.flow_px, b.flow_px[..., :height, :width], rtol=1e-12, atol=1e-12
+        )
     assert torch.equal(found[-1].flow_px, net(as_volume(counts)).flow_px)
     assert found[-1].interval_s == pytest.approx(0.05)
 
@@ -60,7 +64,8 @@ def test_predictions_are_the_levels_in_full_resolution_pixels(network):
     shown = presence(volume.counts)
     for factor, level, field in zip((8, 4, 2, 1), levels, net.predictions(volume), strict=True):
         assert level.shape == (2, 2, 32 // factor, 48 // factor)
-        # a bilinear resampling keeps the mean of a field whose border repeats; the vectors grow with the grid
+        # a bilinear resampling keeps the mean of a field whose border repeats; the vectors grow
+        # with the grid
         torch.testing.assert_close(
             field.flow_px.mean((2, 3)), factor * (level * shown).mean((2, 3)), rtol=1e-9, atol=1e-12
         )
@@ -69,7 +74,9 @@ def test_predictions_are_the_levels_in_full_resolution_pixels(network):
 def test_the_flow_fades_in_with_the_square_of_the_events():
     counts = torch.zeros(3, 2, BINS, 16, 16, dtype=D)
     counts[1, 0, 0, 3, 4], counts[2, 1, 2, 5, 5] = 10.0, 1.0
-    torch.testing.assert_close(presence(counts).flatten(), torch.tensor([0.0, 0.5, 1 / 101], dtype=D))
+    torch.testing.assert_close(
+        presence(counts).flatten(), torch.tensor([0.0, 0.5, 1 / 101], dtype=D)
+    )
 
 
 @pytest.mark.parametrize("network", NETWORKS)
@@ -132,8 +139,8 @@ def test_unfit_constructions_are_refused(build, sentence):
 
 
 def test_the_recurrent_unit_written_out():
-    """On one cell the 3 x 3 kernels touch their centre alone: z and r by the logistic function, h' =
-    tanh(U (r h) + W x), h <- (1 - z) h + z h'."""
+    """On one cell the 3 x 3 kernels touch their centre alone: z and r by the logistic function, h'
+    = tanh(U (r h) + W x), h <- (1 - z) h + z h'."""
     net = small(IDNet)
     read = torch.randn(1, BINS, 32, 1, 1, dtype=D, generator=torch.Generator().manual_seed(5))
     held = net.state_dict()
@@ -150,8 +157,8 @@ def test_the_recurrent_unit_written_out():
 
 
 def test_the_second_iteration_reads_what_the_first_one_deblurred():
-    """With a head that always says 8 px to the right on cells of 8, each bin is read where its points have
-    got to: 8 t px further; a bar that moves so stands still."""
+    """With a head that always says 8 px to the right on cells of 8, each bin is read where its
+    points have got to: 8 t px further; a bar that moves so stands still."""
     net = small(IDNet, iterations=2)
     with torch.no_grad():
         for parameter in net.head.parameters():

@@ -1,5 +1,5 @@
-"""The spiking baseline against its published form, and the cure for each of the troubles that form is known
-for (docs/flow_baselines.md)."""
+"""The spiking baseline against its published form, and the cure for each of the troubles that form
+is known for (docs/flow_baselines.md)."""
 
 import numpy as np
 import pytest
@@ -20,15 +20,19 @@ THETA = 0.75
 
 def busy(batch=1, size=32, bins=8, mean=0.3, seed=0):
     return torch.poisson(
-        torch.full((batch, 2, bins, size, size), mean, dtype=D), generator=torch.Generator().manual_seed(seed)
+        torch.full((batch, 2, bins, size, size), mean, dtype=D),
+        generator=torch.Generator().manual_seed(seed),
     )
 
 
 def by_hand(net, halves):
-    """Sums and flows of the published loop: step by step, layer by layer, hard reset, every neck and head on
-    its own; each level adds to the coarser flow."""
+    """Sums and flows of the published loop: step by step, layer by layer, hard reset, every neck
+    and head on its own; each level adds to the coarser flow."""
     sums, potential = (
-        [torch.zeros(len(halves), c, 32 >> i, 32 >> i, dtype=D) for i, c in enumerate((8, 16, 32, 64), 1)]
+        [
+            torch.zeros(len(halves), c, 32 >> i, 32 >> i, dtype=D)
+            for i, c in enumerate((8, 16, 32, 64), 1)
+        ]
         for _ in range(2)
     )
     for t in range(halves.shape[4]):
@@ -43,7 +47,8 @@ def by_hand(net, halves):
     flows = []
     for first, second in net.residual:
         x = x + leaky_relu(
-            conv2d(leaky_relu(conv2d(x, first.weight, padding=1), 0.1), second.weight, padding=1), 0.1
+            conv2d(leaky_relu(conv2d(x, first.weight, padding=1), 0.1), second.weight, padding=1),
+            0.1,
         )
     for level in range(4):
         neck = conv_transpose2d(x, net.necks[level].weight, stride=2, padding=1)
@@ -51,7 +56,9 @@ def by_hand(net, halves):
         coarser = 2 * interpolate(flows[-1], scale_factor=2.0, mode="bilinear") if flows else 0.0
         flows.append(coarser + conv2d(neck, net.heads[level].weight))
         if level < 3:
-            up = leaky_relu(conv_transpose2d(x, net.decoder[level].weight, stride=2, padding=1), 0.1)
+            up = leaky_relu(
+                conv_transpose2d(x, net.decoder[level].weight, stride=2, padding=1), 0.1
+            )
             x = torch.cat([sums[2 - level], up, flows[-1]], 1)
     return sums, flows
 
@@ -81,7 +88,9 @@ def test_halves_are_on_off_former_latter():
     halves = to_halves(counts)
     assert halves.shape == (2, 4, 3, 5, 3)
     for half, polarity, step in np.ndindex(2, 2, 3):
-        assert torch.equal(halves[:, 2 * half + polarity, ..., step], counts[:, polarity, 3 * half + step])
+        assert torch.equal(
+            halves[:, 2 * half + polarity, ..., step], counts[:, polarity, 3 * half + step]
+        )
 
 
 def test_spikes_and_their_gradient_by_hand():
@@ -105,9 +114,10 @@ def test_spikes_and_their_gradient_by_hand():
 
 
 def test_gradient_norms_stay_within_bounds_over_contrast():
-    """Of what reaches the events through all four spiking layers, the sums of the last one being asked for: the
-    density lies between 1/(8 theta) at rest and 1/(2 theta) at threshold and falls slowly beyond. (The published
-    one jumps between 0 and 1/theta, and gives nothing where no spike is.)"""
+    """Of what reaches the events through all four spiking layers, the sums of the last one being
+    asked for: the density lies between 1/(8 theta) at rest and 1/(2 theta) at threshold and falls
+    slowly beyond. (The published one jumps between 0 and 1/theta, and gives nothing where no spike
+    is.)"""
     net = SpikeFlowNet(bins=8, width=8.0).double()
     norms = []
     for scale in (0.02, 0.1, 0.3, 1.0, 3.0):
@@ -123,14 +133,16 @@ def test_gradient_norms_stay_within_bounds_over_contrast():
 
 @pytest.mark.parametrize("factor", [0.5, 20.0])
 def test_the_input_does_not_depend_on_the_threshold_that_made_the_counts(factor):
-    # usual count (sum c^2 + 1) / (sum c + 1): a factor k on all counts cancels but for the added event, 1
-    # part in k sum c or so
+    # usual count (sum c^2 + 1) / (sum c + 1): a factor k on all counts cancels but for the added
+    # event, 1 part in k sum c or so
     counts = busy(mean=0.6)
     n = float(counts.sum())
     n2 = float(counts.square().sum())
     expected = factor * ((n2 + 1) / (n + 1)) / ((factor**2 * n2 + 1) / (factor * n + 1))
     assert abs(expected - 1) <= 2 / (min(factor, 1.0) * n)
-    torch.testing.assert_close(normalise(factor * counts), normalise(counts) * expected, rtol=1e-12, atol=0)
+    torch.testing.assert_close(
+        normalise(factor * counts), normalise(counts) * expected, rtol=1e-12, atol=0
+    )
 
 
 def test_mixed_precision_makes_no_neuron_fire_that_did_not():

@@ -1,5 +1,5 @@
-"""Network files: every bit comes back, equal networks are equal files, and each kind of damage is one clear
-error."""
+"""Network files: every bit comes back, equal networks are equal files, and each kind of damage is
+one clear error."""
 
 import json
 import sys
@@ -46,7 +46,8 @@ def path(tmp_path):
 def bits(network):
     state = network.state_dict()
     return {
-        name: (tensor.dtype, tensor.reshape(-1).view(torch.uint8).tolist()) for name, tensor in state.items()
+        name: (tensor.dtype, tensor.reshape(-1).view(torch.uint8).tolist())
+        for name, tensor in state.items()
     }
 
 
@@ -82,7 +83,10 @@ def test_a_name_stands_for_the_delivered_file(monkeypatch, tmp_path, path):
     monkeypatch.setitem(checkpoint.DELIVERED, "refiner", path)
     assert bits(checkpoint.load("refiner")) == bits(checkpoint.load(path))
     monkeypatch.setitem(checkpoint.DELIVERED, "refiner", tmp_path / "gone.safetensors")
-    for name, sentence in (("refiner", "no file lies at"), ("refinerr", "neither a delivered network")):
+    for name, sentence in (
+        ("refiner", "no file lies at"),
+        ("refinerr", "neither a delivered network"),
+    ):
         with pytest.raises(FileFormatError, match=sentence):
             checkpoint.load(name)
 
@@ -109,7 +113,12 @@ def test_pickles_are_never_opened(tmp_path):
 def rewritten(path, weights=None, **changes):
     """The file with another content, its checksum right."""
     stored = checkpoint.read(path)
-    content = {"kind": "network", "network": stored.network, "config": stored.config, "metadata": {}}
+    content = {
+        "kind": "network",
+        "network": stored.network,
+        "config": stored.config,
+        "metadata": {},
+    }
     checkpoint.write_tensors(path, {**stored.weights, **(weights or {})}, content | changes)
     return path
 

@@ -1,4 +1,5 @@
-"""flow.estimate on windows with exact flow, where the closed form as it is set fails, and on noise."""
+"""flow.estimate on windows with exact flow, where the closed form as it is set fails, and on
+noise."""
 # pyright: reportOptionalMemberAccess=false, reportOptionalOperand=false, reportOptionalSubscript=false
 
 from dataclasses import replace
@@ -22,12 +23,15 @@ def judged(family):
 
 @pytest.mark.parametrize("family", ["zoom_fine", "roll_fine"])
 def test_as_good_as_the_better_option(family):
-    """A window of weak texture is lost by the closed form as it is set (1.0 of zero flow), not by the
-    wide prior."""
+    """A window of weak texture is lost by the closed form as it is set (1.0 of zero flow), not by
+    the wide prior."""
     windows, found = judged(family)
     wide = {"prior_px": 20.0, "levels_px": (8.0, 4.0, 2.0, 1.0)}
     errors = [
-        aee(flow.estimate_lk(windows.volume, model="local", **options).flow_px, windows.truth.flow_px)
+        aee(
+            flow.estimate_lk(windows.volume, model="local", **options).flow_px,
+            windows.truth.flow_px,
+        )
         for options in ({}, wide)
     ]
     assert aee(found.flow_px, windows.truth.flow_px) <= 1.1 * min(errors)
@@ -36,13 +40,15 @@ def test_as_good_as_the_better_option(family):
 
 @pytest.mark.parametrize(
     ("family", "most"),
-    # of zero flow; the closed form as it is set has 7 to 9 on out_and_back, 15 on small_discs, whose
-    # ground is still
+    # of zero flow; the closed form as it is set has 7 to 9 on out_and_back, 15 on small_discs,
+    # whose ground is still
     [("out_and_back", 0.7), ("vibration_hard", 0.5), ("noise", 1.001), ("small_discs", 0.7)],
 )
 def test_error_over_zero_flow(family, most):
     windows, found = judged(family)
-    assert aee(found.flow_px, windows.truth.flow_px) <= most * zero_flow_error(windows.truth.flow_px)
+    assert aee(found.flow_px, windows.truth.flow_px) <= most * zero_flow_error(
+        windows.truth.flow_px
+    )
 
 
 def test_motion_that_turns_back_is_told_as_such():
@@ -66,7 +72,9 @@ def test_gradient_is_that_of_the_closed_form_that_was_chosen():
     gradient, as long as the choice stays."""
     volume = HARSH["roll_fine"](SEED, 8).batch([0]).volume
     counts = volume.counts.double().requires_grad_()
-    weight = torch.randn(1, 2, 128, 128, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    weight = torch.randn(
+        1, 2, 128, 128, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
 
     def value(counts):
         return (weight * flow.estimate(replace(volume, counts=counts)).flow_px).mean()

@@ -17,8 +17,8 @@ D = torch.float64
 
 
 def window(counts):
-    """EventVolume of counts [B, 2, bins, H, W] whose bins lie at evenly spaced times from 0 to 1 of a window
-    of 0.2 s; one bin at its start."""
+    """EventVolume of counts [B, 2, bins, H, W] whose bins lie at evenly spaced times from 0 to 1 of
+    a window of 0.2 s; one bin at its start."""
     bins = counts.shape[2]
     times = torch.linspace(0, 0.2, bins, dtype=D), torch.full((bins,), 0.2 / bins, dtype=D)
     return EventVolume(counts, *times)
@@ -38,11 +38,14 @@ def centred(size):
 
 
 def uniform(u, v, height, width):
-    return torch.tensor([u, v], dtype=D)[None, :, None, None].expand(1, 2, height, width).contiguous()
+    return (
+        torch.tensor([u, v], dtype=D)[None, :, None, None].expand(1, 2, height, width).contiguous()
+    )
 
 
 def moving_dots():
-    """An ON dot that goes 8 px right, an OFF dot that goes 8 px right and 2 events strong, in five bins."""
+    """An ON dot that goes 8 px right, an OFF dot that goes 8 px right and 2 events strong, in five
+    bins."""
     counts = torch.zeros(1, 2, 5, 8, 16, dtype=D)
     k = torch.arange(5)
     counts[0, 0, k, 4, 3 + 2 * k] = 1
@@ -76,8 +79,8 @@ def test_shares_of_an_event_between_pixels_and_what_leaves():
 
 
 def test_a_stream_uses_exact_time_stamps_and_both_ends_of_the_interval():
-    # an edge that passes one pixel per millisecond; the event before and the one after are not of the
-    # interval
+    # an edge that passes one pixel per millisecond; the event before and the one after are not of
+    # the interval
     t_us = torch.tensor([4999, 5000, 6000, 7000, 8000, 8001])
     x = torch.tensor([0, 2, 3, 4, 5, 0])
     stream = ordered(t_us, x, torch.ones_like(x), torch.tensor([1, 1, -1, 1, 1, 1]), 3, 8)
@@ -91,15 +94,18 @@ def test_a_stream_uses_exact_time_stamps_and_both_ends_of_the_interval():
 
 @pytest.mark.parametrize("zoom", [0.2, -0.2])
 def test_tracks_are_carried_back_to_the_pixel_they_start_from(zoom):
-    # flow zoom x0 of the start: at time tau the point is at x = x0 (1 + tau zoom), so its flow is zoom x / (1
-    # + tau zoom); k steps give the geometric series to order k, whose next term is zoom x (tau zoom)^(k + 1)
+    # flow zoom x0 of the start: at time tau the point is at x = x0 (1 + tau zoom), so its flow is
+    # zoom x / (1 + tau zoom); k steps give the geometric series to order k, whose next term is zoom
+    # x (tau zoom)^(k + 1)
     flow = zoom * centred(17)[None]
     volume = window(torch.ones(1, 2, 3, 17, 17, dtype=D))
     inside = (..., slice(3, 14), slice(3, 14))
     tau = torch.tensor([0.0, 0.5, 1.0], dtype=D)[:, None, None]
     exact = (flow[0, :, None] / (1 + tau * zoom))[inside]
     for steps in (0, 1, 3):
-        found = contrast.volume_tracks(volume, flow, steps).flow_px.unflatten(2, (3, 17, 17))[0][inside]
+        found = contrast.volume_tracks(volume, flow, steps).flow_px.unflatten(2, (3, 17, 17))[0][
+            inside
+        ]
         left = (exact * (-tau * zoom) ** (steps + 1)).abs().amax((0, 2, 3))
         torch.testing.assert_close((found - exact).abs().amax((0, 2, 3)), left, rtol=0, atol=1e-12)
 
@@ -107,9 +113,9 @@ def test_tracks_are_carried_back_to_the_pixel_they_start_from(zoom):
 def test_the_smooth_spread_is_alike_wherever_an_event_falls():
     place = torch.arange(9, dtype=D)
     for u, v in [(0.0, 0.0), (0.3, -0.2), (0.5, 0.5), (1.7, -1.1)]:
-        image = contrast.smooth_image(contrast.volume_tracks(lone(9, 9, 4, 4), uniform(u, v, 9, 9)), 1.0)[
-            0, 0
-        ]
+        image = contrast.smooth_image(
+            contrast.volume_tracks(lone(9, 9, 4, 4), uniform(u, v, 9, 9)), 1.0
+        )[0, 0]
         assert float(image.sum()) == pytest.approx(1)
         for shares, centre in ((image.sum(0), 4 + u), (image.sum(1), 4 + v)):
             assert float((shares * place).sum()) == pytest.approx(centre)
@@ -146,8 +152,8 @@ def test_gradcheck_in_counts_and_flow(image, carry_steps, generator):
 
 
 def test_the_smooth_image_has_no_jump_in_its_gradient():
-    # an event that crosses the border between two pixels, and the centre line of one: bilinear shares jump
-    # there, the B-spline does not
+    # an event that crosses the border between two pixels, and the centre line of one: bilinear
+    # shares jump there, the B-spline does not
     weights = torch.arange(9, dtype=D).square()
 
     def jump(image, place):
@@ -180,7 +186,9 @@ STILL = torch.zeros(2, 8, 16)
             "flow of these events must be finite, got .* in 16 of 256",
         ),
         (
-            lambda: contrast.warp_jacobian(contrast.volume_tracks(FLAT, uniform(0, 0, 1, 4)), 2, 0.0),
+            lambda: contrast.warp_jacobian(
+                contrast.volume_tracks(FLAT, uniform(0, 0, 1, 4)), 2, 0.0
+            ),
             "1 x 4 pixels has no slope",
         ),
         (lambda: contrast.stream_tracks(STREAM, STILL, 20, 30), "no event lies"),

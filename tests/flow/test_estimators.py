@@ -1,5 +1,6 @@
-"""What every estimator of flow promises: an answer of its own for every sample, size and type, nothing where
-nothing is seen, gradients that differences confirm, and one sentence for what is no volume of events."""
+"""What every estimator of flow promises: an answer of its own for every sample, size and type,
+nothing where nothing is seen, gradients that differences confirm, and one sentence for what is no
+volume of events."""
 # pyright: reportArgumentType=false, reportCallIssue=false
 
 import math
@@ -38,7 +39,8 @@ NETWORKS = {
 }
 WIDE = {name: deepcopy(network).double() for name, network in NETWORKS.items()}
 CLOSED = {
-    name: partial(flow.estimate_lk, model=name) for name in ("constant", "affine", "quadratic", "local")
+    name: partial(flow.estimate_lk, model=name)
+    for name in ("constant", "affine", "quadratic", "local")
 }
 CLOSED |= {"choice": flow.estimate}
 
@@ -67,7 +69,9 @@ def test_a_batch_is_its_samples_and_an_empty_one_shows_nothing(name, size):
     field = estimate(evenly_timed(counts))
     assert field.flow_px.shape == (4, 2, *size)
     assert field.valid.flatten(1).all(1).tolist() == [True, False, True, True]
-    assert 0 <= float(field.confidence.detach().min()) <= float(field.confidence.detach().max()) <= 1
+    assert (
+        0 <= float(field.confidence.detach().min()) <= float(field.confidence.detach().max()) <= 1
+    )
     assert not field.flow_px[1].any()
     assert float(field.confidence[1].detach().abs().max()) < 1e-12
     (grad,) = torch.autograd.grad(field.flow_px.square().sum() + field.flow_px.sum(), counts)
@@ -77,7 +81,9 @@ def test_a_batch_is_its_samples_and_an_empty_one_shows_nothing(name, size):
         found = estimate(evenly_timed(alone)).flow_px
         (own,) = torch.autograd.grad(found.square().sum() + found.sum(), alone)
         torch.testing.assert_close(found[0], field.flow_px[sample], rtol=1e-9, atol=1e-9)
-        torch.testing.assert_close(own[0], grad[sample], rtol=1e-8, atol=1e-8 * float(own.abs().max()))
+        torch.testing.assert_close(
+            own[0], grad[sample], rtol=1e-8, atol=1e-8 * float(own.abs().max())
+        )
 
 
 @pytest.mark.parametrize(
@@ -96,8 +102,8 @@ def test_a_batch_is_its_samples_and_an_empty_one_shows_nothing(name, size):
 )
 def test_gradients_of_counts_and_weights_are_those_of_differences(name, rate, generator):
     """Central differences in float64 along random directions: error of order step^2 and rounding /
-    step. Counts of nothing but one event, of a textured scene, and of a saturated one. Of the spiking
-    network those weights alone that no spike depends on."""
+    step. Counts of nothing but one event, of a textured scene, and of a saturated one. Of the
+    spiking network those weights alone that no spike depends on."""
     net = WIDE[name.split()[0]]
     options = {"clock": "events"} if "by events" in name else {}
     counts = busy(1, 20, 24, rate=rate) + 0.5 * (rate > 0)
@@ -106,7 +112,9 @@ def test_gradients_of_counts_and_weights_are_those_of_differences(name, rate, ge
     learnt = list(net.parameters())
     places = [counts.requires_grad_(), *(learnt[k] for k in (0, len(learnt) // 2, -4, -1))]
     if name == "spiking":
-        places = [value for key, value in net.named_parameters() if key.startswith(("necks", "heads"))]
+        places = [
+            value for key, value in net.named_parameters() if key.startswith(("necks", "heads"))
+        ]
 
     def loss():
         field = net(evenly_timed(counts), **options)
@@ -116,7 +124,8 @@ def test_gradients_of_counts_and_weights_are_those_of_differences(name, rate, ge
             *([] if field.covariance_px2 is None else field.covariance_px2.unbind(1)),
         ]
         return sum(
-            ((w * value).sum() for w, value in zip(weight, values, strict=False)), counts.new_zeros(())
+            ((w * value).sum() for w, value in zip(weight, values, strict=False)),
+            counts.new_zeros(()),
         )
 
     found = torch.autograd.grad(loss(), places, allow_unused=True, materialize_grads=True)
@@ -153,7 +162,9 @@ def test_a_network_takes_both_types_and_gives_that_of_the_events_back(name):
 
 
 def test_events_and_weights_on_two_devices():
-    with pytest.raises(CodesignError, match="events are on cpu, the weights of the network on meta"):
+    with pytest.raises(
+        CodesignError, match="events are on cpu, the weights of the network on meta"
+    ):
         flow.FlowNetEvents(BINS, width=4.0).to("meta")(VOLUME)
 
 

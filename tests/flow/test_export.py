@@ -1,4 +1,5 @@
-"""Networks as programs: the same numbers as the network, from torch.export and from ONNX, and refusals."""
+"""Networks as programs: the same numbers as the network, from torch.export and from ONNX, and
+refusals."""
 
 import importlib.util
 import warnings
@@ -18,15 +19,17 @@ needs_onnx = pytest.mark.skipif(
 
 
 class Small(nn.Module):
-    """Every kind of step that flow networks have: a check of the values, numbers worked out from the bins'
-    times, a solve, a warp, a branch for the size."""
+    """Every kind of step that flow networks have: a check of the values, numbers worked out from
+    the bins' times, a solve, a warp, a branch for the size."""
 
     def __init__(self, solves=True):
         super().__init__()
         self.config = {"bins": 4}
         self.solves = solves
         self.layer = nn.Conv2d(8, 2, 3, padding=1)
-        self.layer.weight.data = self.layer.weight.data.contiguous(memory_format=torch.channels_last)
+        self.layer.weight.data = self.layer.weight.data.contiguous(
+            memory_format=torch.channels_last
+        )
         self.drop = nn.Dropout(0.5)
 
     def forward(self, volume):
@@ -35,7 +38,9 @@ class Small(nn.Module):
             raise DomainError("not finite")
         span = float(volume.collected_s.sum())
         middle = float((volume.centroid_s * volume.collected_s).sum()) / span**2
-        x = self.drop(self.layer(nn.functional.pad(counts.flatten(1, 2), (0, 1))))[..., :-1] * (1 + middle)
+        x = self.drop(self.layer(nn.functional.pad(counts.flatten(1, 2), (0, 1))))[..., :-1] * (
+            1 + middle
+        )
         if self.solves:
             cross = torch.einsum("bihw,bjhw->bij", x, x) + torch.diag(torch.tensor([1.0, 2.0]))
             x = torch.einsum(
@@ -54,14 +59,16 @@ def load(path, counts):
 
     return [
         torch.from_numpy(output)
-        for output in ReferenceEvaluator(str(path)).run(["flow_px", "confidence"], {"counts": counts.numpy()})
+        for output in ReferenceEvaluator(str(path)).run(
+            ["flow_px", "confidence"], {"counts": counts.numpy()}
+        )
     ]
 
 
 @pytest.mark.parametrize("name", ["small.pt2", pytest.param("small.onnx", marks=needs_onnx)])
 def test_the_program_gives_the_numbers_of_the_network(tmp_path, generator, name):
-    """torch.export runs the same operations; ONNX's own order of sums differs in the last bits of numbers of
-    order 1."""
+    """torch.export runs the same operations; ONNX's own order of sums differs in the last bits of
+    numbers of order 1."""
     network = Small().train()
     with warnings.catch_warnings():
         # of the packages that write and read programs
@@ -83,7 +90,9 @@ def test_solving_by_elimination_is_solving(generator):
     root = torch.randn(3, 6, 6, generator=generator, dtype=torch.float64)
     matrix = root @ root.mT + torch.eye(6)
     right = torch.randn(3, 6, 4, generator=generator, dtype=torch.float64)
-    assert torch.allclose(eliminate(matrix, right), torch.linalg.solve(matrix, right), rtol=1e-12, atol=1e-12)
+    assert torch.allclose(
+        eliminate(matrix, right), torch.linalg.solve(matrix, right), rtol=1e-12, atol=1e-12
+    )
 
 
 def test_what_cannot_be_written_is_said(tmp_path):

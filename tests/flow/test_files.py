@@ -1,5 +1,5 @@
-"""Flow files: the bytes of both formats, round trips within half a quantum, other writers' PNGs, and damaged
-files."""
+"""Flow files: the bytes of both formats, round trips within half a quantum, other writers' PNGs,
+and damaged files."""
 
 import struct
 import zlib
@@ -24,7 +24,9 @@ def field():
 
 def png(width, height, raw, depth=16):
     def chunk(name, data):
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        return (
+            struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        )
 
     return (
         b"\x89PNG\r\n\x1a\n"
@@ -65,7 +67,9 @@ def test_other_programs_read_the_png(field, tmp_path):
 def test_flo_holds_the_bytes_of_the_format(tmp_path):
     flow = torch.tensor([[[1.0, 2.0, 3.0]], [[-1.0, -2.0, -3.0]]])
     write_flow(tmp_path / "a.flo", flow, torch.tensor([[True, True, False]]))
-    assert (tmp_path / "a.flo").read_bytes() == b"PIEH" + struct.pack("<ii6f", 3, 1, 1, -1, 2, -2, 1e10, 1e10)
+    assert (tmp_path / "a.flo").read_bytes() == b"PIEH" + struct.pack(
+        "<ii6f", 3, 1, 1, -1, 2, -2, 1e10, 1e10
+    )
 
 
 @pytest.mark.parametrize("value", [256.0, -256.01])

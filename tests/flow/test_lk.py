@@ -1,5 +1,5 @@
-"""The closed form on patterns whose motion is known, on noise, on windows of rendered planes; its confidence and
-its gradient."""
+"""The closed form on patterns whose motion is known, on noise, on windows of rendered planes; its
+confidence and its gradient."""
 
 import math
 
@@ -24,7 +24,9 @@ def pattern(seed, finest_px=6.0, coarsest_px=24.0, count=40):
     kx = wave * (2 * math.pi * u[1]).cos()
     ky = wave * (2 * math.pi * u[1]).sin()
     phase = 2 * math.pi * u[2]
-    return lambda x, y: torch.cos(x[..., None] * kx + y[..., None] * ky + phase).sum(-1) * (2 / count) ** 0.5
+    return lambda x, y: (
+        torch.cos(x[..., None] * kx + y[..., None] * ky + phase).sum(-1) * (2 / count) ** 0.5
+    )
 
 
 def pixels(height=SIZE, width=SIZE):
@@ -43,11 +45,11 @@ def moving(
     bins=5,
     waves_px=(6.0, 24.0),
 ):
-    """Volume of a signed event rate whose points move evenly, by matrix (x - centre) + shift from where they
-    are at mid-interval, and the flow [2, H, W].
+    """Volume of a signed event rate whose points move evenly, by matrix (x - centre) + shift from
+    where they are at mid-interval, and the flow [2, H, W].
 
-    A point seen at a at the start is at x with a = x - (matrix x + shift) / 2 at mid-interval, so the flow on
-    the pixels of the start is matrix (1 - matrix / 2)^-1 (a + shift / 2) + shift.
+    A point seen at a at the start is at x with a = x - (matrix x + shift) / 2 at mid-interval, so
+    the flow on the pixels of the start is matrix (1 - matrix / 2)^-1 (a + shift / 2) + shift.
     """
     matrix = torch.tensor(matrix, dtype=D)
     shift = torch.tensor(shift, dtype=D)
@@ -61,7 +63,9 @@ def moving(
         origin = (at - tau * shift) @ torch.linalg.inv(unit + tau * matrix).T
         signed = rate(origin[..., 0], origin[..., 1]) * per_pixel / steps
         counts.append(torch.stack([signed.clamp_min(0), (-signed).clamp_min(0)]))
-    volume = events.from_counts(torch.stack(counts), torch.linspace(0, SPAN_S, steps + 1, dtype=D), bins)
+    volume = events.from_counts(
+        torch.stack(counts), torch.linspace(0, SPAN_S, steps + 1, dtype=D), bins
+    )
     middle = (at + shift / 2) @ torch.linalg.inv(unit - matrix / 2).T
     return volume, (middle @ matrix.T + shift).permute(2, 0, 1)
 
@@ -74,9 +78,9 @@ def length(flow):
     return float(flow.square().sum(0).sqrt().mean())
 
 
-# relative error allowed: bilinear warping has the slope of a chord over two pixels, sin(k)/k = 0.83 of the
-# true one at a period of 6 px and 0.99 at 24 px, so small flows come out some 6 % too long; over whole pixels
-# that averages out
+# relative error allowed: bilinear warping has the slope of a chord over two pixels, sin(k)/k = 0.83
+# of the true one at a period of 6 px and 0.99 at 24 px, so small flows come out some 6 % too long;
+# over whole pixels that averages out
 @pytest.mark.parametrize(
     ("seed", "shift", "relative"),
     [
@@ -95,7 +99,8 @@ def test_constant_flow_of_any_size(seed, shift, relative):
 
 
 @pytest.mark.parametrize(
-    "matrix", [((0.03, -0.02), (0.02, 0.04)), ((0.05, 0.0), (0.0, 0.05)), ((0.0, 0.06), (-0.06, 0.0))]
+    "matrix",
+    [((0.03, -0.02), (0.02, 0.04)), ((0.05, 0.0), (0.0, 0.05)), ((0.0, 0.06), (-0.06, 0.0))],
 )
 def test_affine_flow_on_the_pixels_of_the_start(matrix):
     volume, truth = moving(2, matrix, (1.0, -0.5))
@@ -108,7 +113,9 @@ def test_flow_changes_sign_with_time_turns_with_the_image_and_knows_no_polarity(
     volume, _ = moving(3, shift=(2.0, 1.0))
 
     def found(counts, model="affine"):
-        return estimate_lk(EventVolume(counts, volume.centroid_s, volume.collected_s), model).flow_px
+        return estimate_lk(
+            EventVolume(counts, volume.centroid_s, volume.collected_s), model
+        ).flow_px
 
     counts = volume.counts
     right = found(counts)
@@ -120,11 +127,13 @@ def test_flow_changes_sign_with_time_turns_with_the_image_and_knows_no_polarity(
 
 @pytest.mark.parametrize("count", [1, 20, 1000])
 def test_scattered_noise_gives_almost_no_flow(count):
-    # up to one event per two pixels, at random places, times and signs: nothing moves. (Plain damping gives
-    # some 9 px here.)
+    # up to one event per two pixels, at random places, times and signs: nothing moves. (Plain
+    # damping gives some 9 px here.)
     shell, _ = moving(0, steps=10)
     for seed in range(3):
-        cells = torch.randint(shell.counts.numel(), (count,), generator=torch.Generator().manual_seed(seed))
+        cells = torch.randint(
+            shell.counts.numel(), (count,), generator=torch.Generator().manual_seed(seed)
+        )
         counts = torch.zeros_like(shell.counts)
         counts.view(-1).index_add_(0, cells, torch.ones(count, dtype=D))
         flow = estimate_lk(EventVolume(counts, shell.centroid_s, shell.collected_s)).flow_px
@@ -135,21 +144,25 @@ def test_confidence_follows_from_the_covariance_and_is_zero_without_events():
     volume, _ = moving(0, shift=(1.0, 0.5), steps=10)
     both = torch.cat([volume.counts, 0 * volume.counts])
     field = certain(
-        estimate_lk(EventVolume(both, volume.centroid_s, volume.collected_s), "constant", prior_px=2.0)
+        estimate_lk(
+            EventVolume(both, volume.centroid_s, volume.collected_s), "constant", prior_px=2.0
+        )
     )
     variance = field.covariance_px2[:, 0] + field.covariance_px2[:, 2]
     # the empty sample has the prior's: 2^2 + 2^2, and a little for what no polynomial explains
     assert 8 < float(variance[1].min()) <= float(variance[1].max()) < 8.5
-    torch.testing.assert_close(field.confidence, 1 - variance / variance[1:], rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(
+        field.confidence, 1 - variance / variance[1:], rtol=1e-12, atol=1e-12
+    )
     assert not field.confidence[1].any()
     assert float(field.confidence[0].min()) > 0.99
 
 
 @pytest.mark.parametrize(("kind", "most"), [("fine", 0.23), ("mixed", 0.55)])
 def test_squared_errors_are_those_of_the_covariance(kind, most):
-    # windows of photographs and speckle with hard events. Errors have tails (a wrong texture is a wrong
-    # flow), so the mean is known to some 20 %; over kinds it runs from 0.4 to 1.7 (docs/flow_closed_form.md):
-    # within a factor of 3 either way
+    # windows of photographs and speckle with hard events. Errors have tails (a wrong texture is a
+    # wrong flow), so the mean is known to some 20 %; over kinds it runs from 0.4 to 1.7
+    # (docs/flow_closed_form.md): within a factor of 3 either way
     windows = RenderedWindows(planes(kind, 0.2, (0.002, 0.002)), seed=11).batch(range(48))
     with torch.no_grad():
         field = certain(estimate_lk(windows.volume))
@@ -158,7 +171,9 @@ def test_squared_errors_are_those_of_the_covariance(kind, most):
     xx, xy, yy = field.covariance_px2.unbind(1)
     normalised = (yy * x**2 - 2 * xy * x * y + xx * y**2) / (2 * (xx * yy - xy**2))
     assert 1 / 3 <= float(normalised.mean()) <= 3
-    assert float((field.flow_px - truth).norm(dim=1).mean()) <= most * float(truth.norm(dim=1).mean())
+    assert float((field.flow_px - truth).norm(dim=1).mean()) <= most * float(
+        truth.norm(dim=1).mean()
+    )
 
 
 @pytest.mark.parametrize(
@@ -172,7 +187,8 @@ def test_squared_errors_are_those_of_the_covariance(kind, most):
     ],
 )
 def test_gradients_are_those_of_differences(model, clock, generator):
-    """Of the flow, its covariance and confidence; by events as the clock, of a motion that turns back."""
+    """Of the flow, its covariance and confidence; by events as the clock, of a motion that turns
+    back."""
     volume, _ = moving(4, shift=(0.7, -0.4), steps=20, bins=6)
     counts = volume.counts[..., 10:24, 8:22] * 0.3
     if clock == "events":
@@ -192,5 +208,6 @@ def test_gradients_are_those_of_differences(model, clock, generator):
         tangent = torch.randn(counts.shape, generator=generator, dtype=D)
         ahead, behind = (float(loss((counts + s * 1e-6 * tangent).detach())) for s in (1, -1))
         truth = (ahead - behind) / 2e-6
-        # steps of 1e-6 events; the warp is only piecewise smooth, but so short a step crosses no kink
+        # steps of 1e-6 events; the warp is only piecewise smooth, but so short a step crosses no
+        # kink
         assert abs(float((found * tangent).sum()) - truth) <= 1e-5 * abs(truth) + 1e-6

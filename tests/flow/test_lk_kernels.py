@@ -39,12 +39,17 @@ def times(bins):
 
 
 def drawn(case, generator):
-    """Grid, cell, bins, flow, density and weights; a part of the samples reads beyond the border."""
+    """Grid, cell, bins, flow, density and weights; a part of the samples reads beyond the
+    border."""
     batch, bins, height, width, stride, cell = case
     grid = Grid(height, width, stride)
     # batch first, then bins: two of flow, density, three of weights
     numbers = torch.randn(bins + 6, batch, *grid.shape, generator=generator, dtype=D)
-    rate, flow, density = numbers[:-6].transpose(0, 1), 4 * numbers[-6:-4].transpose(0, 1), numbers[-4].abs()
+    rate, flow, density = (
+        numbers[:-6].transpose(0, 1),
+        4 * numbers[-6:-4].transpose(0, 1),
+        numbers[-4].abs(),
+    )
     return grid, cell, rate.contiguous(), flow.contiguous(), density, numbers[-3:]
 
 
@@ -62,7 +67,9 @@ def everything(form, grid, cell, rate, flow, density, weights):
         rate = blurred(images, grid, TAPS)
         read = moving(rate, flow, time, contrast, grid, FADE_PX)
         by_reading = torch.autograd.grad(
-            sum((w * x).sum() for w, x in zip(weights, read, strict=True)), (images, flow), retain_graph=True
+            sum((w * x).sum() for w, x in zip(weights, read, strict=True)),
+            (images, flow),
+            retain_graph=True,
         )
         sums = cell_sums(*read, density, grid, cell)
         pulls = torch.linspace(-1, 1, sums.numel(), dtype=D).to(sums).reshape(sums.shape)
@@ -72,8 +79,8 @@ def everything(form, grid, cell, rate, flow, density, weights):
 
 @pytest.mark.parametrize(
     "case",
-    # batch, bins, height, width, stride, cell; whole cells and cells cut off, one pair of bins, one row of
-    # samples
+    # batch, bins, height, width, stride, cell; whole cells and cells cut off, one pair of bins, one
+    # row of samples
     [
         (2, 3, 13, 9, 1, 4),
         (1, 2, 7, 22, 2, 3),
@@ -88,8 +95,8 @@ def test_kernels_are_the_plain_operations_and_their_gradients(case, dtype, gener
     grid, cell, *given = drawn(case, generator)
     found = everything(nullcontext, grid, cell, *(x.to(dtype) for x in given))
     truth = everything(plain_operations, grid, cell, *(x.to(dtype).to(D) for x in given))
-    # a place 20 px away is rounded by 10 eps, neighbours differ by up to 6 and slopes enter twice; a sum over
-    # cells takes 64 of them
+    # a place 20 px away is rounded by 10 eps, neighbours differ by up to 6 and slopes enter twice;
+    # a sum over cells takes 64 of them
     for one, other in zip(found, truth, strict=True):
         assert one.dtype == dtype
         off = (one.detach().to(D) - other.detach()).abs().max()
@@ -97,7 +104,8 @@ def test_kernels_are_the_plain_operations_and_their_gradients(case, dtype, gener
 
 
 @pytest.mark.parametrize(
-    ("shape", "stride"), [((2, 3, 150, 21), 1), ((1, 2, 31, 42), 4), ((1, 2, 3, 2), 1), ((3, 1, 1, 5), 1)]
+    ("shape", "stride"),
+    [((2, 3, 150, 21), 1), ((1, 2, 31, 42), 4), ((1, 2, 3, 2), 1), ((3, 1, 1, 5), 1)],
 )
 def test_the_blur_is_that_of_scipy(shape, stride, generator):
     # more rows than a lane goes down; squares cut off; images smaller than the kernel
@@ -142,8 +150,8 @@ def test_other_sizes_need_no_new_kernel_but_for_copies_to_scatter_into(generator
 
 
 def test_no_garbage_is_collected_in_a_recording():
-    """A scene that is freed in one ends the process: the kernel makes more garbage than the collector
-    waits for."""
+    """A scene that is freed in one ends the process: the kernel makes more garbage than the
+    collector waits for."""
     before = gc.get_threshold()
     recording = False
     collections = []
@@ -188,8 +196,15 @@ def test_replaying_runs_no_python_while_drjit_holds_its_lock(generator):
 
     def watch(frame, event, arg):
         outer = frame.f_back.f_code if frame.f_back else None
-        if event == "call" and outer and outer.co_filename == dr.__file__ and outer.co_name == "__call__":
-            (replays if frame.f_code.co_name == "capture_closure" else called).append(frame.f_code.co_name)
+        if (
+            event == "call"
+            and outer
+            and outer.co_filename == dr.__file__
+            and outer.co_name == "__call__"
+        ):
+            (replays if frame.f_code.co_name == "capture_closure" else called).append(
+                frame.f_code.co_name
+            )
 
     sys.setprofile(watch)
     passes()
@@ -231,7 +246,11 @@ def test_the_step_to_the_start_is_that_of_plain_operations(model, height, width,
     half = 0.3 * draw(2, 2 * shape.terms, 2 * shape.terms)
     value, covariance = draw(*cells.value.shape), draw(*cells.covariance.shape)
     given = leaves(
-        1.5 * draw(2, 2 * shape.terms), half @ half.mT, value, covariance, torch.tensor([-0.5, -0.4], dtype=D)
+        1.5 * draw(2, 2 * shape.terms),
+        half @ half.mT,
+        value,
+        covariance,
+        torch.tensor([-0.5, -0.4], dtype=D),
     )
     weights = [draw(2, count, height, width) for count in (2, 3)]
 
@@ -262,8 +281,9 @@ class Closed(nn.Module):
 
 
 def test_a_program_follows_the_counts_it_is_given(generator):
-    """A kernel that the recording does not see would be a constant: the flow of the empty volume that
-    was recorded. The same sums in another order: 1e-4 px of flows of a pixel in single precision."""
+    """A kernel that the recording does not see would be a constant: the flow of the empty volume
+    that was recorded. The same sums in another order: 1e-4 px of flows of a pixel in single
+    precision."""
     counts = torch.poisson(torch.full((1, 2, 2, 16, 20), 2.0), generator=generator)
     expected = Closed()(evenly_timed(counts))
     assert float(expected.flow_px.abs().max()) > 0.01

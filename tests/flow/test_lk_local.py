@@ -1,5 +1,5 @@
-"""The closed form's local part: its tree against a dense solve, its fields where one polynomial does
-not do."""
+"""The closed form's local part: its tree against a dense solve, its fields where one polynomial
+does not do."""
 # pyright: reportCallIssue=false
 
 from contextlib import nullcontext
@@ -58,7 +58,9 @@ def test_the_tree_finds_the_posterior_of_a_dense_solve(form, generator):
             posterior = np.linalg.inv(np.linalg.inv(prior) + data)
             means.append(posterior @ h)
             covariances.append(posterior)
-            evidences.append((h @ posterior @ h - np.linalg.slogdet(np.eye(2 * cells) + prior @ data)[1]) / 2)
+            evidences.append(
+                (h @ posterior @ h - np.linalg.slogdet(np.eye(2 * cells) + prior @ data)[1]) / 2
+            )
         whole = np.mean(covariances, 0) + np.cov(np.transpose(means), bias=True)
         np.testing.assert_allclose(mean.flatten(), np.mean(means, 0), atol=1e-10)
         ends = whole.reshape(2, cells, 2, cells).diagonal(axis1=1, axis2=3)
@@ -72,7 +74,9 @@ def test_the_trees_gradient_is_that_of_differences(generator):
     xx, xy, _, yy = (half @ half.mT).flatten(3).unbind(3)
     precision = torch.stack([xx, xy, yy], 1).requires_grad_()
     pull = torch.randn(2, 2, 5, 2, generator=generator, dtype=D).requires_grad_()
-    assert torch.autograd.gradcheck(lambda *given: quadtree.posterior(*given, steps()), (precision, pull))
+    assert torch.autograd.gradcheck(
+        lambda *given: quadtree.posterior(*given, steps()), (precision, pull)
+    )
     mean, *_ = quadtree.posterior(precision, pull, steps())
     (grad,) = torch.autograd.grad(mean.square().sum(), pull, create_graph=True)
     with pytest.raises(GradientError, match="first derivatives only"):
@@ -80,8 +84,8 @@ def test_the_trees_gradient_is_that_of_differences(generator):
 
 
 def test_two_motions_side_by_side():
-    # the left half moves by (2, 1), the right one by (-2, 1) px: no polynomial of second degree comes
-    # near; the best one, u = -3.75 x / w, leaves 0.7 px in the mean
+    # the left half moves by (2, 1), the right one by (-2, 1) px: no polynomial of second degree
+    # comes near; the best one, u = -3.75 x / w, leaves 0.7 px in the mean
     (left, left_px), (right, right_px) = moving(0, shift=(2.0, 1.0)), moving(1, shift=(-2.0, 1.0))
     on_left = torch.arange(48) < 24
     counts = torch.where(on_left, left.counts, right.counts)

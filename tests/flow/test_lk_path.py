@@ -1,5 +1,5 @@
-"""Motion that is not even: speed that changes, motion that turns back, against displacements known in
-closed form."""
+"""Motion that is not even: speed that changes, motion that turns back, against displacements known
+in closed form."""
 
 import math
 
@@ -17,9 +17,9 @@ STEPS = 160  # of the quadrature, per bin 20
 
 
 def along(seed, way):
-    """Volume [1, 2, 8, 48, 48] of the signed rate dL/dt of a pattern whose points are (4, -2) px times
-    way(t) from where they were at t = 0, t in 0..1, in bins of equal length, and the displacement over
-    the whole time [2, 48, 48]."""
+    """Volume [1, 2, 8, 48, 48] of the signed rate dL/dt of a pattern whose points are (4, -2) px
+    times way(t) from where they were at t = 0, t in 0..1, in bins of equal length, and the
+    displacement over the whole time [2, 48, 48]."""
     x, y = pixels()
     shade = pattern(seed)
     edges = torch.linspace(0, 1, STEPS + 1, dtype=D)
@@ -33,7 +33,8 @@ def along(seed, way):
 
 @pytest.mark.parametrize(
     ("seed", "way", "most_px"),
-    # bins hold a tenth of the way or two: that much of a bin's length is the place of an event not known
+    # bins hold a tenth of the way or two: that much of a bin's length is the place of an event not
+    # known
     [
         (0, lambda t: t, 0.03 * 20**0.5),
         (1, lambda t: t**2, 0.05 * 20**0.5),  # from rest
@@ -51,8 +52,8 @@ def test_displacement_of_uneven_motion(seed, way, most_px):
 
 def test_a_sensor_that_begins_with_the_window_is_no_slow_start():
     """All pixels begin in the middle of their thresholds, so that the first bin has half of its
-    events. By events alone the flow is 13 to 18 % short; by time 6 to 9 %, since the first events of a
-    pixel come late."""
+    events. By events alone the flow is 13 to 18 % short; by time 6 to 9 %, since the first events
+    of a pixel come late."""
     x, y = pixels()
     shade = pattern(1)
     t_s = torch.linspace(0, 1, 25, dtype=D)

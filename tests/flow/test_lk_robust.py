@@ -1,4 +1,5 @@
-"""The closed form on volumes that say little or nothing, on sensors with faulty pixels, on small images."""
+"""The closed form on volumes that say little or nothing, on sensors with faulty pixels, on small
+images."""
 
 import numpy as np
 import pytest
@@ -45,11 +46,18 @@ def test_what_says_little_has_finite_gradients_and_what_says_nothing_no_flow(mod
         scale = 10.0 ** (5 * k % 13 - 6)
         counts = (scale * counts[None]).to(dtype).requires_grad_()
         field = certain(estimate_lk(evenly_timed(counts), model))
-        values = torch.stack([*field.flow_px.unbind(1), field.confidence, *field.covariance_px2.unbind(1)])
+        values = torch.stack(
+            [*field.flow_px.unbind(1), field.confidence, *field.covariance_px2.unbind(1)]
+        )
         assert bool(values.isfinite().all())
         (gradient,) = torch.autograd.grad((values * values).sum() + values.sum(), counts)
         assert bool(gradient.isfinite().all())
-        assert 0 <= float(field.confidence.min().detach()) <= float(field.confidence.max().detach()) <= 1
+        assert (
+            0
+            <= float(field.confidence.min().detach())
+            <= float(field.confidence.max().detach())
+            <= 1
+        )
         if name in ("all ON", "all alike"):
             assert float(field.flow_px.detach().abs().max()) <= 0.01
         if name == "empty":
@@ -87,5 +95,7 @@ def test_pixels_count_by_what_their_surroundings_explain(generator):
         assert float(kept[image, y, x]) == pytest.approx(1 / (1 + excess**2), rel=1e-12)
     assert int((kept < 1).sum()) == 2
     torch.testing.assert_close(events, kept * n, rtol=1e-14, atol=0)
-    torch.testing.assert_close(signed, kept[:, None] * (counts[:, 0] - counts[:, 1]), rtol=1e-14, atol=0)
+    torch.testing.assert_close(
+        signed, kept[:, None] * (counts[:, 0] - counts[:, 1]), rtol=1e-14, atol=0
+    )
     assert torch.autograd.gradcheck(weighed_down, counts.requires_grad_())

@@ -1,4 +1,5 @@
-"""Warm starts of the closed form: motions that are found from near by only, and starts that are wrong."""
+"""Warm starts of the closed form: motions that are found from near by only, and starts that are
+wrong."""
 
 import pytest
 import torch
@@ -44,7 +45,8 @@ def test_a_start_near_by_finds_what_the_coarse_blur_wipes_out(model):
 @pytest.mark.parametrize("waves_px", [FINE_PX, (6.0, 24.0)])
 @pytest.mark.parametrize("levels_px", [(4.0, 2.0, 1.0), (2.0, 1.0)])
 def test_a_wrong_start_leaves_what_is_found_without(waves_px, levels_px):
-    # the share of the wrong one is below 1e-3 where contrasts differ by 7 in the logarithm of the odds
+    # the share of the wrong one is below 1e-3 where contrasts differ by 7 in the logarithm of the
+    # odds
     volume, truth = moving(1, shift=(3.0, -2.0), waves_px=waves_px)
     cold = mean_error(estimate_lk(volume, levels_px=levels_px), truth)
     for wrong in ((-6.0, 4.0), (9.0, 9.0), (0.0, -12.0)):
@@ -54,11 +56,14 @@ def test_a_wrong_start_leaves_what_is_found_without(waves_px, levels_px):
 
 @pytest.mark.parametrize("count", [0, 1, 200])
 def test_events_that_say_nothing_keep_no_start(count):
-    # few steps of at most 4 px do not lead back from 40 px: the prior drops it (without it 27 px stay)
+    # few steps of at most 4 px do not lead back from 40 px: the prior drops it (without it 27 px
+    # stay)
     shell, _ = moving(0, steps=10)
     for seed in range(2):
         counts = torch.zeros_like(shell.counts)
-        places = torch.randint(counts.numel(), (count,), generator=torch.Generator().manual_seed(seed))
+        places = torch.randint(
+            counts.numel(), (count,), generator=torch.Generator().manual_seed(seed)
+        )
         counts.view(-1)[places] += 1
         volume = EventVolume(counts, shell.centroid_s, shell.collected_s)
         warm = estimate_lk(volume, start_px=torch.tensor([[40.0, -20.0]])).flow_px

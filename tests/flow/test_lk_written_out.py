@@ -27,7 +27,8 @@ def pooled(image, step):
 
 
 def gaussian(sigma_px, step):
-    """Taps, in samples step px apart, that with the means of step px have the standard deviation sigma."""
+    """Taps, in samples step px apart, that with the means of step px have the standard deviation
+    sigma."""
     spread = math.sqrt(sigma_px**2 - (step**2 - 1) / 12) / step
     reach = int((3.0 if step == 1 else 2.5) * spread + 0.5)
     taps = np.exp(-(np.arange(-reach, reach + 1) ** 2) / (2 * spread**2))
@@ -39,8 +40,8 @@ def blurred(image, taps):
 
 
 def slope_of_white_noise(taps, step):
-    """Variance per px^2 of the slope in x at the middle of an image of white noise: the sum over all
-    pixels of the square of what one pixel does there."""
+    """Variance per px^2 of the slope in x at the middle of an image of white noise: the sum over
+    all pixels of the square of what one pixel does there."""
     count = len(taps) + 4
     middle = count // 2
     # [sample, sample that is lit]
@@ -61,7 +62,12 @@ def prior_precision(terms):
     rows = [(unit[0], 1.0), (unit[terms], 1.0)]
     if terms >= 3:
         ux, uy, vx, vy = unit[1], unit[2], unit[terms + 1], unit[terms + 2]
-        rows += [((ux + vy) / 2, 0.35), ((vx - uy) / 2, 0.35), ((ux - vy) / 2, 0.25), ((vx + uy) / 2, 0.25)]
+        rows += [
+            ((ux + vy) / 2, 0.35),
+            ((vx - uy) / 2, 0.35),
+            ((ux - vy) / 2, 0.25),
+            ((vx + uy) / 2, 0.25),
+        ]
     rows += [(unit[i + shift], 0.15) for i in range(3, terms) for shift in (0, terms)]
     return sum(np.outer(row, row) / (share * PRIOR_PX) ** 2 for row, share in rows)
 
@@ -81,7 +87,9 @@ def evidence(volume, terms, sigma_px):
     slope = np.einsum("n,nyx->yx", share * centred, bins) / spread
     by_y, by_x = (d / step for d in np.gradient(mean))
     height, width = counts.shape[-2:]
-    at = [np.arange(size // step) * step + (step - 1) / 2 - (size - 1) / 2 for size in (width, height)]
+    at = [
+        np.arange(size // step) * step + (step - 1) / 2 - (size - 1) / 2 for size in (width, height)
+    ]
     x, y = np.meshgrid(*at)
     ends = [
         np.clip(((size - 1) / 2 - np.abs(place)) / (1 + sigma_px), 0, 1)
@@ -97,7 +105,10 @@ def evidence(volume, terms, sigma_px):
     scattered = np.kron(np.eye(2), crowd) * slope_of_white_noise(taps, step)
     # directions in which nothing is seen count as noise
     prior = prior_precision(terms)
-    scattered = scattered + 1e-5 * np.trace(np.linalg.solve(prior, normal + scattered)) / (2 * terms) * prior
+    scattered = (
+        scattered
+        + 1e-5 * np.trace(np.linalg.solve(prior, normal + scattered)) / (2 * terms) * prior
+    )
     z, vectors = np.linalg.eig(np.linalg.solve(normal + scattered, scattered))
     trust = (vectors * ((1 - z) ** 4 / ((1 - z) ** 4 + (3 * z) ** 4))) @ np.linalg.inv(vectors)
     per_event = 1 / (spread * 4 * math.pi * sigma_px**2)
@@ -139,22 +150,30 @@ def one_step(volume, terms, sigma_px):
 @pytest.mark.parametrize("sigma_px", [1.0, 1.5, 4.0])
 @pytest.mark.parametrize(("model", "terms"), [("constant", 1), ("affine", 3), ("quadratic", 6)])
 @pytest.mark.parametrize("per_pixel", [8.0, 0.01])
-def test_one_step_is_that_of_the_formulas_written_out(model, terms, sigma_px, per_pixel, monkeypatch):
+def test_one_step_is_that_of_the_formulas_written_out(
+    model, terms, sigma_px, per_pixel, monkeypatch
+):
     # the polynomial by itself: see test_lk_local for what it leaves
     monkeypatch.setattr(cells, "SIZES", (1e-9,))
-    # plenty of events and large motion, where the step is limited; a hundredth of an event per pixel,
-    # where the prior and the few events of the start decide
+    # plenty of events and large motion, where the step is limited; a hundredth of an event per
+    # pixel, where the prior and the few events of the start decide
     volume, _ = moving(3, ((0.02, -0.03), (0.01, 0.04)), (5.0, -4.0), per_pixel, steps=20)
     field = certain(estimate_lk(volume, model, PRIOR_PX, (sigma_px,), 1, FLOOR))
     flow, covariance = one_step(volume, terms, sigma_px)
     found = field.flow_px[0].numpy()
-    # the estimator adds ridges of 1e-6 and stops its fixed point after four rounds, each a factor of 0.04
+    # the estimator adds ridges of 1e-6 and stops its fixed point after four rounds, each a factor
+    # of 0.04
     assert np.abs(found - flow).max() <= 1e-4 * np.abs(flow).max()
-    assert np.abs(field.covariance_px2[0].numpy() - covariance).max() <= 1e-4 * np.abs(covariance).max()
+    assert (
+        np.abs(field.covariance_px2[0].numpy() - covariance).max()
+        <= 1e-4 * np.abs(covariance).max()
+    )
 
 
 @pytest.mark.parametrize(("model", "terms"), [("constant", 1), ("affine", 3), ("quadratic", 6)])
 def test_the_length_of_a_step_is_its_mean_over_the_image(model, terms, generator):
     parameters = torch.randn(5, 2 * terms, generator=generator, dtype=torch.float64)
     found = Polynomials(model, 40, 40).mean_square(parameters)
-    assert found.tolist() == pytest.approx([mean_square(p, terms) for p in parameters.numpy()], rel=1e-12)
+    assert found.tolist() == pytest.approx(
+        [mean_square(p, terms) for p in parameters.numpy()], rel=1e-12
+    )

@@ -1,4 +1,5 @@
-"""Losses against values worked out by hand, the true motion of moving dots, and finite differences."""
+"""Losses against values worked out by hand, the true motion of moving dots, and finite
+differences."""
 # pyright: reportArgumentType=false
 
 import math
@@ -17,13 +18,21 @@ D = torch.float64
 def field(values, valid=None, **claims):
     """FlowField [B, 2, 1, N] of [B][N] pairs."""
     flow = torch.tensor(values, dtype=D).permute(0, 2, 1)[:, :, None]
-    valid = torch.ones_like(flow[:, 0], dtype=torch.bool) if valid is None else torch.tensor(valid)[:, None]
+    valid = (
+        torch.ones_like(flow[:, 0], dtype=torch.bool)
+        if valid is None
+        else torch.tensor(valid)[:, None]
+    )
     return FlowField(flow, valid, 0.05, **claims)
 
 
 def check_gradients(function, *inputs):
     assert torch.autograd.gradcheck(
-        function, [value.clone().requires_grad_() for value in inputs], eps=1e-6, atol=1e-8, rtol=1e-5
+        function,
+        [value.clone().requires_grad_() for value in inputs],
+        eps=1e-6,
+        atol=1e-8,
+        rtol=1e-5,
     )
 
 
@@ -42,8 +51,8 @@ FIRST = field([[(3.0, 0.0), (1.0, 0.0)], [(0.0, 0.0), (0.0, 0.0)]])
 LAST = field([[(0.0, 3.0), (1.0, 3.0)], [(0.0, 2.0), (5.0, 5.0)]])
 
 
-# epsilon 4: an error of 3 px costs 1, one of 2 px sqrt(20) - 4. FIRST: samples (1 + 0) / 2 and sqrt(20) - 4;
-# LAST: (1 + 1) / 2 and 0
+# epsilon 4: an error of 3 px costs 1, one of 2 px sqrt(20) - 4. FIRST: samples (1 + 0) / 2 and
+# sqrt(20) - 4; LAST: (1 + 1) / 2 and 0
 ONE = (0.5 + math.sqrt(20) - 4) / 2
 
 
@@ -71,7 +80,9 @@ def test_the_relative_unit_by_hand():
 
 def test_samples_without_truth_count_zero_and_may_hold_anything():
     nan = math.nan
-    truth = field([[(nan, nan), (1.0, 0.0)], [(nan, 2.0), (math.inf, 9.0)]], [[False, True], [False, False]])
+    truth = field(
+        [[(nan, nan), (1.0, 0.0)], [(nan, 2.0), (math.inf, 9.0)]], [[False, True], [False, False]]
+    )
     flow = FIRST.flow_px.clone().requires_grad_()
     loss = losses.supervised_loss([replace(FIRST, flow_px=flow + 1)], truth, epsilon=4.0)
     # the one error is (1, 1); the second sample adds 0 to the mean of two
@@ -98,13 +109,15 @@ def test_gradcheck_of_the_supervised_losses(generator):
     check_gradients(supervised, TRUTH.flow_px)  # smooth at zero error
     check_gradients(claiming, flow, factor)
     check_gradients(
-        lambda f, c: losses.laplace_loss([replace(LAST, flow_px=f, confidence=c)], TRUTH), flow, confidence
+        lambda f, c: losses.laplace_loss([replace(LAST, flow_px=f, confidence=c)], TRUTH),
+        flow,
+        confidence,
     )
 
 
 def test_long_tailed_likelihood_is_that_of_a_density_with_the_covariance_claimed(generator):
-    """exp(-sqrt(3) |e|) integrated over the plane in polar coordinates has the second moment 1 along each
-    axis; with it the loss is the log density of errors whitened by the claim."""
+    """exp(-sqrt(3) |e|) integrated over the plane in polar coordinates has the second moment 1
+    along each axis; with it the loss is the log density of errors whitened by the claim."""
     radius = torch.linspace(0, 40, 400_001, dtype=D)
     density = torch.exp(-math.sqrt(3) * radius) * radius
     moment = torch.trapezoid(density * radius**2, radius) / torch.trapezoid(density, radius)
@@ -115,7 +128,9 @@ def test_long_tailed_likelihood_is_that_of_a_density_with_the_covariance_claimed
     claim = torch.stack([matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 1]])[None, :, None]
     spare = matrix + 0.0025 * torch.eye(2, dtype=D)
     white = torch.linalg.solve(torch.linalg.cholesky(spare), (flow - truth)[0][..., None])
-    expected = math.sqrt(3) * white.square().sum((-1, -2)).add(1e-4).sqrt() + torch.logdet(spare) / 2
+    expected = (
+        math.sqrt(3) * white.square().sum((-1, -2)).add(1e-4).sqrt() + torch.logdet(spare) / 2
+    )
     found = losses.laplace_loss([field(flow.tolist(), covariance_px2=claim)], field(truth.tolist()))
     assert float(found) == pytest.approx(float(expected.mean()))
 
@@ -129,8 +144,8 @@ def test_a_confidence_is_the_share_of_the_prior_that_the_events_have_removed(con
 
 
 def test_a_degenerate_covariance_keeps_its_floor_in_single_precision():
-    # fully correlated, 100 px: S = 1e4 [[1, 1], [1, 1]] + 0.0025 I has the determinant 6.25e-6 + 0.0025 * 2e4;
-    # float32 loses it in xx yy - xy^2
+    # fully correlated, 100 px: S = 1e4 [[1, 1], [1, 1]] + 0.0025 I has the determinant 6.25e-6 +
+    # 0.0025 * 2e4; float32 loses it in xx yy - xy^2
     claim = torch.full((1, 3, 1, 1), 1e4)
     shape = (1, 2, 1, 1)
     truth = FlowField(torch.zeros(shape), torch.ones(1, 1, 1, dtype=torch.bool), 0.05)
@@ -150,7 +165,12 @@ def test_photometric_loss_of_a_moved_picture(generator):
     still = losses.charbonnier(((frames[:, 1] - frames[:, 0]) / 255).square(), 1e-3, 0.45)
     # the last three columns leave and keep their zero-flow difference; all others fit
     fitted = still[..., -3:].sum() / still.numel()
-    for shift, right in ((3.0, fitted), (1e3, still.mean()), (-1e6, still.mean()), (0.0, still.mean())):
+    for shift, right in (
+        (3.0, fitted),
+        (1e3, still.mean()),
+        (-1e6, still.mean()),
+        (0.0, still.mean()),
+    ):
         flow = torch.tensor([shift, 0.0], dtype=D)[None, :, None, None].expand(1, 2, 9, 11)
         assert float(losses.photometric_loss(frames, flow)) == pytest.approx(float(right))
 
@@ -174,19 +194,23 @@ def test_gradcheck_of_the_frame_losses(generator):
 
 
 def test_half_precision_predictions_lose_no_place(generator):
-    # 0.25 px is exact in bfloat16, and so must the loss be: bfloat16 pixel numbers above 256 would be two
-    # apart
+    # 0.25 px is exact in bfloat16, and so must the loss be: bfloat16 pixel numbers above 256 would
+    # be two apart
     frames = 255 * torch.rand(1, 2, 3, 400, generator=generator)
     truth = FlowField(torch.zeros(1, 2, 3, 400), torch.ones(1, 3, 400, dtype=torch.bool), 0.05)
     volume = EventVolume(
-        torch.rand(1, 2, 2, 3, 400, generator=generator), torch.tensor([0.0, 1.0]), torch.tensor([0.5, 0.5])
+        torch.rand(1, 2, 2, 3, 400, generator=generator),
+        torch.tensor([0.0, 1.0]),
+        torch.tensor([0.5, 0.5]),
     )
     for loss in (
         lambda flow: losses.photometric_loss(frames, flow),
         lambda flow: losses.smoothness_loss(flow),
         lambda flow: losses.contrast_loss(volume, flow),
         lambda flow: losses.supervised_loss([replace(truth, flow_px=flow)], truth),
-        lambda flow: losses.laplace_loss([replace(truth, flow_px=flow, confidence=flow[:, 0] + 0.5)], truth),
+        lambda flow: losses.laplace_loss(
+            [replace(truth, flow_px=flow, confidence=flow[:, 0] + 0.5)], truth
+        ),
     ):
         flow = torch.full((1, 2, 3, 400), 0.25)
         assert loss(flow.bfloat16()).item() == loss(flow).item()
@@ -199,11 +223,19 @@ TILTED = torch.tensor([1.0, 2.0, 1.0], dtype=D)[None, :, None, None].expand(2, 3
     ("loss", "given", "sentence"),
     [
         ("supervised_loss", ([], TRUTH), "no prediction"),
-        ("supervised_loss", ([replace(FIRST, flow_px=FIRST.flow_px[..., :1])], TRUTH), r"must be \[2"),
+        (
+            "supervised_loss",
+            ([replace(FIRST, flow_px=FIRST.flow_px[..., :1])], TRUTH),
+            r"must be \[2",
+        ),
         ("supervised_loss", ([FIRST], TRUTH, 0.8, 0.01, torch.ones(3)), "unit_per_px must be"),
         ("laplace_loss", ([FIRST], TRUTH), "neither covariance_px2 nor confidence"),
         ("laplace_loss", ([replace(FIRST, covariance_px2=TILTED)], TRUTH), "not positive semi"),
-        ("laplace_loss", ([replace(FIRST, confidence=1.5 + TILTED[:, 0])], TRUTH), "outside 0 to 1"),
+        (
+            "laplace_loss",
+            ([replace(FIRST, confidence=1.5 + TILTED[:, 0])], TRUTH),
+            "outside 0 to 1",
+        ),
         ("photometric_loss", (None, FIRST.flow_px), "frames .* must be"),
         ("smoothness_loss", (FIRST.flow_px,), "no neighbours both ways"),
     ],

@@ -1,5 +1,5 @@
-"""Contrast maximisation: the true motion of moving dots and of a physical sensor's events, event collapse,
-and finite differences."""
+"""Contrast maximisation: the true motion of moving dots and of a physical sensor's events, event
+collapse, and finite differences."""
 
 import math
 from dataclasses import replace
@@ -16,15 +16,20 @@ D = torch.float64
 
 
 def dots(zoom=0.0, shift=(0.0, 0.0), size=40, radius=12.0, count=24, bins=6, steps=36):
-    """Volume of Gaussian dots (1.2 px) of both signs, scattered around the middle, that move and grow by zoom
-    x + shift; the grid [2, H, W] from the middle."""
+    """Volume of Gaussian dots (1.2 px) of both signs, scattered around the middle, that move and
+    grow by zoom x + shift; the grid [2, H, W] from the middle."""
     y, x = torch.meshgrid(*[torch.arange(size, dtype=D) - (size - 1) / 2] * 2, indexing="ij")
     u = torch.rand(3, count, generator=torch.Generator().manual_seed(3), dtype=D)
-    place = radius * u[0].sqrt() * torch.stack([(2 * math.pi * u[1]).cos(), (2 * math.pi * u[1]).sin()])
+    place = (
+        radius * u[0].sqrt() * torch.stack([(2 * math.pi * u[1]).cos(), (2 * math.pi * u[1]).sin()])
+    )
     tau = (torch.arange(steps, dtype=D)[:, None, None, None] + 0.5) / steps
     at = place[:, None, :, None, None] * (1 + tau * zoom)
     at = at + tau * torch.tensor(shift, dtype=D)[:, None, None, None, None]
-    blob = torch.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / (2 * (1.2 * (1 + tau * zoom)) ** 2)) / steps
+    blob = (
+        torch.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / (2 * (1.2 * (1 + tau * zoom)) ** 2))
+        / steps
+    )
     frames = torch.stack([blob[:, u[2] > 0.5].sum(1), blob[:, u[2] <= 0.5].sum(1)], 1)
     times = torch.linspace(0, 0.05, steps + 1, dtype=D)
     return events.from_counts(frames, times, bins), torch.stack([x, y])
@@ -41,7 +46,10 @@ def least(loss, values):
 def plain_contrast(volume, flow_px):
     """The objective as published, without a guard: zero-flow sharpness over mean sharpness."""
     tracks = contrast.volume_tracks(volume, flow_px)
-    moved = [share * contrast.sharpness(contrast.smooth_image(tracks, at)) for at, share in losses.REFERENCES]
+    moved = [
+        share * contrast.sharpness(contrast.smooth_image(tracks, at))
+        for at, share in losses.REFERENCES
+    ]
     return (contrast.sharpness(contrast.still_image(volume.counts)) / sum(moved)).mean()
 
 
@@ -52,10 +60,14 @@ def test_translation_is_least_at_the_true_motion(loss):
     def along(u, v):
         return loss(volume, (0 * grid + torch.tensor([u, v], dtype=D)[:, None, None])[None])
 
-    # symmetric about the true motion but for the grid, whose phases the B-spline leaves visible in third
-    # moments only
-    assert least(lambda u: along(u, -2.5), [3.0, 3.5, 4.0, 4.5, 5.0]) == pytest.approx(4.0, abs=0.03)
-    assert least(lambda v: along(4.0, v), [-3.5, -3.0, -2.5, -2.0, -1.5]) == pytest.approx(-2.5, abs=0.03)
+    # symmetric about the true motion but for the grid, whose phases the B-spline leaves visible in
+    # third moments only
+    assert least(lambda u: along(u, -2.5), [3.0, 3.5, 4.0, 4.5, 5.0]) == pytest.approx(
+        4.0, abs=0.03
+    )
+    assert least(lambda v: along(4.0, v), [-3.5, -3.0, -2.5, -2.0, -1.5]) == pytest.approx(
+        -2.5, abs=0.03
+    )
     assert float(along(4.0, -2.5)) < 0.6
 
 
@@ -88,7 +100,9 @@ def test_no_events_cost_as_much_as_zero_flow_and_give_no_gradient(generator):
 
 
 def test_gradcheck_in_events_and_flow(generator):
-    shell = EventVolume(torch.zeros(1), torch.tensor([0.0, 0.7], dtype=D), torch.full((2,), 0.5, dtype=D))
+    shell = EventVolume(
+        torch.zeros(1), torch.tensor([0.0, 0.7], dtype=D), torch.full((2,), 0.5, dtype=D)
+    )
     counts = torch.rand(1, 2, 2, 3, 4, generator=generator, dtype=D)
     flow = 0.8 * torch.randn(1, 2, 3, 4, generator=generator, dtype=D)
     check_gradients(lambda c, f: losses.contrast_loss(replace(shell, counts=c), f), counts, flow)
@@ -98,10 +112,14 @@ def test_the_weight_of_an_area_is_itself_where_it_is_moderate():
     area = torch.tensor([-3.0, 0.0, 0.2, 0.5, 1.0, 1.5, 1e6], dtype=D)
     one = torch.ones_like(area)
     none = torch.zeros_like(area)
-    assert losses._stretch((area, none, none, one)).tolist() == pytest.approx([0, 0, 0.2, 0.5, 1, 1.5, 2.5])
+    assert losses._stretch((area, none, none, one)).tolist() == pytest.approx(
+        [0, 0, 0.2, 0.5, 1, 1.5, 2.5]
+    )
     # turned over in both axes: the area is positive, the warp is not upright
     assert not losses._stretch((-one, none, none, -area.abs())).any()
     # no corner at 0, 0.2 or 1.5
     check_gradients(lambda a: losses._stretch((a, none, none, one)), area)
     turn = torch.tensor(0.8, dtype=D)  # a rotation by 46 degrees changes no area
-    assert losses._stretch((turn.cos(), -turn.sin(), turn.sin(), turn.cos())).item() == pytest.approx(1)
+    assert losses._stretch(
+        (turn.cos(), -turn.sin(), turn.sin(), turn.cos())
+    ).item() == pytest.approx(1)

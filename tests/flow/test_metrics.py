@@ -34,7 +34,9 @@ LONG = torch.tensor([[True, False, False, True, False]])
         (metrics.aee(FOUND, TRUTH, LONG), 9.5 / 2),
         # over the pixels of all samples, not over samples
         (
-            metrics.aee(torch.stack([FOUND, TRUTH]), TRUTH.expand(2, 2, 1, 5), torch.stack([LONG, ~LONG])),
+            metrics.aee(
+                torch.stack([FOUND, TRUTH]), TRUTH.expand(2, 2, 1, 5), torch.stack([LONG, ~LONG])
+            ),
             9.5 / 5,
         ),
         (metrics.zero_flow_error(TRUTH, LONG), 5),
@@ -56,7 +58,9 @@ def test_errors_worked_out_by_hand(found, right):
 
 def test_small_angles_keep_their_digits():
     # acos of a rounded cosine would lose all of them: 1e-6 rad changes a cosine by 5e-13
-    found = metrics.angular_error_deg(field([(1e-6, 0.0)]).float(), field([(0.0, 0.0)]).float()).item()
+    found = metrics.angular_error_deg(
+        field([(1e-6, 0.0)]).float(), field([(0.0, 0.0)]).float()
+    ).item()
     assert found == pytest.approx(math.degrees(1e-6), rel=1e-6)
 
 
@@ -103,8 +107,8 @@ def test_nan_is_no_inlier(measure):
 
 
 def line(steps, width, height=3):
-    """A vertical line that starts at column 2 and moves a pixel to the right per 1000 us; one event per pixel
-    it comes to."""
+    """A vertical line that starts at column 2 and moves a pixel to the right per 1000 us; one event
+    per pixel it comes to."""
     k = torch.arange(steps).repeat_interleave(height)
     y = torch.arange(height).repeat(steps)
     return ordered(1000 * k, 2 + k, y, torch.ones_like(k), height, width), 1000 * (steps - 1)
@@ -116,22 +120,26 @@ def constant(u, width, height=3):
 
 @pytest.mark.parametrize(("steps", "width"), [(5, 12), (9, 16)])
 def test_a_moving_line_in_closed_form(steps, width):
-    # unwarped: n of w columns hold 1; warped: one of them n. Variances n/w - (n/w)^2 and n^2/w - (n/w)^2
+    # unwarped: n of w columns hold 1; warped: one of them n. Variances n/w - (n/w)^2 and n^2/w -
+    # (n/w)^2
     stream, end_us = line(steps, width)
     flow = constant(steps - 1.0, width)
     sharper = steps * (width - 1) / (width - steps)
     for at in (0.0, 0.4, 1.0):
         assert metrics.fwl(stream, flow, 0, end_us, at) == pytest.approx(sharper)
     assert metrics.fwl(stream, flow[None].float(), 0, end_us) == pytest.approx(sharper, rel=1e-6)
-    # mean squares of the times: of k / (n - 1) before, (2n - 1) / (6 (n - 1)); of their mean after, 1/4
-    assert metrics.rsat(stream, flow, 0, end_us) == pytest.approx(1.5 * (steps - 1) / (2 * steps - 1))
+    # mean squares of the times: of k / (n - 1) before, (2n - 1) / (6 (n - 1)); of their mean after,
+    # 1/4
+    assert metrics.rsat(stream, flow, 0, end_us) == pytest.approx(
+        1.5 * (steps - 1) / (2 * steps - 1)
+    )
     for measure in (metrics.fwl, metrics.rsat):
         assert measure(stream, 0 * flow, 0, end_us) == 1
 
 
 def test_events_that_leave_count_in_the_denominator_only():
-    # from column 2 + k at time k/4 to column 2 + k + (1 - k/4) u; for u = 8 that is 10 - k: mirrored, and as
-    # sharp as before
+    # from column 2 + k at time k/4 to column 2 + k + (1 - k/4) u; for u = 8 that is 10 - k:
+    # mirrored, and as sharp as before
     stream, end_us = line(5, 12)
     assert metrics.fwl(stream, constant(8.0, 12), 0, end_us) == pytest.approx(1)
     # u = 40: to 42 - 9 k = 42, 33, 24, 15, 6: one stays. Variances 1/12 - 1/144 and 5/12 - 25/144
@@ -155,7 +163,9 @@ def test_polarities_share_an_image_in_fwl_but_not_in_rsat():
 
 NOTHING = torch.zeros(1, 5, dtype=torch.bool)
 ONES = torch.ones(4, dtype=torch.int64)
-EVERYWHERE = ordered(torch.arange(4), torch.tensor([0, 1, 0, 1]), torch.tensor([0, 0, 1, 1]), ONES, 2, 2)
+EVERYWHERE = ordered(
+    torch.arange(4), torch.tensor([0, 1, 0, 1]), torch.tensor([0, 0, 1, 1]), ONES, 2, 2
+)
 AT_ONCE = ordered(0 * ONES[:1], 0 * ONES[:1], 0 * ONES[:1], ONES[:1], 2, 2)
 FOUR = torch.zeros(2, 2, 2, dtype=D)
 

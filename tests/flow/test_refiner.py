@@ -1,5 +1,5 @@
-"""The refining network: where it stands still, what it does to sizes, gradients against differences,
-what it is told of the flow that is missing, and what a few steps of training do."""
+"""The refining network: where it stands still, what it does to sizes, gradients against
+differences, what it is told of the flow that is missing, and what a few steps of training do."""
 # pyright: reportArgumentType=false, reportCallIssue=false, reportOperatorIssue=false
 
 import math
@@ -52,12 +52,16 @@ def volume(counts):
 
 
 def events(*shape, rate=0.3, seed=1):
-    return torch.poisson(torch.full(shape, rate, dtype=D), generator=torch.Generator().manual_seed(seed))
+    return torch.poisson(
+        torch.full(shape, rate, dtype=D), generator=torch.Generator().manual_seed(seed)
+    )
 
 
 def begun(flow):
     """A start that may be off by a pixel."""
-    covariance = torch.tensor([1.0, 0.0, 1.0]).to(flow)[:, None, None].expand(len(flow), 3, *flow.shape[2:])
+    covariance = (
+        torch.tensor([1.0, 0.0, 1.0]).to(flow)[:, None, None].expand(len(flow), 3, *flow.shape[2:])
+    )
     return FlowField(flow, torch.ones_like(flow[:, 0], dtype=torch.bool), 1.0, None, covariance)
 
 
@@ -72,7 +76,9 @@ def drifting(flow, side=64):
     time = ((torch.arange(8, dtype=D) + 0.5) / 8)[:, None, None]
     u = x - flow[0] * time
     v = y - flow[1] * time
-    return signed(2 * (torch.sin(u / 2 + v / 7) + torch.sin(v / 2 - u / 5) + torch.sin((u + v) / 3)))
+    return signed(
+        2 * (torch.sin(u / 2 + v / 7) + torch.sin(v / 2 - u / 5) + torch.sin((u + v) / 3))
+    )
 
 
 @pytest.mark.parametrize("size", [(64, 64), (9, 6)])
@@ -86,7 +92,9 @@ def test_a_fresh_network_is_the_closed_form(size):
     found = made.refined(given, start)[-1]
     assert torch.equal(found.flow_px, start.flow_px)
     shown = counts.flatten(1).sum(1).square() / (counts.flatten(1).sum(1).square() + 100)
-    expected = (0.01 * shown)[:, None, None, None] * torch.tensor([1.0, 0.0, 1.0], dtype=D)[:, None, None]
+    expected = (0.01 * shown)[:, None, None, None] * torch.tensor([1.0, 0.0, 1.0], dtype=D)[
+        :, None, None
+    ]
     added = found.covariance_px2 - start.covariance_px2
     torch.testing.assert_close(added, expected.expand_as(added), rtol=0, atol=1e-12)
     expected = torch.tensor([[5.0, -2.0]], dtype=D).expand(2, 2)
@@ -127,7 +135,9 @@ def test_the_correction_counts_as_far_as_events_bend_the_field(case, most_px, of
             whole = made.refined(windows.volume, start, clock="events")[-1].flow_px
             found = made(windows.volume, clock="events").flow_px
             truth = windows.truth
-            errors = [aee(flow, truth.flow_px, truth.valid) for flow in (found, start.flow_px, whole)]
+            errors = [
+                aee(flow, truth.flow_px, truth.valid) for flow in (found, start.flow_px, whole)
+            ]
             rows.append(torch.stack([(found - start.flow_px).norm(dim=1).mean(), *errors]))
     change, error, of_it, of_all = torch.stack(rows).mean(0)
     assert change < most_px
@@ -137,22 +147,25 @@ def test_the_correction_counts_as_far_as_events_bend_the_field(case, most_px, of
 
 @pytest.mark.parametrize("missing", [(0.0, 0.0), (0.6, -0.4)])
 def test_the_evidence_says_what_is_missing(missing):
-    """A texture that drifts by (2, -1) px, looked at along a flow that is short by ``missing``: what
-    the finest blur asks for, within the 0.1 px that the prior and second differences take."""
+    """A texture that drifts by (2, -1) px, looked at along a flow that is short by ``missing``:
+    what the finest blur asks for, within the 0.1 px that the prior and second differences take."""
     short = torch.tensor([2.0 - missing[0], -1.0 - missing[1]], dtype=D)
     unknown = torch.full((1, 1, 16, 16), MOST_PX**2 / MISFIT, dtype=D)
-    _, solved = Evidence(drifting((2.0, -1.0))).at(short[None, :, None, None].expand(1, 2, 16, 16), unknown)
+    _, solved = Evidence(drifting((2.0, -1.0))).at(
+        short[None, :, None, None].expand(1, 2, 16, 16), unknown
+    )
     for flow in solved[0, :4, :, 5:11, 5:11]:
         assert flow.mean((1, 2)).tolist() == pytest.approx(missing, abs=0.1)
 
 
 def test_the_evidence_is_damped_least_squares(generator):
     """Sums of products of slopes over a window: the solutions of (w N + 1 / MOST^2) f = -w r and of
-    the same with the claimed variance, with the weight of the module's docstring, bent towards 3 px at
-    a blur of 1 px."""
+    the same with the claimed variance, with the weight of the module's docstring, bent towards 3 px
+    at a blur of 1 px."""
     evidence = Evidence(drifting((0.0, 0.0), 16))
     slopes = (
-        torch.randn(3, 60, generator=generator, dtype=D) * torch.tensor([0.3, 0.2, 0.2], dtype=D)[:, None]
+        torch.randn(3, 60, generator=generator, dtype=D)
+        * torch.tensor([0.3, 0.2, 0.2], dtype=D)[:, None]
     )
     pairs = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
     products = [float((slopes[i] * slopes[j]).sum()) for i, j in pairs]
@@ -160,7 +173,9 @@ def test_the_evidence_is_damped_least_squares(generator):
     density = 0.7
     sums = torch.tensor([*products, seen, density * (seen + 1) - (seen + 1) / 64], dtype=D)
     claimed = 0.03
-    found = evidence._solved(sums[None, :, None, None], 1, torch.full((1, 1, 1, 1), claimed, dtype=D))
+    found = evidence._solved(
+        sums[None, :, None, None], 1, torch.full((1, 1, 1, 1), claimed, dtype=D)
+    )
     xx, xy, yy, xs, ys, _ = products
     overlap = 4 * math.pi
     time_noise = density * evidence.time_noise / overlap
@@ -168,7 +183,8 @@ def test_the_evidence_is_damped_least_squares(generator):
     weight = ((xx + yy) / (xx + yy + noise)) ** 2 / (CALIBRATION * overlap * time_noise)
     for flow, precision in zip(found[:2], (MOST_PX**-2, 1 / (MISFIT * claimed)), strict=True):
         expected = np.linalg.solve(
-            weight * np.array([[xx, xy], [xy, yy]]) + np.eye(2) * precision, -weight * np.array([xs, ys])
+            weight * np.array([[xx, xy], [xy, yy]]) + np.eye(2) * precision,
+            -weight * np.array([xs, ys]),
         )
         expected /= math.sqrt(1 + expected @ expected / 9.0)
         assert flow.flatten().tolist() == pytest.approx(expected.tolist(), rel=1e-9)
@@ -189,7 +205,10 @@ def test_beside_a_border_the_flow_of_the_other_side_is_told_true_from_false():
         flow = torch.zeros(1, 2, 16, 16, dtype=D)
         flow[:, 1] = torch.where(torch.arange(16) < border, 8.0, -8.0)
         told, offered = evidence.others(flow)
-        assert set(offered[0, place, 1].unique().tolist()) == {0.0, 16.0 if place == leftwards else -16.0}
+        assert set(offered[0, place, 1].unique().tolist()) == {
+            0.0,
+            16.0 if place == leftwards else -16.0,
+        }
         return told[0, place * len(TRIED_IN), 4:12].mean(0)
 
     assert tried(8, rightwards)[5:8].max() < -0.1
@@ -199,8 +218,8 @@ def test_beside_a_border_the_flow_of_the_other_side_is_told_true_from_false():
 
 
 def test_cells_become_pixels_linearly_until_edges_are_learnt():
-    """Without weights a picture linear in x and y stays linear but for the thousandth that every cell
-    keeps; a cell that is chosen gives its value to all its pixels."""
+    """Without weights a picture linear in x and y stays linear but for the thousandth that every
+    cell keeps; a cell that is chosen gives its value to all its pixels."""
     y, x = torch.meshgrid(torch.arange(6, dtype=D), torch.arange(7, dtype=D), indexing="ij")
     image = torch.stack([x, 2 * y - x])[None]
     found = _on_pixels(image, torch.zeros(1, 9 * CELL**2, 6, 7, dtype=D))
@@ -219,7 +238,9 @@ def test_cells_become_pixels_linearly_until_edges_are_learnt():
 
 def test_an_image_is_continued_on_cells_by_its_own_width_and_height():
     rows, columns = 7, 9
-    y, x = np.meshgrid(np.arange(8).clip(max=rows - 1), np.arange(12).clip(max=columns - 1), indexing="ij")
+    y, x = np.meshgrid(
+        np.arange(8).clip(max=rows - 1), np.arange(12).clip(max=columns - 1), indexing="ij"
+    )
     whole = (10.0 * y + x).reshape(2, CELL, 3, CELL).mean((1, 3))
     image = 10 * torch.arange(rows, dtype=D)[:, None] + torch.arange(columns, dtype=D)
     np.testing.assert_allclose(_on_cells(image[None, None])[0, 0].numpy(), whole, rtol=1e-14)

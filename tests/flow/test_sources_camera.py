@@ -87,7 +87,9 @@ def test_distortion_is_that_of_another_implementation_and_its_inverse_brings_pix
     matrix[:2, :2] = torch.diag(torch.tensor(lens.focal_px))
     matrix[:2, 2] = torch.tensor(lens.centre_px)
     flat = torch.from_numpy(rays[..., :2] * lens.focal_px + lens.centre_px).reshape(1, -1, 2)
-    theirs = distort_points(flat, matrix[None], torch.tensor([lens.distortion], dtype=torch.float64))
+    theirs = distort_points(
+        flat, matrix[None], torch.tensor([lens.distortion], dtype=torch.float64)
+    )
     np.testing.assert_allclose(theirs.reshape(180, 240, 2).numpy(), pixels, rtol=0, atol=1e-5)
 
 
@@ -106,9 +108,12 @@ def test_rotation_flow_in_closed_form():
     assert valid.all()
     c, s = math.cos(angle), math.sin(angle)
     np.testing.assert_allclose(roll, [u * c + v * s - u, -u * s + v * c - v], rtol=0, atol=1e-9)
-    # a pan to the right carries the picture to the left: along the middle row x = f tan(atan(u / f) - angle)
+    # a pan to the right carries the picture to the left: along the middle row x = f tan(atan(u / f)
+    # - angle)
     pan, _ = flow([0, angle, 0])
-    np.testing.assert_allclose(pan[0], 200 * np.tan(np.arctan(u / 200) - angle) - u, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        pan[0], 200 * np.tan(np.arctan(u / 200) - angle) - u, rtol=0, atol=1e-9
+    )
     # z' of the turned ray
     np.testing.assert_allclose(pan[1], v * (1 / (c + u / 200 * s) - 1), rtol=0, atol=1e-9)
     behind, seen = flow([0, math.pi / 2, 0])
@@ -124,7 +129,9 @@ def test_flow_of_undistorted_pixels_is_carried_to_raw_ones(lens, tmp_path):
     write_flow(tmp_path / "flow.flo", torch.from_numpy(flat))
 
     def read(**options):
-        made_of = PacketOptions(window_s=0.02, start_s=0.0, size_px=DAVIS, truth_interval_s=0.02, **options)
+        made_of = PacketOptions(
+            window_s=0.02, start_s=0.0, size_px=DAVIS, truth_interval_s=0.02, **options
+        )
         return read_packets(tmp_path / "a", tmp_path / "flow.flo", made_of)[0]
 
     carried = read(truth_pixels="undistorted")
@@ -132,7 +139,9 @@ def test_flow_of_undistorted_pixels_is_carried_to_raw_ones(lens, tmp_path):
     # barrel distortion: the corners of the raw picture lie beside the undistorted one
     assert both.mean() > 0.75
     # read between pixels, linearly: an eighth of the field's second derivative, (0.06 rad / 200 px)
-    np.testing.assert_allclose(carried.truth.flow_px[0].numpy()[:, both], right[:, both], rtol=0, atol=2e-4)
+    np.testing.assert_allclose(
+        carried.truth.flow_px[0].numpy()[:, both], right[:, both], rtol=0, atol=2e-4
+    )
     assert carried.undistorted_px == 0
     doubted = read()
     assert doubted.undistorted_px == pytest.approx(np.hypot(*(right - flat))[both].mean(), rel=1e-3)

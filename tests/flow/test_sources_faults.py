@@ -1,4 +1,5 @@
-"""Recordings with faulty events and gaps: named, left out only where that was asked for, and counted."""
+"""Recordings with faulty events and gaps: named, left out only where that was asked for, and
+counted."""
 
 from dataclasses import replace
 
@@ -51,7 +52,9 @@ def test_gaps_and_empty_windows(tmp_path):
     assert all(any("1 gap(s)" in note for note in packet.notes) for packet in whole)
     for fault in ("windows_without_events", "windows_across_gaps"):
         some = read_packets(tmp_path / "a", options=replace(options, skip=(fault,)))
-        assert [packet.name for packet in some] == [packet.name for packet in whole if len(packet.stream)]
+        assert [packet.name for packet in some] == [
+            packet.name for packet in whole if len(packet.stream)
+        ]
         assert some[0].left_out == {fault: 4}
     assert across([(0, 10), (4, 8)], np.array([[0, 5]])).tolist() == [True, False]
     assert len(gaps(np.arange(0, 10**6, 50))) == 0

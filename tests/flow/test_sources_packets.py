@@ -82,7 +82,9 @@ def test_numbered_packets_and_their_flows(layout, tmp_path):
             (place / "flow").mkdir(exist_ok=True)
             np.save(place / "flow" / f"{k}.npy", field(k).numpy())
         elif truth is None:
-            write_flow(folder / ("flow.flo" if layout == "subfolders" else f"{name}_flow.flo"), field(k))
+            write_flow(
+                folder / ("flow.flo" if layout == "subfolders" else f"{name}_flow.flo"), field(k)
+            )
     if truth is not None:
         np.save(truth, np.stack([field(k).permute(1, 2, 0).numpy() for k in (1, 2, 10)]))
     if layout == "zip":
@@ -129,7 +131,9 @@ def test_a_flow_over_another_time_is_scaled(times, options, span_us, factor, pla
     first = 100_000_000 if times else t_us[0]
     assert (packet.t0_us - first, packet.t1_us - first) == span_us
     torch.testing.assert_close(packet.truth.flow_px[0], field() * factor, rtol=1e-6, atol=0)
-    assert any("scaled linearly" in note for note in packet.notes) == (factor == 0.2 or factor == 0.25)
+    assert any("scaled linearly" in note for note in packet.notes) == (
+        factor == 0.2 or factor == 0.25
+    )
 
 
 def test_flows_outside_the_recording_are_counted(place):
@@ -154,7 +158,9 @@ def test_the_flow_of_rotation_is_no_truth_of_a_slider(by, place):
     assert packet.rotation_only
     assert packet.translates
     # 5 mm in 20 ms, at 1 m: f x / z
-    assert packet.neglected_px == pytest.approx((199.092366542 + 198.82882047) / 2 * 0.005, rel=1e-4)
+    assert packet.neglected_px == pytest.approx(
+        (199.092366542 + 198.82882047) / 2 * 0.005, rel=1e-4
+    )
     # 0.08 px of a scene 1 m away beside 4 px
     poses(place, (0.02, 0.0, 0.0), (0.0, 1.0, 0.0))
     (place / "imu.txt").unlink(missing_ok=True)
@@ -168,7 +174,9 @@ def test_a_recording_in_two_forms_is_one(place):
     np.save(place / "events.npy", np.zeros((3, 4)))  # somebody's array: no events at all
     (packet, *_) = read_packets(place, options=PacketOptions(window_s=0.02, start_s=0.0))
     assert len(packet.stream) == (t_us <= t_us[0] + 20_000).sum()
-    assert any("events from events.txt; events.npy beside it not read" in note for note in packet.notes)
+    assert any(
+        "events from events.txt; events.npy beside it not read" in note for note in packet.notes
+    )
 
 
 def test_without_a_truth_beside_there_is_none(tmp_path):

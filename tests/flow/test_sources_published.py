@@ -1,4 +1,5 @@
-"""DSEC and MVSEC in their published layouts: windows against closed forms, damage before training."""
+"""DSEC and MVSEC in their published layouts: windows against closed forms, damage before
+training."""
 # pyright: reportArgumentType=false
 
 import hdf5plugin
@@ -36,8 +37,8 @@ def dsec_field(k):
 
 
 def make_dsec(folder, shift=(0.0, 0.0), two=False):
-    """A sequence of 120 x 160 px in the published layout, events packed by Blosc; rectification moves
-    everything by ``shift`` (x, y). two: events and flow lie apart."""
+    """A sequence of 120 x 160 px in the published layout, events packed by Blosc; rectification
+    moves everything by ``shift`` (x, y). two: events and flow lie apart."""
     held = folder / "train_events" / "thun_00_a" if two else folder / "thun_00_a"
     flows = folder / "train_optical_flow" / "thun_00_a" if two else held
     place = held / "events" / "left"
@@ -46,7 +47,11 @@ def make_dsec(folder, shift=(0.0, 0.0), two=False):
     events.write(place / "events.h5", DSEC)
     with h5(place / "events.h5", "r+") as file:
         for key in "xypt":
-            packed = {"data": file[f"events/{key}"][()], "chunks": (1000,), **hdf5plugin.Blosc(cname="zstd")}
+            packed = {
+                "data": file[f"events/{key}"][()],
+                "chunks": (1000,),
+                **hdf5plugin.Blosc(cname="zstd"),
+            }
             del file[f"events/{key}"]
             file["events"].create_dataset(key, **packed)
     y, x = np.mgrid[0:120, 0:160].astype(np.float32)
@@ -95,8 +100,8 @@ MVSEC = some_events(9000, (26, 34), 10_000_000, 10_600_000, seed=3)
 
 
 def make_mvsec(folder, chunks=None):
-    """indoor_flying1 of 26 x 34 px: flow (8, -4) px per 50 ms, grey frames every 31.25 ms; nothing measured
-    in the first columns."""
+    """indoor_flying1 of 26 x 34 px: flow (8, -4) px per 50 ms, grey frames every 31.25 ms; nothing
+    measured in the first columns."""
     folder.mkdir(parents=True)
     columns = (MVSEC.x, MVSEC.y, MVSEC.t_us.double() / 1e6, MVSEC.p)
     rows = torch.stack([column.double() for column in columns], 1).numpy()
@@ -138,8 +143,8 @@ def test_mvsec_windows(frames, chunks, length_s, grid, tmp_path):
     flow, valid = batch.truth.flow_px[0], batch.truth.valid[0]
     truth = torch.tensor([[8.0], [-4.0]]).expand(2, int(valid.sum())) * (length_s / 0.05)
     torch.testing.assert_close(flow[:, valid], truth, rtol=1e-6, atol=1e-5)
-    # followed through as many intervals as the window touches: it ends where a lookup, one interval's part
-    # before the end, leaves the picture
+    # followed through as many intervals as the window touches: it ends where a lookup, one
+    # interval's part before the end, leaves the picture
     edges = 10.02 + 0.05 * np.arange(12)
     parts = np.clip(np.minimum(t1_s, edges[1:]) - np.maximum(t0_s, edges[:-1]), 0, None) / 0.05
     before_last = parts.sum() - parts[parts > 1e-9][-1]
@@ -184,7 +189,9 @@ MAPS = {"x_flow_dist": np.ones((11, 26, 34)), "y_flow_dist": np.ones((11, 26, 34
         (dsec, lambda at: gone(at / LEFT / "rectify_map.h5"), "no file lies at .*rectify_map.h5"),
         (
             dsec,
-            lambda at: stores(at / LEFT / "rectify_map.h5", "rectify_map", np.zeros((9, 9, 2), np.float32)),
+            lambda at: stores(
+                at / LEFT / "rectify_map.h5", "rectify_map", np.zeros((9, 9, 2), np.float32)
+            ),
             "rectify_map has shape",
         ),
         (dsec, lambda at: gone(at / LEFT / "events.h5"), "no file lies at .*events.h5"),
@@ -196,15 +203,23 @@ MAPS = {"x_flow_dist": np.ones((11, 26, 34)), "y_flow_dist": np.ones((11, 26, 34
         ),
         (
             dsec,
-            lambda at: rewritten(at / FLOW / "forward_timestamps.txt", "1310000, 14", "9310000, 94"),
+            lambda at: rewritten(
+                at / FLOW / "forward_timestamps.txt", "1310000, 14", "9310000, 94"
+            ),
             "the events of",
         ),
         (
             dsec,
-            lambda at: rewritten(at / FLOW / "forward_timestamps.txt", "1310000, 141", "1310000, 142"),
+            lambda at: rewritten(
+                at / FLOW / "forward_timestamps.txt", "1310000, 141", "1310000, 142"
+            ),
             "all must last alike",
         ),
-        (dsec, lambda at: (at / FLOW / "forward" / "000004.png").write_bytes(b"no"), "is not a PNG file"),
+        (
+            dsec,
+            lambda at: (at / FLOW / "forward" / "000004.png").write_bytes(b"no"),
+            "is not a PNG file",
+        ),
         (dsec, lambda at: gone(at / FLOW), "holds no sequence of DSEC"),
         (dsec, lambda at: gone(at / LEFT), "is missing; download the events"),
         (mvsec, lambda at: gone(at / GT), f"has no {GT}"),
@@ -226,12 +241,17 @@ def test_damage_is_refused_at_once(source, damage, reason, tmp_path):
 
 def test_a_folder_is_opened_as_what_it_is(tmp_path):
     # DSEC's own size
-    with pytest.raises(CodesignError, match=r"rectify_map has shape \[120, 160, 2\], \[480, 640, 2\]"):
+    with pytest.raises(
+        CodesignError, match=r"rectify_map has shape \[120, 160, 2\], \[480, 640, 2\]"
+    ):
         open_windows(make_dsec(tmp_path / "d"))
     assert isinstance(open_windows(make_mvsec(tmp_path / "m"), window_frames=1), MvsecWindows)
     with pytest.raises(CodesignError, match="no window"):
         MvsecWindows(tmp_path / "m", span_s=(0.0, 0.01))
     (tmp_path / "empty").mkdir()
-    for name, reason in (("empty", r"holds no events: no events\.txt"), ("absent", "nothing lies at")):
+    for name, reason in (
+        ("empty", r"holds no events: no events\.txt"),
+        ("absent", "nothing lies at"),
+    ):
         with pytest.raises(CodesignError, match=reason):
             open_windows(tmp_path / name)

@@ -1,5 +1,5 @@
-"""True flow by path: one closed-form field through every kind of file; flows followed through several
-intervals."""
+"""True flow by path: one closed-form field through every kind of file; flows followed through
+several intervals."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,9 @@ TWICE = np.concatenate([NUMBERED + side * np.array([0, 0, 0, 0, 1, 1]) for side 
 
 def table(head, rows):
     def save(path):
-        path.write_text(head + "".join(" ".join(f"{value:.6f}" for value in row) + "\n" for row in rows))
+        path.write_text(
+            head + "".join(" ".join(f"{value:.6f}" for value in row) + "\n" for row in rows)
+        )
 
     return save
 
@@ -46,7 +48,9 @@ KINDS = {
     "last.npy": lambda path: np.save(path, NAN.transpose(1, 2, 0)),
     "third.npy": lambda path: np.save(path, np.dstack([*FLOW, VALID])),
     "npz": lambda path: np.savez(path, flow=FLOW, valid=VALID),
-    "float.npz": lambda path: np.savez(path, gt_flow=FLOW.astype(np.float32), mask=VALID.astype(np.uint8)),
+    "float.npz": lambda path: np.savez(
+        path, gt_flow=FLOW.astype(np.float32), mask=VALID.astype(np.uint8)
+    ),
     "pair.npz": lambda path: np.savez(path, vx=FLOW[0], vy=NAN[1]),
     "mvsec.npz": lambda path: np.savez(
         path, x_flow_dist=FLOW[:1], y_flow_dist=FLOW[1:], timestamps=np.array([1.5])
@@ -69,7 +73,9 @@ def test_one_field_through_every_kind_of_file(kind, tmp_path):
     # MVSEC: there (0, 0) says that nothing is known
     valid = VALID & (FLOW != 0).any(0) if kind == "mvsec.npz" else VALID
     np.testing.assert_array_equal(found.valid, valid)
-    np.testing.assert_allclose(found.flow, np.where(valid, FLOW, 0), rtol=0, atol=1e-6 * ("txt" in kind))
+    np.testing.assert_allclose(
+        found.flow, np.where(valid, FLOW, 0), rtol=0, atol=1e-6 * ("txt" in kind)
+    )
     assert found.span_s is None
     assert size_of(path) in (SIZE, None)
 
@@ -81,12 +87,17 @@ def test_one_field_through_every_kind_of_file(kind, tmp_path):
         ({"timestamps": [1.0, 2.0, 3.0, 4.0]}, [(1.0, 2.0), (2.0, 3.0), (3.0, 4.0)]),
         ({"timestamps": [1.0, 2.0, 4.0]}, [(1.0, 2.0), (2.0, 4.0), None]),
         ({"ts": [[1.0, 2.0], [2.0, 3.0], [5.0, 7.0]]}, [(1.0, 2.0), (2.0, 3.0), (5.0, 7.0)]),
-        ({"t0": [1000000, 2000000, 4], "t1": [1500000, 2500000, 9]}, [(1.0, 1.5), (2.0, 2.5), (4e-6, 9e-6)]),
+        (
+            {"t0": [1000000, 2000000, 4], "t1": [1500000, 2500000, 9]},
+            [(1.0, 1.5), (2.0, 2.5), (4e-6, 9e-6)],
+        ),
     ],
 )
 def test_several_flows_and_their_times(times, spans, tmp_path):
     flows = np.stack([field(k)[0] for k in range(3)])
-    np.savez(tmp_path / "a.npz", flow=flows, **{key: np.array(value) for key, value in times.items()})  # pyright: ignore[reportArgumentType]
+    np.savez(
+        tmp_path / "a.npz", flow=flows, **{key: np.array(value) for key, value in times.items()}
+    )  # pyright: ignore[reportArgumentType]
     found = read_truth(tmp_path / "a.npz", SIZE)
     assert [flow.span_s for flow in found] == spans
     np.testing.assert_array_equal([flow.flow for flow in found], flows)
@@ -185,7 +196,8 @@ def test_what_is_hidden_invalid_or_between_surfaces_is_not_followed():
     holes[1, 4, 5] = False  # read between the first and the second part
     assert lost(holes, None) == [[4, 4]]
     hidden = ~ok
-    # hidden after the first part; after the second (from 3, 4); at the end, where nothing is read any more
+    # hidden after the first part; after the second (from 3, 4); at the end, where nothing is read
+    # any more
     hidden[0, 2, 2] = hidden[1, 3, 5] = hidden[2, 6, 3] = True
     assert lost(ok, hidden) == [[2, 2], [3, 4]]
     edge = torch.zeros(2, 2, 8, 9, dtype=torch.float64)

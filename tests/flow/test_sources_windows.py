@@ -1,4 +1,5 @@
-"""Windows of our data sets and of recordings: against what is stored and the renderer; damage before training."""
+"""Windows of our data sets and of recordings: against what is stored and the renderer; damage
+before training."""
 # pyright: reportCallIssue=false, reportOptionalSubscript=false
 
 import shutil
@@ -60,7 +61,9 @@ def test_windows_of_one_interval_are_what_is_stored(dataset):
     batch = source.batch([15, 2])
     for k, (name, frame) in enumerate((("sequence_001_radial", 3), ("sequence_000_orbital", 2))):
         stream, file = stored(dataset, name)
-        volume = events.from_stream(stream, *(int(t) for t in file["timestamps"][frame : frame + 2]), 4)
+        volume = events.from_stream(
+            stream, *(int(t) for t in file["timestamps"][frame : frame + 2]), 4
+        )
         assert float(volume.counts.sum()) > 0
         assert torch.equal(batch.volume.counts[k], volume.counts[0])
         for found, right in (
@@ -79,7 +82,9 @@ def test_flow_over_several_frames_is_the_renderers(dataset):
     stream, file = stored(dataset, "sequence_000_orbital")
     camera = study.make_camera(study.Config(size=40, samples=2))
     with torch.no_grad():
-        rendered = flow_and_occlusion(camera, worlds.room(), torch.from_numpy(file["poses"])[[6, 12]])
+        rendered = flow_and_occlusion(
+            camera, worlds.room(), torch.from_numpy(file["poses"])[[6, 12]]
+        )
     truth, seen = rendered.flow_px[0], rendered.valid[0]
     assert float(truth.norm(dim=0).mean()) > 1
     source = DatasetWindows(dataset / "sequence_000_orbital", window_frames=6)
@@ -88,8 +93,8 @@ def test_flow_over_several_frames_is_the_renderers(dataset):
     both = batch.truth.valid[0] & seen
     # points far outside the picture have no place in the fit
     assert float((both == seen).double().mean()) > 0.99
-    # float32 depth to 6e-8 of some metres over a flow of some px, and the fit of the camera (1e-4 px,
-    # measured with traced rays)
+    # float32 depth to 6e-8 of some metres over a flow of some px, and the fit of the camera (1e-4
+    # px, measured with traced rays)
     assert float((batch.truth.flow_px[0].double() - truth).norm(dim=0)[both].max()) < 2e-4
     np.testing.assert_array_equal(batch.frames[0].numpy(), file["frames"][[6, 12]])
     ends = (int(file["timestamps"][k]) for k in (6, 12))
@@ -102,7 +107,9 @@ def test_pieces_depend_on_seed_and_number_alone(dataset):
     one, other = source.batch([7, 3]), source.batch([3])
     assert torch.equal(one.volume.counts[1], other.volume.counts[0])
     full = DatasetWindows(dataset).batch([3])
-    pieces = [(slice(top, top + 16), slice(left, left + 24)) for top in range(25) for left in range(17)]
+    pieces = [
+        (slice(top, top + 16), slice(left, left + 24)) for top in range(25) for left in range(17)
+    ]
     found = [
         torch.equal(full.truth.flow_px[(0, ..., *piece)], other.truth.flow_px[0])
         and torch.equal(full.volume.counts[(0, ..., *piece)], other.volume.counts[0])
@@ -157,7 +164,9 @@ def test_a_recording_is_a_source_of_windows(tmp_path):
     assert float(windows.volume.counts.sum()) == pytest.approx(inside)
     assert not bool(windows.truth.valid.any())
     first, middle, last = columns[0][0] + np.array([10_000, 30_000, 80_000])
-    np.savez(place / "flow.npz", flow=np.ones((2, 2, 180, 240)), t0=[first, middle], t1=[middle, last])
+    np.savez(
+        place / "flow.npz", flow=np.ones((2, 2, 180, 240)), t0=[first, middle], t1=[middle, last]
+    )
     with pytest.raises(CodesignError, match="must last alike"):
         RecordingWindows(place, options=PacketOptions())
 
@@ -188,7 +197,12 @@ def test_damage_is_refused_at_once(damage, reason, dataset, tmp_path):
 @pytest.mark.parametrize(
     ("name", "key", "values", "reason"),
     [
-        ("frames.h5", "flow", np.zeros((12, 2, 40, 39), np.float32), r"flow has shape \[12, 2, 40, 39\], \["),
+        (
+            "frames.h5",
+            "flow",
+            np.zeros((12, 2, 40, 39), np.float32),
+            r"flow has shape \[12, 2, 40, 39\], \[",
+        ),
         ("frames.h5", "timestamps", np.zeros(13, np.int64), "do not rise"),
         ("events.h5", "ms_to_idx", np.full(200, 10**9, np.uint64), "no index"),
     ],

@@ -34,12 +34,18 @@ def random_times(count=600, seed=0):
 
 
 def summed(volume):
-    """An estimator whose flow tells the volume: events on the left to the right, and their mean time."""
+    """An estimator whose flow tells the volume: events on the left to the right, and their mean
+    time."""
     counts = volume.counts
     total = counts.sum((1, 2))
-    late = (counts * (volume.centroid_s / volume.collected_s.sum())[:, None, None].to(counts)).sum((1, 2))
+    late = (counts * (volume.centroid_s / volume.collected_s.sum())[:, None, None].to(counts)).sum(
+        (1, 2)
+    )
     return FlowField(
-        torch.stack([total, late], 1), total > 0, float(volume.collected_s.sum()), (total > 0).float()
+        torch.stack([total, late], 1),
+        total > 0,
+        float(volume.collected_s.sum()),
+        (total > 0).float(),
     )
 
 
@@ -64,16 +70,21 @@ def test_chunks_change_nothing_and_every_event_is_in_one_window(by):
     stream = stream_of(random_times(300))
     whole = list(flow.Tracker(summed, **by).track([stream]))
     assert sum(window.events for window in whole) == len(stream)
-    assert sum(float(window.field.flow_px[:, 0].sum()) for window in whole) == pytest.approx(len(stream))
+    assert sum(float(window.field.flow_px[:, 0].sum()) for window in whole) == pytest.approx(
+        len(stream)
+    )
     for before, after in pairwise(whole):
         assert before.t0_us < before.t1_us
-        # windows tile time; events of one microsecond that are more than a window holds may share it
+        # windows tile time; events of one microsecond that are more than a window holds may share
+        # it
         assert before.t1_us - 1 <= after.t0_us <= before.t1_us
     for cuts in (range(40, 300, 40), range(1, 300)):
         tracker = flow.Tracker(summed, **by)
         found = list(tracker.track(pieces(stream, cuts)))
         assert told(found) == told(whole)
-        assert all(torch.equal(a.field.flow_px, b.field.flow_px) for a, b in zip(found, whole, strict=True))
+        assert all(
+            torch.equal(a.field.flow_px, b.field.flow_px) for a, b in zip(found, whole, strict=True)
+        )
         assert (tracker.windows, tracker.events) == (len(whole), len(stream))
         assert tracker.event_s == pytest.approx(sum(w.t1_us - w.t0_us for w in whole) * 1e-6)
 
@@ -92,7 +103,11 @@ def test_windows_by_time_are_those_of_the_volume_and_empty_ones_are_handed_out()
     assert found[-1].t1_us == int(stream.t_us[-1])
     skipping = flow.Tracker(summed, window_s=0.004, bins=5, skip=("windows_without_events",))
     assert told(skipping.track([stream])) == [one for one in told(found) if one[2]]
-    assert skipping.left_out["windows_without_events"] == sum(not window.events for window in found) >= 5
+    assert (
+        skipping.left_out["windows_without_events"]
+        == sum(not window.events for window in found)
+        >= 5
+    )
     # a clock that jumps costs nothing then
     tracker = flow.Tracker(summed, window_s=0.001, skip=("windows_without_events",))
     jumped = told(tracker.track([stream_of([0, 500, 10**15])]))
@@ -132,7 +147,10 @@ def test_a_warm_start_has_the_speed_of_the_window_before():
     for start, window in zip(starts[1:], found[1:], strict=True):
         seconds = (window.t1_us - window.t0_us) * 1e-6
         torch.testing.assert_close(start, speed * seconds, rtol=1e-5, atol=0)
-    for tracker in (flow.Tracker(steady, events=10, warm_start=False), flow.Tracker(summed, events=10)):
+    for tracker in (
+        flow.Tracker(steady, events=10, warm_start=False),
+        flow.Tracker(summed, events=10),
+    ):
         starts.clear()
         assert not any(window.warm for window in tracker.track([stream]))
         assert not any(start is not None for start in starts)
@@ -220,7 +238,10 @@ def tracker(estimator=summed, **options):
         (lambda: tracker(events=5, size_px=SIZE).add(([1, 2], [1], [1], [1])), "entries"),
         (lambda: tracker(events=5, size_px=(3, 3)).add(stream_of([1])), "sensor of 16 x 12 px"),
         (lambda: tracker(window_s=1e-3).add(stream_of([0, 10**11])), "did the clock jump"),
-        (lambda: tracker(lambda _: 3, window_s=1e-3).add(stream_of([0, 10**4])), "the estimator returned"),
+        (
+            lambda: tracker(lambda _: 3, window_s=1e-3).add(stream_of([0, 10**4])),
+            "the estimator returned",
+        ),
     ],
 )
 def test_one_wrong_value(call, words):

@@ -1,4 +1,5 @@
-"""The certificate itself: it must pass right gradients and fail wrong ones, by amounts that are known."""
+"""The certificate itself: it must pass right gradients and fail wrong ones, by amounts that are
+known."""
 
 import math
 from pathlib import Path
@@ -15,8 +16,11 @@ D = torch.float64
 
 
 def test_right_gradient_passes_with_the_plateau_between_bending_and_rounding():
-    (row,) = certify(lambda p: p["x"].sin().sum(), {"x": torch.linspace(0.1, 1, 5, dtype=D)}, tolerance=1e-8)
-    # central differences of sin: h^2/6 of bending and 1e-16/h of rounding meet near h = 1e-5, at about 1e-11
+    (row,) = certify(
+        lambda p: p["x"].sin().sum(), {"x": torch.linspace(0.1, 1, 5, dtype=D)}, tolerance=1e-8
+    )
+    # central differences of sin: h^2/6 of bending and 1e-16/h of rounding meet near h = 1e-5, at
+    # about 1e-11
     assert row.verdict == "pass"
     assert row.relative_error < 1e-9
     assert row.cosine == pytest.approx(1, abs=1e-12)
@@ -37,13 +41,16 @@ def test_wrong_scale_is_seen_as_bias_of_that_size(factor):
 
 
 def test_scales_set_the_unit_of_every_number():
-    (row,) = certify(lambda p: (2 * p["x"]).sum(), {"x": torch.zeros(1, dtype=D)}, scales={"x": 0.25})
+    (row,) = certify(
+        lambda p: (2 * p["x"]).sum(), {"x": torch.zeros(1, dtype=D)}, scales={"x": 0.25}
+    )
     assert row.autograd == pytest.approx((0.5,))
     assert row.difference == pytest.approx((0.5,))
 
 
 def on_a_thousand(seed, longer):
-    """A mean of squares on top of 1,000 in single precision, whose gradient is longer by a share."""
+    """A mean of squares on top of 1,000 in single precision, whose gradient is longer by a
+    share."""
     generator = torch.Generator().manual_seed(seed)
     weight = torch.rand(12, 12, generator=generator)
     x = 2 * torch.rand(12, 12, generator=generator) - 1
@@ -80,8 +87,9 @@ def test_the_weights_of_a_network_with_kinks():
 
 
 def test_a_small_signal_on_a_large_constant_is_noise_and_never_judged_wrongly():
-    # one unit in the last place of 1000 is 6e-5; the mean of 144 squares moves by some 1e-4 along a random
-    # direction of length 0.1, so four directions know the gradient to some ten percent and no better
+    # one unit in the last place of 1000 is 6e-5; the mean of 144 squares moves by some 1e-4 along a
+    # random direction of length 0.1, so four directions know the gradient to some ten percent and
+    # no better
     right = [on_a_thousand(seed, 0.0) for seed in range(40)]
     assert {row.verdict for row in right} <= {"pass", "noise"}
     assert all(row.noise_floor > 0.01 for row in right)
@@ -92,7 +100,9 @@ def test_a_small_signal_on_a_large_constant_is_noise_and_never_judged_wrongly():
     assert len(decided) >= 30
     # the floor along the gradient is below 2 %, so three of them are 0.06
     assert all(
-        row.length_bias == pytest.approx(0.3, abs=0.06) for row in decided if row.length_bias is not None
+        row.length_bias == pytest.approx(0.3, abs=0.06)
+        for row in decided
+        if row.length_bias is not None
     )
 
 
@@ -116,8 +126,8 @@ def test_a_gradient_where_the_function_stands_still_fails():
 
 
 def test_rounding_noise_is_measured():
-    # rounding to multiples of 1e-3, many of them apart: errors uniform in +-5e-4, 2.9e-4 rms; nine points
-    # tell it within a factor of two
+    # rounding to multiples of 1e-3, many of them apart: errors uniform in +-5e-4, 2.9e-4 rms; nine
+    # points tell it within a factor of two
     def rounded(x):
         return (1e3 * (x.square().sum() + x.sum())).round() / 1e3
 
@@ -125,7 +135,10 @@ def test_rounding_noise_is_measured():
     assert found == pytest.approx(1e-3 / 12**0.5, rel=1.0, abs=0)
     assert found > 1e-3 / 12**0.5 / 2
     assert (
-        rounding_noise(lambda x: x.pow(3).sum(), torch.ones(3, dtype=D), torch.ones(3, dtype=D), 1e-3) < 1e-14
+        rounding_noise(
+            lambda x: x.pow(3).sum(), torch.ones(3, dtype=D), torch.ones(3, dtype=D), 1e-3
+        )
+        < 1e-14
     )
 
 
@@ -161,11 +174,18 @@ def test_the_stages_of_the_page_are_certified():
         exec(block.split("```")[0], names)
         if "rows" in names:
             assert {row.verdict for row in names["rows"]} == {"pass"}
-    assert [row.name for row in names["rows"]] == ["0.weight", "0.bias", "2.weight", "2.bias", "input"]
+    assert [row.name for row in names["rows"]] == [
+        "0.weight",
+        "0.bias",
+        "2.weight",
+        "2.bias",
+        "input",
+    ]
 
 
 def test_the_best_pair_weighs_rounding_against_what_is_left_of_truncation():
-    # (4 x 1.01 - 1.04) / 3 = 1, known to hypot(4 x 0.02, 0.02) / 3 by rounding; it moved 1.01 by 0.01
+    # (4 x 1.01 - 1.04) / 3 = 1, known to hypot(4 x 0.02, 0.02) / 3 by rounding; it moved 1.01 by
+    # 0.01
     ladder = Ladder(torch.sum, torch.ones(1, dtype=D), torch.ones(1, dtype=D))
     ladder.rungs = [(0.2, 1.04, 0.02), (0.1, 1.01, 0.02)]
     found = ladder.difference()
@@ -176,7 +196,9 @@ def test_the_best_pair_weighs_rounding_against_what_is_left_of_truncation():
 def test_rungs_that_agree_by_accident_are_contradicted_by_smaller_ones():
     # differences of x + c x^3 + e x^5 at 0 are 1 + c h^2 + e h^4, alike at 0.4 and 0.2 for
     # c = -e (0.4^2 + 0.2^2); there they are 1 - e 0.4^2 0.2^2 = 0.968
-    ladder = Ladder(lambda x: (x - x**3 + 5 * x**5).sum(), torch.zeros(1, dtype=D), torch.ones(1, dtype=D))
+    ladder = Ladder(
+        lambda x: (x - x**3 + 5 * x**5).sum(), torch.zeros(1, dtype=D), torch.ones(1, dtype=D)
+    )
     ladder.take((0.4, 0.2, 0.1, 0.05))
     found = ladder.difference()
     assert [d for _, d in found.ladder[:2]] == pytest.approx([0.968, 0.968])
@@ -218,7 +240,8 @@ def test_larger_steps_that_the_function_refuses_are_left_out():
 
 
 def test_a_step_is_what_rounding_of_the_parameter_leaves_of_it():
-    # numbers near 1000 are 6.1e-5 apart in single precision: 1e-4 becomes twice that, and 1e-5 nothing
+    # numbers near 1000 are 6.1e-5 apart in single precision: 1e-4 becomes twice that, and 1e-5
+    # nothing
     ladder = Ladder(lambda x: x.double().sum(), torch.full((1,), 1e3), torch.ones(1))
     ladder.take((1e-4, 1e-5))
     found = ladder.difference()

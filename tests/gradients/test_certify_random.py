@@ -1,7 +1,8 @@
-"""The certificate on functions drawn at random: of twelve families, 1 to 200 numbers, in both precisions.
+"""The certificate on functions drawn at random: of twelve families, 1 to 200 numbers, in both
+precisions.
 
-The truth is the gradient of the same function in double precision. No right gradient may fail, and no wrong one pass whose
-error is above twice the tolerance and above the noise.
+The truth is the gradient of the same function in double precision. No right gradient may fail, and
+no wrong one pass whose error is above twice the tolerance and above the noise.
 """
 
 from collections import Counter
@@ -41,7 +42,9 @@ def waves(low, high):
 
 def several_scales(of):
     waves = [(of.decades(*rates), of.decades(0.1, 1)) for rates in ((1, 30), (30, 1e3), (1e3, 3e4))]
-    return of.uniform(), lambda x: sum(share / rate * (rate * x).sin().sum() for rate, share in waves)
+    return of.uniform(), lambda x: sum(
+        share / rate * (rate * x).sin().sum() for rate, share in waves
+    )
 
 
 def kinks(of):
@@ -52,7 +55,10 @@ def kinks(of):
 
 def single_inside(of):
     offset = of.decades(1, 1e3)
-    return of.uniform(), lambda x: (offset + (3 * x.float()).sin().sum()).to(x) + 0.3 * x.square().sum()
+    return (
+        of.uniform(),
+        lambda x: (offset + (3 * x.float()).sin().sum()).to(x) + 0.3 * x.square().sum(),
+    )
 
 
 def coupled(of):
@@ -75,7 +81,10 @@ FAMILIES = {
     "several scales": several_scales,
     "exponentials": with_a_number(0.1, 10, lambda x, rate: (rate * x).exp().mean()),
     "logarithms": with_a_number(
-        1, 1, lambda x, _: (x + 1).log().square().mean(), lambda of: of.decades(0.1, 300) * of.uniform()
+        1,
+        1,
+        lambda x, _: (x + 1).log().square().mean(),
+        lambda of: of.decades(0.1, 300) * of.uniform(),
     ),
     "rational": with_a_number(0.02, 1, lambda x, width: (1 / (width + x.square())).mean()),
     "powers": with_a_number(
@@ -125,13 +134,16 @@ def test_no_right_gradient_fails_and_no_wrong_one_passes(name):
             wrong = judged(fn, x, WRONG[seed * 2 % 5](grad, fn, x, of) - grad)
             error = torch.tensor(wrong.autograd) - torch.tensor(right.autograd)
             gap = float(error.norm() / torch.tensor(right.autograd).norm())
-            # three noise floors of the verdict's margin, and three by which the differences may be off
+            # three noise floors of the verdict's margin, and three by which the differences may be
+            # off
             if gap > 1.99 * TOLERANCE and gap > TOLERANCE + 6 * wrong.noise_floor:
                 assert wrong.verdict != "pass", (seed, wrong)
                 verdicts["wrong", wrong.verdict] += 1
     # and it decides, where double precision has the digits
     assert verdicts[D, "pass"] >= 0.7 * len(SEEDS)
-    assert verdicts["wrong", "fail"] >= 0.9 * (verdicts["wrong", "fail"] + verdicts["wrong", "noise"])
+    assert verdicts["wrong", "fail"] >= 0.9 * (
+        verdicts["wrong", "fail"] + verdicts["wrong", "noise"]
+    )
 
 
 IMAGES = {

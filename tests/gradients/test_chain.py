@@ -1,4 +1,5 @@
-"""Gradients along the whole chain, certified with the cases that ``studies.gradient_flow --cases chain`` reports."""
+"""Gradients along the whole chain, certified with the cases that
+``studies.gradient_flow --cases chain`` reports."""
 
 import pytest
 
@@ -17,8 +18,8 @@ def test_junction_gradients_agree_with_differences(label):
 
 
 def test_straight_through_gradient_of_the_lens_points_where_the_hard_loss_falls():
-    # 32 cases give a cosine of 0.997 to three curvatures; 10 keep the test short, and the standard error of their mean
-    # difference, about a sixth of its length, allows 0.9
+    # 32 cases give a cosine of 0.997 to three curvatures; 10 keep the test short, and the standard
+    # error of their mean difference, about a sixth of its length, allows 0.9
     curvature, _ = chain.hard_rows(0, 10, moved=["curvature"])
     assert curvature.cosine >= 0.9, curvature
     # the scale is right within a factor of two or three

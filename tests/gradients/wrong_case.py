@@ -12,6 +12,9 @@ def grad_of(fn, x):
 
 
 def certified(fn, x, error, **options):
-    """Row of certify for the right gradient plus an error that the function's values do not show."""
-    (row,) = certify(lambda p: fn(p["x"]) + (error * (p["x"] - p["x"].detach())).sum(), {"x": x}, **options)
+    """Row of certify for the right gradient plus an error that the function's values do not
+    show."""
+    (row,) = certify(
+        lambda p: fn(p["x"]) + (error * (p["x"] - p["x"].detach())).sum(), {"x": x}, **options
+    )
     return row

@@ -40,7 +40,11 @@ def learned(geo):
 def gradients(geo, loss):
     tensors = learned(geo)
     return torch.cat(
-        [g.reshape(-1) for g in torch.autograd.grad(loss, tensors, allow_unused=True) if g is not None]
+        [
+            g.reshape(-1)
+            for g in torch.autograd.grad(loss, tensors, allow_unused=True)
+            if g is not None
+        ]
     )
 
 
@@ -89,7 +93,11 @@ CASES = {
 def test_a_failed_ray_says_what_where_and_by_how_much(name):
     geo, origin, direction, status, surface, deficit = CASES[name]
     out = geo.trace(f64([origin]), f64([direction]))
-    assert (out.status.item(), out.failed_surface.item(), out.weight.item()) == (status, surface, 0.0)
+    assert (out.status.item(), out.failed_surface.item(), out.weight.item()) == (
+        status,
+        surface,
+        0.0,
+    )
     # radicands are measured from the grazing limit of 1e-8
     assert abs(out.deficit.item() - deficit) <= 1e-7
 
@@ -181,7 +189,8 @@ def test_bad_rays_leave_the_gradients_of_good_ones_alone(kind, generator):
     alone, out = weighted(good, ahead)
     assert not out.status.any()
     crowd, _ = weighted(
-        torch.cat([good, f64([o for o, _ in BAD_RAYS])]), torch.cat([ahead, unit([d for _, d in BAD_RAYS])])
+        torch.cat([good, f64([o for o, _ in BAD_RAYS])]),
+        torch.cat([ahead, unit([d for _, d in BAD_RAYS])]),
     )
     # weight 0 times anything finite adds exactly 0; sums over lanes may run in another order
     a = gradients(geo, alone)
@@ -192,8 +201,8 @@ def test_bad_rays_leave_the_gradients_of_good_ones_alone(kind, generator):
 
 @pytest.mark.parametrize("name", ["double-gauss", "cooke-triplet"])
 def test_single_precision_from_ten_kilometres_away(name):
-    # a parallel beam whose origins lie 10 km before the lens must land where the beam started at the lens
-    # does
+    # a parallel beam whose origins lie 10 km before the lens must land where the beam started at
+    # the lens does
     near = f64([(x, y, -5.0) for x, y in ((0.0, 0.0), (2.0, 0.0), (0.0, -3.0), (1.5, 2.5))]).float()
     far = None
     far = near * f64([1, 1, 2e6]).float()
@@ -206,30 +215,38 @@ def test_single_precision_from_ten_kilometres_away(name):
 
 
 def test_a_ball_lens_has_its_textbook_focal_length():
-    # Hecht, Optics, ch. 6: f = n R / (2 (n - 1)) from the centre; rays start behind the centre of the second
-    # half
+    # Hecht, Optics, ch. 6: f = n R / (2 (n - 1)) from the centre; rays start behind the centre of
+    # the second half
     R = 5.0
     n = 1.5
-    ball = GeoLens([Surface(R, 2 * R, GLASS, 4.99), Surface(-R, n * R / (2 * (n - 1)) - R, None, 4.99)], 2.0)
+    ball = GeoLens(
+        [Surface(R, 2 * R, GLASS, 4.99), Surface(-R, n * R / (2 * (n - 1)) - R, None, 4.99)], 2.0
+    )
     height = 1e-4
     out = ball.trace(f64([[height, 0, -9.0], [4.0, 0.0, -9.0]]), f64([[0, 0, 1.0]] * 2))
     # spherical aberration at this height: (1e-4 / 5)^2 of it
     assert abs(out.position_mm[0, 0].item()) <= 1e-8 * height
-    # 4 mm off the axis: sin i = 0.8, bent by 2 (i - i') altogether; crosses the axis at R sin i / sin(2 (i -
-    # i')) from the centre
+    # 4 mm off the axis: sin i = 0.8, bent by 2 (i - i') altogether; crosses the axis at R sin i /
+    # sin(2 (i - i')) from the centre
     turn = 2 * (math.asin(0.8) - math.asin(0.8 / n))
     crossing = 4.0 / math.sin(turn)
-    assert abs(out.position_mm[1, 0].item() - math.tan(turn) * (crossing - n * R / (2 * (n - 1)))) <= 1e-12
+    assert (
+        abs(out.position_mm[1, 0].item() - math.tan(turn) * (crossing - n * R / (2 * (n - 1))))
+        <= 1e-12
+    )
 
 
 @pytest.mark.parametrize("conic", [3.0, 0.5, 0.0, -0.5])
 def test_the_far_half_of_an_ellipsoid_is_not_a_surface(conic):
-    """Half axes: R / (1 + k) along the axis, where its middle lies too, and R / sqrt(1 + k) across. A ray that
-    crosses the axis 1.3 half axes behind the vertex, nearly at right angles, meets the far half only."""
+    """Half axes: R / (1 + k) along the axis, where its middle lies too, and R / sqrt(1 + k) across.
+    A ray that crosses the axis 1.3 half axes behind the vertex, nearly at right angles, meets the
+    far half only."""
     radius = 10.0
     deep = radius / (1 + conic)
     wide = radius / math.sqrt(1 + conic)
-    geo = GeoLens([Surface(radius, 5.0, GLASS, 4.0, conic=conic), Surface(INF, 10.0, None, 4.0)], 4.0)
+    geo = GeoLens(
+        [Surface(radius, 5.0, GLASS, 4.0, conic=conic), Surface(INF, 10.0, None, 4.0)], 4.0
+    )
     start = f64([[3 * wide, 0.0, 1.3 * deep - 0.02 * 3 * wide]])
     out = geo.trace(start, unit([(-1.0, 0.0, 0.02)]))
     assert (out.status.item(), out.failed_surface.item()) == (Status.MISS, 0)
@@ -238,8 +255,8 @@ def test_the_far_half_of_an_ellipsoid_is_not_a_surface(conic):
 
 @pytest.mark.parametrize("conic", [3.0, 0.5, -0.5, -1.0, -2.0])
 def test_deep_conics_are_met_at_their_sag(conic):
-    """Rays parallel to the axis, to 0.99 of the rim of an ellipsoid and to two radii on a paraboloid or
-    hyperboloid; r^2 = 2 R z - (1 + k) z^2 at the point that is met."""
+    """Rays parallel to the axis, to 0.99 of the rim of an ellipsoid and to two radii on a
+    paraboloid or hyperboloid; r^2 = 2 R z - (1 + k) z^2 at the point that is met."""
     radius = 10.0
     reach = 0.99 * radius / math.sqrt(1 + conic) if conic > -1 else 2 * radius
     surface = GeoLens([Surface(radius, 5.0, GLASS, 4.0, conic=conic)], 4.0).prescription().until(0)
@@ -254,8 +271,8 @@ def test_deep_conics_are_met_at_their_sag(conic):
 
 @pytest.mark.parametrize("distance", [1e-3, 1e-5, 1e-7])
 def test_grazing_rays_have_the_steep_but_true_derivatives_of_the_closed_form(distance):
-    """A ray parallel to the axis at R - e meets the sphere at depth R - sqrt(R^2 - h^2), whose slope in h is
-    h / sqrt(R^2 - h^2)."""
+    """A ray parallel to the axis at R - e meets the sphere at depth R - sqrt(R^2 - h^2), whose
+    slope in h is h / sqrt(R^2 - h^2)."""
     radius = 10.0
     height = radius - distance
     ball = GeoLens([Surface(radius, 20.0, GLASS, 9.999)], 4.0).prescription().until(0)
@@ -264,8 +281,8 @@ def test_grazing_rays_have_the_steep_but_true_derivatives_of_the_closed_form(dis
     depth = radius - math.sqrt((radius - height) * (radius + height))
     close(out.position_mm[0, 2], depth, atol=1e-11)
     (slope,) = torch.autograd.grad(out.position_mm[0, 2], origin)
-    # R^2 - h^2 is a difference of nearly equal numbers: rounding 1e-16 relative to 2 e / R, and half of that
-    # in the root
+    # R^2 - h^2 is a difference of nearly equal numbers: rounding 1e-16 relative to 2 e / R, and
+    # half of that in the root
     close(
         slope[0, 1],
         height / math.sqrt((radius - height) * (radius + height)),
@@ -274,8 +291,8 @@ def test_grazing_rays_have_the_steep_but_true_derivatives_of_the_closed_form(dis
 
 
 def test_the_soft_edge_is_a_cubic_step_in_the_square_of_the_radius():
-    """3 u^2 - 2 u^3 with u = 1/2 at the aperture, u falling by r / (edge x aperture) per radius: flat where it
-    begins and where it ends, so that gradients have no jump."""
+    """3 u^2 - 2 u^3 with u = 1/2 at the aperture, u falling by r / (edge x aperture) per radius:
+    flat where it begins and where it ends, so that gradients have no jump."""
     semi = 9.5
     edge = 0.4
     geo = GeoLens([Surface(INF, 10.0, None, semi)], 4.0, soft_edge_mm=edge)
@@ -290,8 +307,11 @@ def test_the_soft_edge_is_a_cubic_step_in_the_square_of_the_radius():
 
 
 def test_a_ray_that_meets_the_vertex_plane_but_not_the_asphere_has_deficit_one():
-    # z = r^2 from (20, 0, -1) along (0.1, 0, 1): s - 1 = (20 + 0.1 s)^2 has no root (its discriminant is 9 - 16.04)
-    bowl = GeoLens([Surface(INF, 5.0, GLASS, 4.0, asphere=(1.0,)), Surface(INF, 10.0, None, 9.0)], 4.0)
+    # z = r^2 from (20, 0, -1) along (0.1, 0, 1): s - 1 = (20 + 0.1 s)^2 has no root (its
+    # discriminant is 9 - 16.04)
+    bowl = GeoLens(
+        [Surface(INF, 5.0, GLASS, 4.0, asphere=(1.0,)), Surface(INF, 10.0, None, 9.0)], 4.0
+    )
     out = bowl.trace(f64([(20.0, 0.0, -1.0)]), unit([(0.1, 0.0, 1.0)]))
     assert (out.status.item(), out.failed_surface.item()) == (Status.MISS, 0)
     assert out.deficit.item() == 1.0
@@ -299,8 +319,11 @@ def test_a_ray_that_meets_the_vertex_plane_but_not_the_asphere_has_deficit_one()
 
 @pytest.mark.parametrize("fourth", [2e-3, -2e-3, 1e-2])
 def test_steep_aspheres_are_met_far_from_their_vertex_plane(fourth):
-    """z = a r^4, some millimetres deep: the point that is met solves it, found here by bisection in plain numbers."""
-    surface = GeoLens([Surface(INF, 5.0, GLASS, 4.0, asphere=(0.0, fourth))], 4.0).prescription().until(0)
+    """z = a r^4, some millimetres deep: the point that is met solves it, found here by bisection in
+    plain numbers."""
+    surface = (
+        GeoLens([Surface(INF, 5.0, GLASS, 4.0, asphere=(0.0, fourth))], 4.0).prescription().until(0)
+    )
     origin = (0.3, 5.5, -5.0)
     direction = unit([(0.05, -0.25, 1.0)])
 
@@ -321,8 +344,8 @@ def test_steep_aspheres_are_met_far_from_their_vertex_plane(fourth):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_when_all_rays_are_blocked_the_loss_is_zero_and_so_are_its_gradients(dtype):
-    """Weights of blocked rays are exactly 0, the hard mask says so, and the merit of what arrives has the
-    gradient 0, not NaN."""
+    """Weights of blocked rays are exactly 0, the hard mask says so, and the merit of what arrives
+    has the gradient 0, not NaN."""
     geo = lens.load("cooke-triplet", dtype)
     origin = f64([(0.0, 9.9, -5.0), (9.8, 0.0, -5.0)]).to(dtype)
     direction = f64([(0, 0, 1.0)] * 2).to(dtype)
@@ -335,8 +358,8 @@ def test_when_all_rays_are_blocked_the_loss_is_zero_and_so_are_its_gradients(dty
 
 
 def test_the_hard_mask_is_half_the_soft_edge():
-    """9.4 and 9.6 mm at an aperture of 9.5 mm with an edge of 0.4 mm: both within the soft edge, one
-    inside."""
+    """9.4 and 9.6 mm at an aperture of 9.5 mm with an edge of 0.4 mm: both within the soft edge,
+    one inside."""
     geo = GeoLens([Surface(INF, 10.0, None, 9.5)], 4.0, soft_edge_mm=0.4)
     out = geo.trace(
         f64([(0.0, 9.4, 0.0), (0.0, 9.5 + 1e-9, 0.0), (0.0, 9.6, 0.0), (0.0, 9.1, 0.0)]),

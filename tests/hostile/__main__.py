@@ -1,7 +1,8 @@
 """Attacks from outside, and the figures of docs/safety.md.
 
-``python -m tests.hostile PART`` attacks one part and writes what was found into ``runs/hostile/metrics.json``, beside
-the figures of the other parts; exit code 1 where something was found.
+``python -m tests.hostile PART`` attacks one part and writes what was found into
+``runs/hostile/metrics.json``, beside the figures of the other parts; exit code 1 where something
+was found.
 """
 
 import argparse
@@ -35,13 +36,19 @@ def main() -> int:
         part = parts.add_parser(name, help=words)
         part.add_argument("--count", type=int, default=count, help=f"how many (default {count})")
         part.add_argument("--seed", type=int, default=0)
-        part.add_argument("--out", type=Path, default=Path("runs/hostile"), help="folder of metrics.json")
+        part.add_argument(
+            "--out", type=Path, default=Path("runs/hostile"), help="folder of metrics.json"
+        )
         if name == "fuzz":
             part.add_argument("--minutes", type=float, default=10.0)
-            part.add_argument("--format", default="", help="end of the names of seeds, such as .npz")
+            part.add_argument(
+                "--format", default="", help="end of the names of seeds, such as .npz"
+            )
             part.add_argument("--processes", type=int, default=2)
         if name == "calls":
-            part.add_argument("paths", nargs="*", default=["tests"], help="tests whose calls are exchanged")
+            part.add_argument(
+                "paths", nargs="*", default=["tests"], help="tests whose calls are exchanged"
+            )
     chosen = vars(parser.parse_args())
     part, out = chosen.pop("part"), chosen.pop("out")
     figures, findings = importlib.import_module(f"tests.hostile.{part}").measure(**chosen)

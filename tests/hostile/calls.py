@@ -1,8 +1,9 @@
-"""Wrong calls into every public function: what tests gave it, with one argument exchanged for what does not belong.
+"""Wrong calls into every public function: what tests gave it, with one argument exchanged for what
+does not belong.
 
-A plugin of pytest: while tests run, the first calls of every public function and method are kept; after each test they
-are made anew, once for each argument and wrong value. Right is a sentence of ours or a result with a meaning; NaN that
-comes out where NaN went in is counted, and no finding.
+A plugin of pytest: while tests run, the first calls of every public function and method are kept;
+after each test they are made anew, once for each argument and wrong value. Right is a sentence of
+ours or a result with a meaning; NaN that comes out where NaN went in is counted, and no finding.
 """
 
 import contextlib
@@ -34,7 +35,10 @@ from codesign import doors
 from codesign.errors import CodesignError
 
 ROOMS = [
-    *(f"codesign.{room}" for room in ("pose", "state", "types", "events", "flow", "grad", "lens", "mount")),
+    *(
+        f"codesign.{room}"
+        for room in ("pose", "state", "types", "events", "flow", "grad", "lens", "mount")
+    ),
     *(f"codesign.{room}" for room in ("optimise", "render", "system", "train")),
     *(
         f"scenes.{room}"
@@ -63,7 +67,8 @@ class Door:
 
 
 class Calls:
-    """Keeps calls while tests run, makes them anew after each, and writes a line for each into a journal."""
+    """Keeps calls while tests run, makes them anew after each, and writes a line for each into a
+    journal."""
 
     def __init__(self, journal: Path, known: list[str]) -> None:
         self.doors: dict[str, Door] = {}
@@ -84,7 +89,9 @@ class Calls:
                 public, "_is_protocol", False
             ):
                 for method, made in list(vars(public).items()):
-                    if isinstance(made, types.FunctionType) and (method == "__init__" or method[0] != "_"):
+                    if isinstance(made, types.FunctionType) and (
+                        method == "__init__" or method[0] != "_"
+                    ):
                         setattr(public, method, self._kept(f"{full}.{method}", made))
         elif isinstance(public, types.FunctionType):
             setattr(module, name, self._kept(full, public))
@@ -108,7 +115,11 @@ class Calls:
     def pytest_runtest_teardown(self, item):
         self.inside = True
         state = torch.get_rng_state()
-        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder), warnings.catch_warnings():
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            contextlib.chdir(folder),
+            warnings.catch_warnings(),
+        ):
             warnings.simplefilter("ignore")
             for name, door in self.doors.items():
                 for args, kwargs in door.calls[door.attacked :]:
@@ -166,7 +177,11 @@ def wrong_values(value: Any) -> list[tuple[str, Any]]:
         ("empty", value[:0] if value.ndim else value.new_zeros(0)),
         ("flat", value.reshape(-1)),
     ]
-    wrong += [("one axis more", value[None]), ("numpy text", np.array(["a"])), ("meta", value.to("meta"))]
+    wrong += [
+        ("one axis more", value[None]),
+        ("numpy text", np.array(["a"])),
+        ("meta", value.to("meta")),
+    ]
     if value.ndim and value.shape[-1] > 1:
         wrong.append(("shorter", value[..., :-1]))
     if value.is_floating_point() and value.numel():
@@ -231,7 +246,9 @@ def copied(value: Any) -> Any:
     return value
 
 
-def has_nan(value: Any, is_so: Callable[[torch.Tensor], torch.Tensor] = torch.isnan, depth: int = 0) -> bool:
+def has_nan(
+    value: Any, is_so: Callable[[torch.Tensor], torch.Tensor] = torch.isnan, depth: int = 0
+) -> bool:
     """Whether there is NaN in a number, a tensor, or a few floors of lists and dictionaries."""
     if isinstance(value, torch.Tensor):
         dense = value.layout == torch.strided and not value.is_meta
@@ -254,7 +271,10 @@ def not_finite(value: torch.Tensor) -> torch.Tensor:
 
 
 def measure(
-    count: int = 10**9, seed: int = 0, say: Callable[[str], Any] = print, paths: tuple[str, ...] = ("tests",)
+    count: int = 10**9,
+    seed: int = 0,
+    say: Callable[[str], Any] = print,
+    paths: tuple[str, ...] = ("tests",),
 ) -> tuple[dict[str, float], list[str]]:
     """Wrong calls through the tests in ``paths``, a process for each file, ``count`` files at most.
 
@@ -263,7 +283,9 @@ def measure(
     files = [
         file
         for path in paths
-        for file in ([path] if path.endswith(".py") else sorted(map(str, Path(path).rglob("test_*.py"))))
+        for file in (
+            [path] if path.endswith(".py") else sorted(map(str, Path(path).rglob("test_*.py")))
+        )
     ]
     files = [file for file in files if "/hostile/" not in file and "/studies/" not in file][:count]
     made, passed, doors, findings = 0, 0, set(), {}

@@ -1,4 +1,5 @@
-"""Mutants of every seed, read in processes of their own that are started anew where they die or hang."""
+"""Mutants of every seed, read in processes of their own that are started anew where they die or
+hang."""
 
 import importlib
 import json
@@ -33,7 +34,8 @@ def seeds(only: str = "") -> list[tuple[str, str]]:
 
 
 def read_mutants(module: str, name: str, seed: int, count: int, seconds: float = float("inf")):
-    """(mutants read, findings [{"index", "kind", "found"}]) of one seed; the time counts from the first mutant on."""
+    """(mutants read, findings [{"index", "kind", "found"}]) of one seed; the time counts from the
+    first mutant on."""
     findings = []
     first, last, until = 1, 1 + count, float("inf")
     while first < last and time.monotonic() < until:
@@ -102,9 +104,11 @@ def measure(
     format: str = "",
     processes: int = 2,
 ) -> tuple[dict[str, float], list[str]]:
-    """Read ``count`` mutants of every seed whose name ends in ``format``, or as many as the time allows.
+    """Read ``count`` mutants of every seed whose name ends in ``format``, or as many as the time
+    allows.
 
-    Returns: {name of the seed: mutants read} with their sum, and a sentence for each finding, whose file is kept.
+    Returns: {name of the seed: mutants read} with their sum, and a sentence for each finding, whose
+      file is kept.
     """
     chosen = seeds(format)
     share_s = minutes * 60 * processes / max(len(chosen), 1)
@@ -115,12 +119,18 @@ def measure(
         say(f"{name:28} {read:9d} mutants, {len(found)} findings")
         for finding in found:
             kept(module, name, seed, finding)
-        return name, read, [f"{name} {each['index']}: {each['kind']}: {each['found']}" for each in found]
+        return (
+            name,
+            read,
+            [f"{name} {each['index']}: {each['kind']}: {each['found']}" for each in found],
+        )
 
     with ThreadPoolExecutor(processes) as pool:
         rows = list(pool.map(one, chosen))
     figures = {name: read for name, read, _ in rows}
-    return {**figures, "all": sum(figures.values())}, [each for _, _, found in rows for each in found]
+    return {**figures, "all": sum(figures.values())}, [
+        each for _, _, found in rows for each in found
+    ]
 
 
 def kept(module, name, seed, finding):

@@ -1,11 +1,11 @@
-"""Is the pose gradient of one frame right? Central differences with common random numbers are the judge, with
-their own noise known.
+"""Is the pose gradient of one frame right? Central differences with common random numbers are the
+judge, with their own noise known.
 
-The loss is a smooth weighting of the frame. A difference over a step is the mean of the derivative along it,
-whatever kinks lie on the way (an edge that passes from one row of pixels to the next, a thing that comes into
-view): the gradient that is judged is averaged over poses along the same step. What is left is noise of sampling,
-and both sides tell their standard error over seeds. More samples and seeds are taken until that is small enough,
-or the last round is done.
+The loss is a smooth weighting of the frame. A difference over a step is the mean of the derivative
+along it, whatever kinks lie on the way (an edge that passes from one row of pixels to the next, a
+thing that comes into view): the gradient that is judged is averaged over poses along the same step.
+What is left is noise of sampling, and both sides tell their standard error over seeds. More samples
+and seeds are taken until that is small enough, or the last round is done.
 """
 
 import time
@@ -32,10 +32,11 @@ Verdict = Literal["right", "near", "wrong", "noisy", "doubtful", "refused", "emp
 
 @dataclass(frozen=True)
 class Effort:
-    """samples: per pixel of the differences; the gradient takes a quarter of them at each of so many poses along
-    every step. per_px: samples per pixel length of curve. seeds: of either side, more in every round for the side
-    that needs them. directions: random ones that stand for the six components, 0 for the six themselves; enough: noise
-    at which no more samples are taken of what is right."""
+    """samples: per pixel of the differences; the gradient takes a quarter of them at each of so
+    many poses along every step. per_px: samples per pixel length of curve. seeds: of either side,
+    more in every round for the side that needs them. directions: random ones that stand for the six
+    components, 0 for the six themselves; enough: noise at which no more samples are taken of what
+    is right."""
 
     samples: int = 256
     poses: int = 4
@@ -50,8 +51,8 @@ USUAL = Effort()
 
 @dataclass(frozen=True)
 class Case:
-    """A scene before a camera at T_world_cam [4, 4] or on its way [T, 4, 4]; nearest_m: how near the nearest thing in
-    view is."""
+    """A scene before a camera at T_world_cam [4, 4] or on its way [T, 4, 4]; nearest_m: how near
+    the nearest thing in view is."""
 
     scene: Any
     optics: Any
@@ -63,14 +64,18 @@ class Case:
 
     def camera(self, samples: int, seed: int) -> render.Camera:
         """The camera with so many samples per pixel."""
-        return render.Camera(self.optics, self.width_px, self.width_px, self.pitch_mm, samples, seed)
+        return render.Camera(
+            self.optics, self.width_px, self.width_px, self.pitch_mm, samples, seed
+        )
 
     @property
     def weight(self) -> Tensor:
         """What the pixels of every frame count in the loss: [T, H, W], smooth and random."""
         generator = torch.Generator().manual_seed(self.seed)
         coarse = torch.randn(len(self.path), 1, COARSE, COARSE, generator=generator)
-        return torch.nn.functional.interpolate(coarse, size=(self.width_px,) * 2, mode="bicubic")[:, 0]
+        return torch.nn.functional.interpolate(coarse, size=(self.width_px,) * 2, mode="bicubic")[
+            :, 0
+        ]
 
     @property
     def path(self) -> Tensor:
@@ -78,8 +83,8 @@ class Case:
         return self.T_world_cam.double().reshape(-1, 4, 4)
 
     def steps(self, directions: int = 0) -> Tensor:
-        """Twists [k, 6], metres and radians: STEP_PX of motion on the film each, to either side; of the six components,
-        or in so many random directions."""
+        """Twists [k, 6], metres and radians: STEP_PX of motion on the film each, to either side; of
+        the six components, or in so many random directions."""
         turn = STEP_PX * self.camera(1, 0).slope_per_px()
         size = torch.tensor([turn * self.nearest_m] * 3 + [turn] * 3, dtype=torch.float64)
         if not directions:
@@ -91,9 +96,10 @@ class Case:
 
 @dataclass(frozen=True)
 class Judged:
-    """What was found about one case. error: relative L2 over the k steps, each component in units of its own;
-    noise: of both sides together, noise_of_gradient: of what is judged; interior: error where silhouettes are left
-    out; truth, found: [k]; seeds: of differences and of the gradient."""
+    """What was found about one case. error: relative L2 over the k steps, each component in units
+    of its own;
+    noise: of both sides together, noise_of_gradient: of what is judged; interior: error where
+    silhouettes are left out; truth, found: [k]; seeds: of differences and of the gradient."""
 
     verdict: Verdict
     error: float | None = None
@@ -112,7 +118,8 @@ class Judged:
 
 
 def optics_of(kind: str, scale: float = 1.0, focus_m: float = 2.0) -> Any:
-    """One of LENSES of 11 mm times ``scale``, at f/5 where it has an aperture, focused at a distance."""
+    """One of LENSES of 11 mm times ``scale``, at f/5 where it has an aperture, focused at a
+    distance."""
     if kind == "pinhole":
         return lens.Pinhole(11.0 * scale)
     if kind == "thin":
@@ -121,9 +128,10 @@ def optics_of(kind: str, scale: float = 1.0, focus_m: float = 2.0) -> Any:
 
 
 def judge(case: Case, way: Way = "boundary", effort: Effort = USUAL) -> Judged:
-    """The verdict on one way to the pose gradient: right within RIGHT + 2 x noise, wrong beyond WRONG +
-    noise, near between the two, noisy where that of the gradient stays above HIGHEST, doubtful where that of
-    the differences does, refused with the sentence, empty where nothing in view changes."""
+    """The verdict on one way to the pose gradient: right within RIGHT + 2 x noise, wrong beyond
+    WRONG + noise, near between the two, noisy where that of the gradient stays above HIGHEST,
+    doubtful where that of the differences does, refused with the sentence, empty where nothing in
+    view changes."""
     began = time.process_time()
     plain = gradient(case, effort, 0, "interior")
     truth = torch.zeros(0, len(plain), dtype=torch.float64)
@@ -147,8 +155,8 @@ def judge(case: Case, way: Way = "boundary", effort: Effort = USUAL) -> Judged:
 
 
 def compared(truth: Tensor, got: Tensor, plain: Tensor, cpu_s: float = 0.0) -> Judged:
-    """Judged out of differences [seeds, k], the gradient [seeds, k] and the interior one [k], all in units of the
-    steps."""
+    """Judged out of differences [seeds, k], the gradient [seeds, k] and the interior one [k], all
+    in units of the steps."""
     if float(truth.abs().max()) < 1e-9 and float(got.abs().max()) < 1e-9:
         return Judged("empty", cpu_s=cpu_s)
     mean = truth.mean(0)
@@ -174,7 +182,8 @@ def _spread(estimates):
 
 
 def _share(estimates, truth):
-    """Standard error of the mean of estimates [seeds, k] over the size of the truth's; infinite without any."""
+    """Standard error of the mean of estimates [seeds, k] over the size of the truth's; infinite
+    without any."""
     if not len(estimates) or not len(truth):
         return float("inf")
     return float(_spread(estimates).norm() / truth.mean(0).norm().clamp_min(1e-30))
@@ -202,8 +211,8 @@ def differences(case: Case, effort: Effort, seed: int) -> Tensor:
 
 
 def gradient(case: Case, effort: Effort, seed: int, way: Way) -> Tensor:
-    """The gradient [k] of the loss by one way, in units of the steps: every component is the mean over poses along
-    its own step, one in each of ``effort.poses`` equal parts."""
+    """The gradient [k] of the loss by one way, in units of the steps: every component is the mean
+    over poses along its own step, one in each of ``effort.poses`` equal parts."""
     generator = torch.Generator().manual_seed(seed)
     steps = case.steps(effort.directions)
     at = torch.rand(len(steps), effort.poses, generator=generator, dtype=torch.float64)
@@ -217,12 +226,15 @@ def gradient(case: Case, effort: Effort, seed: int, way: Way) -> Tensor:
         gradient=way,
         per_px=effort.per_px,
     )
-    (found,) = torch.autograd.grad((frames.double() * case.weight).sum() / case.weight.numel(), twist)
+    (found,) = torch.autograd.grad(
+        (frames.double() * case.weight).sum() / case.weight.numel(), twist
+    )
     return (found.reshape(-1, effort.poses, 6).mean(1) * steps).sum(1)
 
 
 def nearest_m(scene: Any, optics: Any, path: Tensor, pitch_mm: float, width_px: int) -> float:
-    """Distance of the nearest thing that the chief rays of the film meet on the way [T, 4, 4], 1 where they meet none."""
+    """Distance of the nearest thing that the chief rays of the film meet on the way [T, 4, 4], 1
+    where they meet none."""
     camera = render.Camera(optics, 4 * width_px, 4 * width_px, pitch_mm / 4, 1)
     rays = camera.rays()
     poses = views_of(scene, path).cameras

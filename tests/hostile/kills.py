@@ -1,6 +1,7 @@
 """Long studies killed at random moments, resumed, and compared with the run that nobody killed.
 
-A full disk is RLIMIT_FSIZE set on the running process, as root or not: from then on every write beyond it fails.
+A full disk is RLIMIT_FSIZE set on the running process, as root or not: from then on every write
+beyond it fails.
 """
 
 import contextlib
@@ -34,13 +35,20 @@ STUDIES = {
     "phase_plate": "--quick",
     "lens_opt": "--quick --after-steps 1 --cases 1 --scored 1 --spot-steps 1 --steps 2 --judged 2 --samples 4",
 }
-KINDS = {"SIGKILL": signal.SIGKILL, "SIGTERM": signal.SIGTERM, "SIGINT": signal.SIGINT, "full_disk": 0}
-# Python itself ends by SIGINT, after our sentence, where KeyboardInterrupt came from within exec of a text, as
-# dataclasses use
+KINDS = {
+    "SIGKILL": signal.SIGKILL,
+    "SIGTERM": signal.SIGTERM,
+    "SIGINT": signal.SIGINT,
+    "full_disk": 0,
+}
+# Python itself ends by SIGINT, after our sentence, where KeyboardInterrupt came from within exec of
+# a text, as dataclasses use
 ENDS = {"SIGKILL": {-9}, "SIGTERM": {143, -2}, "SIGINT": {130, -2}, "full_disk": {2}}
 KILLS = 3  # of one run, at most
 LONGEST_S = 400.0
-IGNORED = re.compile(r"(^|_)(seconds|minutes|hours|s|ms|mib|gib|mb|date)(_|$)|per_second|versions|hardware")
+IGNORED = re.compile(
+    r"(^|_)(seconds|minutes|hours|s|ms|mib|gib|mb|date)(_|$)|per_second|versions|hardware"
+)
 
 
 def _started(arguments):
@@ -59,7 +67,9 @@ def _started(arguments):
 
 def _kept(folder):
     return folder.is_dir() and any(
-        path.is_file() and path.name not in ("config.json", ".lock") and not UNFINISHED.fullmatch(path.name)
+        path.is_file()
+        and path.name not in ("config.json", ".lock")
+        and not UNFINISHED.fullmatch(path.name)
         for path in folder.rglob("*")
     )
 
@@ -82,7 +92,9 @@ def _numbers(folder):
 def _whole(study, folder, seed):
     """(numbers, seconds until something is kept, seconds in all) of a run that nobody kills."""
     began = time.monotonic()
-    process = _started([f"studies.{study}", *STUDIES[study].split(), f"--seed={seed}", "--out", str(folder)])
+    process = _started(
+        [f"studies.{study}", *STUDIES[study].split(), f"--seed={seed}", "--out", str(folder)]
+    )
     while process.poll() is None and not _kept(folder):
         time.sleep(0.02)
     first_s = time.monotonic() - began
@@ -108,8 +120,11 @@ def _kill(process, kind, order):
         process.send_signal(KINDS[kind])
 
 
-def measure(count: int, seed: int, say=print, studies=tuple(STUDIES)) -> tuple[dict[str, float], list[str]]:
-    """Kill until ``count`` kills hit. A kill that comes after the end, or before anything was kept, is no hit."""
+def measure(
+    count: int, seed: int, say=print, studies=tuple(STUDIES)
+) -> tuple[dict[str, float], list[str]]:
+    """Kill until ``count`` kills hit. A kill that comes after the end, or before anything was kept,
+    is no hit."""
     order = random.Random(seed)
     hits: Counter[str] = Counter()
     hit_studies = set()
@@ -126,7 +141,13 @@ def measure(count: int, seed: int, say=print, studies=tuple(STUDIES)) -> tuple[d
                 say(f"{study}: first kept after {whole[study][1]:.1f} s of {whole[study][2]:.1f} s")
             expected, first_s, all_s = whole[study]
             folder = Path(place) / f"{study}-{number}"
-            arguments = [f"studies.{study}", *STUDIES[study].split(), f"--seed={seed}", "--out", str(folder)]
+            arguments = [
+                f"studies.{study}",
+                *STUDIES[study].split(),
+                f"--seed={seed}",
+                "--out",
+                str(folder),
+            ]
             story = []
             code = None
             for _ in range(order.randint(1, KILLS)):
@@ -165,11 +186,15 @@ def measure(count: int, seed: int, say=print, studies=tuple(STUDIES)) -> tuple[d
             if code != 0:
                 findings.append(f"{study}, {', '.join(story)}: resuming ends with {code}: {said}")
             elif different or left:
-                pairs = [f"{name} {found.get(name)} for {expected.get(name)}" for name in different[:3]]
+                pairs = [
+                    f"{name} {found.get(name)} for {expected.get(name)}" for name in different[:3]
+                ]
                 findings.append(
                     f"{study}, {', '.join(story)}: {len(different)} differ: {pairs}; left: {left}"
                 )
-            say(f"{study}, {', '.join(story)}: {'equal' if not different and not left else findings[-1]}")
+            say(
+                f"{study}, {', '.join(story)}: {'equal' if not different and not left else findings[-1]}"
+            )
     figures = {f"kill_hits_{kind}": hits[kind] for kind in KINDS}
     figures |= {"kills": kills, "kill_hits": sum(hits.values()), "kill_studies": len(hit_studies)}
     return figures | {"killed_runs": compared, "killed_runs_equal": equal}, findings

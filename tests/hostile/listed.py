@@ -1,5 +1,5 @@
-"""Worlds in which gradients at silhouettes once were wrong without a word: each judged, or refused where its shapes
-pass through each other. Shown by ``python -m tests.hostile listed``."""
+"""Worlds in which gradients at silhouettes once were wrong without a word: each judged, or refused
+where its shapes pass through each other. Shown by ``python -m tests.hostile listed``."""
 
 from collections.abc import Callable
 
@@ -53,7 +53,9 @@ def measure(
             figures[f"{label}_refused"] = 1.0
         else:
             figures |= {f"{label}_error": found.error or 0.0, f"{label}_noise": found.noise or 0.0}
-        say(f"{label}: {found.verdict}, error {found.error}, noise {found.noise}, interior {found.interior}")
+        say(
+            f"{label}: {found.verdict}, error {found.error}, noise {found.noise}, interior {found.interior}"
+        )
         if not passes(label.rsplit("_", 1)[0], found):
             findings.append(f"{label}: {found.verdict} {found.error or 0.0:.1%} {found.sentence}")
     return figures, findings
@@ -71,7 +73,8 @@ def passes(name: str, found: Judged) -> bool:
 
 
 def auto_after_wall(effort: Effort = USUAL) -> Judged:
-    """gradient="auto" before the boxes, with a scene that was asked first where it shows nothing but its wall."""
+    """gradient="auto" before the boxes, with a scene that was asked first where it shows nothing
+    but its wall."""
     scene = silhouettes.build("cubes")
     boxes = pose.look_at((0.05, -1.2, 1.0), (0.0, 1.0, 0.7))
     wall = pose.look_at((0.0, 0.0, 2.4), (0.0, 2.5, 2.4)) @ pose.se3_exp(

@@ -1,5 +1,6 @@
-"""Mutants of a file: bytes, words, and what stands inside (members of a zip, chunks of a PNG, headers of NumPy), put
-back with the checksums right, so that readers are reached behind the first check."""
+"""Mutants of a file: bytes, words, and what stands inside (members of a zip, chunks of a PNG,
+headers of NumPy), put back with the checksums right, so that readers are reached behind the first
+check."""
 
 import io
 import re
@@ -75,7 +76,9 @@ def changed_bytes(content, dice):
         length = int(dice.choice((1, 2, 4, 8, 16, 64)))
         match int(dice.integers(8)):
             case 0:
-                data[at : at + 1] = bytes([(data[at : at + 1] or b"\0")[0] ^ 1 << int(dice.integers(8))])
+                data[at : at + 1] = bytes(
+                    [(data[at : at + 1] or b"\0")[0] ^ 1 << int(dice.integers(8))]
+                )
             case 1:
                 data = data[:at]
             case 2:
@@ -184,5 +187,10 @@ def _png(content, dice):
                 data = zlib.compress(changed_bytes(zlib.decompress(data), dice))
             else:
                 data = changed_bytes(data, dice)
-        made += [struct.pack(">I", len(data)), name, data, struct.pack(">I", zlib.crc32(name + data))]
+        made += [
+            struct.pack(">I", len(data)),
+            name,
+            data,
+            struct.pack(">I", zlib.crc32(name + data)),
+        ]
     return b"".join(made)

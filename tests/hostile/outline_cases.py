@@ -1,5 +1,6 @@
-"""Worlds in which gradients at silhouettes once were wrong without a word, one by one: each a scene and where the
-camera stands. Radiances are constant or smooth, so that the silhouettes are what is tested."""
+"""Worlds in which gradients at silhouettes once were wrong without a word, one by one: each a scene
+and where the camera stands. Radiances are constant or smooth, so that the silhouettes are what is
+tested."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,9 +21,9 @@ RADIUS_M = 0.01  # of the cylinders that are seen from afar
 
 @dataclass(frozen=True)
 class World:
-    """scene: what is seen. T_world_cam: [4, 4]. nearest_m: how far away its things are. focus_m, lens_scale: of a
-    lens with an aperture; over one of 11 mm at f/5. narrow: how much less than the usual field the film takes
-    in."""
+    """scene: what is seen. T_world_cam: [4, 4]. nearest_m: how far away its things are. focus_m,
+    lens_scale: of a lens with an aperture; over one of 11 mm at f/5. narrow: how much less than the
+    usual field the film takes in."""
 
     scene: MitsubaScene | MovingScene
     T_world_cam: Tensor
@@ -34,7 +35,8 @@ class World:
 
 
 def frame(axis, centre=(0, 0, 0), turn=0.0):
-    """A rigid motion [4, 4] that takes z to ``axis`` and the origin to ``centre``, after a turn about z."""
+    """A rigid motion [4, 4] that takes z to ``axis`` and the origin to ``centre``, after a turn
+    about z."""
     axis = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
     u = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     u /= np.linalg.norm(u)
@@ -58,7 +60,9 @@ def icosphere(level):
         ends, which = np.unique(edges, axis=0, return_inverse=True)
         middle = vertices[ends].mean(1)
         ab, bc, ca = len(vertices) + which.reshape(3, -1)
-        vertices = np.concatenate([vertices, middle / np.linalg.norm(middle, axis=1, keepdims=True)])
+        vertices = np.concatenate(
+            [vertices, middle / np.linalg.norm(middle, axis=1, keepdims=True)]
+        )
         a, b, c = faces.T
         faces = np.concatenate(
             [np.stack(t, 1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
@@ -100,8 +104,8 @@ def poles() -> World:
 
 
 def far_pole(ratio: float) -> World:
-    """A cylinder seen from ``ratio`` times its radius, its ends out of view, through a film that is narrower where
-    it is further."""
+    """A cylinder seen from ``ratio`` times its radius, its ends out of view, through a film that is
+    narrower where it is further."""
     distance = ratio * RADIUS_M
     half = 0.5 * distance
     low, high = [-0.17 * half, distance, -half], [0.17 * half, distance, half]
@@ -109,7 +113,12 @@ def far_pole(ratio: float) -> World:
     shapes = {"wall": _wall(1.5 * distance, 40), "pole": pole}
     narrow = min(1.0, 20.0 / ratio)
     return World(
-        MitsubaScene(shapes), _ahead(), distance, focus_m=distance, narrow=narrow, kinds=("pinhole",)
+        MitsubaScene(shapes),
+        _ahead(),
+        distance,
+        focus_m=distance,
+        narrow=narrow,
+        kinds=("pinhole",),
     )
 
 
@@ -149,7 +158,9 @@ def sphere_in_floor() -> World:
 
 def cylinder_in_floor() -> World:
     """A leaning cylinder that passes through a floor."""
-    return _in_floor(_shape("cylinder", 200, p0=[-0.05, 1.2, -0.5], p1=[0.15, 1.3, 0.15], radius=0.08))
+    return _in_floor(
+        _shape("cylinder", 200, p0=[-0.05, 1.2, -0.5], p1=[0.15, 1.3, 0.15], radius=0.08)
+    )
 
 
 def crossing_mesh() -> World:
@@ -166,12 +177,14 @@ def defocus() -> World:
     """A card just beside the film's border, whose blur reaches far into it."""
     place = _placed(frame([0.0, -1.0, 0.0], (0.155, 0.4, 0.02), 0.1) @ np.diag([0.1, 0.1, 1, 1]))
     world = MitsubaScene({"wall": _wall(8.0, 60), "card": _shape("rectangle", 220, to_world=place)})
-    return World(world, _ahead(), 0.4, focus_m=8.0, lens_scale=15.0, narrow=0.3, kinds=("thin", "traced"))
+    return World(
+        world, _ahead(), 0.4, focus_m=8.0, lens_scale=15.0, narrow=0.3, kinds=("thin", "traced")
+    )
 
 
 def ball_ahead() -> World:
-    """A ball cut by the film's border, straight along a diagonal of the axes: where its outline begins must not depend on
-    the point of the pupil it is seen from."""
+    """A ball cut by the film's border, straight along a diagonal of the axes: where its outline
+    begins must not depend on the point of the pupil it is seen from."""
     ball = _shape("sphere", 200, center=[0.2, 1.5, 0.2], radius=0.3)
     world = MitsubaScene({"wall": _wall(3.0, 60), "ball": ball})
     ahead = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
@@ -179,9 +192,12 @@ def ball_ahead() -> World:
 
 
 def robot_body() -> World:
-    """A robot in the room with two boxes, with its own deck and mast before the camera that stands on it: motions of
-    the camera are those of its mount, under which both the room and the robot move in the picture."""
-    T_world_robot = pose.se3_exp(torch.tensor([[0.05, -1.2, 1.0, 0.0, 0.0, 0.1]], dtype=torch.float64))
+    """A robot in the room with two boxes, with its own deck and mast before the camera that stands
+    on it: motions of the camera are those of its mount, under which both the room and the robot
+    move in the picture."""
+    T_world_robot = pose.se3_exp(
+        torch.tensor([[0.05, -1.2, 1.0, 0.0, 0.0, 0.1]], dtype=torch.float64)
+    )
     T_robot_cam = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, -0.15))
     world = MovingScene(silhouettes.room(), {"robot": (silhouettes.robot(), T_world_robot)})
     return World(world, T_world_robot[0] @ T_robot_cam, 0.4)
@@ -189,7 +205,10 @@ def robot_body() -> World:
 
 CASES: dict[str, Callable[[], World]] = {
     "poles": poles,
-    **{f"far_pole_{ratio}": (lambda ratio=ratio: far_pole(ratio)) for ratio in (20, 100, 250, 500, 600)},
+    **{
+        f"far_pole_{ratio}": (lambda ratio=ratio: far_pole(ratio))
+        for ratio in (20, 100, 250, 500, 600)
+    },
     "facets": facets,
     "t_junction": t_junction,
     "sphere_in_floor": sphere_in_floor,

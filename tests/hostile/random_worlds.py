@@ -1,8 +1,9 @@
-"""Random worlds by number, for gradients at silhouettes: things that stick in each other, lie in each other, are small and
-far, mirrored, or move, before sequences of views.
+"""Random worlds by number, for gradients at silhouettes: things that stick in each other, lie in
+each other, are small and far, mirrored, or move, before sequences of views.
 
-Everything is drawn in the axes of the first camera, where the film says how large things are, and nothing is asked of the
-renderer. Only things that move keep clear of the others: those that stick in each other are refused, as the docs say.
+Everything is drawn in the axes of the first camera, where the film says how large things are, and
+nothing is asked of the renderer. Only things that move keep clear of the others: those that stick
+in each other are refused, as the docs say.
 """
 
 from dataclasses import dataclass, field
@@ -31,8 +32,10 @@ NEIGHBOURS = ("apart", "stuck", "nested")
 
 @dataclass(frozen=True)
 class Draw:
-    """A random world before a camera on its way. T_world_cam: [FRAMES, 4, 4]; half_slope: of the film's border. lens_scale:
-    size of the lens over one of 11 mm; focus_m: distance in focus. facts: what was drawn, in plain values."""
+    """A random world before a camera on its way. T_world_cam: [FRAMES, 4, 4]; half_slope: of the
+    film's border. lens_scale:
+    size of the lens over one of 11 mm; focus_m: distance in focus. facts: what was drawn, in plain
+    values."""
 
     seed: int
     scene: MitsubaScene | MovingScene
@@ -49,7 +52,9 @@ def draw(seed: int) -> Draw:
     half = _between(rng, 0.02, WIDEST)
     depth = _between(rng, 0.5, 100)
     background = str(rng.choice(BACKGROUNDS, p=(0.4, 0.25, 0.25, 0.1)))
-    T_world_first = _rigid(Rotation.random(random_state=rng), rng.standard_normal(3) * _between(rng, 0.1, 30))
+    T_world_first = _rigid(
+        Rotation.random(random_state=rng), rng.standard_normal(3) * _between(rng, 0.1, 30)
+    )
     world = _World(rng, T_world_first, half, depth)
     world.add_background(background)
     for _ in range(int(rng.integers(1, 4))):
@@ -61,15 +66,23 @@ def draw(seed: int) -> Draw:
     if moving:
         scene = MovingScene(scene, moving)
     # a walk of some pixels a frame
-    turns = 2 * half / WIDTH_PX * _between(rng, 0.3, 6) * np.cumsum(rng.standard_normal((FRAMES, 3)), 0)
+    turns = (
+        2 * half / WIDTH_PX * _between(rng, 0.3, 6) * np.cumsum(rng.standard_normal((FRAMES, 3)), 0)
+    )
     ways = (
-        2 * half / WIDTH_PX * depth * _between(rng, 0.3, 3) * np.cumsum(rng.standard_normal((FRAMES, 3)), 0)
+        2
+        * half
+        / WIDTH_PX
+        * depth
+        * _between(rng, 0.3, 3)
+        * np.cumsum(rng.standard_normal((FRAMES, 3)), 0)
     )
     path = [
         T_world_first @ _rigid(Rotation.from_rotvec(t - turns[0]), w - ways[0])
         for t, w in zip(turns, ways, strict=True)
     ]
-    # the pupil, 2.2 mm times the scale, blurs what lies twice as far away as the focus by two pixels at most
+    # the pupil, 2.2 mm times the scale, blurs what lies twice as far away as the focus by two
+    # pixels at most
     scale = min(_between(rng, 1, 10), 8 * half / WIDTH_PX * depth / 2.2e-3)
     focus_m = max(depth * _between(rng, 0.5, 3), 0.03 * scale)
     facts = {
@@ -79,7 +92,9 @@ def draw(seed: int) -> Draw:
         "moving": len(moving),
         "things": world.told,
     }
-    return Draw(seed, scene, torch.as_tensor(np.stack(path)), half, max(scale, 0.05), focus_m, facts)
+    return Draw(
+        seed, scene, torch.as_tensor(np.stack(path)), half, max(scale, 0.05), focus_m, facts
+    )
 
 
 def _between(rng, low, high):
@@ -94,7 +109,8 @@ def _rigid(rotation, place):
 
 
 class _World:
-    """Things so far: shapes by name, and balls around them (middle, radius) in the axes of the first camera."""
+    """Things so far: shapes by name, and balls around them (middle, radius) in the axes of the
+    first camera."""
 
     def __init__(self, rng, T_world_first, half, depth):
         self.rng, self.T_world_first, self.half, self.depth = rng, T_world_first, half, depth
@@ -111,13 +127,17 @@ class _World:
             self.shapes["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": level}}
         if kind == "wall":
             self.furthest = self.depth * _between(rng, 1.3, 5)
-            lean = Rotation.from_rotvec([np.pi, 0, 0]) * Rotation.from_rotvec(rng.uniform(-0.3, 0.3, 3))
+            lean = Rotation.from_rotvec([np.pi, 0, 0]) * Rotation.from_rotvec(
+                rng.uniform(-0.3, 0.3, 3)
+            )
             placed = _rigid(lean, [0, 0, self.furthest]) @ np.diag([3 * self.furthest] * 2 + [1, 1])
             self.add("wall", "card", placed, 20)
         if kind == "room":
             self.furthest = self.depth * _between(rng, 2, 4)
             size = np.array([1.1, 1.2, 1.3]) * self.furthest
-            inside = _rigid(Rotation.from_rotvec(rng.uniform(-0.5, 0.5, 3)), [0, 0, 0]) @ np.diag([*size, 1])
+            inside = _rigid(Rotation.from_rotvec(rng.uniform(-0.5, 0.5, 3)), [0, 0, 0]) @ np.diag(
+                [*size, 1]
+            )
             self.add("room", "cube", inside, 20, flip_normals=True)
 
     def add_cluster(self):
@@ -130,7 +150,11 @@ class _World:
             centre, size = self.somewhere(px)
             if first is not None and how != "apart":
                 away = rng.standard_normal(3)
-                away *= first[1] * (rng.uniform(0.5, 1.1) if how == "stuck" else 0.3) / np.linalg.norm(away)
+                away *= (
+                    first[1]
+                    * (rng.uniform(0.5, 1.1) if how == "stuck" else 0.3)
+                    / np.linalg.norm(away)
+                )
                 centre = first[0] + away
                 size = first[1] * rng.uniform(0.1, 0.6) if how == "nested" else size
             if np.linalg.norm(centre) < 1.5 * size or centre[2] < 0.1 * self.depth:
@@ -166,7 +190,8 @@ class _World:
             way = np.cumsum(rng.standard_normal((FRAMES, 3)), 0) * size * 0.5
             reach = size + np.linalg.norm(way - way[0], axis=1).max()
             clear = all(
-                np.linalg.norm(centre - c) > reach + r for c, r in [*self.balls, (np.zeros(3), 0.1 * size)]
+                np.linalg.norm(centre - c) > reach + r
+                for c, r in [*self.balls, (np.zeros(3), 0.1 * size)]
             )
             if clear and centre[2] + reach < 0.6 * self.furthest:
                 break
@@ -181,7 +206,8 @@ class _World:
         ahead = _rigid(Rotation.identity(), [0, 0, -np.linalg.norm(centre)])
         turn = [Rotation.from_rotvec(0.2 * k * rng.standard_normal(3)) for k in range(FRAMES)]
         poses = [
-            T_world_first @ _rigid(t, centre + w - way[0]) @ ahead for t, w in zip(turn, way, strict=True)
+            T_world_first @ _rigid(t, centre + w - way[0]) @ ahead
+            for t, w in zip(turn, way, strict=True)
         ]
         moving[name] = (MitsubaScene(own, merge=False), torch.as_tensor(np.stack(poses)))
 
@@ -193,7 +219,9 @@ class _World:
         slim = max(0.03, float(np.linalg.norm(placed[:3, 3])) / ROUNDEST / size)
         placed = self.T_world_first @ placed
         unit = np.eye(4)
-        plugin = {"ball": "sphere", "cube": "cube", "disc": "disk", "card": "rectangle"}.get(kind, "cylinder")
+        plugin = {"ball": "sphere", "cube": "cube", "disc": "disk", "card": "rectangle"}.get(
+            kind, "cylinder"
+        )
         if kind == "cube" and name != "room":
             sides = rng.uniform(0.2, 1, 3)
             unit[:3, :3] = np.diag(sides / np.linalg.norm(sides))
@@ -207,7 +235,8 @@ class _World:
             if kind == "can":
                 for end, sign in (("low", -1), ("high", 1)):
                     lid = _rigid(
-                        Rotation.from_rotvec([np.pi if sign < 0 else 0, 0, 0]), [0, 0, sign * np.cos(angle)]
+                        Rotation.from_rotvec([np.pi if sign < 0 else 0, 0, 0]),
+                        [0, 0, sign * np.cos(angle)],
                     )
                     lid = placed @ lid @ np.diag([np.sin(angle), np.sin(angle), 1, 1])
                     self.shapes[f"{name} {end}"] = self._plain("disk", lid, px)
@@ -218,7 +247,9 @@ class _World:
                 faces = faces[:, ::-1]
             by_face = rng.random() < 0.5
             light = (
-                rng.uniform(20, 240) * rng.uniform(0.4, 1, len(faces)) if by_face else self._light(px, False)
+                rng.uniform(20, 240) * rng.uniform(0.4, 1, len(faces))
+                if by_face
+                else self._light(px, False)
             )
             self.shapes[name] = emissive_mesh(mi, vertices, faces, light)
             return
@@ -234,12 +265,15 @@ class _World:
     def _light(self, px, textured):
         """One radiance, or a picture without detail below some pixels."""
         rng = self.rng
-        radiance: Any = {"type": "rgb", "value": 0.0 if rng.random() < 0.1 else float(rng.uniform(5, 240))}
+        radiance: Any = {
+            "type": "rgb",
+            "value": 0.0 if rng.random() < 0.1 else float(rng.uniform(5, 240)),
+        }
         if textured and px > 6 and rng.random() < 0.4:
             coarse = torch.as_tensor(rng.uniform(20, 220, (1, 1, 4, 4)))
-            fine = torch.nn.functional.interpolate(coarse, size=(64, 64), mode="bicubic", align_corners=True)[
-                0, 0
-            ]
+            fine = torch.nn.functional.interpolate(
+                coarse, size=(64, 64), mode="bicubic", align_corners=True
+            )[0, 0]
             picture = self.mi.Bitmap(fine.clamp(5, 250).float().numpy()[..., None])
             radiance = {"type": "bitmap", "bitmap": picture, "raw": True, "wrap_mode": "mirror"}
         return {"type": "area", "radiance": radiance}
@@ -256,7 +290,9 @@ def _fine(rng):
     k = np.arange(int(rng.integers(40, 400))) + 0.5
     z = 1 - 2 * k / len(k)
     turn = np.pi * (1 + 5**0.5) * k
-    return convex(np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], 1))
+    return convex(
+        np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], 1)
+    )
 
 
 def _bowl(rng):
@@ -275,7 +311,9 @@ def convex(corners):
 def _grid(rows, columns, around_rows, around_columns):
     """Faces of a grid of vertices, closed where it says so."""
     i, j = np.meshgrid(
-        np.arange(rows - (not around_rows)), np.arange(columns - (not around_columns)), indexing="ij"
+        np.arange(rows - (not around_rows)),
+        np.arange(columns - (not around_columns)),
+        indexing="ij",
     )
     a, b, c, d = (
         ((i + p) % rows * columns + (j + q) % columns).reshape(-1)
@@ -288,7 +326,9 @@ def _ring(rng):
     u, v = np.meshgrid(2 * np.pi * np.arange(18) / 18, 2 * np.pi * np.arange(9) / 9, indexing="ij")
     thick = rng.uniform(0.15, 0.45)
     reach = 1 - thick + thick * np.cos(v)
-    vertices = np.stack([reach * np.cos(u), reach * np.sin(u), thick * np.sin(v)], -1).reshape(-1, 3)
+    vertices = np.stack([reach * np.cos(u), reach * np.sin(u), thick * np.sin(v)], -1).reshape(
+        -1, 3
+    )
     return vertices, _grid(18, 9, True, True)
 
 

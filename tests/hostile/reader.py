@@ -1,7 +1,8 @@
 """The process that reads mutants: ``python -m tests.hostile.reader MODULE NAME SEED FIRST COUNT``.
 
-It says on stdout, a line of JSON each, which mutant comes next and what was found. A mutant may take ten seconds of
-the processor and a gigabyte; it ends in one sentence of ours, or in a value that has a meaning.
+It says on stdout, a line of JSON each, which mutant comes next and what was found. A mutant may
+take ten seconds of the processor and a gigabyte; it ends in one sentence of ours, or in a value
+that has a meaning.
 """
 
 import dataclasses
@@ -46,12 +47,14 @@ def limit():
 
 
 def late(*_):
-    """What the timer of the processor calls: a busy machine is no reader's doing. The parent ends what waits."""
+    """What the timer of the processor calls: a busy machine is no reader's doing. The parent ends
+    what waits."""
     raise Slow
 
 
 def meaningless(value, depth=0):
-    """What is wrong with a value that was read, or "": numbers are finite, events an ordered stream of a sensor."""
+    """What is wrong with a value that was read, or "": numbers are finite, events an ordered stream
+    of a sensor."""
     if isinstance(value, EventStream):
         from codesign.events.stream import check_stream
 
@@ -59,7 +62,11 @@ def meaningless(value, depth=0):
             check_stream(value)
         except CodesignError as error:
             return str(error)
-        return "" if max(value.height_px, value.width_px) <= 2**15 else f"a sensor of {value.height_px} rows"
+        return (
+            ""
+            if max(value.height_px, value.width_px) <= 2**15
+            else f"a sensor of {value.height_px} rows"
+        )
     if isinstance(value, torch.nn.Module):
         value = value.state_dict()
     if isinstance(value, torch.Tensor):
@@ -67,7 +74,9 @@ def meaningless(value, depth=0):
     if isinstance(value, np.ndarray | np.generic | float | complex):
         array = np.asarray(value)
         return (
-            "" if array.dtype.kind not in "fc" or np.isfinite(array).all() else "a number that is not finite"
+            ""
+            if array.dtype.kind not in "fc" or np.isfinite(array).all()
+            else "a number that is not finite"
         )
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = [getattr(value, field.name) for field in dataclasses.fields(value)]
@@ -142,7 +151,8 @@ def main(module, name, seed, first, count):
                 kind, found = judged(path, reader)
                 if kind:
                     print(
-                        json.dumps({"index": index, "name": each, "kind": kind, "found": found}), flush=True
+                        json.dumps({"index": index, "name": each, "kind": kind, "found": found}),
+                        flush=True,
                     )
     print(json.dumps({"done": True}), flush=True)
 

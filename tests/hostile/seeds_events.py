@@ -48,13 +48,23 @@ def dsec(packing=None) -> Callable[[], bytes]:
         import h5py
         import hdf5plugin
 
-        options = {"blosc": dict(hdf5plugin.Blosc(cname="zstd", clevel=1)), "gzip": {"compression": "gzip"}}
+        options = {
+            "blosc": dict(hdf5plugin.Blosc(cname="zstd", clevel=1)),
+            "gzip": {"compression": "gzip"},
+        }
         buffer = io.BytesIO()
         given = stream()
         with h5py.File(buffer, "w") as file:
-            for name, values in (("t", given.t_us), ("x", given.x), ("y", given.y), ("p", given.p > 0)):
+            for name, values in (
+                ("t", given.t_us),
+                ("x", given.x),
+                ("y", given.y),
+                ("p", given.p > 0),
+            ):
                 data = values.numpy().astype(np.uint32)
-                file.create_dataset(f"events/{name}", data=data, chunks=(64,), **options.get(packing, {}))
+                file.create_dataset(
+                    f"events/{name}", data=data, chunks=(64,), **options.get(packing, {})
+                )
             file["t_offset"] = 0
         return buffer.getvalue()
 
@@ -91,7 +101,9 @@ def hdf5(name: str, order: str, seconds: bool) -> Callable[[], bytes]:
 
 def text(order: str, form: str, head: str = "") -> Callable[[], bytes]:
     """Lines of four numbers, as other programs write them."""
-    lines = (form.format(**dict(zip(order, row, strict=True))) for row in rows(order, True).tolist())
+    lines = (
+        form.format(**dict(zip(order, row, strict=True))) for row in rows(order, True).tolist()
+    )
     return (head + "".join(lines)).encode
 
 
@@ -119,7 +131,10 @@ def picture(kind: str, dtype=np.uint8, colour=True, **options) -> Callable[[], b
             import tifffile
 
             tifffile.imwrite(
-                buffer, (pixels * 150).astype(dtype), photometric="rgb" if colour else "minisblack", **options
+                buffer,
+                (pixels * 150).astype(dtype),
+                photometric="rgb" if colour else "minisblack",
+                **options,
             )
         else:
             PIL.Image.fromarray(pixels.astype(dtype)).save(buffer, kind, **options)
@@ -156,7 +171,10 @@ SEEDS: dict[str, Seed] = {
     "v2e.h5": (hdf5("events", "txyp", False), events.read),
     "mvsec.hdf5": (hdf5("davis/left/events", "xytp", True), events.read),
     "ecd.txt": (text("txyp", "{t:.9f} {x:.0f} {y:.0f} {p:.0f}\n"), events.read),
-    "headed.txt": (text("xytp", "{x:.0f},{y:.0f},{t:.6f},{p:.0f}\n", "346 260\nx,y,t_s,p\n"), events.read),
+    "headed.txt": (
+        text("xytp", "{x:.0f},{y:.0f},{t:.6f},{p:.0f}\n", "346 260\nx,y,t_s,p\n"),
+        events.read,
+    ),
     "xytp.csv": (text("xytp", "{x:.0f},{y:.0f},{t:.6f},{p:.0f}\n"), events.read),
     "rows.npy": (arrays(False, only=rows("txyp", True)), events.read),
     "names.npz": (

@@ -35,7 +35,9 @@ def matlab(packed: bool) -> Callable[[], bytes]:
         import scipy.io
 
         buffer = io.BytesIO()
-        scipy.io.savemat(buffer, {"flow": FLOW, "t0": 1.0, "t1": 1.5, "who": "me"}, do_compression=packed)
+        scipy.io.savemat(
+            buffer, {"flow": FLOW, "t0": 1.0, "t1": 1.5, "who": "me"}, do_compression=packed
+        )
         return buffer.getvalue()
 
     return written
@@ -51,7 +53,10 @@ def table() -> bytes:
     y, x = np.mgrid[: SIZE[0], : SIZE[1]]
     buffer = io.StringIO()
     np.savetxt(
-        buffer, np.column_stack([x.ravel(), y.ravel(), *FLOW.reshape(2, -1)]), header="x y u v", fmt="%.6g"
+        buffer,
+        np.column_stack([x.ravel(), y.ravel(), *FLOW.reshape(2, -1)]),
+        header="x y u v",
+        fmt="%.6g",
     )
     return buffer.getvalue().encode()
 

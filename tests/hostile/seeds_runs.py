@@ -28,14 +28,16 @@ def run(folder: Path) -> Run[Config]:
     """A run with a state and a number."""
     begun = open_run("hostile", Config(out=folder / "run", device="cpu"))
     begun.save_state(
-        {"x": torch.arange(3.0), "g": torch.Generator().get_state()}, {"step": 3, "rows": {"a": [1.0]}}
+        {"x": torch.arange(3.0), "g": torch.Generator().get_state()},
+        {"step": 3, "rows": {"a": [1.0]}},
     )
     begun.record(loss=0.5)
     return begun
 
 
 def resumed(path: Path):
-    """The run beside a file that was changed: its configuration, numbers, and what its state names."""
+    """The run beside a file that was changed: its configuration, numbers, and what its state
+    names."""
     if path.name != "config.json" and not (path.parent / "config.json").exists():
         (path.parent / "config.json").write_bytes(made("config.json", run)())
     again = open_run("hostile", Config(resume=path.parent, device="cpu"))
@@ -61,7 +63,9 @@ class Learner:
 
 def training(folder: Path):
     """A checkpoint of three steps."""
-    checkpoint.save(folder, Learner(), Progress(3, 1.0, 2.0, 0.5, 0, 0, [1.0], [1.0], [0.1]), {"seed": 0})  # type: ignore[arg-type]
+    checkpoint.save(
+        folder, Learner(), Progress(3, 1.0, 2.0, 0.5, 0, 0, [1.0], [1.0], [0.1]), {"seed": 0}
+    )  # type: ignore[arg-type]
 
 
 def trained(path: Path):
@@ -77,7 +81,9 @@ def hand_over(folder: Path):
     """A mount with a thin lens and a sensor."""
     mount = Mount((0.2, 0.0, 0.4), (0.1, 0.0, 0.2), yaw_rad=0.3)
     camera = render.Camera(lens.ThinLens(8.0, 2.0).focus_at(1.3), 32, 24, 0.1, 4, falloff=True)
-    save_hand_over(folder / "mount.yaml", HandOver(mount, camera, events.SensorModel(), notes={"by": "me"}))
+    save_hand_over(
+        folder / "mount.yaml", HandOver(mount, camera, events.SensorModel(), notes={"by": "me"})
+    )
 
 
 def handed(path: Path):
@@ -94,7 +100,10 @@ SEEDS: dict[str, Seed] = {
     "state.npz": (made("state.npz", run), resumed),
     "metrics.json": (made("metrics.json", run), resumed),
     "checkpoint.json": (made("checkpoint.json", training), trained),
-    "generator.npz": (made("g.npz", lambda folder: SpikeEsim().save(folder / "g.npz")), SpikeEsim.load),
+    "generator.npz": (
+        made("g.npz", lambda folder: SpikeEsim().save(folder / "g.npz")),
+        SpikeEsim.load,
+    ),
     "mount.yaml": (made("mount.yaml", hand_over), handed),
     "page.yaml": (
         lambda: plain_yaml.dump({"a": {"b": [0.1, 2, "x"], "c": None}, "d": True}).encode(),

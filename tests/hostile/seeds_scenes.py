@@ -1,4 +1,5 @@
-"""Small whole files of every format that worlds are made of, and who reads each: what mutants are made of."""
+"""Small whole files of every format that worlds are made of, and who reads each: what mutants are
+made of."""
 
 import io
 import struct
@@ -59,11 +60,14 @@ def picture(kind: str) -> Callable[[], bytes]:
 
 
 def hdr() -> bytes:
-    """Radiance RGBE with run lengths of the newer kind: a run and literal bytes in every channel."""
+    """Radiance RGBE with run lengths of the newer kind: a run and literal bytes in every
+    channel."""
     rgbe = np.concatenate([LIGHT, np.full((6, 12, 1), 130, np.uint8)], 2)
     rgbe[:, :5] = 77
     rows = b"".join(
-        b"\x02\x02" + struct.pack(">H", 12) + b"".join(bytes([133, 77, 7, *row[5:, k]]) for k in range(4))
+        b"\x02\x02"
+        + struct.pack(">H", 12)
+        + b"".join(bytes([133, 77, 7, *row[5:, k]]) for k in range(4))
         for row in rgbe
     )
     return b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=1\n\n-Y 6 +X 12\n" + rows
@@ -90,7 +94,9 @@ def mesh(kind: str) -> Callable[[], bytes]:
         if kind != "gltf":
             data = box.export(file_type=kind)
             return data.encode() if isinstance(data, str) else data
-        return trimesh.exchange.gltf.export_gltf(trimesh.Scene(box), embed_buffers=True)["model.gltf"]
+        return trimesh.exchange.gltf.export_gltf(trimesh.Scene(box), embed_buffers=True)[
+            "model.gltf"
+        ]
 
     return made
 
@@ -108,7 +114,10 @@ SEEDS: dict[str, Seed] = {
     "picture.png": (picture("PNG"), textures.photo),
     "picture.tif": (picture("TIFF"), textures.photo),
     "picture.jpg": (picture("JPEG"), textures.photo),
-    **{f"mesh.{kind}": (mesh(kind), mesh_files.read) for kind in ("obj", "ply", "stl", "glb", "gltf", "dae")},
+    **{
+        f"mesh.{kind}": (mesh(kind), mesh_files.read)
+        for kind in ("obj", "ply", "stl", "glb", "gltf", "dae")
+    },
     "robot.urdf": (URDF.encode, robots.from_urdf),
     "scene.xml": (XML.encode, read_scene),
     "robot.yaml": (PAGE.encode, read_own),

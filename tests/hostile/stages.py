@@ -1,4 +1,5 @@
-"""Stages cut, misshapen, hidden and altered at every junction of one small smooth chain, alone and together."""
+"""Stages cut, misshapen, hidden and altered at every junction of one small smooth chain, alone and
+together."""
 
 import functools
 import random
@@ -87,7 +88,9 @@ class Stage(nn.Module):
 def picture(rays=same, poses=same, after=same):
     def render(rays_in, T):
         (a, b, _), T = rays(rays_in.direction)[0], poses(T)
-        wave = (a * X + T[..., 0, 3, None, None] + T[..., 1, 2, None, None] * Y).sin() * rays(rays_in.weight)
+        wave = (a * X + T[..., 0, 3, None, None] + T[..., 1, 2, None, None] * Y).sin() * rays(
+            rays_in.weight
+        )
         return after((100 + 60 * (wave + b * (Y + T[..., 2, 3, None, None]).cos())).float())
 
     return lambda rays, T_world_cam: render(rays, T_world_cam)
@@ -141,12 +144,19 @@ def speed(before=same, **spoilt):
 
 
 def checked(batch=BATCH, only=None, may_cut=(), **parts):
-    """``check`` of the chain with other parts, on a batch of its own; ``only`` variables of one stage."""
-    usual = of(camera=Camera(glass()), mount=held(), render=picture(), events=layer(), flow=network())
-    system = System(**{**usual, "bins": 2, "estimate": speed(), "objectives": {"error": error}, **parts})
+    """``check`` of the chain with other parts, on a batch of its own; ``only`` variables of one
+    stage."""
+    usual = of(
+        camera=Camera(glass()), mount=held(), render=picture(), events=layer(), flow=network()
+    )
+    system = System(
+        **{**usual, "bins": 2, "estimate": speed(), "objectives": {"error": error}, **parts}
+    )
     poses = None if batch.T_world_body is None else batch.T_world_body.clone()
     batch = replace(batch, T_world_body=poses, t_s=batch.t_s.clone())
-    variables = [p for name, p in system.named_parameters() if name.startswith(only)] if only else None
+    variables = (
+        [p for name, p in system.named_parameters() if name.startswith(only)] if only else None
+    )
     return system, check(system, batch, variables, may_cut=may_cut)
 
 
@@ -174,7 +184,10 @@ CUT_AT = {
     "factor": lambda cut: ("estimate.*its own 'gain'", of(estimate=speed(gain=cut))),
 }
 THROUGH = {
-    f"{part}, {own}": lambda cut, part=part, make=make, own=own: (part, {part: make(before=cut, own=own)})
+    f"{part}, {own}": lambda cut, part=part, make=make, own=own: (
+        part,
+        {part: make(before=cut, own=own)},
+    )
     for part, make in (("events", layer), ("flow", network), ("estimate", speed))
     for own in (True, False)
 }
@@ -192,9 +205,18 @@ SHAPES = {
 SHAPED_AT = {
     "frames": lambda change: ("render|frames", of(render=picture(after=change))),
     "counts": lambda change: ("events", of(events=lambda frames: change(counted(frames)))),
-    "volume": lambda change: ("events", of(events=lambda frames: entry("counts", change)(volume_of(frames)))),
-    "flow": lambda change: ("flow", of(flow=lambda volume: entry("flow_px", change)(flow_of(volume)))),
-    "valid": lambda change: ("flow", of(flow=lambda volume: entry("valid", change)(flow_of(volume)))),
+    "volume": lambda change: (
+        "events",
+        of(events=lambda frames: entry("counts", change)(volume_of(frames))),
+    ),
+    "flow": lambda change: (
+        "flow",
+        of(flow=lambda volume: entry("flow_px", change)(flow_of(volume))),
+    ),
+    "valid": lambda change: (
+        "flow",
+        of(flow=lambda volume: entry("valid", change)(flow_of(volume))),
+    ),
     "rays": lambda change: ("camera", of(camera=Camera(glass(), entry("direction", change)))),
     "mount": lambda change: ("mount", of(mount=held(change))),
 }
@@ -205,7 +227,10 @@ IN_PLACE = {
     "by numpy": lambda t: t.detach().numpy().__imul__(1.1),
 }
 TOUCHED_AT = {
-    "frames": lambda touch: ("in place", of(events=lambda frames: (touch(frames), counted(frames))[1])),
+    "frames": lambda touch: (
+        "in place",
+        of(events=lambda frames: (touch(frames), counted(frames))[1]),
+    ),
     "volume": lambda touch: ("in place", of(flow=lambda v: (touch(v.counts), flow_of(v))[1])),
     "field": lambda touch: ("in place", of(estimate=lambda f: (touch(f.flow_px), mean_flow(f))[1])),
 }
@@ -272,11 +297,15 @@ GOOD = {
     "keyword alone": of(flow=lambda *, volume: flow_of(volume)),
     "starred": of(flow=lambda *given: flow_of(given[0])),
     "any keywords": of(flow=lambda volume, **more: flow_of(volume)),
-    "a mask of events": of(flow=lambda volume, frames: field_of(frames.diff(dim=1)[:, :2] * seen(volume))),
+    "a mask of events": of(
+        flow=lambda volume, frames: field_of(frames.diff(dim=1)[:, :2] * seen(volume))
+    ),
     "an argument for its shape": of(flow=lambda volume, frames: flow_of(volume, frames.shape[1])),
     "checkpointed": of(flow=lambda volume: checkpoint(flow_of, volume, use_reentrant=False)),
     "truth as a target": of(
-        objectives={"a": lambda field, truth: (field.flow_px - truth.flow_px.detach()).square().mean()},
+        objectives={
+            "a": lambda field, truth: (field.flow_px - truth.flow_px.detach()).square().mean()
+        },
         batch=replace(BATCH, truth=field_of(torch.ones(2, 2, SIDE, SIDE))),
     ),
     "zero-initialised": of(flow=zeroed(Convolution())),
@@ -284,7 +313,9 @@ GOOD = {
     "in place behind a layer": of(flow=Convolution(nn.ReLU(inplace=True))),
     "in place on a copy": of(flow=network(before=lambda c: c.clone().mul_(2))),
     "float64 element by element": of(events=layer(gain=torch.Tensor.double)),
-    "a pair": of(flow=lambda v: (moved(v), moved(v).exp()), estimate=lambda pair: pair[0] + pair[1]),
+    "a pair": of(
+        flow=lambda v: (moved(v), moved(v).exp()), estimate=lambda pair: pair[0] + pair[1]
+    ),
     "noise": of(events=layer(before=lambda f: f + torch.rand(f.shape))),
     "frozen, behind a function": of(flow=closed(network().requires_grad_(False).method)),
     "network alone behind a hard sensor": of(events=HARD_SENSOR, flow=Convolution(), only="flow"),
@@ -294,12 +325,15 @@ GOOD = {
     "a mount per drive": of(mount=held(lambda T: T.expand(2, 4, 4))),
     "a lens without variables": of(camera=Camera(glass().requires_grad_(False))),
     "dim frames": of(render=picture(after=lambda f: f / 100)),
-    "hard counts with gradients": of(events=events.layer("memory", HARD_SENSOR.sensor), render=picture()),
+    "hard counts with gradients": of(
+        events=events.layer("memory", HARD_SENSOR.sensor), render=picture()
+    ),
 }
 
 
 def outcome(parts, said):
-    """None where ``check`` says what it should (nothing where ``said`` is None); else what it said."""
+    """None where ``check`` says what it should (nothing where ``said`` is None); else what it
+    said."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)
@@ -310,7 +344,8 @@ def outcome(parts, said):
 
 
 def measure(count: int, seed: int, say=print) -> tuple[dict[str, float], list[str]]:
-    """Chains of one to three bad parts, and as many of right ones: how many are named, and how many pass."""
+    """Chains of one to three bad parts, and as many of right ones: how many are named, and how many
+    pass."""
     draw = random.Random(seed)
     findings = []
     named = passed = 0
@@ -329,4 +364,6 @@ def measure(count: int, seed: int, say=print) -> tuple[dict[str, float], list[st
         findings += [] if said is None else [f"right, with {', '.join(right)}: {said}"]
     for finding in findings:
         say(finding)
-    return of(stages_bad=count, stages_named=named, stages_right=count, stages_right_passed=passed), findings
+    return of(
+        stages_bad=count, stages_named=named, stages_right=count, stages_right_passed=passed
+    ), findings

@@ -1,5 +1,5 @@
-"""Random worlds and their judge: shapes told apart by closed forms, a square whose frames are known, and gradients
-that are right and wrong."""
+"""Random worlds and their judge: shapes told apart by closed forms, a square whose frames are
+known, and gradients that are right and wrong."""
 
 import dataclasses
 import json
@@ -17,7 +17,8 @@ QUICK = judge.Effort(seeds=(4,))
 
 
 def test_meshes_are_wound_outwards():
-    """Volumes by the divergence theorem: of a ball below 4 pi / 3, of a ring below 2 pi^2 R r^2 with R = 1 - r."""
+    """Volumes by the divergence theorem: of a ball below 4 pi / 3, of a ring below 2 pi^2 R r^2
+    with R = 1 - r."""
 
     def volume(vertices, faces):
         a, b, c = (vertices[faces[:, k]] for k in range(3))
@@ -52,9 +53,9 @@ def test_draws_are_the_same_every_time_and_cover_what_they_promise():
 
 
 def test_a_square_is_judged_by_its_closed_form():
-    """A bright rectangle along the pixels: coverage of every pixel is a product of two overlaps, so that the
-    difference over a step to the side and ahead is known exactly; the boundary gradient is right, the interior one
-    wrong."""
+    """A bright rectangle along the pixels: coverage of every pixel is a product of two overlaps, so
+    that the difference over a step to the side and ahead is known exactly; the boundary gradient is
+    right, the interior one wrong."""
     mi = backend.mitsuba()
     T = mi.ScalarTransform4f
     half = 0.21
@@ -125,7 +126,9 @@ def test_random_worlds_are_judged_once_and_counted(tmp_path):
     assert findings[0] == "world 0 through the lens 'pinhole' is 8.0% wrong at a noise of 1.0%."
     assert findings[1:] == ["1 of 6 random worlds are refused, 3% may be."]
     rows = [json.loads(line) for line in path.read_text().splitlines()]
-    assert all(row["verdict"] == "right" and row["interior"] > 0.5 for row in rows if row["world"] == 1)
+    assert all(
+        row["verdict"] == "right" and row["interior"] > 0.5 for row in rows if row["world"] == 1
+    )
     assert worlds.measure(2, 0, told.append, path) == (figures, findings)
     assert told == []
 

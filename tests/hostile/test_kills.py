@@ -1,4 +1,5 @@
-"""A run that was killed and resumed ends with the numbers of the run that nobody killed; hours by ``make kill-test``."""
+"""A run that was killed and resumed ends with the numbers of the run that nobody killed; hours by
+``make kill-test``."""
 
 import sys
 

@@ -1,4 +1,5 @@
-"""Damaged and hostile files end in one sentence of ours, or in a value that has a meaning; a minute of ``make fuzz``."""
+"""Damaged and hostile files end in one sentence of ours, or in a value that has a meaning; a minute
+of ``make fuzz``."""
 
 import json
 import os

@@ -1,4 +1,5 @@
-"""Many threads at once, each with gradients through every kind of kernel, against the same work done serially."""
+"""Many threads at once, each with gradients through every kind of kernel, against the same work
+done serially."""
 
 import faulthandler
 import gc
@@ -67,13 +68,17 @@ def _path(seed, start=START):
 def traced(seed: int) -> list[Tensor]:
     bent = (_lens().curvature_per_mm.detach() * (1 + 0.001 * seed)).requires_grad_()
     camera = _camera(seed)
-    return _gradients(camera.with_lens(_lens().replace(curvature_per_mm=bent)).rays().direction, bent)
+    return _gradients(
+        camera.with_lens(_lens().replace(curvature_per_mm=bent)).rays().direction, bent
+    )
 
 
 def rendered(seed: int) -> list[Tensor]:
     """Of a scene that is built and freed in the thread itself."""
     twist = torch.zeros(6, dtype=D, requires_grad=True)
-    return _gradients(render.frames(_camera(seed), _wall(), _path(seed) @ pose.se3_exp(twist)), twist)
+    return _gradients(
+        render.frames(_camera(seed), _wall(), _path(seed) @ pose.se3_exp(twist)), twist
+    )
 
 
 def outlined(seed: int) -> list[Tensor]:
@@ -92,13 +97,17 @@ def counted(seed: int) -> list[Tensor]:
 def spiked(seed: int) -> list[Tensor]:
     drive = _drawn(seed, 40, 2, 8, 8).requires_grad_()
     theta = torch.tensor(1.0, dtype=D, requires_grad=True)
-    found = events.srm(drive, theta=theta, tau_r=4.0, tau_s=3.0, response="alpha", through_reset="bounded")
+    found = events.srm(
+        drive, theta=theta, tau_r=4.0, tau_s=3.0, response="alpha", through_reset="bounded"
+    )
     return _gradients(found[0], drive, theta)
 
 
 def simulated(seed: int) -> list[Tensor]:
     frames = (100 + 30 * _drawn(seed, 6, 24, 24)).clamp_min(1)
-    stream = events.simulate(frames, torch.linspace(0, 0.1, 6, dtype=D), events.SensorModel(theta_on=0.2))
+    stream = events.simulate(
+        frames, torch.linspace(0, 0.1, 6, dtype=D), events.SensorModel(theta_on=0.2)
+    )
     return [stream.t_us, stream.x, stream.p]
 
 
@@ -125,7 +134,8 @@ def optimised(seed: int) -> list[Tensor]:
 
 
 KINDS: dict[str, Callable[[int], list[Tensor]]] = {
-    f.__name__: f for f in (traced, rendered, outlined, counted, spiked, simulated, estimated, optimised)
+    f.__name__: f
+    for f in (traced, rendered, outlined, counted, spiked, simulated, estimated, optimised)
 }
 
 
@@ -139,11 +149,12 @@ def _difference(found, expected):
 
 
 def run(threads: int, rounds: int, kinds: tuple[str, ...] = tuple(KINDS)) -> dict[str, float]:
-    """Every thread does every kind of work ``rounds`` times, in an order of its own, while garbage is collected at
-    random in another.
+    """Every thread does every kind of work ``rounds`` times, in an order of its own, while garbage
+    is collected at random in another.
 
-    Returns: by kind, the largest relative difference from the work done serially, and rounds of a thread per second,
-      serially and threaded. Hangs or ends the process where threads are not safe: call it in a process with a time limit.
+    Returns: by kind, the largest relative difference from the work done serially, and rounds of a
+      thread per second, serially and threaded. Hangs or ends the process where threads are not
+      safe: call it in a process with a time limit.
     Raises: what the first thread raised.
     """
     # else every thread gets a pool of torch's, and they wait for one another's cores
@@ -160,7 +171,9 @@ def run(threads: int, rounds: int, kinds: tuple[str, ...] = tuple(KINDS)) -> dic
             for _ in range(rounds):
                 for kind in order.sample(kinds, len(kinds)):
                     seed = order.randrange(SEEDS)
-                    worst[kind] = max(worst[kind], _difference(KINDS[kind](seed), serial[kind, seed]))
+                    worst[kind] = max(
+                        worst[kind], _difference(KINDS[kind](seed), serial[kind, seed])
+                    )
         except (CodesignError, RuntimeError, ValueError, TypeError, AssertionError) as error:
             raised.append(error)
 
@@ -185,7 +198,8 @@ def run(threads: int, rounds: int, kinds: tuple[str, ...] = tuple(KINDS)) -> dic
 
 
 def lock() -> dict[str, float]:
-    """What the lock costs one thread: nanoseconds, and the time of a small kernel with it over that without it."""
+    """What the lock costs one thread: nanoseconds, and the time of a small kernel with it over that
+    without it."""
 
     def least_s(work, number):
         return min(timeit.repeat(work, number=number, repeat=7)) / number
@@ -199,17 +213,32 @@ def lock() -> dict[str, float]:
     Exclusive.__enter__, Exclusive.__exit__ = (lambda self: self), (lambda self, *error: None)
     bare = least_s(lambda: counted(0), 20)
     Exclusive.__enter__, Exclusive.__exit__ = enter, leave
-    return {"lock_ns": 1e9 * least_s(entered, 10_000), "small_kernel_with_over_without_lock": held / bare}
+    return {
+        "lock_ns": 1e9 * least_s(entered, 10_000),
+        "small_kernel_with_over_without_lock": held / bare,
+    }
 
 
-def measure(count: int, seed: int, say=print, threads: int = 30) -> tuple[dict[str, float], list[str]]:
-    """``count`` rounds of all kinds in every thread, in a process that is ended where they do not."""
+def measure(
+    count: int, seed: int, say=print, threads: int = 30
+) -> tuple[dict[str, float], list[str]]:
+    """``count`` rounds of all kinds in every thread, in a process that is ended where they do
+    not."""
     limit_s = 120 + 3.0 * threads * count
-    command = [sys.executable, "-m", "tests.hostile.threads", str(threads), str(count), str(limit_s)]
+    command = [
+        sys.executable,
+        "-m",
+        "tests.hostile.threads",
+        str(threads),
+        str(count),
+        str(limit_s),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     say(f"{threads} threads, {count} rounds: exit code {done.returncode}")
     if done.returncode:
-        return {}, [f"{threads} threads, {count} rounds: ends with {done.returncode}: {done.stderr[-300:]}"]
+        return {}, [
+            f"{threads} threads, {count} rounds: ends with {done.returncode}: {done.stderr[-300:]}"
+        ]
     found = {f"threads_{name}": value for name, value in json.loads(done.stdout).items()}
     wrong = [
         f"{name} differs by {found[f'threads_{name}']}"
@@ -222,5 +251,9 @@ def measure(count: int, seed: int, say=print, threads: int = 30) -> tuple[dict[s
 if __name__ == "__main__":
     faulthandler.dump_traceback_later(float(sys.argv[3]), exit=True)
     print(
-        json.dumps(run(int(sys.argv[1]), int(sys.argv[2]), *([tuple(sys.argv[4:])] if sys.argv[4:] else [])))
+        json.dumps(
+            run(
+                int(sys.argv[1]), int(sys.argv[2]), *([tuple(sys.argv[4:])] if sys.argv[4:] else [])
+            )
+        )
     )

@@ -1,6 +1,8 @@
 """Random worlds through three lenses: is every gradient that can be judged right, or refused?
 
-Judged by differences with common random numbers, in two random directions of every walk instead of six components. One line a case is written as soon as it is judged, and a later call goes on from there.
+Judged by differences with common random numbers, in two random directions of every walk instead of
+six components. One line a case is written as soon as it is judged, and a later call goes on from
+there.
 """
 
 import json
@@ -30,8 +32,8 @@ def case_of(draw: random_worlds.Draw, kind: str) -> Case:
 def measure(
     count: int, seed: int, say: Callable[[str], None] = print, path: str | Path | None = None
 ) -> tuple[dict[str, float], list[str]]:
-    """Figures and findings of ``count`` worlds before each of the lenses. path: of the cases, a line each, else
-    CODESIGN_WORLDS, else runs/hostile/worlds.jsonl."""
+    """Figures and findings of ``count`` worlds before each of the lenses. path: of the cases, a
+    line each, else CODESIGN_WORLDS, else runs/hostile/worlds.jsonl."""
     path = Path(path or os.environ.get("CODESIGN_WORLDS", "runs/hostile/worlds.jsonl"))
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = path.read_text().splitlines() if path.exists() else []
@@ -52,7 +54,9 @@ def measure(
 def summary(rows: list[dict]) -> tuple[dict[str, float], list[str]]:
     """Figures and findings of judged cases."""
     counts = Counter(map(_fate, rows))
-    figures = {f"worlds_{name}": float(counts[name]) for name in ("right", "wrong", "noisy", "refused")}
+    figures = {
+        f"worlds_{name}": float(counts[name]) for name in ("right", "wrong", "noisy", "refused")
+    }
     figures["worlds_judged"] = figures["worlds_right"] + figures["worlds_wrong"]
     figures["cpu_s"] = sum(row["cpu_s"] for row in rows)
     findings = [_told(row) for row in rows if _fate(row) == "wrong"]

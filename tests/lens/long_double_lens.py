@@ -1,9 +1,10 @@
-"""An independent lens in long double, for tests: real rays from object points, paraxial rays, random systems.
+"""An independent lens in long double, for tests: real rays from object points, paraxial rays,
+random systems.
 
-It shares nothing with codesign.lens: surfaces are met by Newton steps on z - sag, pupils come from two
-forward paraxial rays, wavefronts from whole path lengths (where ours subtracts first). With 64 bits of
-mantissa its rounding is some two thousand times finer than float64's. Beside it a tracer of spheres from one local
-frame to the next, for what is tilted and shifted.
+It shares nothing with codesign.lens: surfaces are met by Newton steps on z - sag, pupils come from
+two forward paraxial rays, wavefronts from whole path lengths (where ours subtracts first). With 64
+bits of mantissa its rounding is some two thousand times finer than float64's. Beside it a tracer of
+spheres from one local frame to the next, for what is tilted and shifted.
 """
 
 from dataclasses import dataclass
@@ -13,7 +14,8 @@ import numpy as np
 L = np.longdouble
 NEWTON_STEPS = 12
 FIELDS = (0.0, 0.1, 0.2)
-# media behind the surfaces (g glass, a air) and their kinds: s sphere, c conic, a asphere, p plane in air
+# media behind the surfaces (g glass, a air) and their kinds: s sphere, c conic, a asphere, p plane
+# in air
 STRUCTURES = (
     ("ga", "as"),
     ("gga", "ssc"),
@@ -26,7 +28,8 @@ STRUCTURES = (
 
 @dataclass(frozen=True)
 class System:
-    """A lens in mm: curvature, thickness, conic [S]; asphere [S, A] of r^2, r^4, ...; index: line -> [S + 1];
+    """A lens in mm: curvature, thickness, conic [S]; asphere [S, A] of r^2, r^4, ...; index: line
+    -> [S + 1];
     stop: surface; diameter of the entrance pupil at the d line."""
 
     curvature: np.ndarray
@@ -40,9 +43,9 @@ class System:
 
 @dataclass(frozen=True)
 class Rays:
-    """On the film: position [N, 2], direction [N, 3], path [N] from the object point; heights [S, N] on the
-    surfaces, cosines [S, N] of incidence; worst [N], the least cosine of incidence or refraction (NaN where a ray
-    fails)."""
+    """On the film: position [N, 2], direction [N, 3], path [N] from the object point; heights
+    [S, N] on the surfaces, cosines [S, N] of incidence; worst [N], the least cosine of incidence or
+    refraction (NaN where a ray fails)."""
 
     position: np.ndarray
     direction: np.ndarray
@@ -57,8 +60,8 @@ class Rays:
 
 
 def field_rays(system, line, field, pupil, at):
-    """Rays of the object point at an angle, ``at`` mm before the entrance pupil, through points [N, 2] of the
-    unit disc of the pupil."""
+    """Rays of the object point at an angle, ``at`` mm before the entrance pupil, through points
+    [N, 2] of the unit disc of the pupil."""
     z = entrance_pupil(system)
     point = np.array([0, -L(at) * np.tan(L(field)), z - L(at)], dtype=L)
     aim = np.concatenate([L(pupil) * system.diameter / 2, np.full((len(pupil), 1), z, dtype=L)], 1)
@@ -124,23 +127,25 @@ def entrance_pupil(system):
 
 
 def crossing(system, line, at):
-    """Where the paraxial light of the axial point ``at`` mm before the entrance pupil meets the axis behind
-    the last vertex; at = 0 is the exit pupil."""
+    """Where the paraxial light of the axial point ``at`` mm before the entrance pupil meets the
+    axis behind the last vertex; at = 0 is the exit pupil."""
     y, nu = paraxial(system, line, at - entrance_pupil(system), 1)
     return -y[-1] * system.index[line][-1] / nu[-1]
 
 
 def path_differences(system, line, rays, chief):
-    """Path of the chief ray minus that of each ray [N], from the object point to the sphere about the chief
-    ray's point on the film through the centre of the exit pupil; and slopes [N, 2], n times the direction
-    cosines from the sphere to that point, minus the chief ray's."""
+    """Path of the chief ray minus that of each ray [N], from the object point to the sphere about
+    the chief ray's point on the film through the centre of the exit pupil; and slopes [N, 2], n
+    times the direction cosines from the sphere to that point, minus the chief ray's."""
     centre = np.array([*chief.position[0], 0], dtype=L)
     before = system.thickness[-1] - crossing(system, "d", 0)
     radius = np.sqrt(before**2 + (centre**2).sum())
     n = system.index[line][-1]
 
     def to_sphere(bundle):
-        away = np.concatenate([bundle.position, np.zeros((len(bundle.path), 1), dtype=L)], 1) - centre
+        away = (
+            np.concatenate([bundle.position, np.zeros((len(bundle.path), 1), dtype=L)], 1) - centre
+        )
         b = (away * bundle.direction).sum(1)
         # along the ray, to the side of the pupil
         length = -b - np.sign(before) * np.sqrt(b * b - (away**2).sum(1) + radius**2)
@@ -153,7 +158,8 @@ def path_differences(system, line, rays, chief):
 
 
 def seidel(system, field, at):
-    """S_I to S_V of each surface, [5, S] mm: Welford's sums, with S_V = (A_bar / A) (S_III + S_IV)."""
+    """S_I to S_V of each surface, [5, S] mm: Welford's sums, with S_V = (A_bar / A)
+    (S_III + S_IV)."""
     z = entrance_pupil(system)
     u = system.diameter / 2 / L(at)
     u_bar = np.tan(L(field))
@@ -183,13 +189,16 @@ def seidel(system, field, at):
 
 
 def focus_shifts(system, field, at):
-    """Tangential and sagittal focus of d behind the film, [2]: limits of close rays by extrapolation."""
+    """Tangential and sagittal focus of d behind the film, [2]: limits of close rays by
+    extrapolation."""
     found = []
     for axis in ((0, 1), (1, 0)):
         estimates = []
         for reach in (1e-3, 5e-4, 2.5e-4):
             rays = field_rays(system, "d", field, reach * np.outer([1, -1], axis), at)
-            position, slope = (np.diff(values, axis=0) @ axis for values in (rays.position, rays.slopes))
+            position, slope = (
+                np.diff(values, axis=0) @ axis for values in (rays.position, rays.slopes)
+            )
             estimates.append(-(position / slope)[0])
         # errors go as the square and the fourth power of the reach
         a, b, c = estimates
@@ -198,7 +207,8 @@ def focus_shifts(system, field, at):
 
 
 def draw(seed):
-    """A System that images a near object, and the distance of that in metres; the same for the same seed."""
+    """A System that images a near object, and the distance of that in metres; the same for the same
+    seed."""
     rng = np.random.default_rng(seed)
     while True:
         found = _attempt(rng, *STRUCTURES[seed % len(STRUCTURES)])
@@ -212,7 +222,9 @@ def _attempt(rng, media, kinds):
     efl = rng.uniform(12.0, 50.0)
     at_m = float(np.exp(rng.uniform(np.log(0.2), np.log(5.0))))
     curvature = rng.normal(0, 0.6, count) / efl * [k != "p" for k in kinds]
-    share = np.where([m == "g" for m in media], rng.uniform(0.05, 0.2, count), rng.uniform(0.01, 0.15, count))
+    share = np.where(
+        [m == "g" for m in media], rng.uniform(0.05, 0.2, count), rng.uniform(0.01, 0.15, count)
+    )
     conic = rng.uniform(-1.5, 1.0, count) * [k in "ca" for k in kinds]
     terms = rng.normal(0, 1, (count, 4)) * 2e-2 / efl ** np.array([1, 3, 5, 7])
     asphere = terms * np.array([[k == "a"] for k in kinds])
@@ -229,7 +241,11 @@ def _attempt(rng, media, kinds):
     film = float(crossing(system, "d", 1e3 * at_m))
     system.thickness[-1] = film * (1 + 0.003 * rng.normal())
     near = 0.1 * efl < film < 3 * efl and abs(entrance_pupil(system)) < 2 * efl
-    if not near or abs(crossing(system, "d", 0)) > 20 * efl or np.abs(system.curvature).max() > 2.5 / efl:
+    if (
+        not near
+        or abs(crossing(system, "d", 0)) > 20 * efl
+        or np.abs(system.curvature).max() > 2.5 / efl
+    ):
         return None
     turn = np.linspace(0, 2 * np.pi, 13)[:-1]
     rim = np.stack([np.cos(turn), np.sin(turn)], 1)
@@ -258,15 +274,19 @@ INDICES = {"glass": 1.6, "air": 1.0}
 
 
 def by_frames(rows, p, d, bends=True):
-    """A ray through rows of (medium or "mirror", thickness, curvature) and of coordinate breaks ("break", thickness, and
-    PARM 1 to 6 of a .zmx file: shifts, angles in degrees, order), each in the frame of its own, to a plane; only led
-    through the frames where it does not bend. Media are names or indices; point and direction [3] -> the same."""
+    """A ray through rows of (medium or "mirror", thickness, curvature) and of coordinate breaks
+    ("break", thickness, and PARM 1 to 6 of a .zmx file: shifts, angles in degrees, order), each in
+    the frame of its own, to a plane; only led through the frames where it does not bend. Media are
+    names or indices; point and direction [3] -> the same."""
     n = L(1)
     p, d = (np.array(v, dtype=L) for v in (p, d))
     for kind, thickness, *what in [*rows, ("air", 0.0, 0.0)]:
         what = np.array(what, dtype=L)
         if kind == "break":
-            (sx, sy, sz), (cx, cy, cz) = np.sin(np.radians(what[2:5])), np.cos(np.radians(what[2:5]))
+            (sx, sy, sz), (cx, cy, cz) = (
+                np.sin(np.radians(what[2:5])),
+                np.cos(np.radians(what[2:5])),
+            )
             # components along axes that were turned right-handed
             about_x = np.array([[1, 0, 0], [0, cx, sx], [0, -sx, cx]])
             about_y = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
@@ -282,7 +302,10 @@ def by_frames(rows, p, d, bends=True):
             cosine = d @ normal
             behind = n if kind == "mirror" else L(INDICES.get(kind, kind))
             root = np.copysign(np.sqrt(1 - (n / behind) ** 2 * (1 - cosine**2)), cosine)
-            d = n / behind * d + ((-root if kind == "mirror" else root) - n / behind * cosine) * normal
+            d = (
+                n / behind * d
+                + ((-root if kind == "mirror" else root) - n / behind * cosine) * normal
+            )
             n = behind
         p = p - np.array([0, 0, thickness])
     return p, d

@@ -1,5 +1,5 @@
-"""Lenses that several tests ask for and what they ask of them in one word; lens files to read and to spoil: the good files,
-faults and facts of files.txt, and exchanges within them."""
+"""Lenses that several tests ask for and what they ask of them in one word; lens files to read and
+to spoil: the good files, faults and facts of files.txt, and exchanges within them."""
 
 import json
 import math
@@ -23,8 +23,11 @@ def f64(values):
 
 
 def close(found, truth, rtol=0.0, atol=0.0):
-    """Whether numbers agree with their truth, or all with one: away by no more than the larger of both."""
-    found, truth = (v.detach() if isinstance(v, torch.Tensor) else np.array(v) for v in (found, truth))
+    """Whether numbers agree with their truth, or all with one: away by no more than the larger of
+    both."""
+    found, truth = (
+        v.detach() if isinstance(v, torch.Tensor) else np.array(v) for v in (found, truth)
+    )
     found = torch.as_tensor(found) * f64(1.0)
     truth = (torch.as_tensor(truth) * f64(1.0)).expand_as(found)
     allowed = torch.clamp(rtol * truth.abs(), min=atol)
@@ -52,7 +55,9 @@ def reference(name, shared):
 
 def paraboloid(diameter=5.0, focal_mm=100.0, defocus_mm=0.0):
     """A mirror that is perfect on its axis."""
-    surface = Surface(-2 * focal_mm, focal_mm + defocus_mm, None, 30.0, conic=-1.0, is_stop=True, mirror=True)
+    surface = Surface(
+        -2 * focal_mm, focal_mm + defocus_mm, None, 30.0, conic=-1.0, is_stop=True, mirror=True
+    )
     return GeoLens([surface], diameter)
 
 
@@ -79,8 +84,8 @@ def figure_of(geo, figure, parameters):
 
 
 def check_gradient(function, *values, step=1e-4, rel=1e-6, seed=0):
-    """The slope of a scalar function along a direction drawn for every tensor, in proportion to its size,
-    against central differences of fourth order."""
+    """The slope of a scalar function along a direction drawn for every tensor, in proportion to its
+    size, against central differences of fourth order."""
     generator = torch.Generator().manual_seed(seed)
     leaves = [v.detach().clone().requires_grad_() for v in values]
     slopes = torch.autograd.grad(function(*leaves), leaves)
@@ -97,7 +102,9 @@ def check_gradient(function, *values, step=1e-4, rel=1e-6, seed=0):
 
         truth = (8 * (moved(1) - moved(-1)) - (moved(2) - moved(-2))) / (12 * step)
         found = float((slope * direction).sum())
-        assert abs(found - truth) <= rel * max(abs(truth), 1e-3 * float((slope * direction).abs().sum()))
+        assert abs(found - truth) <= rel * max(
+            abs(truth), 1e-3 * float((slope * direction).abs().sum())
+        )
         assert truth != 0
 
 
@@ -130,13 +137,16 @@ def edited(text, exchanges):
 
 
 def _sections():
-    """Good files by format, rows (format, exchanges, pattern) of faults and (format, exchanges, expression) of facts."""
+    """Good files by format, rows (format, exchanges, pattern) of faults and (format, exchanges,
+    expression) of facts."""
     files, faults, facts = {}, [], []
     for section in Path(__file__).with_name("files.txt").read_text().split("\n[")[1:]:
         kind, rest = section.split("]\n", 1)
         files[kind], *tables = rest.split("--\n")
         for rows, table in zip((faults, facts), tables, strict=True):
-            rows += [(kind, *re.split(r" ?\| ", row, maxsplit=1)) for row in table.splitlines() if row]
+            rows += [
+                (kind, *re.split(r" ?\| ", row, maxsplit=1)) for row in table.splitlines() if row
+            ]
     return files, faults, facts
 
 

@@ -1,5 +1,5 @@
-"""Ray aiming and radiometry: rays meet the real stop; irradiance agrees with closed forms and with the area
-of the image-space cone."""
+"""Ray aiming and radiometry: rays meet the real stop; irradiance agrees with closed forms and with
+the area of the image-space cone."""
 
 import math
 from dataclasses import replace
@@ -25,8 +25,8 @@ def at_stop(geo, rays):
 
 
 def wide_angle():
-    """A reversed telephoto of strong negative front elements: at 65 degrees the real entrance pupil is far
-    from the paraxial one."""
+    """A reversed telephoto of strong negative front elements: at 65 degrees the real entrance pupil
+    is far from the paraxial one."""
     glass = Glass.named("N-SK16")
     surfaces = [
         Surface(40.0, 2.0, glass, 25.0),
@@ -56,13 +56,17 @@ def test_aimed_rays_meet_the_stop(name):
 def test_rays_that_cannot_be_aimed_are_told_and_keep_their_paraxial_aim():
     geo = wide_angle()
     pupil = pupil_grid(4)
-    with pytest.warns(UserWarning, match=r"rays cannot be aimed at the stop .* keep their paraxial aim"):
+    with pytest.warns(
+        UserWarning, match=r"rays cannot be aimed at the stop .* keep their paraxial aim"
+    ):
         origin, direction = (v.detach() for v in aimed_rays(geo, math.radians(85.0), pupil))
     first = geo.first_order()
     wanted = pupil * first.stop_semi_aperture_mm.detach()
     lost = (at_stop(geo, (origin, direction)) - wanted).norm(dim=1) > 1e-6
     assert lost.any()
-    crossing = origin + direction * ((first.entrance_pupil_z_mm.detach() - origin[:, 2:]) / direction[:, 2:])
+    crossing = origin + direction * (
+        (first.entrance_pupil_z_mm.detach() - origin[:, 2:]) / direction[:, 2:]
+    )
     guess = pupil * first.entrance_pupil_diameter_mm.detach() / 2
     close(crossing[lost, :2], guess[lost], atol=1e-9)
 
@@ -75,7 +79,9 @@ def cone_area(geo, field):
 
 def opened(geo, factor):
     """The lens with apertures that many times as wide, within their spheres."""
-    wide = (factor * s.semi_aperture_mm if not s.is_stop else s.semi_aperture_mm for s in geo.surfaces)
+    wide = (
+        factor * s.semi_aperture_mm if not s.is_stop else s.semi_aperture_mm for s in geo.surfaces
+    )
     surfaces = [
         replace(s, semi_aperture_mm=min(a, 0.99 * abs(s.radius_mm)))
         for s, a in zip(geo.surfaces, wide, strict=True)
@@ -85,10 +91,11 @@ def opened(geo, factor):
 
 @pytest.mark.parametrize("name", ["cooke-triplet", "double-gauss"])
 def test_illumination_is_the_area_of_the_image_space_cone(name):
-    """Without vignetting. The grid of pupil points integrates a smooth function over a disc of stairs: 0.3 %.
+    """Without vignetting. The grid of pupil points integrates a smooth function over a disc of
+    stairs: 0.3 %.
 
-    The cone is that of one object direction; the image point of the chief ray collects the same but for
-    aberrations, whose share is as small.
+    The cone is that of one object direction; the image point of the chief ray collects the same but
+    for aberrations, whose share is as small.
     """
     geo = opened(lens.load(name), 10.0)
     fields = [half_field(name) * share for share in (0.5, 0.8)]
@@ -103,14 +110,16 @@ def test_vignetting_takes_the_share_of_rays_that_the_hard_apertures_stop():
     geo = GeoLens(published.surfaces, published.entrance_pupil_diameter_mm, soft_edge_mm=0.02)
     inside = geo.trace(*aimed_rays(geo, field, pupil_grid(40))).inside.double().mean().item()
     assert 0.9 < inside < 0.97
-    lit, open_ = (relative_illumination(g, [field], grid=40).item() for g in (geo, opened(published, 1.4)))
+    lit, open_ = (
+        relative_illumination(g, [field], grid=40).item() for g in (geo, opened(published, 1.4))
+    )
     close(lit / open_, inside, atol=0.01)
     close(relative_illumination(geo, [0.0]), 1.0, atol=1e-12)
 
 
 def disc_irradiance(tangent, pupil_tangent):
-    """Irradiance of a plane by a parallel uniform disc of unit radiance seen off its axis, over pi (Foote
-    1915): exact for any aperture."""
+    """Irradiance of a plane by a parallel uniform disc of unit radiance seen off its axis, over pi
+    (Foote 1915): exact for any aperture."""
     t2, a2 = tangent**2, pupil_tangent**2
     return 0.5 * (1 - (1 + t2 - a2) / math.sqrt(t2**2 + 2 * t2 * (1 - a2) + (1 + a2) ** 2))
 
@@ -122,8 +131,8 @@ def uniform_world(camera):
 
 @pytest.mark.parametrize("diameter", [0.0, 4.0, 20.0])
 def test_a_uniform_world_falls_off_as_an_ideal_lens_makes_it(diameter):
-    """Sensor of 29 x 1 mm behind 20 mm of air: cos^4 for the pinhole, the disc formula for wide pupils. 256
-    samples integrate to 3e-3."""
+    """Sensor of 29 x 1 mm behind 20 mm of air: cos^4 for the pinhole, the disc formula for wide
+    pupils. 256 samples integrate to 3e-3."""
     ideal = ThinLens(20.0, diameter) if diameter else Pinhole(20.0)
     image = uniform_world(render.Camera(ideal, 29, 1, 1.0, 256, falloff=True))[0]
     for column in (0, 7, 14):
@@ -143,4 +152,6 @@ def test_colours_share_the_samples_of_a_pixel():
     shares = f64([0.5] * 4 + [1.5] * 4)
     torch.testing.assert_close(rays.weight.reshape(6, 8), shares.expand(6, 8))
     red = render.Camera(geo, 3, 2, 0.5, 8, spectrum=Spectrum((0.6562725,), (1.0,))).rays()
-    assert torch.equal(rays.direction.reshape(6, 8, 3)[:, 4:], red.direction.reshape(6, 8, 3)[:, 4:])
+    assert torch.equal(
+        rays.direction.reshape(6, 8, 3)[:, 4:], red.direction.reshape(6, 8, 3)[:, 4:]
+    )

@@ -61,8 +61,8 @@ def sphere_with_stop_at_its_centre(radius=200.0):
 
 
 def test_a_concentric_mirror_has_its_image_on_a_sphere():
-    # every chief ray is an axis: both foci lie R / 2 from the centre, so (R / 2) (1 - cos) behind the plane,
-    # unfolded; 1e-15 of 200 mm over a reach of 1e-3
+    # every chief ray is an axis: both foci lie R / 2 from the centre, so (R / 2) (1 - cos) behind
+    # the plane, unfolded; 1e-15 of 200 mm over a reach of 1e-3
     fields = [0.0, 0.1, 0.25]
     geo = sphere_with_stop_at_its_centre()
     found = analysis.focus_shift_mm(geo, fields)
@@ -79,14 +79,17 @@ def test_a_concentric_mirror_has_its_image_on_a_sphere():
 def test_fans_show_lateral_colour_about_a_common_point():
     geo = lens.load("cooke-triplet")
     field = half_field("cooke-triplet")
-    fan = analysis.ray_fan(geo, field, LINES[1], reference_mm=analysis.chief_ray(geo, field).position_mm[0])
+    fan = analysis.ray_fan(
+        geo, field, LINES[1], reference_mm=analysis.chief_ray(geo, field).position_mm[0]
+    )
     colour = analysis.lateral_colour_mm(geo, [field], [LINES[1]])[0, 0]
     close(fan.tangential_mm[16], colour, atol=1e-14)
     assert fan.pupil[16].item() == 0
 
 
 def test_encircled_energy_of_a_defocused_point_is_that_of_a_disc():
-    # rays evenly over the pupil stay even over the disc (up to (y / 2 f)^2): the share inside r is (r / a)^2
+    # rays evenly over the pupil stay even over the disc (up to (y / 2 f)^2): the share inside r is
+    # (r / a)^2
     a = 0.5 * 2.5 / 100
     radii = [0.25 * a, 0.5 * a, 0.75 * a, 1.01 * a]
     found = analysis.encircled_energy(paraboloid(defocus_mm=0.5), 0.0, radii, grid=128)
@@ -96,8 +99,8 @@ def test_encircled_energy_of_a_defocused_point_is_that_of_a_disc():
 
 
 def test_a_polychromatic_spot_adds_the_spread_of_its_means():
-    # the parallel axis theorem: mean square of all = mean of the squares within each wavelength + spread of
-    # their centres
+    # the parallel axis theorem: mean square of all = mean of the squares within each wavelength +
+    # spread of their centres
     geo = lens.load("cooke-triplet").freeze()
     field = half_field("cooke-triplet")
     positions, weight = analysis.polychromatic_spot(geo, field, LINES)
@@ -113,7 +116,9 @@ def test_vignetting_narrows_the_spot_to_the_rays_that_pass():
     surfaces = lens.load("la1509").surfaces
     narrow = GeoLens([Surface(PLANE, 5.0, None, 4.0), *surfaces], 20.0, soft_edge_mm=0.0)
     positions, weight = analysis.polychromatic_spot(GeoLens(surfaces, 20.0), 0.0, LINES[0], 64)
-    clipped, clipped_weight = analysis.polychromatic_spot(narrow, 0.0, LINES[0], 64, vignetting=True)
+    clipped, clipped_weight = analysis.polychromatic_spot(
+        narrow, 0.0, LINES[0], 64, vignetting=True
+    )
     kept = analysis.pupil_grid(64).norm(dim=1) * 10 < 4.0
     assert torch.equal(clipped_weight[0] > 0, kept)
     expected = analysis.spot_radius_mm(positions[:, kept], weight[:, kept])
@@ -138,8 +143,8 @@ def test_a_paraboloid_is_perfect_on_its_axis():
 
 @pytest.mark.parametrize("shift", [-0.3, 0.05, 2.0])
 def test_defocus_of_a_perfect_lens_is_the_gap_between_two_spheres(shift):
-    # rays at angle a through the focus F meet the sphere of radius f + s about F + s at r = sqrt((f + s)^2 -
-    # s^2 sin^2 a) - s cos a; OPD = r - f
+    # rays at angle a through the focus F meet the sphere of radius f + s about F + s at r = sqrt((f
+    # + s)^2 - s^2 sin^2 a) - s cos a; OPD = r - f
     f = 100.0
     pupil = pupil_grid(16)
     # of a paraboloid
@@ -160,8 +165,8 @@ def disc(waves, count=200):
 
 @pytest.mark.parametrize("size", [0.1, 0.25, 1.0])
 def test_rms_and_strehl_of_defocus_and_spherical_aberration(size):
-    # W r^2: RMS W / sqrt 12, Strehl sinc^2 W; W r^4: RMS 2 W / sqrt 45 (Mahajan, Optical Imaging and
-    # Aberrations, ch. 8); the rim is a staircase of 1 / 100
+    # W r^2: RMS W / sqrt 12, Strehl sinc^2 W; W r^4: RMS 2 W / sqrt 45 (Mahajan, Optical Imaging
+    # and Aberrations, ch. 8); the rim is a staircase of 1 / 100
     defocus = disc(lambda p, r2: size * r2)
     close(rms_waves(defocus), size / math.sqrt(12), 5e-4)
     close(peak_to_valley_waves(defocus), size, 1e-3)
@@ -190,14 +195,16 @@ def test_fits_take_away_what_they_fit():
 
 
 def test_a_telecentric_lens_has_a_plane_for_a_reference_sphere():
-    # a stop in the front focal plane: the wavefront differs from one with a very far pupil by no more than
-    # the pupil's distance tells
+    # a stop in the front focal plane: the wavefront differs from one with a very far pupil by no
+    # more than the pupil's distance tells
     surfaces = lens.load("la1509").surfaces
     front = -float(cardinal_points(lens.load("la1509")).front_focal_z_mm.detach())
     found = []
     for shift in (0.0, 1e-4):
         stop = Surface(math.inf, front + shift, None, 12.7, is_stop=True)
-        geo = GeoLens([stop, *(Surface(s.radius_mm, s.thickness_mm, s.medium, 12.7) for s in surfaces)], 10.0)
+        geo = GeoLens(
+            [stop, *(Surface(s.radius_mm, s.thickness_mm, s.medium, 12.7) for s in surfaces)], 10.0
+        )
         found.append(wavefront(geo, 0.02, grid=16).waves.detach())
     assert found[0].isfinite().all()
     # moved 1e-4 mm: slopes of the wavefront by 1e-6 of 10 waves

@@ -77,15 +77,19 @@ def test_thicknesses_gaps_and_lengths_by_hand():
         "centre of glass between surfaces 1 and 2": 6.0,
         "edge of glass between surfaces 1 and 2": 6 - sag(40, 12) + sag(-60, 12),
         "edge of glass between surfaces 3 and 4": 3 - sag(-50, 11) + sag(-90, 11),
-        # surface 3 curves back faster than surface 2: the gap closes towards the edge, the larger of 12 and
-        # 11 mm
+        # surface 3 curves back faster than surface 2: the gap closes towards the edge, the larger
+        # of 12 and 11 mm
         "air between surfaces 2 and 3": 1 - sag(-60, 12) + sag(-50, 12),
         "total track": 80.0,
         "back focus": 70.0,
         "steepness of surface 1": 12 / 40,
     }
     assert {name: found[name].value.item() for name in truth} == pytest.approx(truth, abs=1e-13)
-    assert {c.name for c in active(found.values())} >= {"total track", "back focus", "steepness of surface 1"}
+    assert {c.name for c in active(found.values())} >= {
+        "total track",
+        "back focus",
+        "steepness of surface 1",
+    }
     assert found["total track"].state() == "violated"
     assert found["centre of glass between surfaces 3 and 4"].state() == "free"
     hinges = penalty([found["total track"], found["back focus"]])
@@ -97,14 +101,14 @@ def test_thicknesses_gaps_and_lengths_by_hand():
 
 
 def test_the_least_gap_is_found_inside_the_aperture_and_on_the_axis():
-    """A plane and r^4 / 1000 - r^2 / 20: the gap 3 - r^2/20 + r^4/1000 is least where r^2 = 25, by 0.625
-    below the axis."""
+    """A plane and r^4 / 1000 - r^2 / 20: the gap 3 - r^2/20 + r^4/1000 is least where r^2 = 25, by
+    0.625 below the axis."""
     bowl = Surface(PLANE, 3.0, CROWN, 8.0, asphere=(-0.05, 1e-3))
     flat = Surface(50.0, 3.0, CROWN, 8.0), Surface(PLANE, 3.0, None, 8.0)
     geo = GeoLens([*flat, bowl, Surface(PLANE, 50.0, None, 8.0)], 8.0).freeze()
     found = found_in(geo, Limits(air_gap_mm=0.1))["air between surfaces 2 and 3"].value.item()
-    # the nearest of 33 heights, a quarter of a millimetre apart, misses the lowest by at most (1/8)^2 times
-    # half the second derivative 0.2
+    # the nearest of 33 heights, a quarter of a millimetre apart, misses the lowest by at most
+    # (1/8)^2 times half the second derivative 0.2
     assert 3 - 0.625 <= found <= 3 - 0.625 + 0.1 / 64
     line = torch.linspace(0, 1, 33, dtype=D)
     truth = [3 - 0.05 * r * r + 1e-3 * r**4 for r in (8 * line).tolist()]
@@ -122,7 +126,9 @@ def test_the_least_gap_is_found_inside_the_aperture_and_on_the_axis():
 def test_gradients_of_the_penalty_against_differences():
     limits = dataclasses.replace(ALL, glass_edge_mm=3.0)
     names = "curvature_per_mm thickness_mm"
-    check_lens_gradient(doublet(), names, lambda geo: penalty(evaluate(geo, limits)), step=1e-5, rel=1e-5)
+    check_lens_gradient(
+        doublet(), names, lambda geo: penalty(evaluate(geo, limits)), step=1e-5, rel=1e-5
+    )
 
 
 @pytest.mark.parametrize("at_least", [True, False])
@@ -167,7 +173,11 @@ def test_a_face_between_equal_glasses_is_met_at_its_own_angle():
     """As one between glasses that hardly differ."""
 
     def buried(step):
-        faces = (40.0, 3.0, glass(1.5 + step), 6.0), (-12.0, 3.0, CROWN, 6.0), (-60.0, 60.0, None, 6.0)
+        faces = (
+            (40.0, 3.0, glass(1.5 + step), 6.0),
+            (-12.0, 3.0, CROWN, 6.0),
+            (-60.0, 60.0, None, 6.0),
+        )
         return lens_of(faces)
 
     def incidence(geo):
@@ -189,7 +199,8 @@ def test_mirrors_reflect_at_the_angle_of_incidence():
 
 
 def test_traced_and_paraxial_apertures():
-    # a thin plate at the stop needs the pupil; 30 mm of air before a second one adds the slope of the field
+    # a thin plate at the stop needs the pupil; 30 mm of air before a second one adds the slope of
+    # the field
     plates = [
         (PLANE, 1e-9, CROWN, 5.0),
         (PLANE, 30.0, None, 5.0),
@@ -207,8 +218,8 @@ def test_traced_and_paraxial_apertures():
 
 
 def test_rays_that_fail_push_back_until_they_pass():
-    """A steep first surface loses the rim rays of a wide pupil; following the penalty alone brings them
-    back."""
+    """A steep first surface loses the rim rays of a wide pupil; following the penalty alone brings
+    them back."""
     geo = lens_of([(9.9, 3.0, CROWN, 9.0), (-30.0, 15.0, None, 9.5)], 19.0)
     limits = Limits(rays=True, fields_rad=(0.0, 0.2))
     assert evaluate(geo, limits)[0].state() == "violated"
@@ -258,11 +269,15 @@ def motion(design, variables):
     RMS-normalised."""
     ahead, behind = (lens.spots(design.lens(0.01 * s * variables), FIELDS)[0] for s in (1, -1))
     moved = (ahead - behind) / 0.02
-    return (moved - moved.mean(1, keepdim=True)).reshape(-1) / (moved.shape[0] * moved.shape[1]) ** 0.5
+    return (moved - moved.mean(1, keepdim=True)).reshape(-1) / (
+        moved.shape[0] * moved.shape[1]
+    ) ** 0.5
 
 
 def test_every_unit_variable_moves_the_rays_by_the_stated_rms_each_in_its_own_way(design):
-    jacobian = torch.stack([motion(design, unit) for unit in torch.eye(len(design.basis), dtype=D)], 1)
+    jacobian = torch.stack(
+        [motion(design, unit) for unit in torch.eye(len(design.basis), dtype=D)], 1
+    )
     curvatures = design.reference.curvature_per_mm.abs().mean().expand(5)
     size = torch.cat([curvatures, design.reference.thickness_mm])
     # a tenth of a curvature or thickness is the limit
@@ -271,7 +286,8 @@ def test_every_unit_variable_moves_the_rays_by_the_stated_rms_each_in_its_own_wa
     free = ~held
     # the strong modes: defocus and its kin
     assert int(free.sum()) >= 3
-    # differences over a hundredth of a step and those that made the modes bend by some 1e-5 of their motion
+    # differences over a hundredth of a step and those that made the modes bend by some 1e-5 of
+    # their motion
     close(gram[free][:, free], torch.eye(int(free.sum()), dtype=D), atol=1e-3)
     assert (gram.diagonal()[held] < 1).all()
 
@@ -337,7 +353,9 @@ def test_penalty_by_hand_and_its_slope():
 @pytest.mark.bits
 @pytest.mark.parametrize("seed", [0, 1])
 def test_detuning_reaches_its_target_and_keeps_the_other_thicknesses(design, seed):
-    geo, again = (detune(design, FIELDS, 0.05, torch.Generator().manual_seed(seed)) for _ in range(2))
+    geo, again = (
+        detune(design, FIELDS, 0.05, torch.Generator().manual_seed(seed)) for _ in range(2)
+    )
     # forty halvings
     close(lens.rms_spot_mm(geo, FIELDS).mean(), 0.05, 1e-9)
     close(efl(geo), design.efl_mm, 1e-12)

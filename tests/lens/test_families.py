@@ -1,5 +1,5 @@
-"""Lens families: traced lenses whose focal length, f-number, focus and bending are variables; against rays near the
-axis, differences, and what the film has to see."""
+"""Lens families: traced lenses whose focal length, f-number, focus and bending are variables;
+against rays near the axis, differences, and what the film has to see."""
 
 import itertools
 
@@ -48,7 +48,9 @@ def test_rays_near_the_axis_have_the_focal_length_and_the_f_number(family):
         slope = float(-out.direction[0, 1] / out.direction[0, 2])
         assert height_mm / slope == pytest.approx(efl_mm, rel=1e-6)
         # the marginal ray goes through the rim of the stop
-        (*_, at_stop) = itertools.islice(at_surfaces(geo.prescription(), start, along), geo.stop_index + 1)
+        (*_, at_stop) = itertools.islice(
+            at_surfaces(geo.prescription(), start, along), geo.stop_index + 1
+        )
         rim_mm = float(geo.semi_aperture_mm[geo.stop_index])
         assert abs(float(at_stop.position_mm[0, 1])) == pytest.approx(share * rim_mm, rel=1e-6)
         # closed form: -1 / C of the system matrix
@@ -60,20 +62,28 @@ def test_the_film_follows_the_image_of_the_point_in_focus(family):
     """As far as ``focus_at`` moves it, which knows nothing of families."""
     for efl_mm, fno, focus_per_m, bending in box(family, 3, focus_per_m=(0.5, 8.0)):
         near, far = (family.lens(efl_mm, fno, focus, bending) for focus in (focus_per_m, 0.0))
-        moved = far.focus_at(1 / focus_per_m).thickness_mm[-1] - far.focus_at(float("inf")).thickness_mm[-1]
-        assert float(near.thickness_mm[-1] - far.thickness_mm[-1]) == pytest.approx(float(moved), rel=1e-9)
+        moved = (
+            far.focus_at(1 / focus_per_m).thickness_mm[-1]
+            - far.focus_at(float("inf")).thickness_mm[-1]
+        )
+        assert float(near.thickness_mm[-1] - far.thickness_mm[-1]) == pytest.approx(
+            float(moved), rel=1e-9
+        )
 
 
 def test_the_film_is_lit_over_the_whole_range(family):
     pixels = torch.tensor([[0.0, 0.0], [172.5, 129.5], [345.0, 129.5]], dtype=D)
     for efl_mm, fno, focus_per_m, bending in box(family):
-        camera = render.Camera(family.lens(efl_mm, fno, focus_per_m, bending), 346, 260, 0.0185, film=DAVIS)
+        camera = render.Camera(
+            family.lens(efl_mm, fno, focus_per_m, bending), 346, 260, 0.0185, film=DAVIS
+        )
         camera.check()
         pupil = lens.pupil_grid(8)
         rays = camera.rays_through(pixels.repeat_interleave(len(pupil), 0), pupil.repeat(3, 1))
         corner, middle, side = rays.weight.reshape(3, -1).mean(1).tolist()
         assert middle > 0.999
-        # wide open the corner may be vignetted, as with any fast lens, and not when stopped down twice as far
+        # wide open the corner may be vignetted, as with any fast lens, and not when stopped down
+        # twice as far
         assert min(corner, side) > (0.3 if fno == family.fno[0] else 0.95)
 
 
@@ -91,8 +101,8 @@ def test_glass_and_air_have_room_everywhere_in_the_box(family):
 
 
 def test_light_fades_out_and_never_jumps(family):
-    """Across the pupil, wide open: the edges of apertures take a ray away before it fails, which would be a jump from
-    whatever its weight was."""
+    """Across the pupil, wide open: the edges of apertures take a ray away before it fails, which
+    would be a jump from whatever its weight was."""
     line = torch.linspace(-1, 1, 4001, dtype=D)
     turn = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.6, 0.8], [-0.6, 0.8]], dtype=D)
     pupil = (line[:, None] * turn[:, None]).reshape(-1, 2)
@@ -102,7 +112,8 @@ def test_light_fades_out_and_never_jumps(family):
     for efl_mm, bending in itertools.product(efls_mm(family, 7), (-1.0, 0.0, 1.0)):
         geo = family.lens(efl_mm, family.fno[0], 0.0, bending)
         weight = geo.camera_rays(film_mm, pupil).weight.reshape(-1, len(line))
-        # a step moves rays by 0.1 to 1 % of a millimetre, a tenth of the soft edge, and where they lean most by more
+        # a step moves rays by 0.1 to 1 % of a millimetre, a tenth of the soft edge, and where they
+        # lean most by more
         assert float(weight.diff(dim=1).abs().max()) < 0.25
         assert float(weight.amin(1).min()) < 0.5 < float(weight.mean())
 
@@ -131,7 +142,9 @@ def test_gradients_of_frames_against_differences(generator):
     scene = worlds.smooth_plane(5)
 
     def loss(*variables):
-        camera = render.Camera(lens.family("retrofocus-4").lens(*variables), 8, 8, 0.4, 8, falloff=True)
+        camera = render.Camera(
+            lens.family("retrofocus-4").lens(*variables), 8, 8, 0.4, 8, falloff=True
+        )
         return (render.frames(camera, scene, pose) * weights).sum()
 
     at = [torch.tensor(v, dtype=D) for v in (4.0, 1.3, 0.7, 0.3)]
@@ -147,19 +160,23 @@ def test_speed_and_field_cost_sharpness(family):
 
 
 def spots_px(geo, heights_mm=(0.0, 2.8, 4.0)):
-    """RMS spots of far points that are seen at heights on the film, in px: how far apart the rays of a film point
-    run, over how far apart neighbouring film points look."""
+    """RMS spots of far points that are seen at heights on the film, in px: how far apart the rays
+    of a film point run, over how far apart neighbouring film points look."""
     pupil = lens.pupil_grid(16)
     found = []
     for height in heights_mm:
         at = torch.tensor([[0.0, height]], dtype=D)
         step = 1e-3 * torch.tensor([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], dtype=D)
-        chief, right, left, down, up = geo.camera_rays(at + step, torch.zeros(5, 2, dtype=D)).direction
+        chief, right, left, down, up = geo.camera_rays(
+            at + step, torch.zeros(5, 2, dtype=D)
+        ).direction
         per_mm = torch.stack([right - left, down - up], 1) / 2e-3
         rays = geo.camera_rays(at.expand(len(pupil), 2), pupil)
         off_mm = torch.linalg.lstsq(per_mm, (rays.direction - chief).T).solution.T
         light = rays.weight[:, None] / rays.weight.sum()
-        found.append(float((light * (off_mm - (light * off_mm).sum(0)).square()).sum().sqrt()) / 0.0185)
+        found.append(
+            float((light * (off_mm - (light * off_mm).sum(0)).square()).sum().sqrt()) / 0.0185
+        )
     return found
 
 
@@ -167,7 +184,12 @@ def test_a_larger_image_circle_scales_all_lengths(family):
     larger = lens.family(family.name, image_radius_mm=2 * family.image_radius_mm)
     efl_mm, fno = float(family.efl_mm[1]), 2 * family.fno[0]
     small, large = family.lens(efl_mm, fno, 0.4, 0.5), larger.lens(2 * efl_mm, fno, 0.2, 0.5)
-    for name, power in (("curvature_per_mm", -1), ("thickness_mm", 1), ("semi_aperture_mm", 1), ("conic", 0)):
+    for name, power in (
+        ("curvature_per_mm", -1),
+        ("thickness_mm", 1),
+        ("semi_aperture_mm", 1),
+        ("conic", 0),
+    ):
         torch.testing.assert_close(getattr(large, name), 2.0**power * getattr(small, name))
 
 
@@ -182,7 +204,9 @@ def test_what_a_family_cannot_reach_is_refused():
     ):
         with pytest.raises(DomainError, match=words):
             family.lens(*wrong)
-    with pytest.raises(DomainError, match="no lens family is called 'zoom'; choose one of retrofocus-4"):
+    with pytest.raises(
+        DomainError, match="no lens family is called 'zoom'; choose one of retrofocus-4"
+    ):
         lens.family("zoom")
 
 

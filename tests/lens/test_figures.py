@@ -1,5 +1,6 @@
-"""Figures of a lens as a contract: gradients to the lens and to the object distance against differences, parallel
-light as the limit, several distances as each alone, single precision; and depth of field."""
+"""Figures of a lens as a contract: gradients to the lens and to the object distance against
+differences, parallel light as the limit, several distances as each alone, single precision; and
+depth of field."""
 
 import math
 
@@ -7,7 +8,14 @@ import pytest
 import torch
 
 from codesign import lens
-from codesign.lens import aimed_rays, analysis, diffraction, paraxial, pupil_grid, relative_illumination
+from codesign.lens import (
+    aimed_rays,
+    analysis,
+    diffraction,
+    paraxial,
+    pupil_grid,
+    relative_illumination,
+)
 from codesign.lens.design import Limits, fit_apertures
 from codesign.lens.design.constraints import evaluate, penalty
 from codesign.lens.design.hits import paraxial_semi_aperture_mm, traced_semi_aperture_mm
@@ -26,11 +34,15 @@ def triplet():
 
 
 def point_spread(geo, at_m):
-    return (analysis.psf_on_pixels(geo, 0.02, 0.004, 8, LINES, grid=128, at_m=at_m).energy * PICTURE).sum()
+    return (
+        analysis.psf_on_pixels(geo, 0.02, 0.004, 8, LINES, grid=128, at_m=at_m).energy * PICTURE
+    ).sum()
 
 
 def geometric_spread(geo, at_m):
-    return (analysis.geometric_psf(geo, 0.02, 0.004, 8, LINES, grid=32, at_m=at_m).energy * PICTURE).sum()
+    return (
+        analysis.geometric_psf(geo, 0.02, 0.004, 8, LINES, grid=32, at_m=at_m).energy * PICTURE
+    ).sum()
 
 
 def polychromatic_spot(geo, at_m):
@@ -41,14 +53,20 @@ def polychromatic_spot(geo, at_m):
 FOCUSED = {
     "point spread": point_spread,
     "geometric spread": geometric_spread,
-    "MTF": lambda geo, at_m: analysis.diffraction_mtf(geo, 0.2, [10.0, 40.0], LINES, grid=64, at_m=at_m),
+    "MTF": lambda geo, at_m: analysis.diffraction_mtf(
+        geo, 0.2, [10.0, 40.0], LINES, grid=64, at_m=at_m
+    ),
     "depth of field": lambda geo, at_m: analysis.depth_of_field(geo.focus_at(at_m), 0.02).near_m,
 }
 FIGURES = {
     "spots": lambda geo, at_m: lens.rms_spot_mm(geo, FIELDS, grid=8, at_m=at_m),
-    "wavefront": lambda geo, at_m: analysis.rms_waves(analysis.wavefront(geo, 0.15, grid=16, at_m=at_m)),
+    "wavefront": lambda geo, at_m: analysis.rms_waves(
+        analysis.wavefront(geo, 0.15, grid=16, at_m=at_m)
+    ),
     "fan": lambda geo, at_m: analysis.ray_fan(geo, 0.15, count=7, at_m=at_m).tangential_mm.square(),
-    "fan paths": lambda geo, at_m: analysis.ray_fan(geo, 0.35, count=5, at_m=at_m).tangential_waves.square(),
+    "fan paths": lambda geo, at_m: analysis.ray_fan(
+        geo, 0.35, count=5, at_m=at_m
+    ).tangential_waves.square(),
     "seidel": lambda geo, at_m: seidel_sums(geo, 0.15, at_m=at_m).per_surface.square(),
     "distortion": lambda geo, at_m: analysis.distortion_percent(geo, [0.15], at_m=at_m),
     "field curvature": lambda geo, at_m: analysis.focus_shift_mm(geo, [0.15], at_m=at_m),
@@ -56,9 +74,13 @@ FIGURES = {
     "encircled": lambda geo, at_m: analysis.encircled_radius_mm(geo, 0.15, grid=8, at_m=at_m),
     "polychromatic spot": polychromatic_spot,
     "geometric MTF": lambda geo, at_m: analysis.geometric_mtf(geo, 0.15, [5.0], grid=8, at_m=at_m),
-    "through focus": lambda geo, at_m: analysis.through_focus_spot_mm(geo, FIELDS, [0.1], grid=8, at_m=at_m),
+    "through focus": lambda geo, at_m: analysis.through_focus_spot_mm(
+        geo, FIELDS, [0.1], grid=8, at_m=at_m
+    ),
     "apertures": lambda geo, at_m: paraxial_semi_aperture_mm(geo, 0.15, at_m=at_m),
-    "fitted apertures": lambda geo, at_m: fit_apertures(geo, (0.0, 0.3), at_m=at_m).semi_aperture_mm,
+    "fitted apertures": lambda geo, at_m: (
+        fit_apertures(geo, (0.0, 0.3), at_m=at_m).semi_aperture_mm
+    ),
     "image": lambda geo, at_m: geo.focus_at(at_m).thickness_mm[-1],
     "least spot": lambda geo, at_m: geo.focus_at(at_m, spot_grid=8).thickness_mm[-1],
     "ray focus": lambda geo, at_m: focus_rays(geo, [0.0, 0.35], at_m=at_m).thickness_mm[-1],
@@ -88,10 +110,12 @@ STILL = {
     "illumination": lambda geo, at_m: relative_illumination(geo, [0.2], grid=8),
     "paraxial": paraxial_figures,
     "held focal length": lambda geo, at_m: hold_efl(geo, 50.0).curvature_per_mm[5],
-    "incidence": lambda geo, at_m: penalty(evaluate(geo, Limits(incidence_deg=35.0, fields_rad=(0.35,)))),
+    "incidence": lambda geo, at_m: penalty(
+        evaluate(geo, Limits(incidence_deg=35.0, fields_rad=(0.35,)))
+    ),
 }
-# relative steps, and what differences over them know: light steps from cell to cell, and bilinear shares need
-# steps so small that hardly a ray changes its pixel
+# relative steps, and what differences over them know: light steps from cell to cell, and bilinear
+# shares need steps so small that hardly a ray changes its pixel
 STEPS = {
     "point spread": (1e-6, 1e-5),
     "geometric spread": (2e-9, 1e-3),
@@ -107,7 +131,9 @@ ALL = FIGURES | FOCUSED | STILL
 def test_gradients_of_figures_to_the_lens_are_those_of_differences(name, triplet):
     step, rel = STEPS.get(name, (2e-5, 1e-6))
     names = "curvature_per_mm thickness_mm"
-    check_lens_gradient(triplet, names, lambda geo: ALL[name](geo, math.inf).sum(), step=step, rel=rel)
+    check_lens_gradient(
+        triplet, names, lambda geo: ALL[name](geo, math.inf).sum(), step=step, rel=rel
+    )
 
 
 @pytest.mark.parametrize("name", [*FIGURES, *FOCUSED])
@@ -120,13 +146,16 @@ def test_gradients_of_figures_to_the_distance_are_those_of_differences(name, tri
 @torch.no_grad()
 @pytest.mark.parametrize("name", FIGURES)
 def test_figures_tend_to_those_of_parallel_light(name, triplet):
-    parallel, far, farther = (float(FIGURES[name](triplet, at_m).sum()) for at_m in (math.inf, 1e5, 1e6))
+    parallel, far, farther = (
+        float(FIGURES[name](triplet, at_m).sum()) for at_m in (math.inf, 1e5, 1e6)
+    )
     close(far, parallel, 1e-2)
     # an error goes as 1 / distance
     assert abs(farther - parallel) <= 0.11 * abs(far - parallel) + 1e-11 * abs(parallel)
 
 
-# lens numbers are rounded to 6e-8 of themselves: 6e-6 mm of path, 0.01 waves each, mostly alike for all rays
+# lens numbers are rounded to 6e-8 of themselves: 6e-6 mm of path, 0.01 waves each, mostly alike for
+# all rays
 @pytest.mark.parametrize(
     ("figure", "atol"),
     [
@@ -166,7 +195,9 @@ def test_figures_of_several_distances_are_those_of_each(figure):
 @torch.no_grad()
 @pytest.mark.parametrize("at_m", [0.5, 3.0, math.inf])
 def test_two_ways_to_focus_agree(at_m, triplet):
-    close(focus_paraxial(triplet, at_m=at_m).thickness_mm, triplet.focus_at(at_m).thickness_mm, 1e-14)
+    close(
+        focus_paraxial(triplet, at_m=at_m).thickness_mm, triplet.focus_at(at_m).thickness_mm, 1e-14
+    )
     for wavelength_um in (0.4861327, 0.5875618):
         image = triplet.focus_at(math.inf, wavelength_um).thickness_mm[-1]
         close(image, triplet.first_order(wavelength_um).bfl_mm, 1e-14)
@@ -184,7 +215,8 @@ def test_limits_and_tolerances_see_the_distance(triplet):
     found = squared_spots(spot_errors(FIELDS, at_m=(0.4, 3.0))(geo), 4)
     close(found, sizes, 1e-10)
     near, far = (
-        evaluate(triplet, Limits(incidence_deg=40.0, fields_rad=FIELDS, at_m=d))[0] for d in (0.2, math.inf)
+        evaluate(triplet, Limits(incidence_deg=40.0, fields_rad=FIELDS, at_m=d))[0]
+        for d in (0.2, math.inf)
     )
     assert near.name == "incidence on surface 1"
     assert float(near.value) != pytest.approx(float(far.value), rel=1e-3)
@@ -204,12 +236,17 @@ def test_depth_of_field_of_a_thin_lens_is_that_of_its_circle_of_confusion(focus_
     thin = geo.focus_at(focus_m).thin()
     for limit in filter(math.isfinite, (float(found.near_m), float(found.far_m))):
         # D |s (1 / f - 1 / d) - 1| for pupil D, film distance s and object distance d from the lens
-        close(10.0 * abs(thin.image_distance_mm * (1 / thin.efl_mm - 1e-3 / limit) - 1), 0.05, 1e-10)
+        close(
+            10.0 * abs(thin.image_distance_mm * (1 / thin.efl_mm - 1e-3 / limit) - 1), 0.05, 1e-10
+        )
     hyperfocal = float(analysis.hyperfocal_m(geo, 0.05))
     close(hyperfocal, (50.0**2 / (5.0 * 0.05) + 50.0) / 1e3, 1e-12)
     wide = analysis.depth_of_field(geo.focus_at(hyperfocal), 0.05 * (1 + 1e-9))
     # from half of it, for a thin lens
-    assert (float(wide.near_m), float(wide.far_m)) == (pytest.approx(hyperfocal / 2, rel=1e-6), math.inf)
+    assert (float(wide.near_m), float(wide.far_m)) == (
+        pytest.approx(hyperfocal / 2, rel=1e-6),
+        math.inf,
+    )
 
 
 @torch.no_grad()

@@ -1,5 +1,5 @@
-"""Lens files: exact round trips, what cannot be saved, and one sentence for everything a file can have
-wrong."""
+"""Lens files: exact round trips, what cannot be saved, and one sentence for everything a file can
+have wrong."""
 
 import os
 import random
@@ -18,7 +18,13 @@ from tests.lens.systems import FAULTS, close, f64, load_file
 PLANE = float("inf")
 SPECIAL = [
     Surface(
-        31.7, 5.1, Glass.from_indices(1.61, 1.6, 1.595, "mine"), 9.0, -0.7, (1e-4, -2.2e-6), is_stop=True
+        31.7,
+        5.1,
+        Glass.from_indices(1.61, 1.6, 1.595, "mine"),
+        9.0,
+        -0.7,
+        (1e-4, -2.2e-6),
+        is_stop=True,
     ),
     Surface(-50.3, 0.1, None, 9.0),
     Surface(PLANE, 2.0, Glass.named("F2"), 8.0, asphere=(0.0, 1e-7, 3e-9)),
@@ -29,7 +35,9 @@ PHASE = Phase((-3.3, 0.01), order=2, blaze_um=0.55)
 RARE = [
     Surface(31.7, 5.1, Glass.from_abbe(1.6123, 44.1), 9.0, is_stop=True, phase=PHASE),
     Surface(-250.0, 20.0, None, 9.0, inner_semi_aperture_mm=1.25),
-    Surface(-180.3, 21.0, None, 9.0, -1.1, mirror=True, decentre_mm=(0.1, -0.2), tilt_deg=(0.3, 1 / 3)),
+    Surface(
+        -180.3, 21.0, None, 9.0, -1.1, mirror=True, decentre_mm=(0.1, -0.2), tilt_deg=(0.3, 1 / 3)
+    ),
 ]
 LENSES = {
     "special": GeoLens(SPECIAL, 9.5, soft_edge_mm=0.15, name="special"),
@@ -59,7 +67,9 @@ def test_changed_values_are_what_is_saved(tmp_path):
     geo = LENSES["special"]
     offset = f64([0.01, 0, -0.02, 0])
     changed = geo.replace(
-        curvature_per_mm=geo.curvature_per_mm * 1.1, thickness_mm=geo.thickness_mm + 0.01, index_offset=offset
+        curvature_per_mm=geo.curvature_per_mm * 1.1,
+        thickness_mm=geo.thickness_mm + 0.01,
+        index_offset=offset,
     )
     lens.save(changed, tmp_path / "a.json")
     points = f64([[1.0, 2.0, -5.0], [-3.0, 0.5, -5.0]])
@@ -147,7 +157,10 @@ def test_places_and_endings_that_cannot_be_are_refused(tmp_path):
     (tmp_path / "lens.doc").write_text("{}")
     for call, said in (
         (lambda: lens.load(tmp_path / "folder.json"), "not a regular file"),
-        (lambda: lens.load(tmp_path / "lens.doc"), r"'\.doc' is not read; give \.json, \.zmx, \.seq, \.txt"),
+        (
+            lambda: lens.load(tmp_path / "lens.doc"),
+            r"'\.doc' is not read; give \.json, \.zmx, \.seq, \.txt",
+        ),
         (lambda: lens.save(geo, tmp_path / "lens.txt"), r"'\.txt' is not written"),
         (lambda: lens.save(geo, tmp_path / "missing" / "a.json"), "cannot write .*json"),
         (lambda: lens.save(geo, tmp_path / "folder.json"), "cannot write .*json"),
@@ -248,9 +261,15 @@ INFRARED = Glass("GE-LIKE", "sellmeier", (15.0, 0.2), (2.0, 12.0))
     ("rare", "reason"),
     [
         ({"tilt_deg": (1.0, 0.0)}, "surface 1: .*decentred or tilted.*save the lens as .json"),
-        ({"asphere": (0.0,) * 8 + (1e-20,)}, "surface 1: .*9 asphere terms.*save the lens as .json"),
+        (
+            {"asphere": (0.0,) * 8 + (1e-20,)},
+            "surface 1: .*9 asphere terms.*save the lens as .json",
+        ),
         ({"phase": Phase((-1.0,))}, "surface 1: .*diffractive phase.*save the lens as .json"),
-        ({"medium": Glass.from_indices(1.5, 1.5, 1.5, "flat")}, "surface 1: .*Abbe number inf.*as .json"),
+        (
+            {"medium": Glass.from_indices(1.5, 1.5, 1.5, "flat")},
+            "surface 1: .*Abbe number inf.*as .json",
+        ),
         # a model glass is given by visible lines
         ({"medium": INFRARED}, "GE-LIKE"),
     ],

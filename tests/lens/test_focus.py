@@ -1,5 +1,5 @@
-"""Solves: focal lengths held by a curvature, focus at a distance, semi-apertures that follow the rays;
-against first-order optics worked by hand, brute force and differences."""
+"""Solves: focal lengths held by a curvature, focus at a distance, semi-apertures that follow the
+rays; against first-order optics worked by hand, brute force and differences."""
 
 import math
 
@@ -154,5 +154,7 @@ def test_a_sphere_ends_at_its_radius():
 def test_fitted_apertures_go_into_files_and_scaled_lenses(tmp_path):
     fitted = fit_apertures(lens.load("cooke-triplet").freeze(), (0.0, 0.3))
     lens.save(fitted, tmp_path / "fitted.json")
-    assert torch.equal(lens.load(tmp_path / "fitted.json").semi_aperture_mm, fitted.semi_aperture_mm)
+    assert torch.equal(
+        lens.load(tmp_path / "fitted.json").semi_aperture_mm, fitted.semi_aperture_mm
+    )
     torch.testing.assert_close(fitted.scaled(2.0).semi_aperture_mm, 2 * fitted.semi_aperture_mm)

@@ -1,4 +1,5 @@
-"""Refractive indices against published tables, names as lens files spell them, and glasses that cannot be."""
+"""Refractive indices against published tables, names as lens files spell them, and glasses that
+cannot be."""
 
 import dataclasses
 import json
@@ -16,7 +17,8 @@ from tests.lens.systems import close
 ROWS = {row[0]: row for row in rows()}
 
 
-# rows of a name and numbers: indices at the lines of the header, deviations of the partial dispersion
+# rows of a name and numbers: indices at the lines of the header, deviations of the partial
+# dispersion
 INDICES, DEVIATIONS = (
     [line.split() for line in part.splitlines()]
     for part in Path(__file__).with_name("printed_glasses.txt").read_text().split("\n\n")
@@ -25,9 +27,9 @@ PRINTED_AT = INDICES[2][1:]
 
 
 def test_every_entry_has_the_published_index_and_abbe_number():
-    # Five printed decimals, and the makers quote 5e-6 for their formulas. Sumita, Zeon and Osaka Gas print
-    # measured values beside a fit: two or three units of the fifth decimal, of the third for the polyesters
-    # (spread between lots), and Vd with at most one decimal.
+    # Five printed decimals, and the makers quote 5e-6 for their formulas. Sumita, Zeon and Osaka
+    # Gas print measured values beside a fit: two or three units of the fifth decimal, of the third
+    # for the polyesters (spread between lots), and Vd with at most one decimal.
     printed = {"Sumita": (2.5e-5, 0.25), "Zeon": (2.5e-5, 0.06), "Osaka": (1e-3, 0.3)}
     for name, (*_, (nd, abbe), _, source) in ROWS.items():
         index, number = printed.get(re.split("[, ]", source)[0], (6e-6, 0.01))
@@ -50,9 +52,11 @@ def test_the_catalogue_is_large_and_its_names_are_told_apart():
 @pytest.mark.parametrize(("name", "printed"), [(name, numbers) for name, *numbers in INDICES[3:]])
 def test_indices_agree_with_the_printed_tables(name, printed):
     found = [Glass.named(name).index(LINE_UM[line]) for line in PRINTED_AT]
-    # half a unit of the fifth decimal and the rounding of the line's wavelength (Hoya prints 1013.98 and
-    # 706.52 nm); Sumita prints what it measured
-    close(found, [float(index) for index in printed], atol=2.5e-5 if name.startswith("K-") else 6e-6)
+    # half a unit of the fifth decimal and the rounding of the line's wavelength (Hoya prints
+    # 1013.98 and 706.52 nm); Sumita prints what it measured
+    close(
+        found, [float(index) for index in printed], atol=2.5e-5 if name.startswith("K-") else 6e-6
+    )
 
 
 @pytest.mark.parametrize(("name", "deviation"), DEVIATIONS[1:])
@@ -77,12 +81,18 @@ def test_three_lines_are_met_exactly_and_followed_between(name):
     for wavelength_um in WAVELENGTH_UM.values():
         close(three.index(wavelength_um), true.index(wavelength_um), atol=1e-15)
     # Conrady's three terms; with 1/w^2 and 1/w^4 the same glasses are missed by ten times as much
-    for wavelength_um, tolerance in ((0.5460740, 5e-6), (0.62, 5e-6), (0.45, 1e-4), (0.7065188, 1e-4)):
+    for wavelength_um, tolerance in (
+        (0.5460740, 5e-6),
+        (0.62, 5e-6),
+        (0.45, 1e-4),
+        (0.7065188, 1e-4),
+    ):
         close(three.index(wavelength_um), true.index(wavelength_um), atol=tolerance)
 
 
 @pytest.mark.parametrize(
-    ("nd", "abbe"), [(1.5168, 64.17), (1.92286, 18.9), (1.43875, 94.93), (1.7725, 49.6), (1.5, 150.0)]
+    ("nd", "abbe"),
+    [(1.5168, 64.17), (1.92286, 18.9), (1.43875, 94.93), (1.7725, 49.6), (1.5, 150.0)],
 )
 def test_a_glass_from_nd_and_abbe_number_has_both(nd, abbe):
     glass = Glass.from_abbe(nd, abbe)
@@ -100,9 +110,15 @@ def test_the_error_of_a_glass_from_nd_and_abbe_number_is_the_stated_one():
             continue
         model = Glass.from_abbe(true.index_d, true.abbe_number)
         at.append(abs(model.index_F - true.index_F))
-        visible.append(max(abs(model.index(w) - true.index(w)) for w in (0.45 + 0.01 * i for i in range(26))))
+        visible.append(
+            max(abs(model.index(w) - true.index(w)) for w in (0.45 + 0.01 * i for i in range(26)))
+        )
         blue.append(abs(model.index(LINE_UM["g"]) - true.index(LINE_UM["g"])))
-    for errors, median, most in ((at, 1.6e-5, 5e-5), (visible, 6.2e-5, 1.7e-4), (blue, 9.4e-5, 2.8e-4)):
+    for errors, median, most in (
+        (at, 1.6e-5, 5e-5),
+        (visible, 6.2e-5, 1.7e-4),
+        (blue, 9.4e-5, 2.8e-4),
+    ):
         errors.sort()
         # the figures of the docstring, which are rounded
         close(errors[len(errors) // 2], median, 0.1)

@@ -1,5 +1,5 @@
-"""Coordinate breaks of .zmx files: the same rays traced by hand, from one local frame to the next as the
-file has them."""
+"""Coordinate breaks of .zmx files: the same rays traced by hand, from one local frame to the next
+as the file has them."""
 
 import math
 
@@ -12,7 +12,11 @@ from tests.lens.long_double_lens import by_frames
 from tests.lens.systems import close, f64
 
 HEAD = "MODE SEQ\nUNIT MM\nENPD 4\nFTYP 0 0 2 1 0 0 0\nYFLN 0 8\nWAVM 1 0.5875618 1\nSURF 0\n  DISZ INFINITY"
-MEDIA = {"air": ["GLAS AIR"], "glass": ["GLAS ___BLANK 1 0 1.6 50"], "mirror": ["GLAS MIRROR 0 0 1.5 40"]}
+MEDIA = {
+    "air": ["GLAS AIR"],
+    "glass": ["GLAS ___BLANK 1 0 1.6 50"],
+    "mirror": ["GLAS MIRROR 0 0 1.5 40"],
+}
 # rows of a kind, its thickness, and its curvature or PARM 1 to 6
 CASES = {
     "an element shifted and back": "air 5 0, break 0 .4 -.3 0 0 0 0, glass 4 .02, air 0 -.01, break 60 -.4 "
@@ -28,16 +32,29 @@ CASES = {
 
 
 def typed(case):
-    return [(kind, *map(float, numbers)) for kind, *numbers in (row.split() for row in case.split(","))]
+    return [
+        (kind, *map(float, numbers)) for kind, *numbers in (row.split() for row in case.split(","))
+    ]
 
 
 def drawn(seed):
     draw = np.random.default_rng(seed).uniform
     found = []
     sign = 1.0
-    for kind in ("glass", "air", "mirror", "glass", "air") if seed % 3 else ("glass", "air", "glass", "air"):
+    for kind in (
+        ("glass", "air", "mirror", "glass", "air") if seed % 3 else ("glass", "air", "glass", "air")
+    ):
         if draw() < 0.7:
-            found += [("break", 0.0, *draw(-0.4, 0.4, 2), *draw(-6, 6, 2), draw(-90, 90), int(draw() < 0.5))]
+            found += [
+                (
+                    "break",
+                    0.0,
+                    *draw(-0.4, 0.4, 2),
+                    *draw(-6, 6, 2),
+                    draw(-90, 90),
+                    int(draw() < 0.5),
+                )
+            ]
         sign = -sign if kind == "mirror" else sign
         found += [(kind, sign * draw(4, 9), draw(-0.015, 0.015))]
     return [*found, ("break", sign * 20.0, *draw(-0.4, 0.4, 2), *draw(-6, 6, 3), 0)]
@@ -72,8 +89,12 @@ def test_rays_go_where_a_trace_by_hand_leads_them(case, tmp_path):
     starts = [np.array([*draw(-1.5, 1.5, 2), -10.0]) for _ in range(6)]
     aims = [np.array([*draw(-0.06, 0.06, 2), 1.0]) for _ in range(6)]
     towards = [aim / np.linalg.norm(aim) for aim in aims]
-    led = np.array([by_frames(rows, *ray, bends=False) for ray in zip(starts, towards, strict=True)], float)
-    rays = geo.trace(torch.tensor(led[:, 0] - [0.0, 0.0, float(vertex[2])]), torch.tensor(led[:, 1]))
+    led = np.array(
+        [by_frames(rows, *ray, bends=False) for ray in zip(starts, towards, strict=True)], float
+    )
+    rays = geo.trace(
+        torch.tensor(led[:, 0] - [0.0, 0.0, float(vertex[2])]), torch.tensor(led[:, 1])
+    )
     true = np.array([by_frames(rows, *ray) for ray in zip(starts, towards, strict=True)], float)
     true[:, 1, 2] = abs(true[:, 1, 2])  # light travels along +z behind a mirror too
     assert not rays.status.any()
@@ -98,7 +119,11 @@ def test_four_tilted_mirrors_bring_the_beam_to_the_stated_spot(shared):
     # the breaks' tilts, each once before and once behind its mirror
     angle = -2 * math.radians(16.44 - 12 + 15.939999999989485 - 5.9999999994997468)
     around = torch.linspace(0, 2 * math.pi, 7201, dtype=torch.float64)[:, None]
-    tilt = [[1, 0, 0], [0, math.cos(angle), -math.sin(angle)], [0, math.sin(angle), math.cos(angle)]]
+    tilt = [
+        [1, 0, 0],
+        [0, math.cos(angle), -math.sin(angle)],
+        [0, math.sin(angle), math.cos(angle)],
+    ]
     across, up, along = f64(tilt).T
     vertex = f64([*geo.to_surfaces()[0].decentre_mm, 0.0])
     origins = vertex + 10 * (around.sin() * up + around.cos() * across)

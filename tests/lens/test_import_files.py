@@ -1,4 +1,5 @@
-"""What lens files say: closed forms of first-order optics, the facts of files.txt, encodings, units, folded axes."""
+"""What lens files say: closed forms of first-order optics, the facts of files.txt, encodings,
+units, folded axes."""
 
 import codecs
 import math
@@ -22,7 +23,9 @@ def thick(c1, c2, t, n=N):
 
 # paraxial system matrix of the singlet from first to last vertex, by products of matrices
 THROUGH = np.array([[1, 4 / N], [0, 1]])
-MATRIX = np.array([[1, 0], [-0.01 * (N - 1), 1]]) @ THROUGH @ np.array([[1, 0], [-0.02 * (N - 1), 1]])
+MATRIX = (
+    np.array([[1, 0], [-0.01 * (N - 1), 1]]) @ THROUGH @ np.array([[1, 0], [-0.02 * (N - 1), 1]])
+)
 NAMES = vars(math) | globals() | {"Glass": Glass, "Phase": Phase, "BK7": Glass.named("BK7")}
 
 
@@ -59,7 +62,9 @@ def test_a_singlet_is_what_the_lensmaker_says(kind, name, tmp_path):
     ],
 )
 def test_every_encoding_reads_the_same(encode, tmp_path):
-    geo = load_file(tmp_path, "zmx", content=encode(FILES["zmx"].replace("a singlet", "Ø 16 singlet")))
+    geo = load_file(
+        tmp_path, "zmx", content=encode(FILES["zmx"].replace("a singlet", "Ø 16 singlet"))
+    )
     assert (geo.name, geo.to_surfaces()) == ("Ø 16 singlet", SINGLET)
 
 
@@ -69,8 +74,14 @@ DOE = r"CIR 8 => CIR 8\nASP\nA 1e-6\nDIF DOE\nHWL 550\nHCT R\nHCO C1 -1e-4; HCO 
 
 @pytest.mark.parametrize(
     ("kind", "unit", "shape", "unit_mm"),
-    [("zmx", f"UNIT MM => UNIT {name}", ASPHERE, mm) for name, mm in (("CM", 10), ("IN", 25.4), ("M", 1000))]
-    + [("seq", f"DIM M => DIM {name}", DOE, mm) for name, mm in (("C", 10), ("I", 25.4), ("in", 25.4))],
+    [
+        ("zmx", f"UNIT MM => UNIT {name}", ASPHERE, mm)
+        for name, mm in (("CM", 10), ("IN", 25.4), ("M", 1000))
+    ]
+    + [
+        ("seq", f"DIM M => DIM {name}", DOE, mm)
+        for name, mm in (("C", 10), ("I", 25.4), ("in", 25.4))
+    ],
 )
 def test_units_become_millimetres(kind, unit, shape, unit_mm, tmp_path):
     geo = load_file(tmp_path, kind, f"{unit} ;; {shape}")

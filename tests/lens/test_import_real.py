@@ -1,5 +1,5 @@
-"""Published lens files, where they lie beside the checkout: focal lengths against what makers and patents
-say, one lens in two formats, and reasons for refusals."""
+"""Published lens files, where they lie beside the checkout: focal lengths against what makers and
+patents say, one lens in two formats, and reasons for refusals."""
 
 import contextlib
 import json
@@ -49,7 +49,9 @@ OTHERS = [
 REAL = json.loads(Path(__file__).with_name("real_files.json").read_text())
 
 
-@pytest.mark.parametrize("name", [*HEADERS, *(name for name, claim in CLAIMS.items() if not claim.remark)])
+@pytest.mark.parametrize(
+    "name", [*HEADERS, *(name for name, claim in CLAIMS.items() if not claim.remark)]
+)
 def test_focal_lengths_are_within_half_a_percent_of_what_is_claimed(name, shared):
     outcome = examine(shared(f"{FOLDER}/{name}"), shared(FOLDER))
     claim, found = outcome.claims[0]
@@ -61,7 +63,10 @@ def test_first_order_figures_are_those_of_another_reader(name, shared):
     wavelength_um, *true = REAL["peer"][name]
     geo = lens.load(shared(f"{FOLDER}/rayoptics/{name}"))
     f = geo.first_order(wavelength_um)
-    found = [abs(v.item()) for v in (f.efl_mm, f.bfl_mm, f.entrance_pupil_diameter_mm, f.entrance_pupil_z_mm)]
+    found = [
+        abs(v.item())
+        for v in (f.efl_mm, f.bfl_mm, f.entrance_pupil_diameter_mm, f.entrance_pupil_z_mm)
+    ]
     close(found, true, 1e-6)  # it puts objects at infinity to 1e10 mm
 
 
@@ -98,8 +103,8 @@ def test_the_solved_focus_is_the_one_another_program_stored(name, stored, shared
 
 
 def fan(geo, half_field_deg=5.0):
-    """Rays on and off axis through a tenth of the pupil's width and its rim, on the entrance pupil of the
-    lens."""
+    """Rays on and off axis through a tenth of the pupil's width and its rim, on the entrance pupil
+    of the lens."""
     f = geo.first_order()
     pupil = f64([[0.0, 0.0], [0.0, 0.5], [0.5, 0.0], [0.0, -0.9]])
     origins = torch.cat(
@@ -120,7 +125,11 @@ def same_rays(a, b, atol):
     ("one", "other", "atol"),
     [
         # one radius is -7.02695 in one and -7.027 in the other
-        ("diffoptics/DoubleGauss/US02532751-1.txt", "diffoptics/DoubleGauss/US02532751-1.zmx", 5e-5),
+        (
+            "diffoptics/DoubleGauss/US02532751-1.txt",
+            "diffoptics/DoubleGauss/US02532751-1.zmx",
+            5e-5,
+        ),
         ("deeplens/camera/ef35mm_f2.0.json", "deeplens/camera/ef35mm_f2.0.zmx", 1e-10),
         # indices rounded to 1e-9 in one
         ("cooke-triplet", "optiland/Cooke_triplet.json", 1e-7),
@@ -169,7 +178,9 @@ OPENED = ("cooke-triplet", "optiland/heliar.json", "rayoptics/US05331467-1.zmx")
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", OPENED)
-def test_another_program_opens_what_is_written_as_zmx_and_sees_the_same_lens(name, shared, tmp_path):
+def test_another_program_opens_what_is_written_as_zmx_and_sees_the_same_lens(
+    name, shared, tmp_path
+):
     fileio = pytest.importorskip("optiland.fileio")
     geo = lens.load(shared(f"{FOLDER}/{name}") if "/" in name else name).freeze()
     lens.save(geo, tmp_path / "lens.zmx")

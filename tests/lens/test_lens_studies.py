@@ -1,5 +1,5 @@
-"""What the drawings of a lens show: true sags, rays that end where they are traced to, curves with the values
-of the analysis; and the study on odd lenses."""
+"""What the drawings of a lens show: true sags, rays that end where they are traced to, curves with
+the values of the analysis; and the study on odd lenses."""
 
 import json
 import math
@@ -46,10 +46,10 @@ def _close_figures():
 
 
 def telescope():
-    """A Cassegrain: 200 mm f/8, a paraboloid and a hyperboloid, its axis unfolded at both mirrors; no half
-    field."""
-    # primary f = 500 mm, secondary magnifies 3.2 times; k = -((m + 1) / (m - 1))^2 (Schroeder, Astronomical
-    # Optics, ch. 2)
+    """A Cassegrain: 200 mm f/8, a paraboloid and a hyperboloid, its axis unfolded at both mirrors;
+    no half field."""
+    # primary f = 500 mm, secondary magnifies 3.2 times; k = -((m + 1) / (m - 1))^2 (Schroeder,
+    # Astronomical Optics, ch. 2)
     m = 3.2
     f1 = 500.0
     gap = 380.0
@@ -57,10 +57,20 @@ def telescope():
     # of the secondary; convex, so it bends the other way than the primary
     radius = 2 * image / (m - 1)
     primary = Surface(
-        -2 * f1, gap, None, 100.0, conic=-1.0, is_stop=True, mirror=True, inner_semi_aperture_mm=25.0
+        -2 * f1,
+        gap,
+        None,
+        100.0,
+        conic=-1.0,
+        is_stop=True,
+        mirror=True,
+        inner_semi_aperture_mm=25.0,
     )
     return GeoLens(
-        [primary, Surface(radius, image, None, 40.0, conic=-(((m + 1) / (m - 1)) ** 2), mirror=True)],
+        [
+            primary,
+            Surface(radius, image, None, 40.0, conic=-(((m + 1) / (m - 1)) ** 2), mirror=True),
+        ],
         200.0,
         name="cassegrain",
     )
@@ -101,7 +111,9 @@ def test_a_layout_is_saved_by_its_ending(tmp_path):
 
 def test_a_layout_says_that_mirrors_are_unfolded():
     figure = lens_figures.lens_layout(telescope(), [0.0, 0.002])
-    assert [t.get_text() for t in figure.axes[0].texts] == ["mirrors (thick) along the unfolded axis"]
+    assert [t.get_text() for t in figure.axes[0].texts] == [
+        "mirrors (thick) along the unfolded axis"
+    ]
     assert not lens_figures.lens_layout(lens.load("la1509"), [0.0]).axes[0].texts
 
 
@@ -111,7 +123,9 @@ def test_curves_carry_the_values_of_the_analysis():
     figure = lens_curves.field_errors(geo, field, count=5)
     shown = values(figure.axes[0].lines[0], "x")[-1]
     assert shown == analysis.focus_shift_mm(geo, [field])[0, 0].item()
-    assert values(figure.axes[1].lines[0], "x")[-1] == analysis.distortion_percent(geo, [field]).item()
+    assert (
+        values(figure.axes[1].lines[0], "x")[-1] == analysis.distortion_percent(geo, [field]).item()
+    )
     bars = lens_curves.seidel_bars(seidel_sums(geo, field)).axes[1].patches
     close(
         [b.get_height() for b in bars if isinstance(b, Rectangle)],
@@ -144,7 +158,9 @@ def test_the_report_of_odd_lenses(name, tmp_path, monkeypatch):
         monkeypatch.setattr(lens_report.lens, "load", lambda _: geo)
     assert (
         main(
-            lens_report.study, lens_report.Config, ["--lens", name, "--quick", "--out", str(tmp_path / "run")]
+            lens_report.study,
+            lens_report.Config,
+            ["--lens", name, "--quick", "--out", str(tmp_path / "run")],
         )
         == 0
     )
@@ -161,7 +177,16 @@ def test_the_report_of_odd_lenses(name, tmp_path, monkeypatch):
 
 
 def test_the_report_of_near_objects(tmp_path):
-    command = ["--quick", "--half-field-deg", "8", "--at-m", "0.5", "2", "--out", str(tmp_path / "run")]
+    command = [
+        "--quick",
+        "--half-field-deg",
+        "8",
+        "--at-m",
+        "0.5",
+        "2",
+        "--out",
+        str(tmp_path / "run"),
+    ]
     assert main(lens_report.study, lens_report.Config, command) == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     geo = lens.load("cooke-triplet").requires_grad_(False).focus_at(0.5, spot_grid=16)
@@ -183,19 +208,24 @@ def test_the_report_of_near_objects(tmp_path):
     ("options", "sentence"),
     [
         (["--half-field-deg", "95"], "a half field of 95.0 degrees cannot be"),
-        (["--at-m", "0.5", "-1"], "an object -1 m before the entrance pupil does not lie before the lens"),
+        (
+            ["--at-m", "0.5", "-1"],
+            "an object -1 m before the entrance pupil does not lie before the lens",
+        ),
         (["--focus-m", "0"], "does not lie before the lens"),
         (["--blur-um", "0"], "a blur of 0 um cannot be"),
     ],
 )
 def test_the_report_refuses_what_cannot_be(options, sentence, tmp_path, capsys):
-    assert main(lens_report.study, lens_report.Config, [*options, "--out", str(tmp_path / "run")]) == 2
+    assert (
+        main(lens_report.study, lens_report.Config, [*options, "--out", str(tmp_path / "run")]) == 2
+    )
     assert sentence in capsys.readouterr().err
 
 
 def published():
-    """The Cooke triplet in the study's variables, with its image plane at the paraxial focus; and as
-    published."""
+    """The Cooke triplet in the study's variables, with its image plane at the paraxial focus; and
+    as published."""
     geo = lens.load("cooke-triplet").freeze()
     return torch.cat([geo.curvature_per_mm[:5], geo.thickness_mm[:5], torch.zeros(1, dtype=D)]), geo
 
@@ -215,7 +245,9 @@ def test_the_squared_residuals_are_the_mean_square_spot():
     fields = [HALF_FIELD * k / 3 for k in range(4)]
     mean_square = 0.0
     for field in fields:
-        points = torch.cat([lens.spots(geo, [field], WAVELENGTH_UM[line], grid=8)[0][0] for line in LINES])
+        points = torch.cat(
+            [lens.spots(geo, [field], WAVELENGTH_UM[line], grid=8)[0][0] for line in LINES]
+        )
         mean_square += float((points - points.mean(0)).square().sum(1).mean()) / 4
     rows = residuals_of(stage)(x)
     rays = 4 * len(LINES) * (pupil_grid(8).shape[0] // 2)
@@ -234,8 +266,8 @@ def test_the_judge_sees_the_published_lens_as_it_is():
 
 
 def test_one_seed_reaches_the_published_lens():
-    """From plane plates: better than twice the published spot, all limits held. The yardstick is what the
-    study prints."""
+    """From plane plates: better than twice the published spot, all limits held. The yardstick is
+    what the study prints."""
     goal = 2 * sum(polychromatic_spots_um(published()[1])) / 3
     found = search("direct", 5, goal)
     assert found["succeeded"]

@@ -1,5 +1,5 @@
-"""Removed surfaces and elements against closed forms and invariances; neighbouring glasses against brute
-force."""
+"""Removed surfaces and elements against closed forms and invariances; neighbouring glasses against
+brute force."""
 
 import math
 
@@ -51,7 +51,8 @@ def test_a_plate_taken_out_moves_the_focus_by_what_it_had_moved_it():
     geo = GeoLens([*front, *plate], 8.0).freeze()
     bare = without_element(geo, 1).freeze()
     moved = float(geo.thickness_mm[1:].sum() - bare.thickness_mm[1:].sum())
-    # the defocus of both is the same, so the film moves as the paraxial focus does; rounding of 70 mm
+    # the defocus of both is the same, so the film moves as the paraxial focus does; rounding of 70
+    # mm
     close(moved, 6.0 * (1 - 1 / FLINT.index_d), atol=1e-12)
     assert bare.to_surfaces()[0] == front[0]
     close(bare.curvature_per_mm[1], -1 / 70, 1e-13)
@@ -90,8 +91,8 @@ def test_the_stop_stays_in_its_place_when_its_element_goes(triplet):
     stop = left.to_surfaces()[2]
     assert (left.stop_index, stop.radius_mm, stop.medium) == (2, PLANE, None)
     assert left.glass.tolist() == [True, False, False, True, False]
-    # the entrance pupil is the image of that plane by the crown in front of it, between its principal
-    # planes, from the lens maker's formulae (Smith, ch. 2)
+    # the entrance pupil is the image of that plane by the crown in front of it, between its
+    # principal planes, from the lens maker's formulae (Smith, ch. 2)
     front, back = triplet.to_surfaces()[:2]
     n, d, r1, r2 = front.medium.index_d, front.thickness_mm, front.radius_mm, back.radius_mm
     f = 1 / ((n - 1) * (1 / r1 - 1 / r2 + (n - 1) * d / (n * r1 * r2)))
@@ -101,14 +102,17 @@ def test_the_stop_stays_in_its_place_when_its_element_goes(triplet):
 
 
 def test_a_cemented_component_leaves_the_cement_to_its_neighbour():
-    """Places in front of a last surface that holds the focal length and so has another curvature."""
+    """Places in front of a last surface that holds the focal length and so has another
+    curvature."""
     cemented = [
         Surface(60.0, 4.0, CROWN, 9.0),
         Surface(-50.0, 2.0, FLINT, 9.0),
         Surface(90.0, 3.0, CROWN, 9.0, is_stop=True),
         Surface(-70.0, 5.0, None, 9.0),
     ]
-    geo = GeoLens([*cemented, Surface(80.0, 3.0, CROWN, 9.0), Surface(-200.0, 40.0, None, 9.0)], 8.0)
+    geo = GeoLens(
+        [*cemented, Surface(80.0, 3.0, CROWN, 9.0), Surface(-200.0, 40.0, None, 9.0)], 8.0
+    )
     crown, flint, last = "N-BK7", "F2", (80.0, 3.0, "N-BK7", False)
     for element, front in enumerate(
         (
@@ -134,7 +138,10 @@ def test_the_path_ends_in_a_plate_and_has_gradients(triplet, doublet):
     assert torch.autograd.grad(part.sum(), c)[0].tolist() == [1, 1, 0.75, 0.75, 1, 1]
     # cemented: a shell of equal curvatures, which is what stays of it
     ends = [flattened(doublet, k, 1.0).curvature_per_mm.tolist() for k in (0, 1)]
-    assert ends == [pytest.approx([-1 / 30, -1 / 30, -1 / 120]), pytest.approx([1 / 40, -1 / 30, -1 / 30])]
+    assert ends == [
+        pytest.approx([-1 / 30, -1 / 30, -1 / 120]),
+        pytest.approx([1 / 40, -1 / 30, -1 / 30]),
+    ]
 
 
 @pytest.mark.parametrize("name", ["F2", "N-SK16", "SF6"])
@@ -152,7 +159,9 @@ def test_neighbours_are_the_nearest_of_all(name):
     close([away(g) for g in found], truth, 1e-12)
     assert given.name not in [g.name for g in found]
     few = neighbour_glasses(name, 9, apart=0.0, among=("N-BK7", "F5", "SF6"))
-    assert [g.name for g in few] == sorted(("N-BK7", "F5", "SF6"), key=lambda n: away(Glass.named(n)))
+    assert [g.name for g in few] == sorted(
+        ("N-BK7", "F5", "SF6"), key=lambda n: away(Glass.named(n))
+    )
 
 
 def test_an_exchanged_glass_keeps_focal_length_and_defocus(triplet):
@@ -167,12 +176,16 @@ def test_an_exchanged_glass_keeps_focal_length_and_defocus(triplet):
 def test_glass_on_a_mirror_is_one_gap_for_both_ways():
     faces = Surface(-80.0, 4.0, CROWN, 10.0), Surface(-120.0, 4.0, CROWN, 10.0, mirror=True)
     mangin = GeoLens([*faces, Surface(80.0, 5.0, None, 10.0)], 10.0)
-    assert mangin.replace_glass(0, "SF1").index()[1:3].tolist() == [Glass.named("SF1").index(0.5875618)] * 2
+    assert (
+        mangin.replace_glass(0, "SF1").index()[1:3].tolist()
+        == [Glass.named("SF1").index(0.5875618)] * 2
+    )
 
 
 def in_frames(geo, errors):
-    """Rows of ``by_frames`` of a lens whose elements (first and last face) have a decentre, a tilt and a wedge [3, 2]: the
-    last face is turned about its vertex, the body about its first vertex, and shifted."""
+    """Rows of ``by_frames`` of a lens whose elements (first and last face) have a decentre, a tilt
+    and a wedge [3, 2]: the last face is turned about its vertex, the body about its first vertex,
+    and shifted."""
     media = geo.index().tolist()[1:]
     thickness = geo.thickness_mm.tolist()
     rows = list(zip(media, thickness, geo.curvature_per_mm.tolist(), strict=True))
@@ -196,7 +209,9 @@ def test_moved_elements_are_rigid_bodies(name, generator):
     """Three elements one after another, with errors a hundred times those of a workshop."""
     geo = lens.load(name).freeze()
     size = f64([[0.3], [0.03], [0.02]])
-    errors = {faces: torch.randn(3, 2, generator=generator).double() * size for faces in groups(geo)[:3]}
+    errors = {
+        faces: torch.randn(3, 2, generator=generator).double() * size for faces in groups(geo)[:3]
+    }
     moved = geo
     for faces, error in errors.items():
         moved = moved_element(moved, faces, *error)
@@ -204,7 +219,9 @@ def test_moved_elements_are_rigid_bodies(name, generator):
     towards = torch.nn.functional.normalize(f64([[0.02, 0.1, 1.0]] * 3), dim=1)
     out = moved.trace(starts, towards)
     rows = in_frames(geo, errors)
-    truth = np.array([by_frames(rows, *ray) for ray in zip(starts.numpy(), towards.numpy(), strict=True)])
+    truth = np.array(
+        [by_frames(rows, *ray) for ray in zip(starts.numpy(), towards.numpy(), strict=True)]
+    )
     # both programs agree to some 1e-13 mm on the lens at rest
     close(out.position_mm[:, :2], truth[:, 0, :2].astype(float), atol=2e-12)
     close(out.direction, truth[:, 1].astype(float), atol=2e-14)
@@ -227,9 +244,16 @@ def test_errors_of_an_element_have_gradients(size, triplet, generator):
 @pytest.fixture(scope="module")
 def doublet():
     """A cemented crown and flint."""
-    faces = Surface(40.0, 6.0, CROWN, 8.0), Surface(-30.0, 2.0, FLINT, 8.0), Surface(-120.0, 80.0, None, 8.0)
+    faces = (
+        Surface(40.0, 6.0, CROWN, 8.0),
+        Surface(-30.0, 2.0, FLINT, 8.0),
+        Surface(-120.0, 80.0, None, 8.0),
+    )
     return GeoLens(faces, 8.0).freeze()
 
 
 def rows(geo):
-    return [(s.radius_mm, s.thickness_mm, s.medium and s.medium.name, s.is_stop) for s in geo.to_surfaces()]
+    return [
+        (s.radius_mm, s.thickness_mm, s.medium and s.medium.name, s.is_stop)
+        for s in geo.to_surfaces()
+    ]

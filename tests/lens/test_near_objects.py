@@ -1,4 +1,5 @@
-"""Figures of lenses for near objects, against an independent lens in long double: 50 random systems."""
+"""Figures of lenses for near objects, against an independent lens in long double: 50 random
+systems."""
 
 import dataclasses
 import math
@@ -66,7 +67,11 @@ def geolens(system):
         surfaces.append(
             lens.Surface(math.inf, float(thickness), glass, 1e3, asphere=(0.0,) * 4, is_stop=stop)
         )
-    numbers = {"curvature_per_mm": system.curvature, "conic": system.conic, "asphere": system.asphere}
+    numbers = {
+        "curvature_per_mm": system.curvature,
+        "conic": system.conic,
+        "asphere": system.asphere,
+    }
     tensors = {name: torch.from_numpy(value.astype(float)) for name, value in numbers.items()}
     return lens.GeoLens(surfaces, float(system.diameter)).replace(**tensors).requires_grad_(False)
 
@@ -94,7 +99,10 @@ def rays(system, at_m):
         ld.field_rays(system, "d", FIELD, np.outer(line, axis), at) for axis in ((0, 1), (1, 0))
     )
     fan = analysis.ray_fan(geo, FIELD, count=9, at_m=at_m)
-    paths = [ld.path_differences(system, "d", f, chief)[0] / WAVELENGTH_MM for f in (tangential, sagittal)]
+    paths = [
+        ld.path_differences(system, "d", f, chief)[0] / WAVELENGTH_MM
+        for f in (tangential, sagittal)
+    ]
     turn = np.arange(16) * (2 * np.pi / 16) + np.pi / 2
     rim = np.concatenate([CENTRE, np.stack([np.cos(turn), np.sin(turn)], 1)])
     heights = np.max([ld.field_rays(system, "d", f, rim, at).heights.max(1) for f in FIELDS], 0)
@@ -104,7 +112,8 @@ def rays(system, at_m):
     return {
         "spot positions": error(lens.spots(geo, FIELDS, grid=GRID, at_m=at_m)[0], spots),
         "spots": error(
-            lens.rms_spot_mm(geo, FIELDS, grid=GRID, at_m=at_m) / torch.tensor(sizes.astype(float)), 1
+            lens.rms_spot_mm(geo, FIELDS, grid=GRID, at_m=at_m) / torch.tensor(sizes.astype(float)),
+            1,
         ),
         "encircled radius": error(
             analysis.encircled_radius_mm(geo, FIELD, share, LIGHT_UM[0], GRID, at_m=at_m),
@@ -114,7 +123,9 @@ def rays(system, at_m):
             error(fan.tangential_mm, (tangential.position - chief.position)[:, 1]),
             error(fan.sagittal_mm, (sagittal.position - chief.position)[:, 0]),
         ),
-        "fan paths": max(error(fan.tangential_waves, paths[0]), error(fan.sagittal_waves, paths[1])),
+        "fan paths": max(
+            error(fan.tangential_waves, paths[0]), error(fan.sagittal_waves, paths[1])
+        ),
         "incidence": error(hits.cosine, incidence),
         "apertures": error(traced_semi_aperture_mm(geo, FIELDS, 0.0, at_m=at_m), heights),
     }
@@ -126,15 +137,21 @@ def paraxial(system, at_m):
     at = 1e3 * L(at_m)
     sums = seidel_sums(geo, FIELD, at_m=at_m).per_surface.T
     chief = {
-        k: np.array([ld.field_rays(system, k, f, CENTRE, at).position[0, 1] for f in FIELDS]) for k in LINES
+        k: np.array([ld.field_rays(system, k, f, CENTRE, at).position[0, 1] for f in FIELDS])
+        for k in LINES
     }
-    ideal = -at / ld.paraxial(system, "d", at - ld.entrance_pupil(system), 1)[1][-1] * np.tan(L(FIELDS))
+    ideal = (
+        -at / ld.paraxial(system, "d", at - ld.entrance_pupil(system), 1)[1][-1] * np.tan(L(FIELDS))
+    )
     shifts = np.stack([ld.focus_shifts(system, f, at) for f in FIELDS])
     film = {k: ld.crossing(system, k, at) for k in LINES}
     return {
-        "Seidel sums": max(error(m, t) for m, t in zip(sums, ld.seidel(system, FIELD, at), strict=True)),
+        "Seidel sums": max(
+            error(m, t) for m, t in zip(sums, ld.seidel(system, FIELD, at), strict=True)
+        ),
         "distortion": error(
-            analysis.distortion_percent(geo, FIELDS[1:], at_m=at_m), 100 * (chief["d"][1:] / ideal[1:] - 1)
+            analysis.distortion_percent(geo, FIELDS[1:], at_m=at_m),
+            100 * (chief["d"][1:] / ideal[1:] - 1),
         ),
         "field curvature": error(analysis.focus_shift_mm(geo, FIELDS, at_m=at_m), shifts),
         "lateral colour": error(
@@ -149,7 +166,8 @@ def paraxial(system, at_m):
 
 
 def waves(system, at_m):
-    """Wavefront, point spread and MTF, of the lens stopped down until the cells resolve its wavefront."""
+    """Wavefront, point spread and MTF, of the lens stopped down until the cells resolve its
+    wavefront."""
     at = 1e3 * L(at_m)
     line = (np.arange(CELLS) + 0.5) / CELLS * 2 - 1
     x, y = np.meshgrid(line, line)
@@ -171,12 +189,16 @@ def waves(system, at_m):
     pixel = float(0.25 * WAVELENGTH_MM / np.abs(radius).max())
     place = (np.arange(12) - 6) * L(pixel)
     wave_x, wave_y = (
-        np.exp(2j * np.arctan2(L(0), L(-1)) * r / WAVELENGTH_MM * np.outer(place, line)) for r in radius
+        np.exp(2j * np.arctan2(L(0), L(-1)) * r / WAVELENGTH_MM * np.outer(place, line))
+        for r in radius
     )
     spread = np.abs(wave_y @ field @ wave_x.T) ** 2 / energy * pixel**2 / WAVELENGTH_MM**2
     spread = spread * (2 / L(CELLS)) ** 2 * np.abs(radius).prod()
-    # a shift by whole cells of the pupil is a frequency; the MTF is the overlap of the field with itself
-    mtf = [[np.abs((f[k:] * f[:-k].conj()).sum()) / energy for k in (3, 9)] for f in (field, field.T)]
+    # a shift by whole cells of the pupil is a frequency; the MTF is the overlap of the field with
+    # itself
+    mtf = [
+        [np.abs((f[k:] * f[:-k].conj()).sum()) / energy for k in (3, 9)] for f in (field, field.T)
+    ]
     return {
         "wavefront": error(analysis.wavefront(geo, FIELD, grid=CELLS, at_m=at_m).opd_mm, paths),
         "point spread": error(
@@ -215,7 +237,9 @@ def focus(system, at_m):
     def blur(distance_m):
         """Diameter on the film of the paraxial light of a point."""
         slope = system.diameter / 2 / (1e3 * L(float(distance_m)))
-        y, nu = ld.paraxial(system, "d", system.diameter / 2 - slope * ld.entrance_pupil(system), slope)
+        y, nu = ld.paraxial(
+            system, "d", system.diameter / 2 - slope * ld.entrance_pupil(system), slope
+        )
         return 2 * abs(y[-1] + film * nu[-1] / system.index["d"][-1])
 
     shared = focus_rays(geo, FIELDS, LIGHT_UM[:1], GRID, at_m=(at_m, 2 * at_m)).thickness_mm[-1]

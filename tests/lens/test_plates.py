@@ -1,4 +1,5 @@
-"""Phase plates: their polynomials and splines, rays and light through them, and plates found by gradient."""
+"""Phase plates: their polynomials and splines, rays and light through them, and plates found by
+gradient."""
 
 import copy
 import math
@@ -20,12 +21,16 @@ D = torch.float64
 def landscape():
     """A singlet behind a stop that is a plane in air."""
     singlet = Surface(60.0, 4.0, lens.Glass.named("N-BK7"), 12.0), Surface(-70.0, 60.0, None, 12.0)
-    return GeoLens([Surface(PLANE, 4.0, None, 6.0, is_stop=True), *singlet], 8.0).requires_grad_(False)
+    return GeoLens([Surface(PLANE, 4.0, None, 6.0, is_stop=True), *singlet], 8.0).requires_grad_(
+        False
+    )
 
 
 def bumpy(count=9, pitch=1.5, scale=2.0, **options):
     generator = torch.Generator().manual_seed(5)
-    return GridPlate(scale * torch.randn(count, count, dtype=D, generator=generator), pitch, **options)
+    return GridPlate(
+        scale * torch.randn(count, count, dtype=D, generator=generator), pitch, **options
+    )
 
 
 # --- polynomials and splines
@@ -100,7 +105,12 @@ def test_a_round_plate_is_a_diffractive_surface(where, wavelength_um):
     surfaces, z, surface, origin = {
         "before the stop": ([at(1.5), stop, front, back], -1.5, None, 1.5),
         "behind the stop": ([replace(stop, thickness_mm=1.0), at(3.0), front, back], 1.0, 0, 0.0),
-        "behind the last surface": ([stop, front, replace(back, thickness_mm=20.0), at(40.0)], 20.0, -1, 0.0),
+        "behind the last surface": (
+            [stop, front, replace(back, thickness_mm=20.0), at(40.0)],
+            20.0,
+            -1,
+            0.0,
+        ),
     }[where]
     start, direction = analysis.field_rays(geo, 0.08, pupil_grid(12))
     found = with_plate(geo, plate, surface, z).trace(start, direction, wavelength_um)
@@ -126,7 +136,9 @@ def test_rays_of_the_camera_go_the_same_way_back(where, aim):
     start[:, 2] += geo.first_order().entrance_pupil_z_mm
     out = plated.trace(start, -rays.direction * flip)
     close(-out.position_mm[:, :2], film, atol=1e-8)
-    assert (rays.direction - geo.camera_rays(film, pupil, aim=aim).direction).norm(dim=1).min() > 1e-6
+    assert (rays.direction - geo.camera_rays(film, pupil, aim=aim).direction).norm(
+        dim=1
+    ).min() > 1e-6
 
 
 def test_copies_own_their_plate_and_replacements_share_it():
@@ -149,7 +161,9 @@ def test_loading_and_converting_a_replacement_leave_the_plate_alone(plate):
     (first,) = plate.parameters()
     twin = plated.replace()
     state = twin.state_dict()
-    twin.load_state_dict(state | {name: v * 0 for name, v in state.items() if "extra_state" not in name})
+    twin.load_state_dict(
+        state | {name: v * 0 for name, v in state.items() if "extra_state" not in name}
+    )
     assert float(next(twin.plate.parameters()).detach().abs().max()) == 0
     for other in (plated.replace(), plated):
         assert next(other.float().plate.parameters()).dtype == torch.float32
@@ -200,7 +214,8 @@ def test_gradients_of_rays_reach_the_plate_and_the_lens(where):
 
 
 def test_a_plate_in_the_pupil_adds_its_phase_to_the_wavefront():
-    # to first order the path of the bare rays; the second is that of the turn, slope^2 f / 2 w = 5e-6 waves
+    # to first order the path of the bare rays; the second is that of the turn, slope^2 f / 2 w =
+    # 5e-6 waves
     geo = landscape()
     radius = float(geo.first_order().stop_semi_aperture_mm)
     bare = analysis.wavefront(geo, 0.0, grid=16)
@@ -215,18 +230,20 @@ def test_a_plate_in_the_pupil_adds_its_phase_to_the_wavefront():
 
 
 def before_film(pupil, distance_mm, pixel, count):
-    """Places [count] and field [count, count] about the axis on a plane before the film: each plane wave of the
-    pupil taken back by its own path, and summed."""
+    """Places [count] and field [count, count] about the axis on a plane before the film: each plane
+    wave of the pupil taken back by its own path, and summed."""
     x, y = pupil.cosines()
     axial = (1 - x.square() - y[:, None].square()).sqrt()
-    back = torch.polar(torch.ones_like(axial), -2 * math.pi / pupil.wavelength_mm * distance_mm * axial)
+    back = torch.polar(
+        torch.ones_like(axial), -2 * math.pi / pupil.wavelength_mm * distance_mm * axial
+    )
     places = (torch.arange(count, dtype=D) - count // 2) * pixel
     return places, replace(pupil, field=pupil.field * back).amplitude(places)
 
 
 def onward(field, distance_mm, pixel, wide=3):
-    """The field on its own grid further on: its plane waves, on a grid padded to ``wide`` times its size, by their
-    paths. Source: Goodman, Introduction to Fourier Optics, ch. 3."""
+    """The field on its own grid further on: its plane waves, on a grid padded to ``wide`` times its
+    size, by their paths. Source: Goodman, Introduction to Fourier Optics, ch. 3."""
     count = len(field)
     cosine = torch.fft.fftfreq(wide * count, dtype=D) * (0.5875618e-3 / pixel)
     axial = (1 - cosine.square() - cosine[:, None].square()).clamp_min(0).sqrt()
@@ -235,15 +252,17 @@ def onward(field, distance_mm, pixel, wide=3):
 
 
 def test_light_behind_the_last_surface_is_that_between_plane_waves():
-    # a plate in the converging light of an f/12.5: its phase on rays of the bare lens, against a thin
-    # element in the field, whose rim diffracts on the way to the plate: that differs as 1 / Fresnel number
-    # of the plate
+    # a plate in the converging light of an f/12.5: its phase on rays of the bare lens, against a
+    # thin element in the field, whose rim diffracts on the way to the plate: that differs as 1 /
+    # Fresnel number of the plate
     geo = paraboloid(4.0, 50.0).requires_grad_(False)
     pixel = 0.002
 
     def difference(before_mm, count):
         plate = ZernikePlate({5: 0.4, 7: 0.5, 11: 0.3}, 0.04 * before_mm).requires_grad_(False)
-        psf = analysis.psf_on_pixels(with_plate(geo, plate, -1, 50 - before_mm), 0.0, pixel, 48, grid=256)
+        psf = analysis.psf_on_pixels(
+            with_plate(geo, plate, -1, 50 - before_mm), 0.0, pixel, 48, grid=256
+        )
         x, field = before_film(analysis.pupil_function(geo, 0.0, grid=320), before_mm, pixel, count)
         # of an Airy pattern
         beyond = 2 / (math.pi * 2 * math.pi / 0.5875618e-3 * 0.04 * pixel * count / 2)
@@ -266,7 +285,9 @@ def test_light_behind_the_last_surface_is_that_between_plane_waves():
 
 
 @pytest.mark.parametrize(
-    "plate", [ZernikePlate({4: 0.0, 9: 0.0}, 4.0), GridPlate(torch.zeros(6, 6), 2.0)], ids=["zernike", "grid"]
+    "plate",
+    [ZernikePlate({4: 0.0, 9: 0.0}, 4.0), GridPlate(torch.zeros(6, 6), 2.0)],
+    ids=["zernike", "grid"],
 )
 def test_gradients_of_light_reach_the_plate(plate, generator):
     picture = torch.rand(16, 16, dtype=D, generator=generator)
@@ -284,7 +305,9 @@ def test_gradients_of_light_reach_the_plate(plate, generator):
 def test_phase_follows_wavelength_as_its_kind_says():
     relief = ZernikePlate({4: 1.0}, 4.0, wavelength_um=0.55)
     grating = ZernikePlate({4: 1.0}, 4.0, wavelength_um=0.55, diffractive=True)
-    assert relief.mm_per_rad(0.45) == relief.mm_per_rad(0.65) == pytest.approx(0.55e-3 / (2 * math.pi))
+    assert (
+        relief.mm_per_rad(0.45) == relief.mm_per_rad(0.65) == pytest.approx(0.55e-3 / (2 * math.pi))
+    )
     close(grating.mm_per_rad(0.65) / grating.mm_per_rad(0.55), 0.65 / 0.55, 1e-06)
 
 

@@ -1,4 +1,5 @@
-"""Point spreads against the Airy pattern, Parseval's theorem, the Strehl ratio, and the rays' own mean."""
+"""Point spreads against the Airy pattern, Parseval's theorem, the Strehl ratio, and the rays' own
+mean."""
 
 import math
 
@@ -30,7 +31,9 @@ def test_the_airy_pattern():
     energy = psf_on_pixels(paraboloid(), 0.0, pixel, 128, grid=256).energy.detach()
     r = (torch.arange(128, dtype=D) - 64) * pixel
     x = math.pi * r / (w * N)
-    airy = torch.where(x == 0, 1.0, (2 * torch.special.bessel_j1(x) / torch.where(x == 0, 1, x)).square())
+    airy = torch.where(
+        x == 0, 1.0, (2 * torch.special.bessel_j1(x) / torch.where(x == 0, 1, x)).square()
+    )
     for line in (energy[64], energy[:, 64]):
         # the staircase rim has an area wrong by 1e-4 and a sine condition of (y / f)^2 / 4 = 2e-4
         close(line / energy[64, 64], airy, atol=5e-4)
@@ -71,8 +74,8 @@ def test_the_geometric_spread_keeps_light_and_its_mean():
 
 
 def test_diffraction_keeps_the_mean_of_the_rays():
-    # the mean of |U|^2 is the mean slope of the wavefront (Ehrenfest), and the sign of y is that of the lens:
-    # coma of a singlet
+    # the mean of |U|^2 is the mean slope of the wavefront (Ehrenfest), and the sign of y is that of
+    # the lens: coma of a singlet
     geo = GeoLens(lens.load("la1509").surfaces, 16.0)
     field = math.radians(2.0)
     psf = diffraction_psf(geo, field, grid=256, padding=4)
@@ -101,15 +104,17 @@ def test_a_perfect_lens_reaches_the_closed_form():
 
 @pytest.mark.parametrize("H", [0.0, 0.7, 1.0])
 def test_mtf_against_a_sum_over_rays_with_their_own_directions(H):
-    # Huygens: every ray is a plane wave near the image; no even grid of direction cosines, no Fourier
-    # transform
+    # Huygens: every ray is a plane wave near the image; no even grid of direction cosines, no
+    # Fourier transform
     geo = lens.load("cooke-triplet")
     field = math.radians(20.0) * H
     front = analysis.wavefront(geo, field, grid=64)
     at = (torch.arange(160, dtype=D) - 80) * 0.001
     waves = [
         torch.polar(torch.ones_like(a), a)
-        for a in ((2 * math.pi / 0.5875618e-3 * at[:, None] * front.slope[:, k]).detach() for k in (0, 1))
+        for a in (
+            (2 * math.pi / 0.5875618e-3 * at[:, None] * front.slope[:, k]).detach() for k in (0, 1)
+        )
     ]
     amplitude = torch.polar(torch.ones_like(front.waves), -2 * math.pi * front.waves).detach()
     picture = ((waves[1] * amplitude) @ waves[0].T).abs().square()
@@ -117,13 +122,14 @@ def test_mtf_against_a_sum_over_rays_with_their_own_directions(H):
     kernel = torch.polar(torch.ones(4, 160, dtype=D), -2 * math.pi * frequency[:, None] * at)
     truth = torch.stack([(kernel * picture.sum(axis)).sum(1).abs() for axis in (1, 0)])
     found = diffraction_mtf(geo, field, frequency, grid=128)
-    # the picture's rim at 80 um cuts off 0.4 % of the light, which raises what is left by that share
+    # the picture's rim at 80 um cuts off 0.4 % of the light, which raises what is left by that
+    # share
     close(found, truth / truth[:, :1], atol=5e-3)
 
 
 def test_the_geometric_mtf_is_the_transform_of_the_spot():
-    # a defocused paraboloid spreads its light nearly evenly over a disc of radius a: 2 J1(x) / x, x = 2 pi a
-    # f
+    # a defocused paraboloid spreads its light nearly evenly over a disc of radius a: 2 J1(x) / x, x
+    # = 2 pi a f
     radius = 0.05 * 2.5 / 100
     frequency = torch.linspace(0, 400, 9, dtype=D)
     x = 2 * math.pi * radius * frequency
@@ -138,8 +144,8 @@ def test_several_wavelengths():
     one = diffraction_mtf(geo, field, [30.0], LINES[0], grid=128)
     close(diffraction_mtf(geo, field, [30.0], [LINES[0]] * 3, grid=128), one, 1e-12)
 
-    # transfer functions add as complex numbers, so the sum is at most the sum of the sizes (each about its
-    # own sphere: 1e-6)
+    # transfer functions add as complex numbers, so the sum is at most the sum of the sizes (each
+    # about its own sphere: 1e-6)
     parts = torch.stack([diffraction_mtf(geo, field, [30.0], w, grid=128) for w in LINES]).mean(0)
     assert (diffraction_mtf(geo, field, [30.0], LINES, grid=128) <= parts + 1e-5).all()
 

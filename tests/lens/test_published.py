@@ -1,5 +1,6 @@
-"""Three published lenses against independent programs: two ray tracers, one of 30 digits (tests/data/refs/lens), and
-what optiland says of their wavefronts, foci and transfer functions (optiland.json)."""
+"""Three published lenses against independent programs: two ray tracers, one of 30 digits
+(tests/data/refs/lens), and what optiland says of their wavefronts, foci and transfer functions
+(optiland.json)."""
 
 import json
 import math
@@ -50,11 +51,16 @@ def test_they_are_the_published_prescriptions(page, geo, name):
             close(index, theirs["n"][line], atol=1e-12)
             if theirs["glass"]:
                 # of the catalogue, rounded to 1e-9 there
-                close(Glass.named(theirs["material"]).index(wavelength_um), theirs["n"][line], atol=6e-10)
+                close(
+                    Glass.named(theirs["material"]).index(wavelength_um),
+                    theirs["n"][line],
+                    atol=6e-10,
+                )
 
 
-# the programs agree among themselves to 5e-14 mm (2e-13 in path); the figures asked for leave room for another
-# order of operations. Float32: eleven surfaces, coordinates up to 30 mm with roundings of 2e-6 mm each
+# the programs agree among themselves to 5e-14 mm (2e-13 in path); the figures asked for leave room
+# for another order of operations. Float32: eleven surfaces, coordinates up to 30 mm with roundings
+# of 2e-6 mm each
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_rays(name, page, dtype):
     assert len(page["rays"]) == 54
@@ -79,11 +85,14 @@ def test_derivatives_of_rays(name, page):
         out = geo.trace(f64([case["ray"]["start"]]), f64([case["ray"]["dir"]]))
         values = [*out.position_mm[0, :2], *out.direction[0], out.optical_path_mm[0]]
         found = [torch.autograd.grad(value, tensors, retain_graph=True) for value in values]
-        slopes = {kind: torch.stack(rows) for kind, rows in zip(SLOT, zip(*found, strict=True), strict=True)}
+        slopes = {
+            kind: torch.stack(rows)
+            for kind, rows in zip(SLOT, zip(*found, strict=True), strict=True)
+        }
         for row in case["grads"]:
             truth = f64([row["d"][axis] for axis in AXES])
-            # 1e-8 of each entry; entries that vanish by symmetry may carry the rounding of larger ones (1e-13:
-            # the reference's own step)
+            # 1e-8 of each entry; entries that vanish by symmetry may carry the rounding of larger
+            # ones (1e-13: the reference's own step)
             room = 1e-11 * float(truth.abs().max()) + 1e-13
             close(slopes[row["param"]][:, row["surface"]], truth, 1e-8, atol=room)
 
@@ -104,7 +113,10 @@ def test_first_order_at_three_lines(page, geo):
 
 def test_spots_and_centroids_at_three_lines(page, geo):
     for row in page["spots"]:
-        field, wavelength_um = math.radians(page["half_field_deg"] * row["H"]), lens.WAVELENGTH_UM[row["w"]]
+        field, wavelength_um = (
+            math.radians(page["half_field_deg"] * row["H"]),
+            lens.WAVELENGTH_UM[row["w"]],
+        )
         positions, weight = lens.spots(geo, [field], wavelength_um)
         assert (positions.shape[1], int(weight.sum())) == (row["n_rays"], row["n_rays"])
         # mm; the reference pupil is rounded to 1e-9 mm
@@ -158,7 +170,7 @@ def test_field_curvature(name, dtype, atol):
 def test_tangential_transfer_functions_of_the_triplet():
     geo = lens.load("cooke-triplet").freeze()
     for field, truth in zip(fields("cooke-triplet"), OPTILAND["cooke-triplet"]["mtf"], strict=True):
-        # theirs interpolates between steps of 1.2 / mm, where the curve bends by up to 4e-3, and takes one
-        # f-number for both directions
+        # theirs interpolates between steps of 1.2 / mm, where the curve bends by up to 4e-3, and
+        # takes one f-number for both directions
         found = analysis.diffraction_mtf(geo, field, [20.0, 50.0, 100.0], grid=256)[0]
         close(found, truth, atol=5e-3)

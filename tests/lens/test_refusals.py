@@ -30,7 +30,9 @@ CROWN, FLINT = glass(1.5), Glass.named("F2")
 SINGLET = [Surface(50.0, 5.0, CROWN, 5.0), Surface(-50.0, 5.0, None, 5.0)]
 WINDOW = GeoLens([Surface(PLANE, 5.0, CROWN, 5.0), Surface(PLANE, 5.0, None, 5.0)], 3.0)
 DIVERGING = GeoLens([Surface(-40.0, 2.0, CROWN, 5.0), Surface(40.0, 20.0, None, 5.0)], 4.0)
-MIRROR = GeoLens([Surface(-300.0, 30.0, None, 10.0, mirror=True), Surface(PLANE, 5.0, None, 9.0)], 8.0)
+MIRROR = GeoLens(
+    [Surface(-300.0, 30.0, None, 10.0, mirror=True), Surface(PLANE, 5.0, None, 9.0)], 8.0
+)
 MANGIN_FACES = [Surface(-80.0, 4.0, CROWN, 10.0), Surface(-120.0, 4.0, CROWN, 10.0, mirror=True)]
 MANGIN = GeoLens([*MANGIN_FACES, Surface(80.0, 60.0, None, 10.0)], 10.0)
 # a plate in front of it, passed on the way there and back
@@ -45,13 +47,15 @@ TWICE = GeoLens(
     ],
     10.0,
 )
-# one surface focuses at n R / (n - 1) = 90 mm inside the glass: a surface there meets the axial ray at
-# height 0
+# one surface focuses at n R / (n - 1) = 90 mm inside the glass: a surface there meets the axial ray
+# at height 0
 AT_IMAGE = GeoLens([Surface(30.0, 90.0, CROWN, 5.0), Surface(-40.0, 10.0, None, 5.0)], 4.0)
 # reflects everything that comes from 8 mm off the axis behind it
 BALL_FACES = [Surface(5.0, 10.0, CROWN, 4.99, is_stop=True), Surface(-5.0, 8.0, None, 4.99)]
 BALL = GeoLens(BALL_FACES, 8.0, name="ball")
-NARROW = GeoLens([Surface(50.0, 3.0, CROWN, 5.0, is_stop=True), Surface(-50.0, 40.0, None, 0.01)], 4.0)
+NARROW = GeoLens(
+    [Surface(50.0, 3.0, CROWN, 5.0, is_stop=True), Surface(-50.0, 40.0, None, 0.01)], 4.0
+)
 # stop in the front focal plane of a thin plano-convex lens: f = R / (n - 1) = 100
 STOP = Surface(PLANE, 100.0, None, 5.0, is_stop=True)
 TELECENTRIC = GeoLens([STOP, Surface(50.0, 1.0, CROWN, 9.0), Surface(PLANE, 100.0, None, 9.0)], 3.0)
@@ -82,7 +86,8 @@ def load_state(lens, saved):
 
 def curvatures(count):
     return [
-        tolerance.Error(f"curvature of surface {i + 1}", "curvature_per_mm", (i,), 0.5) for i in range(count)
+        tolerance.Error(f"curvature of surface {i + 1}", "curvature_per_mm", (i,), 0.5)
+        for i in range(count)
     ]
 
 
@@ -151,9 +156,11 @@ def test_the_grid_that_a_sentence_asks_for_is_enough():
     stop = Surface(PLANE, 4.0, None, 6.0, is_stop=True)
     geo = GeoLens([stop, SINGLET[0], Surface(-70.0, 60.0, None, 5.0)], 8.0)
     steep = diffraction.with_plate(geo, diffraction.ZernikePlate({11: 60.0}, 4.0), z_mm=1.0)
-    with pytest.raises(CodesignError, match=r"finer than 64 cells .* give a grid of at least") as caught:
+    with pytest.raises(
+        CodesignError, match=r"finer than 64 cells .* give a grid of at least"
+    ) as caught:
         analysis.pupil_function(steep, 0.0, grid=64)
     needed = int(str(caught.value).split("at least ")[1].split(",")[0])
-    # a phase c Z11 steps by c sqrt(5) (24 - 12) / pi waves per radius at the rim; half a wave from cell to
-    # cell
+    # a phase c Z11 steps by c sqrt(5) (24 - 12) / pi waves per radius at the rim; half a wave from
+    # cell to cell
     close(needed, 60 * math.sqrt(5) * 12 / (2 * math.pi) * 2 * 2, 0.02)

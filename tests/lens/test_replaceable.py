@@ -1,4 +1,5 @@
-"""Lenses as torch Modules: what they own, what they share, what conversions, copies and saved states keep."""
+"""Lenses as torch Modules: what they own, what they share, what conversions, copies and saved
+states keep."""
 
 import copy
 import dataclasses
@@ -61,7 +62,10 @@ def test_a_twin_and_its_original_are_converted_apart():
         spot = made.trace(*rays(dtype)).position_mm[:, :2].square().sum()
         return torch.autograd.grad(spot, geo.curvature_per_mm)[0]
 
-    found, wanted = slope(twin, torch.float32), slope(geo.replace(thickness_mm=geo.thickness_mm * 2), D)
+    found, wanted = (
+        slope(twin, torch.float32),
+        slope(geo.replace(thickness_mm=geo.thickness_mm * 2), D),
+    )
     assert found.dtype == D
     # float32 rays of 1e-6 at spots of 1e-3
     close(found, wanted, 1e-3)
@@ -135,7 +139,9 @@ def test_a_state_of_before_is_taken_where_its_owner_vouches_for_it():
     with pytest.raises(
         RuntimeError, match=r"lens._extra_state .pupil, glasses and .* lack them: strict=False"
     ):
-        torch.nn.ModuleDict({"lens": other}).load_state_dict({f"lens.{n}": v for n, v in old.items()})
+        torch.nn.ModuleDict({"lens": other}).load_state_dict(
+            {f"lens.{n}": v for n, v in old.items()}
+        )
     other.load_state_dict(old, strict=False)
     same(tensors(other), old)
 
@@ -207,7 +213,9 @@ def built_with(geo, at, medium):
     return GeoLens(surfaces, geo.entrance_pupil_diameter_mm, half_field_deg=geo.half_field_deg)
 
 
-@pytest.mark.parametrize(("surface", "glass"), [(2, FLINT), (-4, "sf2_schott"), (2, None), (1, FLINT)])
+@pytest.mark.parametrize(
+    ("surface", "glass"), [(2, FLINT), (-4, "sf2_schott"), (2, None), (1, FLINT)]
+)
 def test_it_is_the_lens_built_with_that_medium(surface, glass):
     geo = lens.load("cooke-triplet")
     before = geo.index().tolist()

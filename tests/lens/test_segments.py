@@ -40,7 +40,9 @@ def long_lens():
 def run(geo):
     y = torch.linspace(-13, 13, 53, dtype=D)
     origin = torch.stack([0.2 * y, y, torch.full_like(y, -5.0)], 1).requires_grad_()
-    direction = torch.nn.functional.normalize(torch.stack([0 * y, 0.02 * y, torch.ones_like(y)], 1), dim=1)
+    direction = torch.nn.functional.normalize(
+        torch.stack([0 * y, 0.02 * y, torch.ones_like(y)], 1), dim=1
+    )
     out = geo.trace(origin, direction)
     total = (
         (out.position_mm.square().sum(1) + out.optical_path_mm)[out.status == Status.OK].sum()
@@ -56,7 +58,9 @@ def test_segments_give_what_one_kernel_gives(monkeypatch, to_plane):
     geo = long_lens()
     if not to_plane:
         whole = geo.prescription
-        monkeypatch.setattr(geo, "prescription", lambda wavelength_um: whole(wavelength_um).until(8))
+        monkeypatch.setattr(
+            geo, "prescription", lambda wavelength_um: whole(wavelength_um).until(8)
+        )
     one, wanted = run(geo)
     # kernels of three surfaces
     monkeypatch.setattr(trace, "LONGEST", 6)
@@ -116,6 +120,8 @@ def test_event_and_flow_kernels_can_be_computed_again_too(function, generator):
     steps = torch.rand(5, 16, 16, generator=generator) + 0.5
     leaf = steps.cumsum(0).requires_grad_()
     want = torch.autograd.grad(function(leaf).square().sum(), leaf)[0]
-    got = torch.autograd.grad(checkpoint(function, leaf, use_reentrant=False).square().sum(), leaf)[0]
+    got = torch.autograd.grad(checkpoint(function, leaf, use_reentrant=False).square().sum(), leaf)[
+        0
+    ]
     assert want.abs().max() > 0
     assert torch.equal(got, want)

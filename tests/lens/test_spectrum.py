@@ -1,5 +1,5 @@
-"""Spectra against closed forms: strata of simple curves, Wien's and Planck's laws, the white point of D65,
-absorption of silicon."""
+"""Spectra against closed forms: strata of simple curves, Wien's and Planck's laws, the white point
+of D65, absorption of silicon."""
 
 import numpy as np
 import pytest
@@ -24,14 +24,18 @@ def test_a_flat_spectrum_gives_midpoints(count):
     spectrum = Spectrum.from_curves(FLAT, FLAT, count)
     assert spectrum.weights == (1 / count,) * count
     # a difference of moments near 0.2 over an energy of 0.3 / count keeps 1e-16 * count
-    close(spectrum.wavelengths_um, 0.4 + 0.3 * (np.arange(count) + 0.5) / count, atol=1e-15 * (10 + count))
+    close(
+        spectrum.wavelengths_um,
+        0.4 + 0.3 * (np.arange(count) + 0.5) / count,
+        atol=1e-15 * (10 + count),
+    )
 
 
 @pytest.mark.parametrize("split", [False, True])
 @pytest.mark.parametrize("swapped", [False, True])
 def test_a_ramp_gives_the_square_roots(swapped, split):
-    # energy below w is (w - a)^2, so the strata end at a + width sqrt(k/N) and their means are 2/3 of cube
-    # over square differences
+    # energy below w is (w - a)^2, so the strata end at a + width sqrt(k/N) and their means are 2/3
+    # of cube over square differences
     ramp = (
         (np.array([0.4, 0.5, 0.7]), np.array([0.0, 1.0, 3.0]))
         if split
@@ -47,7 +51,9 @@ def test_the_product_of_two_ramps_is_integrated_exactly():
     down = (np.array([0.0, 1.0]) + 0.4, np.array([1.0, 0.0]))
     # t (1 - t): mean 1/2; first half has mean 5/16 (integrals 1/12 and 5/192)
     close(Spectrum.from_curves(up, down, 1).wavelengths_um, (0.9,), atol=1e-14)
-    close(Spectrum.from_curves(up, down, 2).wavelengths_um, (0.4 + 5 / 16, 0.4 + 11 / 16), atol=1e-14)
+    close(
+        Spectrum.from_curves(up, down, 2).wavelengths_um, (0.4 + 5 / 16, 0.4 + 11 / 16), atol=1e-14
+    )
 
 
 @pytest.mark.parametrize("count", [2, 5, 24])
@@ -75,8 +81,8 @@ def test_strata_skip_a_gap():
 def test_the_peak_of_a_black_body_follows_wien(temperature_k):
     wavelength_um, value = blackbody(temperature_k)
     top = int(value.argmax())
-    # vertex of the parabola through the three highest points: third-order terms leave less than a tenth of
-    # the 5 nm step
+    # vertex of the parabola through the three highest points: third-order terms leave less than a
+    # tenth of the 5 nm step
     left, peak, right = value[top - 1 : top + 2]
     vertex = wavelength_um[top] + 0.005 * (left - right) / (left - 2 * peak + right) / 2
     close(vertex, 2897.771955 / temperature_k, atol=5e-4)
@@ -84,8 +90,8 @@ def test_the_peak_of_a_black_body_follows_wien(temperature_k):
 
 def test_a_hot_black_body_is_that_of_rayleigh_and_jeans():
     wavelength_um, value = blackbody(100_000)
-    # 1/(e^x - 1) = 1/x - 1/2 + x/12 with x <= 0.48; the next term, x^3/720, is largest beside the others
-    # (0.77/x) at the first point
+    # 1/(e^x - 1) = 1/x - 1/2 + x/12 with x <= 0.48; the next term, x^3/720, is largest beside the
+    # others (0.77/x) at the first point
     x = 14387.768775 / (wavelength_um * 1e5)
     jeans = wavelength_um**-5 * (1 / x - 0.5 + x / 12)
     close(value / value[0], jeans / jeans[0], 1.05 * 0.48**4 / 720 / 0.77)
@@ -96,9 +102,13 @@ def test_d65_is_white():
         return np.exp(-0.5 * ((nm - mean) / np.where(nm < mean, below, above)) ** 2)
 
     nm = np.arange(380.0, 781.0)
-    # colour matching functions of 1931 as sums of lobes: Wyman, Sloan and Shirley, JCGT 2 (2013), good to
-    # about 0.001 in x and y for white
-    x = 1.056 * lobe(599.8, 37.9, 31.0) + 0.362 * lobe(442.0, 16.0, 26.7) - 0.065 * lobe(501.1, 20.4, 26.2)
+    # colour matching functions of 1931 as sums of lobes: Wyman, Sloan and Shirley, JCGT 2 (2013),
+    # good to about 0.001 in x and y for white
+    x = (
+        1.056 * lobe(599.8, 37.9, 31.0)
+        + 0.362 * lobe(442.0, 16.0, 26.7)
+        - 0.065 * lobe(501.1, 20.4, 26.2)
+    )
     y = 0.821 * lobe(568.8, 46.9, 40.5) + 0.286 * lobe(530.9, 16.3, 31.1)
     z = 1.217 * lobe(437.0, 11.8, 36.0) + 0.681 * lobe(459.0, 26.0, 13.8)
     X, Y, Z = (float((np.interp(nm / 1000, *daylight_d65()) * curve).sum()) for curve in (x, y, z))
@@ -111,10 +121,12 @@ def test_d65_is_white():
     [(0.5, 1.11e4), (0.6, 4.18e3), (0.7, 1.89e3), (0.8, 8.5e2), (0.9, 3.03e2), (1.0, 6.4e1)],
 )
 def test_a_thin_layer_of_silicon_absorbs_by_its_coefficient(wavelength_um, absorption_per_cm):
-    # so thin that response / w is proportional to the coefficient (0.5 % at 0.5 um); coefficients as Green,
-    # 2008, tabulates them
+    # so thin that response / w is proportional to the coefficient (0.5 % at 0.5 um); coefficients
+    # as Green, 2008, tabulates them
     w, value = silicon_response(0.01)
-    per_photon = np.interp(wavelength_um, w, value) / wavelength_um / (np.interp(0.5, w, value) / 0.5)
+    per_photon = (
+        np.interp(wavelength_um, w, value) / wavelength_um / (np.interp(0.5, w, value) / 0.5)
+    )
     close(per_photon, absorption_per_cm / 1.11e4, 0.015)
 
 
@@ -123,4 +135,8 @@ def test_a_thick_layer_counts_every_visible_photon():
     visible = (w > 0.37) & (w < 0.9)
     assert value.max() == 1
     # 30 absorption lengths at 0.9 um: the response in A/W is proportional to w
-    close(value[visible] / w[visible], np.full(visible.sum(), value[visible][0] / w[visible][0]), 1e-12)
+    close(
+        value[visible] / w[visible],
+        np.full(visible.sum(), value[visible][0] / w[visible][0]),
+        1e-12,
+    )

@@ -1,5 +1,5 @@
-"""Surfaces of every kind against closed forms, symmetries and differences: conics, aspheres, mirrors, diffractive
-phases, decentres, tilts, obstructions."""
+"""Surfaces of every kind against closed forms, symmetries and differences: conics, aspheres,
+mirrors, diffractive phases, decentres, tilts, obstructions."""
 
 import math
 
@@ -24,7 +24,9 @@ MANGIN = GeoLens(
 )
 ODD = GeoLens(
     [
-        Surface(60.0, 5.0, GLASS, 15.0, -0.4, (0.0, 1e-6), decentre_mm=(0.2, -0.1), tilt_deg=(1.0, -2.0)),
+        Surface(
+            60.0, 5.0, GLASS, 15.0, -0.4, (0.0, 1e-6), decentre_mm=(0.2, -0.1), tilt_deg=(1.0, -2.0)
+        ),
         Surface(-90.0, 2.0, None, 15.0),
         Surface(PLANE, 3.0, GLASS, 15.0, phase=Phase((-0.2, 1e-4))),
         Surface(-300.0, 70.0, None, 15.0, tilt_deg=(-0.5, 0.7)),
@@ -56,13 +58,15 @@ RING = [(0.5, 0.0), (0.0, 9.0), (-4.0, 7.0), (12.0, -3.0)]
 
 
 def test_a_cassegrain_has_its_closed_form_focus_and_no_spherical_aberration():
-    """Paraboloid f1 = 100 and hyperboloid secondary that relays its focus 3x: k = -((m + 1) / (m - 1))^2,
-    unfolded signs."""
+    """Paraboloid f1 = 100 and hyperboloid secondary that relays its focus 3x: k = -((m + 1) /
+    (m - 1))^2, unfolded signs."""
     f1, m, gap = 100.0, 3.0, 75.0
     p = f1 - gap
     conic = -(((m + 1) / (m - 1)) ** 2)
     primary = Surface(-2 * f1, gap, None, 30.0, conic=-1.0, mirror=True)
-    geo = GeoLens([primary, Surface(2 * p * m / (m - 1), p * m, None, 10.0, conic, mirror=True)], 40.0)
+    geo = GeoLens(
+        [primary, Surface(2 * p * m / (m - 1), p * m, None, 10.0, conic, mirror=True)], 40.0
+    )
     close(efl(geo), m * f1, 1e-13)
     out = geo.trace(*parallel_rays(RING))
     close(out.position_mm, 0.0, atol=1e-12)
@@ -70,7 +74,8 @@ def test_a_cassegrain_has_its_closed_form_focus_and_no_spherical_aberration():
 
 
 def test_rays_that_end_on_a_diffractive_surface_are_not_bent_by_it():
-    """As when the stop carries the phase: ``until`` stops on the surface, with the geometric path alone."""
+    """As when the stop carries the phase: ``until`` stops on the surface, with the geometric path
+    alone."""
     ruled = Surface(PLANE, 30.0, None, 9.0, phase=Phase((-40.0, 0.3)))
     plate = GeoLens([Surface(PLANE, 4.0, GLASS, 9.0), ruled], 6.0)
     out = trace(plate.prescription().until(1), *parallel_rays([(1.0, 3.0), (-2.0, 0.5)], angle=0.2))
@@ -94,7 +99,8 @@ def test_the_grating_equation_on_a_plane():
 
 
 def test_a_diffractive_lens_has_its_focal_length_and_disperses_by_wavelength():
-    """phi = -pi r^2 / (w0 f) focuses w0 at f, and w at f w0 / w: the Abbe number of diffraction is -3.45."""
+    """phi = -pi r^2 / (w0 f) focuses w0 at f, and w at f w0 / w: the Abbe number of diffraction is
+    -3.45."""
     blaze, focal = 0.55, 80.0
     phase = Phase((-math.pi / (blaze * 1e-3 * focal),), 1, blaze)
     flat = GeoLens([Surface(PLANE, focal, None, 5.0, phase=phase)], 6.0)
@@ -117,19 +123,22 @@ def test_an_evanescent_order_is_total_reflection():
     assert out.weight[1].item() == 0
 
 
-# the normal of a face turned by +a about x is (0, -sin a, cos a): the ray is bent towards it, hence towards
-# -y; about y the normal turns to +x
+# the normal of a face turned by +a about x is (0, -sin a, cos a): the ray is bent towards it, hence
+# towards -y; about y the normal turns to +x
 @pytest.mark.parametrize(("tilt_deg", "axis", "sign"), [((30.0, 0.0), 1, -1), ((0.0, 30.0), 0, 1)])
 def test_a_tilted_plate_displaces_the_ray_by_its_closed_form(tilt_deg, axis, sign):
-    """A plate turned by a displaces the axial ray by t sin(a) (1 - cos(a) / sqrt(n^2 - sin^2 a))."""
+    """A plate turned by a displaces the axial ray by t sin(a) (1 - cos(a) /
+    sqrt(n^2 - sin^2 a))."""
     sine, cosine = math.sin(math.radians(30)), math.cos(math.radians(30))
     faces = (
-        Surface(PLANE, gap, medium, 10.0, tilt_deg=tilt_deg) for gap, medium in ((5.0, GLASS), (20.0, None))
+        Surface(PLANE, gap, medium, 10.0, tilt_deg=tilt_deg)
+        for gap, medium in ((5.0, GLASS), (20.0, None))
     )
     rays = parallel_rays([(0.0, 0.0)])
     out = GeoLens(faces, 4.0).trace(*rays)
     close(out.direction, rays[1], atol=1e-15)
-    # both faces turn about their own vertices; the distance between the parallel planes is then t cos(a)
+    # both faces turn about their own vertices; the distance between the parallel planes is then t
+    # cos(a)
     expected = 5.0 * cosine * sine * (1 - cosine / math.sqrt(1.6**2 - sine**2))
     close(out.position_mm[0, axis], sign * expected, 1e-13)
 
@@ -161,15 +170,19 @@ def test_a_sphere_has_the_aplanatic_points_of_weierstrass():
     ("surfaces", "path"),
     [
         (
-            [Surface(PLANE, 10.0, GLASS, 15.0), Surface(-40.0 * (N - 1), 40.0, None, 15.0, conic=-(N**2))],
+            [
+                Surface(PLANE, 10.0, GLASS, 15.0),
+                Surface(-40.0 * (N - 1), 40.0, None, 15.0, conic=-(N**2)),
+            ],
             1 + 10 * N + 40.0,
         ),
         ([Surface(60.0 * (N - 1) / N, 60.0, GLASS, 18.0, conic=-1 / N**2)], 1 + N * 60.0),
     ],
 )
 def test_stigmatic_conics_focus_an_axial_beam_by_equal_paths(surfaces, path):
-    """Born and Wolf, Principles of Optics, 4.2: a hyperboloid k = -n^2 out of glass with radius -f (n - 1); an
-    ellipsoid k = -1/n^2 into glass, f = n R / (n - 1); a sphere misses by 2 mm at the edge."""
+    """Born and Wolf, Principles of Optics, 4.2: a hyperboloid k = -n^2 out of glass with radius -f
+    (n - 1); an ellipsoid k = -1/n^2 into glass, f = n R / (n - 1); a sphere misses by 2 mm at the
+    edge."""
     out = GeoLens(surfaces, 10.0).trace(*parallel_rays(RING))
     # rounding of some 40 mm
     close(out.position_mm, 0.0, atol=1e-12)
@@ -227,7 +240,9 @@ def test_gradients_against_differences(geo, names):
 
     def merit(geo):
         out = geo.trace(*rays)
-        return (out.position_mm * probe + out.direction * probe.flip(0)).sum() + out.optical_path_mm.sum()
+        return (
+            out.position_mm * probe + out.direction * probe.flip(0)
+        ).sum() + out.optical_path_mm.sum()
 
     check_lens_gradient(
         geo, names, merit, step=1e-3 if geo is ODD else 1e-4, rel=1e-7 if geo is WINDOW else 1e-6

@@ -1,4 +1,5 @@
-"""Tolerances against closed forms, the statistics of normal errors, and trials of the lens itself."""
+"""Tolerances against closed forms, the statistics of normal errors, and trials of the lens
+itself."""
 
 import math
 from functools import partial
@@ -36,7 +37,9 @@ from tests.lens.systems import PLANE, close, f64, glass
 D = torch.float64
 FIELD = math.radians(20)
 FIELDS = (0.0, 0.7 * FIELD, FIELD)
-ALL = Tolerances(radius_relative=1e-3, thickness_mm=0.02, index=5e-4, decentre_mm=0.01, tilt_deg=0.02)
+ALL = Tolerances(
+    radius_relative=1e-3, thickness_mm=0.02, index=5e-4, decentre_mm=0.01, tilt_deg=0.02
+)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +59,13 @@ def efl(geo):
 
 def test_the_errors_of_a_lens_by_name_and_size():
     """N rings mean that the sag at the edge is off by N half wavelengths."""
-    sizes = {"radius_relative": 1e-3, "radius_mm": 0.1, "fringes": 2.0, "thickness_mm": 0.02, "index": 1e-4}
+    sizes = {
+        "radius_relative": 1e-3,
+        "radius_mm": 0.1,
+        "fringes": 2.0,
+        "thickness_mm": 0.02,
+        "index": 1e-4,
+    }
     errors = errors_of(singlet(), Tolerances(**sizes, decentre_mm=0.01, tilt_deg=0.1))
     # curvatures, a thickness (the last is the focus), an index, decentres, tilts
     assert len(errors) == 2 + 1 + 1 + 4 + 4
@@ -91,8 +100,8 @@ def test_sensitivities_of_the_focal_length_by_the_lens_makers_equation():
     r1, r2, d, n = (torch.tensor(v, dtype=D, requires_grad=True) for v in (60.0, -90.0, 5.0, 1.5))
     f = 1 / ((n - 1) * (1 / r1 - 1 / r2 + (n - 1) * d / (n * r1 * r2)))
     by_r1, by_r2, by_d, by_n = (float(v) for v in torch.autograd.grad(f, (r1, r2, d, n)))
-    # an error adds a share of |curvature| to the curvature: the front gets stronger, the back, which is
-    # negative, weaker
+    # an error adds a share of |curvature| to the curvature: the front gets stronger, the back,
+    # which is negative, weaker
     truth = {
         "curvature of surface 1": -by_r1 * 60 * 1e-3,
         "thickness behind surface 1": by_d * 0.02,
@@ -107,7 +116,8 @@ def test_analytic_sensitivities_agree_with_differences(triplet):
     figures = linear_figures(FIELD)
     exact = sensitivities(triplet, ALL, figures, by_autograd)
     close = sensitivities(triplet, ALL, figures)
-    # central differences of a tenth of a deviation: changes bend by 1e-4 of themselves per deviation, squared
+    # central differences of a tenth of a deviation: changes bend by 1e-4 of themselves per
+    # deviation, squared
     assert ((exact - close).abs().amax(1) <= 1e-6 * exact.abs().amax(1)).all()
     assert len(LINEAR_FIGURES) == exact.shape[0]
 
@@ -140,8 +150,8 @@ def test_linear_forecast_and_trials_agree(triplet):
 
 
 def test_a_refocus_takes_the_shift_of_the_image_plane_out(triplet):
-    """With the image plane at the paraxial focus the back focal length still varies, but no error of the last
-    thickness does."""
+    """With the image plane at the paraxial focus the back focal length still varies, but no error
+    of the last thickness does."""
     t = Tolerances(radius_relative=1e-3)
     size = {}
     for compensate in (None, focus_paraxial):
@@ -170,7 +180,8 @@ def test_the_quadratic_forecast_of_the_spot_agrees_with_trials(triplet, refocus)
     close(predicted.mean(0), trials.figures.mean(0), 0.02)
     for pair in zip(predicted.T, trials.figures.T, strict=True):
         assert float(torch.corrcoef(torch.stack(pair))[0, 1]) >= 0.999
-    # the slope alone forecasts much less than what happens to the axial spot, and says nothing of the mean
+    # the slope alone forecasts much less than what happens to the axial spot, and says nothing of
+    # the mean
     linear = trials.amounts @ forecast.linear.T
     if not refocus:
         assert float(linear[:, 0].std()) < 0.6 * float(trials.figures[:, 0].std())
@@ -181,9 +192,12 @@ def test_mean_and_deviation_of_the_quadratic_form_against_draws(triplet):
     figure = spot_errors(FIELDS, grid=8)
     forecast = forecast_spot(figure(triplet), sensitivities(triplet, ALL, figure), 3)
     drawn = forecast.at(
-        torch.randn(100_000, forecast.added.shape[1], generator=torch.Generator().manual_seed(0), dtype=D)
+        torch.randn(
+            100_000, forecast.added.shape[1], generator=torch.Generator().manual_seed(0), dtype=D
+        )
     )
-    # 1e5 draws know the mean to 0.3 % of a deviation, and the deviation of a heavy-tailed square to about 1 %
+    # 1e5 draws know the mean to 0.3 % of a deviation, and the deviation of a heavy-tailed square to
+    # about 1 %
     added, deviation = forecast.moments()
     close(drawn.mean(0), forecast.nominal + added, 0.015)
     close(drawn.std(0), deviation, 0.04)
@@ -196,8 +210,8 @@ def test_worst_offenders_share_the_whole_variance(triplet):
     sizes = [abs(change) for _, change, _ in every]
     close(sum(share for *_, share in every), 1.0, 1e-12)
     assert sizes == sorted(sizes, reverse=True)
-    # a lens of strong surfaces: the steepest radii lead, and decentres do not change the focal length at
-    # first order
+    # a lens of strong surfaces: the steepest radii lead, and decentres do not change the focal
+    # length at first order
     assert every[0][0].startswith("curvature of surface")
     assert all(abs(change) <= 1e-12 for name, change, _ in every if "decentre" in name)
 
@@ -252,7 +266,8 @@ def test_tolerances_of_elements_move_them_as_bodies():
     ],
 )
 def test_stops_and_planes_have_less_to_get_wrong(t, first, bent):
-    """At the d line a buried surface bends nothing, at other wavelengths it does; a stop in air never."""
+    """At the d line a buried surface bends nothing, at other wavelengths it does; a stop in air
+    never."""
     crown = Glass.from_indices(1.52, 1.51, 1.505, "crown")
     flint = Glass.from_indices(1.53, 1.51, 1.50, "flint")
     faces = (PLANE, 3.0, crown), (-40.0, 3.0, flint), (-90.0, 2.0, crown), (-80.0, 50.0, None)
@@ -266,11 +281,15 @@ def test_stops_and_planes_have_less_to_get_wrong(t, first, bent):
 TWO_FIELDS = (0.0, 0.3)
 SHARE = 0.9
 Z = NormalDist().inv_cdf(SHARE)
-MOUNTED = Tolerances(radius_relative=1e-3, thickness_mm=0.02, element_decentre_mm=0.01, element_tilt_deg=0.02)
+MOUNTED = Tolerances(
+    radius_relative=1e-3, thickness_mm=0.02, element_decentre_mm=0.01, element_tilt_deg=0.02
+)
 
 
 def named(count):
-    return [Error(f"curvature of surface {i + 1}", "curvature_per_mm", (i,), 0.5) for i in range(count)]
+    return [
+        Error(f"curvature of surface {i + 1}", "curvature_per_mm", (i,), 0.5) for i in range(count)
+    ]
 
 
 def plain(slopes):
@@ -296,8 +315,8 @@ def test_cheapest_tolerances_of_a_linear_figure(slopes):
 
 
 def test_the_share_of_one_square_is_that_of_chi_squared():
-    """F = x^2: P(x^2 <= y) = erf(sqrt(y / 2)); a single square has the slowest characteristic function of
-    all."""
+    """F = x^2: P(x^2 <= y) = erf(sqrt(y / 2)); a single square has the slowest characteristic
+    function of all."""
     forecast = Forecast(0.0, torch.zeros(1, dtype=D), torch.ones(1, 1, dtype=D))
     for y in (0.5, 1.0, 2.7, 6.0):
         truth = math.erf(math.sqrt(y / 2))
@@ -306,8 +325,8 @@ def test_the_share_of_one_square_is_that_of_chi_squared():
 
 
 def test_the_share_of_several_squares_and_of_a_slope():
-    """Ten squares: chi squared of ten degrees, 1 - exp(-y/2) sum (y/2)^k / k! over k < 5; a slope: the
-    normal."""
+    """Ten squares: chi squared of ten degrees, 1 - exp(-y/2) sum (y/2)^k / k! over k < 5; a slope:
+    the normal."""
     ten = Forecast(0.0, torch.zeros(10, dtype=D), torch.eye(10, dtype=D))
     for y in (5.0, 12.0, 25.0):
         truth = 1 - math.exp(-y / 2) * sum((y / 2) ** k / math.factorial(k) for k in range(5))
@@ -319,12 +338,15 @@ def test_the_share_of_several_squares_and_of_a_slope():
 
 @pytest.fixture(scope="module")
 def spot():
-    """Forecast of the refocused triplet's squared spot under mounted elements, with its errors and figure."""
+    """Forecast of the refocused triplet's squared spot under mounted elements, with its errors and
+    figure."""
     geo = lens.load("cooke-triplet").freeze()
     compensate = partial(focus_rays, fields_rad=TWO_FIELDS, grid=6)
     figure = spot_errors(TWO_FIELDS, grid=6)
     slopes = sensitivities(geo, MOUNTED, figure, compensate=compensate)
-    forecast = forecast_spot(compensated(figure, compensate)(geo), slopes, len(TWO_FIELDS)).averaged()
+    forecast = forecast_spot(
+        compensated(figure, compensate)(geo), slopes, len(TWO_FIELDS)
+    ).averaged()
     return geo, errors_of(geo, MOUNTED), forecast, figure, compensate
 
 
@@ -355,8 +377,8 @@ def test_the_cheapest_is_a_minimum(spot, generator):
             middle = math.sqrt(low * high)
             inside = share_within(forecast, budget, (other * middle)[member]) >= SHARE
             low, high = (middle, high) if inside else (low, middle)
-        # at the minimum a change of 20 % costs its square; the normal approximation of the shape costs far
-        # less
+        # at the minimum a change of 20 % costs its square; the normal approximation of the shape
+        # costs far less
         assert float((1 / (other * low)).sum()) > found.cost * (1 + 1e-3)
 
 

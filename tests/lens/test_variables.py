@@ -1,5 +1,5 @@
-"""Variables in natural steps: what a unit does to rays, gradients against differences, bounds, solves, saved
-states."""
+"""Variables in natural steps: what a unit does to rays, gradients against differences, bounds,
+solves, saved states."""
 
 import copy
 import math
@@ -38,9 +38,13 @@ def test_a_unit_of_every_variable_moves_the_rays_by_the_natural_step(
     # rays of three fields through the pupil of the lens as it is now
     rays = [
         torch.cat(v)
-        for v in zip(*(field_rays(geo, f, pupil_grid(12), wavelength_um) for f in fields), strict=True)
+        for v in zip(
+            *(field_rays(geo, f, pupil_grid(12), wavelength_um) for f in fields), strict=True
+        )
     ]
-    variables = geo.variables(*names, step_mm=step_mm, fields_rad=fields, wavelength_um=wavelength_um)
+    variables = geo.variables(
+        *names, step_mm=step_mm, fields_rad=fields, wavelength_um=wavelength_um
+    )
     base = geo.trace(*rays, wavelength_um).position_mm
     for variable in variables:
         for i in range(variable.numel()):
@@ -61,7 +65,10 @@ def test_weak_numbers_are_held_to_their_reach_and_dead_ones_left_out():
     base = geo.thickness_mm.detach().clone()
     # thickness of the plate: a millimetre shifts the focus by a third of one
     fill([variables[1][-1:]], 1.0)
-    assert float((geo.thickness_mm.detach() - base).abs().max()) <= 0.1 * geo.first_order().efl_mm.item()
+    assert (
+        float((geo.thickness_mm.detach() - base).abs().max())
+        <= 0.1 * geo.first_order().efl_mm.item()
+    )
 
 
 @torch.no_grad()
@@ -78,7 +85,10 @@ def test_motion_counts_rays_that_arrive_in_both_states():
     ahead = torch.tensor([[[3.0, 4.0], [1.0, 1.0], [1.0, 1.0]]]), torch.tensor([[1.0, 0.0, 1.0]])
     behind = torch.tensor([[[0.0, 0.0], [0.0, 0.0], [9.0, 9.0]]]), torch.tensor([[1.0, 1.0, 0.0]])
     moved, weight = ray_motion(ahead, behind)
-    assert (moved.tolist(), weight.tolist()) == ([[[3.0, 4.0], [0.0, 0.0], [0.0, 0.0]]], [[1.0, 0.0, 0.0]])
+    assert (moved.tolist(), weight.tolist()) == (
+        [[[3.0, 4.0], [0.0, 0.0], [0.0, 0.0]]],
+        [[1.0, 0.0, 0.0]],
+    )
 
 
 def test_gradients_of_rays_against_differences(generator):
@@ -101,7 +111,9 @@ def test_values_never_leave_their_bounds():
     geo = lens.load("cooke-triplet")
     start = geo.thickness_mm.detach().clone()
     low = f64([1.0, 0.5, 0.9, 0.5, 1.0])
-    variables = geo.variables("thickness", "focus", bounds={"thickness": (low, 9.0), "focus": (40.0, None)})
+    variables = geo.variables(
+        "thickness", "focus", bounds={"thickness": (low, 9.0), "focus": (40.0, None)}
+    )
     close(geo.thickness_mm, start, 1e-14)
     for value in (-1e4, -30.0, 30.0, 1e4):
         fill(variables, value)

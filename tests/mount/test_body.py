@@ -1,5 +1,5 @@
-"""Distances to meshes against closed forms and brute force, inside and outside against shapes that are
-known."""
+"""Distances to meshes against closed forms and brute force, inside and outside against shapes that
+are known."""
 
 import math
 from functools import partial
@@ -56,7 +56,8 @@ def test_distance_to_a_box_is_the_closed_form(generator):
 
 
 def test_nearest_points_beat_every_sampled_point(generator):
-    """No point of the triangles is nearer than the one found, and the one found is a point of them."""
+    """No point of the triangles is nearer than the one found, and the one found is a point of
+    them."""
     triangles = torch.randn(7, 3, 3, generator=generator, dtype=D)
     triangles[6, 2] = 0.5 * (triangles[6, 0] + triangles[6, 1])  # one without area
     points = 2 * torch.randn(50, 3, generator=generator, dtype=D)
@@ -76,8 +77,8 @@ def test_nearest_points_beat_every_sampled_point(generator):
 
 
 def test_overlapping_solids_have_no_walls_inside():
-    """Deep inside one of two boxes that overlap, a face of the other is near; the depth is that to the
-    outside."""
+    """Deep inside one of two boxes that overlap, a face of the other is near; the depth is that to
+    the outside."""
     both = Body([box_mesh((0, 0, 0), (2, 1, 1)), box_mesh((0.99, 0.3, 0.3), (3, 0.7, 0.7))])
     found = both.distance_m(torch.tensor([[1.0, 0.5, 0.5], [2.5, 0.5, 0.5]], dtype=D))
     torch.testing.assert_close(found, torch.tensor([-0.5, -0.2], dtype=D), rtol=0, atol=1e-14)
@@ -130,8 +131,8 @@ def test_gradient_of_the_distance(generator):
 
 
 def test_a_capsule_is_its_spheres(generator):
-    """The clearance of a capsule is the smallest of those of the balls along its axis: never more than that
-    of any sampled ball, and less by no more than half their spacing."""
+    """The clearance of a capsule is the smallest of those of the balls along its axis: never more
+    than that of any sampled ball, and less by no more than half their spacing."""
     body = Body([box_mesh(*BOX), ball_mesh(0.2)])
     poses = some_poses(generator, 60, 1.2)
     housing = Housing(0.03, behind_m=0.12)
@@ -152,7 +153,9 @@ def test_a_capsule_through_a_cube_reaches_its_middle():
     body = Body([box_mesh((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1))])
     pose = torch.eye(4, dtype=D)
     pose[2, 3] = 0.2
-    assert float(body.clearances_m(pose, Housing(0.03, behind_m=0.4))) == pytest.approx(-0.13, abs=1e-12)
+    assert float(body.clearances_m(pose, Housing(0.03, behind_m=0.4))) == pytest.approx(
+        -0.13, abs=1e-12
+    )
 
 
 def test_gradient_of_the_clearance_to_the_mount(generator):
@@ -160,7 +163,9 @@ def test_gradient_of_the_clearance_to_the_mount(generator):
     poses = some_poses(generator, 4, 3.0)
     for housing in (Housing(0.05), Housing(0.05, behind_m=0.2)):
         clearances = partial(body.clearances_m, housing=housing)
-        assert torch.autograd.gradcheck(clearances, (poses.clone().requires_grad_(),), eps=1e-7, atol=1e-6)
+        assert torch.autograd.gradcheck(
+            clearances, (poses.clone().requires_grad_(),), eps=1e-7, atol=1e-6
+        )
 
 
 def test_rays_are_hidden_by_what_stands_before_them():

@@ -1,5 +1,5 @@
-"""Velocity from flow fields: exact flow of random bodies through windows of a real lens, least squares
-written out, outliers."""
+"""Velocity from flow fields: exact flow of random bodies through windows of a real lens, least
+squares written out, outliers."""
 
 from dataclasses import replace
 
@@ -35,13 +35,16 @@ def camera():
 
 @pytest.fixture(scope="module")
 def drive(camera):
-    """Mount, poses [N, 3, 4, 4] over flat ground, twists [N, 6], and the exact flow from first to last."""
+    """Mount, poses [N, 3, 4, 4] over flat ground, twists [N, 6], and the exact flow from first to
+    last."""
     generator = torch.Generator().manual_seed(3)
     mount = Mount((0.2, 0.05, 0.5), (0.1, 0.1, 0.1), pitch_rad=1.0, yaw_rad=0.3)().detach()
     twists = TWIST_SCALE * torch.randn(5, 6, generator=generator, dtype=D)
     half = INTERVAL_S / 2 * torch.tensor([-1.0, 0.0, 1.0], dtype=D)
     poses = pose.se3_exp(half[:, None] * twists[:, None]) @ mount
-    truth = [render.truth.true_flow(camera, worlds.smooth_plane(), each, stride=2) for each in poses]
+    truth = [
+        render.truth.true_flow(camera, worlds.smooth_plane(), each, stride=2) for each in poses
+    ]
     assert all(bool(valid.all()) for _, valid in truth)
     return mount, poses, twists, torch.cat([flow[0].detach().movedim(0, 1) for flow, _ in truth])
 
@@ -57,9 +60,9 @@ def test_exact_flow_of_free_bodies_through_a_lens(camera, drive, depth):
     mount, poses, twists, flow = drive
     ours = EgoVelocity(FREE, (1e3,) * 6, depth)
     found = ours(field_of(flow), camera, worlds.smooth_plane(), mount, poses)
-    # the mid-point rule leaves (w t)^2 / 24 of the flow, and points are read where half their flow leads,
-    # whose curvature is of that size: 1e-5 of the flow, in a system that tells turning from shifting ten
-    # times less well
+    # the mid-point rule leaves (w t)^2 / 24 of the flow, and points are read where half their flow
+    # leads, whose curvature is of that size: 1e-5 of the flow, in a system that tells turning from
+    # shifting ten times less well
     torch.testing.assert_close(found.velocity, twists, rtol=0, atol=2e-4)
 
 
@@ -98,12 +101,18 @@ def test_least_squares_written_out_with_covariance_and_confidence(camera, drive)
                 rows, _ = body_flow(camera, depth[0], mount, at[None])
                 j = rows[0][:, list(PLANAR)] * INTERVAL_S
                 c = xy[sample, row, column]
-                spread = torch.stack([xx[sample, row, column], c, c, yy[sample, row, column]]).reshape(2, 2)
+                spread = torch.stack(
+                    [xx[sample, row, column], c, c, yy[sample, row, column]]
+                ).reshape(2, 2)
                 precision = torch.linalg.inv(spread + 0.05**2 * torch.eye(2, dtype=D)) * 3 / 16
                 normal += confidence[sample, row, column] * j.T @ precision @ j
                 right += j.T @ precision @ seen
-    torch.testing.assert_close(found.velocity[body], torch.linalg.solve(normal, right), rtol=1e-9, atol=1e-12)
-    torch.testing.assert_close(found.covariance[body], torch.linalg.inv(normal), rtol=1e-9, atol=1e-15)
+    torch.testing.assert_close(
+        found.velocity[body], torch.linalg.solve(normal, right), rtol=1e-9, atol=1e-12
+    )
+    torch.testing.assert_close(
+        found.covariance[body], torch.linalg.inv(normal), rtol=1e-9, atol=1e-15
+    )
 
 
 def test_windows_that_are_lost_do_not_lead_it_away(camera, drive):
@@ -128,8 +137,8 @@ def test_unseen_flow_says_nothing(camera, drive):
 
 
 def test_what_is_not_valid_means_nothing_and_nan_that_is_valid_is_refused(camera, drive):
-    """NaN under a pixel that is not valid gives the same velocity as any number there; where the field claims
-    to know, it is refused."""
+    """NaN under a pixel that is not valid gives the same velocity as any number there; where the
+    field claims to know, it is refused."""
     mount, poses, _, flow = drive
     field = field_of(flow)
     field.valid[:, 3:9] = False
@@ -140,7 +149,9 @@ def test_what_is_not_valid_means_nothing_and_nan_that_is_valid_is_refused(camera
         given = replace(field, flow_px=torch.where(where[:, None], value, field.flow_px))
         return ours(given, camera, None, mount, poses).velocity
 
-    torch.testing.assert_close(solved(torch.nan, ~field.valid), solved(1e3, ~field.valid), rtol=0, atol=0)
+    torch.testing.assert_close(
+        solved(torch.nan, ~field.valid), solved(1e3, ~field.valid), rtol=0, atol=0
+    )
     with pytest.raises(DomainError, match=r"flow of valid pixels must be finite, got NaN"):
         solved(torch.nan, field.valid)
 
@@ -167,7 +178,9 @@ def test_gradient_to_the_mount(camera, drive):
 def test_scores_by_hand():
     twist = torch.zeros(4, 6, dtype=D)
     twist[:, 0] = torch.tensor([0.0, 1.0, 2.0, 4.0])
-    off = torch.tensor([[0.05, 0.0, 0.0], [0.0, -0.15, 0.0], [0.0, 0.0, 0.3], [9.0, 9.0, 9.0]], dtype=D)
+    off = torch.tensor(
+        [[0.05, 0.0, 0.0], [0.0, -0.15, 0.0], [0.0, 0.0, 0.3], [9.0, 9.0, 9.0]], dtype=D
+    )
     errors = velocity_errors(twist[:, [0, 1, 5]] + off, twist, PLANAR)
     torch.testing.assert_close(errors.squared()[:3], torch.tensor([1 / 3, 1 / 3, 4 / 3], dtype=D))
     assert float(errors.bounded()[3]) == pytest.approx(1.0, abs=1e-3)

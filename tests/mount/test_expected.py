@@ -1,5 +1,5 @@
-"""The error to be expected, against drawn flow errors; the trend of precision, against laws that it has to
-find."""
+"""The error to be expected, against drawn flow errors; the trend of precision, against laws that it
+has to find."""
 
 from dataclasses import replace
 
@@ -32,7 +32,9 @@ def readings(count=1, points=40, axes=3, seed=0):
     confidence = 0.5 + 0.5 * torch.rand(count, points, generator=random, dtype=F)
     depth = 0.2 + 2 * torch.rand(count, points, generator=random, dtype=F)
     flow = torch.zeros(count, points, 2, dtype=F)
-    return Readings(flow, flow, precision, confidence, depth, rows, torch.ones(count, points, dtype=F), 1)
+    return Readings(
+        flow, flow, precision, confidence, depth, rows, torch.ones(count, points, dtype=F), 1
+    )
 
 
 def estimator(**how):
@@ -47,9 +49,13 @@ def drawn_errors(ours, read, true_rows, errors, draws=40_000):
     velocity = TWIST[:, list(ours.axes)]
     flow = (true_rows @ velocity[:, None, :, None])[..., 0]
     root = torch.linalg.cholesky(errors.covariance(read, flow))
-    deviate = torch.randn(draws, *flow.shape[1:], generator=torch.Generator().manual_seed(1), dtype=F)
+    deviate = torch.randn(
+        draws, *flow.shape[1:], generator=torch.Generator().manual_seed(1), dtype=F
+    )
     seen = read.confidence[..., None] * flow + (root @ deviate[..., None])[..., 0]
-    many = {name: getattr(read, name).expand(draws, *getattr(read, name).shape[1:]) for name in READ}
+    many = {
+        name: getattr(read, name).expand(draws, *getattr(read, name).shape[1:]) for name in READ
+    }
     return ours.solve(replace(read, flow_px=seen, **many)).velocity - velocity
 
 
@@ -73,7 +79,8 @@ def test_mean_and_covariance_are_those_of_drawn_flow(wrong):
 
 
 def test_points_that_fit_worse_than_they_claim_count_less():
-    """As in the estimator itself: a point of wrong depth, far beyond its claim, moves the mean little."""
+    """As in the estimator itself: a point of wrong depth, far beyond its claim, moves the mean
+    little."""
     read = readings()
     true_rows = read.rows.clone()
     true_rows[:, :4] *= 30.0
@@ -86,7 +93,9 @@ def test_gradient_is_that_of_differences():
     read = readings(count=2, seed=3)
 
     def value(x):
-        moved = replace(read, rows=read.rows * (1 + 0.3 * x[0]), precision=read.precision * x[1].exp())
+        moved = replace(
+            read, rows=read.rows * (1 + 0.3 * x[0]), precision=read.precision * x[1].exp()
+        )
         moved = replace(moved, confidence=read.confidence * (1 - 0.2 * x[2]))
         return expected_errors(estimator(), moved, TWIST.expand(2, 6), read.rows).squared.sum()
 
@@ -99,8 +108,8 @@ def test_gradient_is_that_of_differences():
 
 
 def test_lost_flow_has_half_its_length_squared():
-    """Far beyond the reach nothing of a flow is left: its error is the flow itself, half of the square in
-    either component."""
+    """Far beyond the reach nothing of a flow is left: its error is the flow itself, half of the
+    square in either component."""
     read = readings(points=3)
     flow = torch.tensor([[[3.0, 4.0], [0.1, 0.0], [100.0, 0.0]]], dtype=F)
     found = FlowErrors(claimed=0.0, share=0.0, reach_px=20.0, width_px=0.5).covariance(read, flow)
@@ -109,8 +118,8 @@ def test_lost_flow_has_half_its_length_squared():
 
 
 def lawful(seed=0, noise=0.5):
-    """Readings whose precision goes with flow to the power 0.8 and depth to the power -1, times what the
-    texture says."""
+    """Readings whose precision goes with flow to the power 0.8 and depth to the power -1, times
+    what the texture says."""
     random = torch.Generator().manual_seed(seed)
     length = (6 * torch.rand(20, 200, generator=random, dtype=F) - 1.5).exp()
     depth = (2 * torch.rand(20, 200, generator=random, dtype=F) - 1.5).exp()
@@ -142,8 +151,8 @@ def test_the_trend_is_found_through_the_texture():
 
 
 def test_precision_is_carried_to_another_place():
-    """From where all is twice as near and twice as fast the same textures are told as the law says; a window
-    that showed nothing from here takes the texture of its neighbour, not that of all."""
+    """From where all is twice as near and twice as fast the same textures are told as the law says;
+    a window that showed nothing from here takes the texture of its neighbour, not that of all."""
     whole, flow = lawful()
     trend = PrecisionTrend().add(whole, flow)
     # bodies whose world has more texture than the law's
@@ -168,7 +177,8 @@ def test_precision_is_carried_to_another_place():
 
 
 def test_what_the_body_covers_is_found_through_the_texture():
-    """Windows of ten points whose precision falls by e to the power of four times what is covered of them."""
+    """Windows of ten points whose precision falls by e to the power of four times what is covered
+    of them."""
     read, flow = lawful(noise=0.3)
     random = torch.Generator().manual_seed(4)
     covered = torch.rand(20, 20, generator=random, dtype=F) * (
@@ -196,7 +206,8 @@ def test_points_without_a_surface_are_left_out():
 
 
 def test_the_share_covered_is_told_by_window():
-    """A sheet over the upper half of the view of four windows: chief rays that meet it, window by window."""
+    """A sheet over the upper half of the view of four windows: chief rays that meet it, window by
+    window."""
     sheet = Body([([(2, -9, 0), (2, 9, 0), (2, 9, 9), (2, -9, 9)], [(0, 1, 2), (0, 2, 3)])])
     film = render.Film(64, 64, 16, 16, 0.1, ((0, 0), (48, 0), (0, 24), (24, 48)))
     camera = render.Camera(lens.Pinhole(8.0), 16, 16, 0.1, 16, 0, film)

@@ -1,5 +1,6 @@
-"""The learnt head: fresh it is least squares, its input against closed forms, gradients against differences,
-symmetry by a world in a mirror, and the delivered weights in a world that they have not seen."""
+"""The learnt head: fresh it is least squares, its input against closed forms, gradients against
+differences, symmetry by a world in a mirror, and the delivered weights in a world that they have
+not seen."""
 
 import math
 from dataclasses import replace
@@ -50,10 +51,15 @@ def noisy(count, windows=3, seed=3):
 
 
 def of_windows(field, pick, flow=None):
-    """The field with each of its tensors [N windows, ...] picked from; ``flow`` instead of its flow."""
+    """The field with each of its tensors [N windows, ...] picked from; ``flow`` instead of its
+    flow."""
     flow = field.flow_px if flow is None else flow
     return FlowField(
-        pick(flow), pick(field.valid), INTERVAL_S, pick(field.confidence), pick(field.covariance_px2)
+        pick(flow),
+        pick(field.valid),
+        INTERVAL_S,
+        pick(field.confidence),
+        pick(field.covariance_px2),
     )
 
 
@@ -75,7 +81,9 @@ def stirred(head, seed=5):
 
 @pytest.fixture(scope="module")
 def mount():
-    return Mount((0.2, 0.05, 0.5), (0.1, 0.1, 0.1), pitch_rad=1.0, yaw_rad=0.3, roll_rad=0.1)().detach()
+    return Mount(
+        (0.2, 0.05, 0.5), (0.1, 0.1, 0.1), pitch_rad=1.0, yaw_rad=0.3, roll_rad=0.1
+    )().detach()
 
 
 @pytest.mark.parametrize("axes", [FREE, PLANAR])
@@ -132,7 +140,9 @@ def test_a_world_in_a_mirror_gives_the_velocity_in_a_mirror(mount):
     left = torch.diag(torch.tensor([1.0, -1, 1, 1], dtype=D))
     image = torch.diag(torch.tensor([-1.0, 1, 1, 1], dtype=D))
     sign = torch.tensor([-1.0, 1], dtype=D)[:, None, None]
-    mirrored = replace(field, covariance_px2=field.covariance_px2 * torch.tensor([1.0, -1, 1])[:, None, None])
+    mirrored = replace(
+        field, covariance_px2=field.covariance_px2 * torch.tensor([1.0, -1, 1])[:, None, None]
+    )
     flipped = of_windows(mirrored, lambda part: part.flip(-1), sign * field.flow_px)
     other = camera_of(tuple((112 - 32 - x, y) for x, y in WINDOWS))
     head = stirred(VelocityHead(plain_of(every_px=1)))
@@ -164,7 +174,9 @@ def designs(mount):
         return head.judged(evidence(changed, plain.solve(changed), camera, mount, plain.prior))[0]
 
     def of_mount(shift):
-        turned = mount @ pose.se3_exp(shift * torch.tensor([0.1, -0.2, 0.3, 0.2, 0.1, -0.3], dtype=D))
+        turned = mount @ pose.se3_exp(
+            shift * torch.tensor([0.1, -0.2, 0.3, 0.2, 0.1, -0.3], dtype=D)
+        )
         return head(field, camera, None, turned, body @ turned).velocity
 
     def of_lens(shift, share_focus):
@@ -179,7 +191,9 @@ def designs(mount):
     }
 
 
-@pytest.mark.parametrize("what", ["flow_px", "precision", "confidence", "mount", "focus", "focal length"])
+@pytest.mark.parametrize(
+    "what", ["flow_px", "precision", "confidence", "mount", "focus", "focal length"]
+)
 def test_gradient_is_that_of_differences(designs, what):
     function, at, step = designs[what], torch.zeros((), dtype=D), 1e-5
     found = torch.autograd.functional.jacobian(function, at)
@@ -196,7 +210,9 @@ def test_weights_are_kept_and_read_again(tmp_path, mount):
     assert again.config == head.config
     field = noisy(2)
     poses = moved(2, mount)
-    found, expected = (each(field, camera_of(), None, mount, poses).velocity for each in (again, head))
+    found, expected = (
+        each(field, camera_of(), None, mount, poses).velocity for each in (again, head)
+    )
     assert torch.equal(found, expected)
     with pytest.raises(FileFormatError, match="no velocity head"):
         VelocityHead.load(plain_of(), DELIVERED["refiner"])
@@ -211,7 +227,9 @@ def test_every_body_may_have_a_mount_of_its_own(mount):
     field = noisy(4)
     found = head(field, camera_of(), None, mounts, poses).velocity
     each = mounts.expand(2, 2, 4, 4).reshape(4, 4, 4)
-    torch.testing.assert_close(found, head(field, camera_of(), None, each, poses.flatten(0, 1)).velocity)
+    torch.testing.assert_close(
+        found, head(field, camera_of(), None, each, poses.flatten(0, 1)).velocity
+    )
     alone = of_windows(field, lambda part: part[6:])
     torch.testing.assert_close(found[2:], head(alone, camera_of(), None, other, poses[1]).velocity)
 
@@ -226,6 +244,6 @@ def test_the_delivered_head_is_ahead_of_least_squares_in_an_unseen_world():
         plain = pair.errors(run["estimate"], batch).bounded().mean()
         learnt = system.replaced(estimate=head).begin(batch)["estimate"]
     assert sum(weight.numel() for weight in head.parameters()) <= 50_000
-    # the study found 0.80 of the typical error over four designs; 12 samples of one world scatter by a third
-    # of that
+    # the study found 0.80 of the typical error over four designs; 12 samples of one world scatter
+    # by a third of that
     assert float(pair.errors(learnt, batch).bounded().mean()) < float(plain)

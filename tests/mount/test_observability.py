@@ -1,4 +1,5 @@
-"""The flow that a body's velocities make, against motions carried out exactly and closed forms of simple mounts."""
+"""The flow that a body's velocities make, against motions carried out exactly and closed forms of
+simple mounts."""
 
 import math
 
@@ -20,7 +21,11 @@ MOUNTS = [
     (-1.2, 0.2, 2.0, (0.1, -0.2, 0.3)),  # part of the view is sky
 ]
 TWISTS = torch.tensor(
-    [[0.7, -0.2, 0.0, 0.0, 0.0, 0.5], [0.1, 0.2, -0.3, 0.8, -0.6, -1.3], [0.0, 0.0, 0.4, 0.3, 1.1, 0.0]],
+    [
+        [0.7, -0.2, 0.0, 0.0, 0.0, 0.5],
+        [0.1, 0.2, -0.3, 0.8, -0.6, -1.3],
+        [0.0, 0.0, 0.4, 0.3, 1.1, 0.0],
+    ],
     dtype=D,
 )
 
@@ -37,12 +42,14 @@ def triplet():
 
 
 def mount_of(yaw, pitch, roll, position):
-    return Mount(position, (0.05, 0.05, 0.05), yaw_rad=yaw, pitch_rad=pitch, roll_rad=roll)().detach()
+    return Mount(
+        position, (0.05, 0.05, 0.05), yaw_rad=yaw, pitch_rad=pitch, roll_rad=roll
+    )().detach()
 
 
 def ground(camera, T_body_cam):
-    """World points on z = 0 under the pixels, depth (NaN where there is none) and a mask: by the renderer's
-    ground truth."""
+    """World points on z = 0 under the pixels, depth (NaN where there is none) and a mask: by the
+    renderer's ground truth."""
     points, depth, valid = world_points(
         camera.chief_rays(camera.film.pixels()), worlds.smooth_plane(), T_body_cam
     )
@@ -50,15 +57,20 @@ def ground(camera, T_body_cam):
 
 
 def exact_flow(camera, T_body_cam, twist, dt_s=1e-3):
-    """Image velocity [P, 2] of static ground, its depth [P] and where there is any: points are projected before and
-    after, by an eighth-order central difference in time."""
+    """Image velocity [P, 2] of static ground, its depth [P] and where there is any: points are
+    projected before and after, by an eighth-order central difference in time."""
     points, depth, valid = ground(camera, T_body_cam)
     safe = torch.where(valid[:, None], points, points[valid][0])
     total = torch.zeros(len(points), 2, dtype=D)
     for step, share in enumerate((4 / 5, -1 / 5, 4 / 105, -1 / 280), start=1):
         for sign in (1, -1):
             camera_pose = pose.se3_exp(sign * step * dt_s * twist) @ T_body_cam
-            total += sign * share * render.project(camera, pose.apply(pose.inverse(camera_pose), safe)) / dt_s
+            total += (
+                sign
+                * share
+                * render.project(camera, pose.apply(pose.inverse(camera_pose), safe))
+                / dt_s
+            )
     return torch.where(valid[:, None], total, 0), depth, valid
 
 
@@ -69,8 +81,8 @@ def test_flow_is_that_of_the_motion_carried_out(camera, placed, twist):
     expected, depth, valid = exact_flow(camera, T_body_cam, twist)
     rows, seen = body_flow(camera, depth, T_body_cam)
     assert torch.equal(seen, valid)
-    # projection is good to 1e-13 px relative to 10 px, over 1e-3 s: 1e-9 px/s; differences of chief rays over
-    # 2e-3 px to 1e-9 of flows of 100 px/s
+    # projection is good to 1e-13 px relative to 10 px, over 1e-3 s: 1e-9 px/s; differences of chief
+    # rays over 2e-3 px to 1e-9 of flows of 100 px/s
     torch.testing.assert_close(rows @ twist, expected, rtol=1e-9, atol=1e-7)
 
 
@@ -86,15 +98,15 @@ def test_mounts_and_pixels_together_as_one_by_one(camera, generator):
 def test_flow_through_a_real_lens(triplet):
     T_body_cam = mount_of(*MOUNTS[1])
     expected, depth, _ = exact_flow(triplet, T_body_cam, TWISTS[1])
-    # differences of chief rays over 2e-3 px: rounding of the trace (1e-13 mm over 1e-3 px) leaves 1e-7 of a
-    # slope
+    # differences of chief rays over 2e-3 px: rounding of the trace (1e-13 mm over 1e-3 px) leaves
+    # 1e-7 of a slope
     rows, _ = body_flow(triplet, depth, T_body_cam)
     torch.testing.assert_close(rows @ TWISTS[1], expected, rtol=1e-6, atol=1e-5)
 
 
 def test_straight_down_is_the_textbook_case(camera):
-    """Camera axis down at height h through the body's origin: velocity = flow h / f, and turning is a
-    rotation about the image's middle."""
+    """Camera axis down at height h through the body's origin: velocity = flow h / f, and turning is
+    a rotation about the image's middle."""
     T_body_cam = mount_of(*MOUNTS[0])
     depth = torch.full((24 * 16,), HEIGHT, dtype=D)
     rows, seen = body_flow(camera, depth, T_body_cam)
@@ -126,4 +138,6 @@ def test_gradient_to_depth_mount_and_focal_length(camera, generator):
 
     at = (torch.ones(1, dtype=D), torch.zeros(6, dtype=D), torch.tensor(3.4, dtype=D))
     # rows are differences of chief rays, good to 1e-9 over steps of 1e-5
-    assert torch.autograd.gradcheck(along, [v.requires_grad_() for v in at], eps=1e-5, atol=1e-3, rtol=1e-5)
+    assert torch.autograd.gradcheck(
+        along, [v.requires_grad_() for v in at], eps=1e-5, atol=1e-3, rtol=1e-5
+    )

@@ -1,4 +1,5 @@
-"""The share of the picture that a robot's body covers, against areas, counted rays and differences."""
+"""The share of the picture that a robot's body covers, against areas, counted rays and
+differences."""
 
 import pytest
 import torch
@@ -34,7 +35,8 @@ def test_a_sheet_covers_its_area(camera):
     # 0.111 by 0.2 m before a picture of 0.4 by 0.4 m
     required = OwnBody(sheet((-0.05, -0.1), (0.061, 0.1)), 0.5)
     share = 0.5 - float(required.slack(at((0.0, 0.0, 0.0)), camera))
-    # an edge is met within one of 64 samples of a pixel: 0.02 px of its length, four edges of 4 to 8 px
+    # an edge is met within one of 64 samples of a pixel: 0.02 px of its length, four edges of 4 to
+    # 8 px
     assert share == pytest.approx(0.111 * 0.2 / 0.16, abs=0.003)
     # chief rays: 4 or 5 columns of 8 rows of 256
     assert round(256 * (0.5 - float(required.exact(at((0.0, 0.0, 0.0)), camera)))) in (32, 40)
@@ -49,7 +51,8 @@ def test_gradient_is_that_of_the_area(camera):
     # silhouettes are sampled 2.5 times a pixel length: four edges, about 80 points
     assert -float(slope[0, 3]) == pytest.approx(area, rel=0.03)
     assert abs(float(slope[1, 3])) < 0.03 * area
-    # pushed half out of the picture to the left, only its right edge moves: 0.2 m of height per metre
+    # pushed half out of the picture to the left, only its right edge moves: 0.2 m of height per
+    # metre
     beside = at((0.0, -0.2, 0.0)).requires_grad_()
     (slope,) = torch.autograd.grad(required.slack(beside, camera).sum(), beside)
     assert float(slope[1, 3]) == pytest.approx(-0.2 / 0.16, rel=0.03)
@@ -82,7 +85,9 @@ def test_gradient_before_the_rover_is_that_of_differences(rover):
 
     numbers = torch.zeros(6, dtype=D, requires_grad=True)
     focal.requires_grad_()
-    slopes = [torch.autograd.grad(slack(numbers, focal, 64, seed), (numbers, focal)) for seed in range(4)]
+    slopes = [
+        torch.autograd.grad(slack(numbers, focal, 64, seed), (numbers, focal)) for seed in range(4)
+    ]
     along = float(sum((slope[0] @ weight) for slope in slopes) / 4)
     zoom = float(sum(slope[1] for slope in slopes) / 4)
     with torch.no_grad():

@@ -17,20 +17,26 @@ HALF = (0.1, 0.05, 0.2)
 
 @pytest.mark.parametrize("up", [1.0, -1.0])
 def test_angles_of_a_view_straight_up_or_down_have_a_gradient(up):
-    """There only yaw and roll together mean something: turned about the vertical by h, yaw grows by h, and
-    the other two angles stay what they are."""
+    """There only yaw and roll together mean something: turned about the vertical by h, yaw grows by
+    h, and the other two angles stay what they are."""
     upright = torch.eye(4, dtype=D)  # a camera's z axis is the body's: straight up
     upright[1:3, 1:3] *= up
     angle = torch.zeros((), dtype=D, requires_grad=True)
 
     def turned(h):
         zero = torch.zeros_like(h)
-        return yaw_pitch_roll_rad(pose.se3_exp(torch.stack([zero, zero, zero, zero, zero, h])) @ upright)
+        return yaw_pitch_roll_rad(
+            pose.se3_exp(torch.stack([zero, zero, zero, zero, zero, h])) @ upright
+        )
 
     step = 1e-5
-    differences = (turned(torch.tensor(step, dtype=D)) - turned(torch.tensor(-step, dtype=D))) / (2 * step)
+    differences = (turned(torch.tensor(step, dtype=D)) - turned(torch.tensor(-step, dtype=D))) / (
+        2 * step
+    )
     slopes = torch.stack([torch.autograd.grad(turned(angle)[k], angle)[0] for k in range(3)])
-    torch.testing.assert_close(differences, torch.tensor([1.0, 0.0, 0.0], dtype=D), rtol=0, atol=1e-10)
+    torch.testing.assert_close(
+        differences, torch.tensor([1.0, 0.0, 0.0], dtype=D), rtol=0, atol=1e-10
+    )
     torch.testing.assert_close(slopes, differences, rtol=0, atol=1e-10)
     yaw, pitch, roll = turned(angle).detach().tolist()
     again = Mount(NOMINAL, HALF, yaw_rad=yaw, pitch_rad=pitch, roll_rad=roll)().detach()

@@ -1,4 +1,5 @@
-"""Shares of bounds to mounts and back: against rotations written by hand, differences, and bad bounds."""
+"""Shares of bounds to mounts and back: against rotations written by hand, differences, and bad
+bounds."""
 
 import math
 
@@ -17,12 +18,14 @@ def changed(bounds, k, value):
 
 
 def test_directions_of_known_angles(generator):
-    """Columns of the rotation: the view by its azimuth and elevation, the image's right level before it
-    rolls."""
+    """Columns of the rotation: the view by its azimuth and elevation, the image's right level
+    before it rolls."""
     share = torch.rand(3, 7, 6, generator=generator, dtype=D)
     poses = MountRanges(LOW, HIGH).pose(share)
     check_poses(poses)
-    numbers = torch.tensor(LOW, dtype=D) + share * (torch.tensor(HIGH, dtype=D) - torch.tensor(LOW, dtype=D))
+    numbers = torch.tensor(LOW, dtype=D) + share * (
+        torch.tensor(HIGH, dtype=D) - torch.tensor(LOW, dtype=D)
+    )
     torch.testing.assert_close(poses[..., :3, 3], numbers[..., :3], rtol=0, atol=1e-15)
     yaw, pitch, roll = numbers[..., 3:].unbind(-1)
     view = torch.stack([yaw.cos() * pitch.cos(), yaw.sin() * pitch.cos(), -pitch.sin()], -1)

@@ -1,4 +1,5 @@
-"""What cannot be is refused by a sentence: each call with one wrong value, and a part of what is said."""
+"""What cannot be is refused by a sentence: each call with one wrong value, and a part of what is
+said."""
 
 import math
 from typing import Any
@@ -113,8 +114,8 @@ WRONG = [
     (lambda: Clearance(NOTHING, Housing(0.1), step=0), "step must be .* got 0"),
     (lambda: OwnBody(ROVER, 2.0), "largest_share must be .* got 2"),
     (lambda: judge([], DOWN[None], NOTHING), r"one mount \[4, 4\]"),
-    # what makes a search hopeless: inside the chassis; beside a wheel, hypot(1.62, 0.07, 0.1); millimetres;
-    # on the mast
+    # what makes a search hopeless: inside the chassis; beside a wheel, hypot(1.62, 0.07, 0.1);
+    # millimetres; on the mast
     (
         lambda: check_mount(Mount((0.0, 0.0, 0.17), (0.05, 0.05, 0.02)), [NEAR], CAMERA),
         "no room for the camera",
@@ -150,11 +151,17 @@ WRONG = [
     (lambda: EgoVelocity(FREE), "each of the 6 velocities"),
     (lambda: EgoVelocity(outlier=NAN), "outlier"),
     (lambda: velocity_errors(torch.zeros(2, 3), torch.zeros(2, 3), PLANAR), "velocities are"),
-    (lambda: PrecisionTrend().followed(read(), torch.zeros(1, 4, 2, dtype=D)), "has seen no readings"),
+    (
+        lambda: PrecisionTrend().followed(read(), torch.zeros(1, 4, 2, dtype=D)),
+        "has seen no readings",
+    ),
     (lambda: UnknownDepth(0.0, 1.0), "nearest"),
     (lambda: UnknownDepth(1.0, 1.0), "nearest"),
     (lambda: UNKNOWN.solve(read()), "know their depth"),
-    (lambda: expected_errors(UNKNOWN, read(torch.zeros(1, 4, 2, 6)), torch.zeros(1, 6)), "depth is known"),
+    (
+        lambda: expected_errors(UNKNOWN, read(torch.zeros(1, 4, 2, 6)), torch.zeros(1, 6)),
+        "depth is known",
+    ),
     (lambda: VelocityHead(UNKNOWN), "head"),
 ]
 

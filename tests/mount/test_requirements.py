@@ -35,8 +35,12 @@ def cube():
 
 def test_clearance_is_that_of_the_housing_less_the_margin(cube, camera):
     kept = Clearance(cube, Housing(0.03), margin_m=0.02)
-    assert float(kept.slack(mount_at(0.3), camera)) == pytest.approx(HEIGHT - 0.1 - 0.03 - 0.02, abs=1e-14)
-    assert float(kept.exact(mount_at(0.3, (0.12, 0.0, 0.0)), camera)) == pytest.approx(-0.03, abs=1e-14)
+    assert float(kept.slack(mount_at(0.3), camera)) == pytest.approx(
+        HEIGHT - 0.1 - 0.03 - 0.02, abs=1e-14
+    )
+    assert float(kept.exact(mount_at(0.3, (0.12, 0.0, 0.0)), camera)) == pytest.approx(
+        -0.03, abs=1e-14
+    )
 
 
 @pytest.mark.parametrize("angle_deg", [5, 29.9, 30.1, 90, 179])
@@ -79,7 +83,8 @@ def test_what_looks_ahead_is_counted(camera, pitch_rad, angles):
 
 @pytest.mark.parametrize("share", [0.001, 0.1, 0.5, 0.77, 1.0])
 def test_the_exact_answer_changes_with_the_last_pixel(camera, share):
-    """Over pitches, a share of the picture is kept exactly as long as so many pixels are counted."""
+    """Over pitches, a share of the picture is kept exactly as long as so many pixels are
+    counted."""
     ahead = LookAhead(1.5, share=share)
     for pitch in torch.linspace(0.0, 1.2, 30).tolist():
         pose = mount_at(pitch)
@@ -99,8 +104,8 @@ def test_gradient_of_every_slack_to_the_mount(cube, camera, generator):
     mount = Mount((0.0, 0.0, HEIGHT), (0.2, 0.2, 0.1), pitch_rad=0.3, roll_rad=0.1)
     numbers = (0.3 * torch.randn(6, generator=generator, dtype=D)).requires_grad_()
     for each in requirements(cube):
-        # a difference of 1e-7 seldom swaps two ranks, and a swap of equal angles changes nothing to first
-        # order
+        # a difference of 1e-7 seldom swaps two ranks, and a swap of equal angles changes nothing to
+        # first order
         assert torch.autograd.gradcheck(
             lambda x, r=each: r.slack(mount(x), camera), (numbers,), eps=1e-7, atol=1e-6
         ), each.name
@@ -127,7 +132,9 @@ def test_penalty_pushes_before_the_limit_and_is_smooth(cube, camera):
     poses = mount_at(0.0).repeat(200, 1, 1)
     poses = (
         poses
-        + torch.eye(4, dtype=D)[2][:, None] * torch.eye(4, dtype=D)[3] * (height - HEIGHT)[:, None, None]
+        + torch.eye(4, dtype=D)[2][:, None]
+        * torch.eye(4, dtype=D)[3]
+        * (height - HEIGHT)[:, None, None]
     )
     found = penalty([wanted], poses, camera)
     over = (1 - (height.detach() - 0.13) / 0.05).clamp_min(0)

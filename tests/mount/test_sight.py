@@ -1,4 +1,5 @@
-"""What cameras are blind to, against closed forms of pinholes over ground, symmetries, and errors of drawn estimates."""
+"""What cameras are blind to, against closed forms of pinholes over ground, symmetries, and errors
+of drawn estimates."""
 
 import math
 
@@ -39,9 +40,9 @@ def over_ground():
 
 
 def test_a_downward_camera_sees_what_textbooks_say(camera, over_ground):
-    """Over its body's origin on the ground, alone: forward and left by f / h each, up by (x, y) / h, yaw by
-    the radius, and turns about the ground below it by no more than (x y, y^2) / f: shift and turn cancel in
-    the middle."""
+    """Over its body's origin on the ground, alone: forward and left by f / h each, up by (x, y) /
+    h, yaw by the radius, and turns about the ground below it by no more than (x y, y^2) / f: shift
+    and turn cancel in the middle."""
     pixels = camera.film.pixels() - camera.film.middle_px
     x, y = pixels.unbind(1)
     sums = {
@@ -68,23 +69,28 @@ def test_the_table_says_what_each_is_blind_to(camera, over_ground):
         assert columns == row["sight"].deviation.tolist()
         assert row["blind"] == [
             name
-            for name, value in zip(("forward", "left", "up", "roll", "pitch", "yaw"), columns, strict=True)
+            for name, value in zip(
+                ("forward", "left", "up", "roll", "pitch", "yaw"), columns, strict=True
+            )
             if value > 0.1
         ]
-    # forward and sideways are one camera turned by a right angle: forward and left, roll and pitch change
-    # places
+    # forward and sideways are one camera turned by a right angle: forward and left, roll and pitch
+    # change places
     ahead, beside = (table[name]["sight"].deviation for name in ("forward", "sideways"))
     torch.testing.assert_close(ahead[[1, 0, 2, 4, 3, 5]], beside, rtol=1e-6, atol=0)
     assert set(table["downward"]["weakest"].split()[1::2]) <= {"forward", "left", "roll", "pitch"}
 
 
 def test_far_walls_show_turns_alone(camera):
-    """Before something 1000 times farther, shifts are a thousandth as visible, turns are as they were."""
+    """Before something 1000 times farther, shifts are a thousandth as visible, turns are as they
+    were."""
     found = []
     for far in (2.0, 2000.0):
         around = Surroundings(
             (0.0, 0.0, 0.0),
-            depth=lambda camera, pixels, poses, scene, far=far: torch.full(pixels.shape[:2], far, dtype=D),
+            depth=lambda camera, pixels, poses, scene, far=far: torch.full(
+                pixels.shape[:2], far, dtype=D
+            ),
             farthest_m=1e4,
         )
         found.append(sight_table(camera, around, {"ahead": (0.0, 0.0)})["ahead"]["sight"].alone)
@@ -131,7 +137,8 @@ def test_precision_is_the_inverse(generator):
 
 
 def test_expected_error_is_what_estimates_miss_on_average(generator):
-    """Velocities drawn from the prior, measured with noise, estimated by the mean of what they can be."""
+    """Velocities drawn from the prior, measured with noise, estimated by the mean of what they can
+    be."""
     rows = torch.randn(7, 3, generator=generator, dtype=D)
     prior = torch.tensor([0.5, 1.0, 2.0], dtype=D)
     unit = torch.tensor([0.1, 0.1, 0.3], dtype=D)
@@ -174,7 +181,8 @@ def test_sight_of_independent_velocities():
 
 
 def test_sight_of_two_that_look_alike():
-    """Forward and pitch seen by their sum alone, each measured a little: the difference shows least."""
+    """Forward and pitch seen by their sum alone, each measured a little: the difference shows
+    least."""
     together = torch.tensor([[1.0, 1.0], [1.0, 1.0]], dtype=D) * 100 + torch.eye(2, dtype=D)
     found = sight(together, (1.0, 1.0), (0, 4))
     inverse = torch.linalg.inv(together)
@@ -187,6 +195,8 @@ def test_sight_of_two_that_look_alike():
 @pytest.mark.parametrize("scale", [1e-10, 1e10])
 def test_what_is_seen_does_not_hang_on_the_unit_of_information(scale):
     """NOTHING is a share of the largest eigenvalue: of 4 and 1 times any scale both are seen."""
-    found = sight(scale * torch.diag(torch.tensor([4.0, 1.0, 0.0], dtype=D)), (1.0, 1.0, 1.0), PLANAR)
+    found = sight(
+        scale * torch.diag(torch.tensor([4.0, 1.0, 0.0], dtype=D)), (1.0, 1.0, 1.0), PLANAR
+    )
     expected = torch.tensor([0.5, 1.0, math.inf], dtype=D) / math.sqrt(scale)
     torch.testing.assert_close(found.deviation, expected, rtol=1e-12, atol=0)

@@ -1,5 +1,6 @@
-"""Velocity without a map: the likelihood against integrals by adaptive quadrature, its maximum against
-descents from the truth, errors and claims over bodies, depths and mounts drawn at random."""
+"""Velocity without a map: the likelihood against integrals by adaptive quadrature, its maximum
+against descents from the truth, errors and claims over bodies, depths and mounts drawn at
+random."""
 
 import math
 
@@ -34,13 +35,17 @@ def points(seed, count=4, many=5, scale=1.0, bounds=(0.1, 3.0)):
         return torch.randn(shape, generator=random, dtype=D)
 
     far, near = scale * normal(count, many, 2, 6), scale * normal(count, many, 2, 6)
-    nearness = bounds[0] + (bounds[1] - bounds[0]) * torch.rand(count, many, 1, 1, generator=random, dtype=D)
+    nearness = bounds[0] + (bounds[1] - bounds[0]) * torch.rand(
+        count, many, 1, 1, generator=random, dtype=D
+    )
     root = normal(count, many, 2, 2)
     precision = root @ root.mT + 0.3 * torch.eye(2, dtype=D)
     flow = (far + nearness * near) @ normal(count, 1, 6, 1) + 0.3 * normal(count, many, 2, 1)
     weight = 0.2 + torch.rand(count, many, generator=random, dtype=D)
     prior = torch.diag(torch.tensor(PRIOR, dtype=D) ** -2)
-    return unknown_depth.Points(precision, (precision @ flow)[..., 0], far, near, weight, prior, bounds), flow
+    return unknown_depth.Points(
+        precision, (precision @ flow)[..., 0], far, near, weight, prior, bounds
+    ), flow
 
 
 @pytest.mark.parametrize("scale", [1e-4, 0.1, 1.0, 30.0])
@@ -100,7 +105,9 @@ def test_a_curvature_that_is_not_positive_counts_by_its_size():
     values, vectors = torch.linalg.eigh(unknown_depth.look(seen, velocity).curvature)
     assert bool((values < 0).any())
     expected = vectors @ (vectors.mT / values.abs()[..., None])
-    torch.testing.assert_close(unknown_depth.covariance(seen, velocity), expected, rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(
+        unknown_depth.covariance(seen, velocity), expected, rtol=1e-6, atol=1e-9
+    )
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +119,8 @@ def camera():
 
 
 def drives(camera, bodies, nearest_m, farthest_m, seed, noise_px=NOISE_PX):
-    """Mount [4, 4], poses, twists [N, 6] and flow fields where every point read has a depth of its own."""
+    """Mount [4, 4], poses, twists [N, 6] and flow fields where every point read has a depth of its
+    own."""
     random = torch.Generator().manual_seed(seed)
     twist = torch.tensor(PRIOR, dtype=D) * torch.randn(bodies, 6, generator=random, dtype=D)
     turned = Mount((0.2, 0.05, 0.4), (0.1, 0.1, 0.1), pitch_rad=0.9, yaw_rad=0.4)().detach()
@@ -166,13 +174,17 @@ def test_the_maximum_is_the_one_by_the_truth(camera):
 
 def test_depths_are_found_where_the_body_moves_across(camera):
     mount, poses, _, _ = drives(camera, 1, 0.3, 5.0, 3)
-    share = torch.rand(1, len(camera.film.pixels()), generator=torch.Generator().manual_seed(1), dtype=D)
+    share = torch.rand(
+        1, len(camera.film.pixels()), generator=torch.Generator().manual_seed(1), dtype=D
+    )
     depth = 1 / (0.2 + (1 / 0.3 - 0.2) * share)
     rows, _ = body_flow(camera, depth, mount)
     flow = (rows @ torch.tensor([0.8, 0.8, 0.0, 0.0, 0.0, 0.3], dtype=D))[0] * INTERVAL_S
     flow = flow.reshape(len(WINDOWS), 32, 32, 2).movedim(-1, 1)
     ones = torch.ones_like(flow[:, 0])
-    field = FlowField(flow, ones.bool(), INTERVAL_S, ones, 1e-6 * torch.stack([ones, 0 * ones, ones], 1))
+    field = FlowField(
+        flow, ones.bool(), INTERVAL_S, ones, 1e-6 * torch.stack([ones, 0 * ones, ones], 1)
+    )
     with torch.no_grad():
         found = estimator(0.3, 5.0)(field, camera, None, mount, poses)
     at = depth.reshape(len(WINDOWS), 32, 32)[:, 8::16, 8::16].reshape(1, -1)
@@ -204,13 +216,22 @@ def test_gradient_is_that_of_differences(camera, outlier):
     def value(flow, spread):
         moved = FlowField(flow, field.valid, INTERVAL_S, field.confidence, spread * covariance)
         found = ours(moved, camera, None, mount, poses)
-        return (found.velocity * weight).sum() + 30 * found.covariance.diagonal(dim1=1, dim2=2).sum()
+        return (found.velocity * weight).sum() + 30 * found.covariance.diagonal(
+            dim1=1, dim2=2
+        ).sum()
 
-    flow, spread = field.flow_px.detach().requires_grad_(), torch.ones((), dtype=D, requires_grad=True)
+    flow, spread = (
+        field.flow_px.detach().requires_grad_(),
+        torch.ones((), dtype=D, requires_grad=True),
+    )
     of_flow, of_spread = torch.autograd.grad(value(flow, spread), (flow, spread))
     step = 1e-3
     with torch.no_grad():
         flows = [value(flow + sign * step * along, spread) for sign in (1, -1)]
         spreads = [value(flow, spread + sign * step) for sign in (1, -1)]
-    assert float((of_flow * along).sum()) == pytest.approx(float(flows[0] - flows[1]) / (2 * step), rel=0.02)
-    assert float(of_spread) == pytest.approx(float(spreads[0] - spreads[1]) / (2 * step), rel=0.02, abs=1e-4)
+    assert float((of_flow * along).sum()) == pytest.approx(
+        float(flows[0] - flows[1]) / (2 * step), rel=0.02
+    )
+    assert float(of_spread) == pytest.approx(
+        float(spreads[0] - spreads[1]) / (2 * step), rel=0.02, abs=1e-4
+    )

@@ -1,4 +1,5 @@
-"""Re-optimised moves against the closed form of the thin achromat, and against what the moves are for."""
+"""Re-optimised moves against the closed form of the thin achromat, and against what the moves are
+for."""
 
 import math
 
@@ -41,8 +42,8 @@ def powers(geo):
 
 
 def closed_form(crown, flint):
-    """Powers of the thin achromat of focal length EFL: V1 / (V1 - V2) and -V2 / (V1 - V2) of the whole (Smith,
-    Modern Optical Engineering, ch. 5)."""
+    """Powers of the thin achromat of focal length EFL: V1 / (V1 - V2) and -V2 / (V1 - V2) of the
+    whole (Smith, Modern Optical Engineering, ch. 5)."""
     v1, v2 = (Glass.named(g).abbe_number for g in (crown, flint))
     return [v1 / (v1 - v2) / EFL, -v2 / (v1 - v2) / EFL]
 
@@ -54,7 +55,8 @@ def started():
 @pytest.mark.parametrize("flint", ["F2", "SF10"])
 def test_re_optimised_powers_are_those_of_the_thin_achromat(flint):
     found = reoptimise(with_glass(started(), 1, flint), colour_and_strength, ("curvature",))
-    # the strength row pulls by 1e-3 against 1e7 of colour: 1e-6 of the powers at most; the gap of 1e-7 mm less
+    # the strength row pulls by 1e-3 against 1e7 of colour: 1e-6 of the powers at most; the gap of
+    # 1e-7 mm less
     assert powers(found.lens) == pytest.approx(closed_form("N-BK7", flint), rel=1e-5)
     assert float(found.lens.first_order().efl_mm.detach()) == pytest.approx(EFL, rel=1e-12)
     assert found.after < 1e-3 * found.before
@@ -63,7 +65,8 @@ def test_re_optimised_powers_are_those_of_the_thin_achromat(flint):
 
 
 def test_the_exchange_keeps_the_neighbour_that_the_closed_form_prefers():
-    """A merit that counts the power of the crown alone prefers the pair of the largest difference in V."""
+    """A merit that counts the power of the crown alone prefers the pair of the largest difference
+    in V."""
 
     def residuals(geo):
         colour = colour_and_strength(geo)[0]
@@ -74,7 +77,8 @@ def test_the_exchange_keeps_the_neighbour_that_the_closed_form_prefers():
     crowns = ["N-BK7", *(g.name for g in neighbour_glasses("N-BK7", 4))]
     found = exchange_glasses(started(), residuals, ("curvature",), count=4, steps=25)
     crown, flint = (getattr(found.lens.surfaces[i].medium, "name", "air") for i in (0, 1))
-    # element by element, as the move goes: first the crown beside F2, then the flint beside that crown
+    # element by element, as the move goes: first the crown beside F2, then the flint beside that
+    # crown
     best = min(crowns, key=lambda name: closed_form(name, "F2")[0])
     assert crown == best
     assert flint == min(["F2", *tried], key=lambda name: closed_form(best, name)[0])
@@ -101,7 +105,9 @@ def test_an_element_goes_and_the_rest_takes_over(triplet, path):
     at_once = lens.design.without_element(triplet, 1)
     assert found.after < 0.2 * float(spot_errors(at_once).detach().square().sum())
     assert found.before == pytest.approx(float(spot_errors(triplet).square().sum()), rel=1e-12)
-    assert found.after == pytest.approx(float(spot_errors(found.lens).detach().square().sum()), rel=1e-9)
+    assert found.after == pytest.approx(
+        float(spot_errors(found.lens).detach().square().sum()), rel=1e-9
+    )
     assert float(found.lens.first_order().efl_mm.detach()) == pytest.approx(
         float(triplet.first_order().efl_mm), rel=1e-12
     )
@@ -132,7 +138,10 @@ def test_a_ray_that_fails_is_a_failed_step(triplet):
 @pytest.mark.parametrize(
     ("call", "sentence"),
     [
-        (lambda geo: reoptimise(geo, lambda g: spot_errors(g) * math.nan, steps=1), "residuals at the start"),
+        (
+            lambda geo: reoptimise(geo, lambda g: spot_errors(g) * math.nan, steps=1),
+            "residuals at the start",
+        ),
         (
             lambda geo: reoptimise(geo, spot_errors, held=range(6)),
             "no surface is left to hold the focal length",

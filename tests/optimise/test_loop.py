@@ -1,4 +1,5 @@
-"""The loop and the descent on bowls whose minimum is known: noise, going back, resuming, refusals."""
+"""The loop and the descent on bowls whose minimum is known: noise, going back, resuming,
+refusals."""
 
 import math
 
@@ -20,12 +21,14 @@ def parameter(*values):
 def sgd_loop(samples, x=None, **options):
     """A parameter from 0 whose steps are those of its gradient, and its loop."""
     x = parameter(0.0) if x is None else x
-    return x, Loop(torch.optim.SGD([x], lr=1.0), lambda step: samples(x, step), clip=None, **options)
+    return x, Loop(
+        torch.optim.SGD([x], lr=1.0), lambda step: samples(x, step), clip=None, **options
+    )
 
 
 def noisy_loop(seed=0, optimiser=lambda p: Descent(p, 0.3)):
-    """A bowl about GOAL; four samples a step with Cauchy noise of scale 1 on every gradient: a mean would not
-    exist."""
+    """A bowl about GOAL; four samples a step with Cauchy noise of scale 1 on every gradient: a mean
+    would not exist."""
     x = parameter(0.0, 0.0)
 
     def samples(step):
@@ -135,7 +138,9 @@ def test_without_a_judge_the_last_point_is_the_best():
 def test_a_bad_gradient_stops_the_loop_at_the_best_point():
     x, loop = sgd_loop(lambda x, step: [x.sum() * (math.nan if step == 3 else 1.0)])
     loop.judge, loop.judge_every = (lambda: float(x)), 1
-    with pytest.raises(NonFiniteError, match="stopped at step 4; the parameters are back at the best point"):
+    with pytest.raises(
+        NonFiniteError, match="stopped at step 4; the parameters are back at the best point"
+    ):
         loop.run(10)
     assert x.item() == -3.0
 
@@ -158,10 +163,16 @@ def loop_of(*samples, optimiser=None, **options):
         (lambda: loop_of(parameter(1.0).sum()).run(1), GradientError, "depend on any parameter"),
         (lambda: loop_of(x.detach().sum()).run(1), GradientError, "the graph is cut"),
         (lambda: loop_of(clip=0), DomainError, "clip must be .* got 0"),
-        (lambda: loop_of(optimiser=torch.optim.LBFGS([x])), DomainError, "LBFGS asks for the loss several"),
+        (
+            lambda: loop_of(optimiser=torch.optim.LBFGS([x])),
+            DomainError,
+            "LBFGS asks for the loss several",
+        ),
         (lambda: Descent([x], lr=0.1, momentum=1.0), DomainError, r"momentum must be .* got 1\.0"),
         (
-            lambda: loop_of(optimiser=torch.optim.SGD([parameter(0.0)])).resume(*noisy_loop().state()),
+            lambda: loop_of(optimiser=torch.optim.SGD([parameter(0.0)])).resume(
+                *noisy_loop().state()
+            ),
             ShapeError,
             "the state of the same problem",
         ),
@@ -170,11 +181,23 @@ def loop_of(*samples, optimiser=None, **options):
             DomainError,
             "of the optimiser Descent, this loop has NAdam",
         ),
-        (lambda: Loop(torch.optim.SGD([x]), [1.0]), DomainError, "samples is a list; give a function"),
+        (
+            lambda: Loop(torch.optim.SGD([x]), [1.0]),
+            DomainError,
+            "samples is a list; give a function",
+        ),
         (lambda: loop_of().run(1), DomainError, "no samples in this step"),
-        (lambda: Loop(torch.optim.SGD([x]), lambda step: x.sum()).run(1), CodesignError, "are one Tensor"),
+        (
+            lambda: Loop(torch.optim.SGD([x]), lambda step: x.sum()).run(1),
+            CodesignError,
+            "are one Tensor",
+        ),
         (lambda: loop_of(2 * x).run(1), ShapeError, r"a sample's loss is \(2,\)"),
-        (lambda: (lambda y: loop_of(y.sum(), y.sum()).run(1))(x.exp()), GradientError, "share a graph"),
+        (
+            lambda: (lambda y: loop_of(y.sum(), y.sum()).run(1))(x.exp()),
+            GradientError,
+            "share a graph",
+        ),
     ],
 )
 def test_what_cannot_be_optimised_is_refused_with_a_sentence(call, error, said):

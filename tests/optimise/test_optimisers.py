@@ -1,5 +1,5 @@
-"""Damped least squares against problems of the literature, scipy, and its own interrupted runs (which must
-repeat to the last bit); Jacobians and their scales against derivatives by hand."""
+"""Damped least squares against problems of the literature, scipy, and its own interrupted runs
+(which must repeat to the last bit); Jacobians and their scales against derivatives by hand."""
 
 import io
 import itertools
@@ -29,7 +29,12 @@ def rosenbrock(x):
 
 def powell_singular(x):
     return torch.stack(
-        [x[0] + 10 * x[1], 5**0.5 * (x[2] - x[3]), (x[1] - 2 * x[2]) ** 2, 10**0.5 * (x[0] - x[3]) ** 2]
+        [
+            x[0] + 10 * x[1],
+            5**0.5 * (x[2] - x[3]),
+            (x[1] - 2 * x[2]) ** 2,
+            10**0.5 * (x[0] - x[3]) ** 2,
+        ]
     )
 
 
@@ -44,7 +49,9 @@ def decay(x):
     return x[0] * torch.exp(-x[1] * TIMES) + x[2] - (1 / (1 + TIMES) + 0.02 * torch.sin(9 * TIMES))
 
 
-@pytest.mark.parametrize("jacobian", [by_autograd, by_differences(1e-7), by_differences(1e-5, central=True)])
+@pytest.mark.parametrize(
+    "jacobian", [by_autograd, by_differences(1e-7), by_differences(1e-5, central=True)]
+)
 def test_rosenbrock_reaches_its_zero(jacobian):
     found = DampedLeastSquares(rosenbrock, vector(-1.2, 1.0), jacobian).run(200)
     # a zero of the residuals: what the Jacobian lacks only slows the way there
@@ -93,10 +100,12 @@ def test_minima_agree_with_scipy(problem, start, lower, upper):
     truth = scipy.optimize.least_squares(
         plain, start, **options, **({"method": "lm"} if free else {"bounds": (lower, upper)})
     )
-    # a minimum with a residual is known to the root of rounding by its loss, 1e-8; scipy's interior steps stop
-    # just short of a bound
+    # a minimum with a residual is known to the root of rounding by its loss, 1e-8; scipy's interior
+    # steps stop just short of a bound
     assert solver.loss == pytest.approx(truth.cost, rel=1e-12 if free else 1e-6, abs=1e-12)
-    torch.testing.assert_close(found, torch.from_numpy(truth.x), rtol=1e-5 if free else 1e-4, atol=1e-5)
+    torch.testing.assert_close(
+        found, torch.from_numpy(truth.x), rtol=1e-5 if free else 1e-4, atol=1e-5
+    )
 
 
 def test_residuals_that_are_not_finite_are_failed_steps():
@@ -129,7 +138,9 @@ def test_the_loss_never_rises_and_the_history_says_what_happened():
     assert solver.stopped in ("gradient", "step", "loss", "damping")
 
 
-@pytest.mark.parametrize(("problem", "start"), [(rosenbrock, (-1.2, 1.0)), (decay, (1.0, 1.0, 0.1))])
+@pytest.mark.parametrize(
+    ("problem", "start"), [(rosenbrock, (-1.2, 1.0)), (decay, (1.0, 1.0, 0.1))]
+)
 def test_steps_do_not_depend_on_the_units_of_the_variables(problem, start):
     start = vector(*start)
     units = vector(1e-4, 1e4, 7.0)[: start.numel()]
@@ -147,8 +158,9 @@ def test_steps_do_not_depend_on_the_units_of_the_variables(problem, start):
 
 
 def test_a_null_mode_does_not_hold_the_others():
-    """The column of z is 1e-6, its step -1e6, and z^2 grows at once: by its own damping x and y wait for
-    1e6 of it. The minimum is at z = -5e-7 where the derivative of (1 + 1e-6 z + z^2)^2 is 0."""
+    """The column of z is 1e-6, its step -1e6, and z^2 grows at once: by its own damping x and y
+    wait for 1e6 of it. The minimum is at z = -5e-7 where the derivative of (1 + 1e-6 z + z^2)^2 is
+    0."""
 
     def residuals(v):
         x, y, z = v
@@ -196,8 +208,16 @@ def carried(state, route):
             r"start must be \[V\]",
         ),
         (lambda: DampedLeastSquares(rosenbrock, vector(math.nan, 0)), DomainError, "start"),
-        (lambda: DampedLeastSquares(rosenbrock, vector(0, 0), lower=vector(1, 1)), DomainError, "outside"),
-        (lambda: DampedLeastSquares(torch.log, vector(-1.0)), DomainError, "residuals at the start"),
+        (
+            lambda: DampedLeastSquares(rosenbrock, vector(0, 0), lower=vector(1, 1)),
+            DomainError,
+            "outside",
+        ),
+        (
+            lambda: DampedLeastSquares(torch.log, vector(-1.0)),
+            DomainError,
+            "residuals at the start",
+        ),
         (
             lambda: DampedLeastSquares(rosenbrock, vector(0, 0)).resume({"variables": [1.0] * 4}),
             ShapeError,
@@ -213,8 +233,8 @@ def test_wrong_input_is_refused(call, error, sentence):
 def test_jacobians_against_derivatives_by_hand():
     x = vector(-1.2, 1.0)
     truth = torch.tensor([[-20 * -1.2, 10.0], [-1.0, 0.0]], dtype=D)
-    # forward: half the second derivative (20) times the step, and rounding 1e-15 over it; central: exact on a
-    # quadratic but for rounding
+    # forward: half the second derivative (20) times the step, and rounding 1e-15 over it; central:
+    # exact on a quadratic but for rounding
     for jacobian, atol in (
         (by_autograd, 1e-13),
         (by_differences(1e-6), 1.1e-5),
@@ -240,4 +260,6 @@ def test_principal_modes_have_effects_at_right_angles_of_size_one(generator):
     modes = J @ principal_modes(J)
     torch.testing.assert_close(modes.T @ modes, torch.eye(5, dtype=D), rtol=0, atol=1e-11)
     assert float(principal_modes(J, limit=0.05).abs().max()) <= 0.05 * (1 + 1e-12)
-    torch.testing.assert_close(J @ torch.diag(column_scales(J)), J / J.norm(dim=0), rtol=1e-12, atol=0)
+    torch.testing.assert_close(
+        J @ torch.diag(column_scales(J)), J / J.norm(dim=0), rtol=1e-12, atol=0
+    )

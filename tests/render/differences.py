@@ -1,10 +1,12 @@
-"""Gradients beside central differences, for losses in double precision; what frames are weighed and moved by."""
+"""Gradients beside central differences, for losses in double precision; what frames are weighed and
+moved by."""
 
 import torch
 
 
 def assert_gradients(loss, at, steps, within, seed=0):
-    """Gradients of loss(*at) are its central differences within a share, each along two random directions.
+    """Gradients of loss(*at) are its central differences within a share, each along two random
+    directions.
 
     Args:
       at: tensors.
@@ -18,12 +20,17 @@ def assert_gradients(loss, at, steps, within, seed=0):
             way = torch.randn(gradient.shape, generator=draw, dtype=gradient.dtype)
             with torch.no_grad():
                 ahead, behind = (
-                    float(loss(*(v + sign * step * way if k == slot else v for k, v in enumerate(at))))
+                    float(
+                        loss(*(v + sign * step * way if k == slot else v for k, v in enumerate(at)))
+                    )
                     for sign in (1, -1)
                 )
             error = float((gradient * way).sum()) - (ahead - behind) / (2 * step)
             # relative to the gradient's own length, as a direction may lie across it
-            assert abs(error) <= within * float(gradient.norm()), (slot, error / float(gradient.norm()))
+            assert abs(error) <= within * float(gradient.norm()), (
+                slot,
+                error / float(gradient.norm()),
+            )
 
 
 def to_twist(loss):

@@ -11,7 +11,9 @@ PITCH_MM = 18.5e-3
 def fitted(name):
     """A catalogue lens scaled until its published field fills the sensor's half diagonal."""
     geo = lens.load(name)
-    image_mm = float(geo.first_order().efl_mm.detach()) * math.tan(math.radians(lens.half_field_deg(name)))
+    image_mm = float(geo.first_order().efl_mm.detach()) * math.tan(
+        math.radians(lens.half_field_deg(name))
+    )
     return geo.scaled(math.hypot(*SENSOR_PX) / 2 * PITCH_MM / image_mm)
 
 

@@ -9,8 +9,8 @@ CUBE = np.array([face for a, b, c, d in SIDES for face in ((a, b, c), (a, c, d))
 
 
 def squares(n, m, around=False):
-    """Two faces for each square between vertices in n rows of m, numbered row by row; the last column goes on
-    in the first."""
+    """Two faces for each square between vertices in n rows of m, numbered row by row; the last
+    column goes on in the first."""
     row, column = (v.reshape(-1) for v in np.mgrid[: n - 1, : m - (not around)])
     a, b = row * m + column, row * m + (column + 1) % m
     return np.stack([a, b, b + m, a, b + m, a + m], 1).reshape(-1, 3)

@@ -1,5 +1,5 @@
-"""Light that apertures take away, sampled at their edges: its gradient against plain samples of the whole
-pupil, many of them, and how much less it scatters with few."""
+"""Light that apertures take away, sampled at their edges: its gradient against plain samples of the
+whole pupil, many of them, and how much less it scatters with few."""
 
 import pytest
 import torch
@@ -15,10 +15,13 @@ WEIGHT = smooth_weights(32)
 
 
 def gradient(way, samples, seed, **options):
-    """To the six thicknesses of a triplet whose film reaches beyond its field, before a textured wall."""
+    """To the six thicknesses of a triplet whose film reaches beyond its field, before a textured
+    wall."""
     optics = lens.load("cooke-triplet").scaled(0.22).freeze()
     held = optics.thickness_mm.detach().clone().requires_grad_()
-    camera = render.Camera(optics.replace(thickness_mm=held), 32, 32, 0.25, samples, seed, **options)
+    camera = render.Camera(
+        optics.replace(thickness_mm=held), 32, 32, 0.25, samples, seed, **options
+    )
     frames = render.frames(camera, silhouette_scenes.build("wall"), START, way)
     return torch.autograd.grad((WEIGHT * frames).double().mean(), held)[0]
 
@@ -35,7 +38,9 @@ def several(way, samples, count, **options):
 def test_the_edge_of_the_light_has_the_gradient_of_the_whole_pupil(options):
     truth = several("interior", 768, 4, **options)
     found = several("boundary", 24, 16, **options)
-    error = (truth.std(0).square() / 4 + found.std(0).square() / 16).sum().sqrt() / truth.mean(0).norm()
+    error = (truth.std(0).square() / 4 + found.std(0).square() / 16).sum().sqrt() / truth.mean(
+        0
+    ).norm()
     assert float(error) < 0.03
     assert float((found.mean(0) - truth.mean(0)).norm() / truth.mean(0).norm()) < 3 * float(error)
 
@@ -59,4 +64,7 @@ def test_a_lens_with_no_edge_in_its_pupil_has_none_and_an_obstructed_one_is_left
             share = 1 / (1 + torch.exp(40 * (0.3 - pupil.norm(dim=1))))
             return type(rays)(rays.origin_m, rays.direction, share.to(rays.weight), rays.irradiance)
 
-    assert aperture_edge_term(render.Camera(Ring(11.0, 2.2), 8, 8, 0.1, 4), views_of(scene, START), 4) is None
+    assert (
+        aperture_edge_term(render.Camera(Ring(11.0, 2.2), 8, 8, 0.1, 4), views_of(scene, START), 4)
+        is None
+    )

@@ -28,7 +28,8 @@ def plane(seed=1, height_m=0.0):
 
 
 def one_by_one(function, poses):
-    """What a function of one trajectory gives for each of a batch, stacked to the shape of the batch."""
+    """What a function of one trajectory gives for each of a batch, stacked to the shape of the
+    batch."""
     found = [function(each) for each in poses.reshape(-1, *poses.shape[-3:])]
     return torch.stack(found).unflatten(0, poses.shape[:-3])
 
@@ -57,7 +58,9 @@ def occlusion(scene, poses, cam, stride=1):
 
 def projected(poses):
     world = 0.2 * torch.rand(7, 3, generator=torch.Generator().manual_seed(0), dtype=D)
-    return render.project(camera(optics=lens.load("cooke-triplet").scaled(0.2)), apply(inverse(poses), world))
+    return render.project(
+        camera(optics=lens.load("cooke-triplet").scaled(0.2)), apply(inverse(poses), world)
+    )
 
 
 def by_time(function):
@@ -78,25 +81,30 @@ def by_time(function):
         by_time(lambda path: render.exposed_frames(camera(), plane(), path, T_S, 0.02, 2)),
         lambda poses: render.frames(camera(), beside(poses), poses),
         lambda poses: render.frames(camera(), beside(poses, own=False), poses),
-        lambda poses: render.frames(camera(), beside(poses).during([1, 3]), poses[..., [1, 3], :, :]),
+        lambda poses: render.frames(
+            camera(), beside(poses).during([1, 3]), poses[..., [1, 3], :, :]
+        ),
         lambda poses: occlusion(beside(poses), poses, camera()),
         lambda poses: occlusion(beside(poses, own=False), poses, camera(WINDOWS)),
-        lambda poses: occlusion(plane(), poses, camera(WINDOWS, lens.load("cooke-triplet").scaled(0.2)), 2),
+        lambda poses: occlusion(
+            plane(), poses, camera(WINDOWS, lens.load("cooke-triplet").scaled(0.2)), 2
+        ),
         lambda poses: render.view(camera(), beside(poses), poses, -1).points_world_m,
         projected,
         lambda poses: torch.cat(render.camera_velocity(poses, T_S), -1),
     ],
 )
 def test_what_a_batch_gives_is_what_each_trajectory_gives(of_poses):
-    # products of 4 x 4 matrices may round differently in another batch; float32 scenes have every bit or a
-    # phase apart
+    # products of 4 x 4 matrices may round differently in another batch; float32 scenes have every
+    # bit or a phase apart
     found = of_poses(paths())
     torch.testing.assert_close(found, one_by_one(of_poses, paths()), rtol=1e-10, atol=1e-10)
     assert not torch.equal(found[0, 0], found[0, 1])
 
 
 def gradients(cam, scene, poses, way, weights, separate):
-    """Gradients to poses [..., T, 4, 4] and to curvatures, of the batch or of the trajectories one by one."""
+    """Gradients to poses [..., T, 4, 4] and to curvatures, of the batch or of the trajectories one
+    by one."""
     leaf = poses.clone().requires_grad_()
     optics = cam.lens.replace(curvature_per_mm=cam.lens.curvature_per_mm.detach().requires_grad_())
     seen = cam.with_lens(optics)
@@ -110,13 +118,15 @@ def gradients(cam, scene, poses, way, weights, separate):
 
 @pytest.mark.parametrize("way", ["interior", "boundary", "auto", "difference"])
 def test_gradients_of_a_batch_are_those_of_each_trajectory(way, generator):
-    # float32 frames, whose adjoints are sums over 8 x 8 pixels x 4 samples in any order; "auto" finds edges
-    # in all
+    # float32 frames, whose adjoints are sums over 8 x 8 pixels x 4 samples in any order; "auto"
+    # finds edges in all
     scene = silhouettes.build("cubes")
     cam = Camera(lens.load("cooke-triplet").scaled(0.11).freeze(), 8, 8, 1.0, 4)
     poses = paths(2, (2, 2), look_at((0.05, -1.2, 1.0), (0.0, 1.0, 0.7)))
     weights = torch.rand(8, 8, generator=generator)
-    whole, parts = (gradients(cam, scene, poses, way, weights, separate) for separate in (False, True))
+    whole, parts = (
+        gradients(cam, scene, poses, way, weights, separate) for separate in (False, True)
+    )
     for found, truth in zip(whole, parts, strict=True):
         assert float(truth.norm()) > 0
         assert float((found - truth).norm() / truth.norm()) <= 256 * 2**-24

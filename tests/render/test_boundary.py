@@ -1,5 +1,5 @@
-"""Silhouettes: gradients of frames with occluders against differences with common random numbers, outlines
-against closed forms."""
+"""Silhouettes: gradients of frames with occluders against differences with common random numbers,
+outlines against closed forms."""
 
 import math
 
@@ -37,7 +37,9 @@ def test_gradients_with_occluders(scene, kind, of, samples, without, within):
     task = Task(silhouette_scenes.build(scene), kind)
     scale = torch.tensor(STEPS[of], dtype=F64)
     truth = torch.stack([task.differences(of, samples, seed) for seed in (11, 12)]).mean(0) * scale
-    plain, whole = (task.gradient(of, 1024, 13, way, 32.0) * scale for way in ("interior", "boundary"))
+    plain, whole = (
+        task.gradient(of, 1024, 13, way, 32.0) * scale for way in ("interior", "boundary")
+    )
     assert float((plain - truth).norm() / truth.norm()) > without
     assert float((whole - truth).norm() / truth.norm()) < within
 
@@ -53,23 +55,29 @@ def test_the_boundary_term_changes_no_frame():
 
 
 def test_a_bright_square_moves_by_its_closed_form():
-    """A square of radiance 100 alone before a pinhole: sideways the sum of all pixels stays, a weighted one
-    gains radiance times length times motion on both sides."""
-    place = backend.mitsuba().ScalarTransform4f().translate([0.013, 0.021, 2.0]).rotate([0, 1, 0], 180)
+    """A square of radiance 100 alone before a pinhole: sideways the sum of all pixels stays, a
+    weighted one gains radiance times length times motion on both sides."""
+    place = (
+        backend.mitsuba().ScalarTransform4f().translate([0.013, 0.021, 2.0]).rotate([0, 1, 0], 180)
+    )
     emitter = area(100.0)
-    scene = MitsubaScene({"square": {"type": "rectangle", "to_world": place.scale(0.2), "emitter": emitter}})
+    scene = MitsubaScene(
+        {"square": {"type": "rectangle", "to_world": place.scale(0.2), "emitter": emitter}}
+    )
     camera = render.Camera(Pinhole(11.0), 32, 32, 0.25, 16)
     total, first = (
         to_twist(
-            lambda t, w=w: (render.frames(camera, scene, pose.se3_exp(t), "boundary").double() * w).sum()
+            lambda t, w=w: (
+                render.frames(camera, scene, pose.se3_exp(t), "boundary").double() * w
+            ).sum()
         )
         for w in (torch.ones(32), torch.arange(32.0))
     )
     px_per_m = 11.0 / 0.25 / 2.0
     side = 0.4 * px_per_m  # 8.8 px
     assert abs(float(total[0])) < 1e-6 * 100 * side * px_per_m  # the two sides cancel
-    # the sides lie in columns 11 and 20, whose weights they carry; points at equal shares of an edge sum a
-    # constant exactly
+    # the sides lie in columns 11 and 20, whose weights they carry; points at equal shares of an
+    # edge sum a constant exactly
     assert float(first[0]) == pytest.approx(-100 * side * (20 - 11) * px_per_m, rel=1e-6)
     # nearer by dz: the area grows by 2 dz / z
     assert float(total[2]) == pytest.approx(2 * 100 * side**2 / 2.0, rel=1e-4)
@@ -96,8 +104,9 @@ def test_auto_takes_the_cheapest_way_that_agrees():
     "lengths_px", [(0.3, 0.05, 1e-4, 0.39), (5.0, 0.01, 0.19, 0.7, 0.3), (2.0, 3.3), (0.01,)]
 )
 def test_points_on_curves_stand_for_their_whole_length(lengths_px, generator):
-    """Shares times lengths add up to the length of all pieces, however short, since what is constant along
-    them is to be summed exactly; points on the short ones lie evenly along their total length."""
+    """Shares times lengths add up to the length of all pieces, however short, since what is
+    constant along them is to be summed exactly; points on the short ones lie evenly along their
+    total length."""
     length = torch.tensor(lengths_px, dtype=F64).repeat(30)
     piece, inside, share = _places(length, 2.5, generator)
     assert bool(((inside >= 0) & (inside <= 1)).all())
@@ -118,8 +127,8 @@ def test_points_on_curves_stand_for_their_whole_length(lengths_px, generator):
 
 @pytest.mark.parametrize("scale", [1.0, 1e-3])
 def test_differences_step_by_a_share_of_a_pixel_in_small_scenes(scale):
-    """A cube before a wall, in metres and in millimetres: the same picture, so gradients to translations are
-    as one over the scale, and turns alike."""
+    """A cube before a wall, in metres and in millimetres: the same picture, so gradients to
+    translations are as one over the scale, and turns alike."""
     mi = backend.mitsuba()
     T = mi.ScalarTransform4f().scale(scale)
 
@@ -137,7 +146,9 @@ def test_differences_step_by_a_share_of_a_pixel_in_small_scenes(scale):
 
     found, truth = (
         unit
-        * to_twist(lambda t, way=way: (render.frames(camera, scene, pose.se3_exp(t), way) * weight).sum())
+        * to_twist(
+            lambda t, way=way: (render.frames(camera, scene, pose.se3_exp(t), way) * weight).sum()
+        )
         for way in ("difference", "boundary")
     )
     assert float((found - truth).norm() / truth.norm()) < 0.1

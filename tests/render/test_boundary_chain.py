@@ -1,6 +1,6 @@
-"""The boundary term where the chain needs it: objects that move, the robot's own body before its camera,
-cameras with aimed pupils, spectrum and falloff, windows on the film and batches of trajectories. Differences
-with common random numbers are the judge."""
+"""The boundary term where the chain needs it: objects that move, the robot's own body before its
+camera, cameras with aimed pupils, spectrum and falloff, windows on the film and batches of
+trajectories. Differences with common random numbers are the judge."""
 
 import functools
 
@@ -22,8 +22,8 @@ START = pose.look_at((0.05, -1.2, 1.0), (0.0, 1.0, 0.7))
 
 
 def judged(loss, many=512, seeds=(11, 12), per_px=12.0):
-    """Relative L2 error of the boundary and the interior gradient of loss(twist [6], samples, seed, way,
-    per_px) against differences, and the noise of these."""
+    """Relative L2 error of the boundary and the interior gradient of loss(twist [6], samples, seed,
+    way, per_px) against differences, and the noise of these."""
     truths = []
     for seed in seeds:
         with torch.no_grad():
@@ -36,7 +36,10 @@ def judged(loss, many=512, seeds=(11, 12), per_px=12.0):
     noise = float(torch.stack(truths).std(0).norm() / len(seeds) ** 0.5 / truth.norm())
 
     def error(way):
-        found = [to_twist(lambda t, seed=seed: loss(t[0], many, seed + 10, way, per_px)) for seed in seeds]
+        found = [
+            to_twist(lambda t, seed=seed: loss(t[0], many, seed + 10, way, per_px))
+            for seed in seeds
+        ]
         return float((torch.stack(found).mean(0) - truth).norm() / truth.norm())
 
     return error("boundary"), error("interior"), noise
@@ -51,8 +54,8 @@ def aside(twist):
 
 
 def mounted(twist):
-    """The robot stands in the world with the camera on it; what moves is the mount, under which the world
-    moves and the robot's own body too."""
+    """The robot stands in the world with the camera on it; what moves is the mount, under which the
+    world moves and the robot's own body too."""
     T_world_robot = pose.se3_exp(torch.tensor([[0.05, -1.2, 1.0, 0.0, 0.0, 0.1]], dtype=F64))
     T_robot_cam = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, -0.15))
     world = render.MovingScene(scene("cubes"), {"robot": (robot(), T_world_robot)})
@@ -89,7 +92,9 @@ def test_the_gradient_to_what_moves_has_its_edges(of_twist, optics, options, how
     def loss(twist, samples, seed, way, per_px):
         film = options.get("film") or render.Film(SIZE_PX, SIZE_PX, SIZE_PX, SIZE_PX, 8.0 / SIZE_PX)
         size = film.width_px, film.height_px
-        camera = render.Camera(optics, *size, 8.0 / SIZE_PX, samples, seed, **{"film": film, **options})
+        camera = render.Camera(
+            optics, *size, 8.0 / SIZE_PX, samples, seed, **{"film": film, **options}
+        )
         frames = render.frames(camera, *of_twist(twist), way, per_px)
         return (WEIGHT[: size[1], : size[0]] * frames).double().mean()
 
@@ -100,8 +105,8 @@ def test_the_gradient_to_what_moves_has_its_edges(of_twist, optics, options, how
 
 
 def test_every_frame_is_looked_at_and_again_through_a_wider_lens():
-    """A ball that sinks into the wall in the second of three frames; a picture with hard texels that only the
-    wider of two lenses sees."""
+    """A ball that sinks into the wall in the second of three frames; a picture with hard texels
+    that only the wider of two lenses sees."""
     mi = backend.mitsuba()
     wall, ball = silhouette_scenes.build("wall"), silhouette_scenes.ball()
     camera = render.Camera(lens.Pinhole(11.0), 32, 32, 0.25, 4)
@@ -124,8 +129,8 @@ def test_every_frame_is_looked_at_and_again_through_a_wider_lens():
 
 
 def test_auto_sees_faint_edges_and_asks_the_rays_of_any_lens():
-    """A card of one per cent more radiance than what is behind it; a lens that is no module and holds its
-    focal length under a name of its own; a scene that cannot be a key."""
+    """A card of one per cent more radiance than what is behind it; a lens that is no module and
+    holds its focal length under a name of its own; a scene that cannot be a key."""
 
     class Plain:
         dtype = F64
@@ -150,7 +155,9 @@ def test_auto_sees_faint_edges_and_asks_the_rays_of_any_lens():
     focal_mm = torch.tensor(11.0, dtype=F64, requires_grad=True)
     camera = render.Camera(Plain(focal_mm), 16, 16, 0.5, 4)
     found, truth = (
-        torch.autograd.grad(render.frames(camera, scene, START[None], way).square().sum(), focal_mm)[0]
+        torch.autograd.grad(
+            render.frames(camera, scene, START[None], way).square().sum(), focal_mm
+        )[0]
         for way in ("auto", "boundary")
     )
     assert float(truth.abs()) > 0

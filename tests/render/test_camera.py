@@ -1,5 +1,5 @@
-"""Cameras: rays against the forward trace, blur against the defocus formula, projection there and back,
-windows."""
+"""Cameras: rays against the forward trace, blur against the defocus formula, projection there and
+back, windows."""
 
 import math
 
@@ -35,8 +35,8 @@ def test_camera_rays_run_the_forward_trace_backwards(name, generator):
     rays = camera.lens.camera_rays(film_mm, pupil)
     passes = rays.weight > 0
     assert int(passes.sum()) >= 20
-    # camera axes: x right, y down, z towards the scene; lens axes: light along +z. Turned about x by half a
-    # turn and mirrored in y: z alone flips
+    # camera axes: x right, y down, z towards the scene; lens axes: light along +z. Turned about x
+    # by half a turn and mirrored in y: z alone flips
     flip = torch.tensor([1.0, 1.0, -1.0], dtype=D)
     direction = (-rays.direction * flip).detach()
     start = (rays.origin_m * 1e3 * flip).detach()
@@ -44,7 +44,8 @@ def test_camera_rays_run_the_forward_trace_backwards(name, generator):
     start = start - direction * ((start[:, 2:] + 5.0) / direction[:, 2:])  # before the first vertex
     out = camera.lens.trace(start, direction)
     assert not out.status[passes].any()
-    # the image is upside down on the film; there and back through up to eleven surfaces rounds to 1e-13 mm
+    # the image is upside down on the film; there and back through up to eleven surfaces rounds to
+    # 1e-13 mm
     torch.testing.assert_close(out.position_mm[passes, :2], -film_mm[passes], rtol=0, atol=1e-11)
 
 
@@ -77,10 +78,10 @@ def test_points_outside_the_field_are_nan_and_leave_the_others_alone():
 
 @pytest.mark.parametrize("semi_aperture_mm", [0.02, 0.2])
 def test_points_behind_the_edge_of_an_aperture_are_nan(semi_aperture_mm):
-    """The stop is seen through a plane 3 mm behind it, in glass of 1.5: the exit pupil lies 2 mm before the
-    plane. So the chief ray of a film point at height h crosses the plane, 95 mm before the film, at 2 h / 97;
-    what passes its aperture is hidden, however little or far it is beyond the edge (the solver comes back
-    into the field by another number of steps for each of these)."""
+    """The stop is seen through a plane 3 mm behind it, in glass of 1.5: the exit pupil lies 2 mm
+    before the plane. So the chief ray of a film point at height h crosses the plane, 95 mm before
+    the film, at 2 h / 97; what passes its aperture is hidden, however little or far it is beyond
+    the edge (the solver comes back into the field by another number of steps for each of these)."""
     glass = lens.Glass.from_indices(1.5, 1.5, 1.5)
 
     def camera(semi_aperture_mm):
@@ -109,7 +110,9 @@ def test_angular_miss_is_the_angle_between_ray_and_point(name, generator):
     pixels = random_pixels(10, generator)
     rays = camera.chief_rays(pixels)
     points = (rays.origin_m + 3 * rays.direction).detach()
-    across = torch.linalg.cross(rays.direction, torch.tensor([[0.3, 1.0, 0.2]], dtype=D).expand(10, 3))
+    across = torch.linalg.cross(
+        rays.direction, torch.tensor([[0.3, 1.0, 0.2]], dtype=D).expand(10, 3)
+    )
     # at right angles to the ray: tan = 0.01
     side = torch.nn.functional.normalize(across, dim=1).detach()
     # the smooth floor
@@ -124,8 +127,8 @@ def test_angular_miss_is_the_angle_between_ray_and_point(name, generator):
 
 @pytest.mark.parametrize(("kind", "tolerance"), [("thin", 0.01), ("traced", 0.03)])
 def test_defocus_takes_contrast_away_as_a_blur_disc_does(kind, tolerance):
-    """A faint grating: contrast falls by 2 J1(x) / x of the disc (x = pi frequency diameter) and sinc of the
-    pixel (Goodman, 6.4)."""
+    """A faint grating: contrast falls by 2 J1(x) / x of the disc (x = pi frequency diameter) and
+    sinc of the pixel (Goodman, 6.4)."""
     # f/40: spherical aberration is 1 % of this defocus
     triplet = fitted("cooke-triplet")
     stopped = lens.GeoLens(triplet.to_surfaces(), triplet.entrance_pupil_diameter_mm / 8)
@@ -134,20 +137,25 @@ def test_defocus_takes_contrast_away_as_a_blur_disc_does(kind, tolerance):
     f = float(optic.first_order().efl_mm.detach())
     z, pitch_mm = 3.0, 0.004
     # of the disc and a pixel at the object
-    diameter_m = 1e-3 * optic.entrance_pupil_diameter_mm * abs(1 - z * 1e3 * (1 / f - 1 / (f + 0.6)))
+    diameter_m = (
+        1e-3 * optic.entrance_pupil_diameter_mm * abs(1 - z * 1e3 * (1 / f - 1 / (f + 0.6)))
+    )
     pixel_m = pitch_mm / (f + 0.6) * z
     frequency = 0.7 / diameter_m  # x = 2.2: contrast 0.5
     plane = TexturedPlane([[frequency, 0.0]], [1e-3], [0.0], dtype=D)
     camera = Camera(optic.thin() if kind == "thin" else optic, 64, 1, pitch_mm, 256)
     with torch.no_grad():
-        row = render.frames(camera, plane, look_at((0, 0, z), (0, 0, 0), down=(0, 1, 0))[None])[0, 0]
+        row = render.frames(camera, plane, look_at((0, 0, z), (0, 0, 0), down=(0, 1, 0))[None])[
+            0, 0
+        ]
     turn = 2 * math.pi * frequency * pixel_m * (torch.arange(64, dtype=D) - 31.5)
     design = torch.stack([torch.ones_like(turn), turn.cos(), turn.sin()], 1)
     mean, cosine, sine = torch.linalg.lstsq(design, row[:, None]).solution[:, 0].tolist()
     disc, box = (math.pi * frequency * width for width in (diameter_m, pixel_m))
     truth = 2 * j1(disc) / disc * math.sin(box) / box
     assert truth < 0.6
-    # the formula's slope is -1.2 at x = 2.2: 1 % in the disc is 2 % in contrast; 256 samples add 1 %
+    # the formula's slope is -1.2 at x = 2.2: 1 % in the disc is 2 % in contrast; 256 samples add 1
+    # %
     assert math.hypot(cosine, sine) / mean / 1e-3 == pytest.approx(truth, rel=tolerance)
 
 
@@ -176,7 +184,9 @@ def test_windows_equal_the_crops_of_the_full_frame():
 def test_pixels_are_in_image_order_with_the_axis_in_the_middle():
     film = Film(6, 4, 2, 3, 0.1, ((1, 0), (4, 1)))
     assert film.pixels()[[0, 1, 2, 6, 7]].tolist() == [[1, 0], [2, 0], [1, 1], [4, 1], [5, 1]]
-    at = Camera(lens.Pinhole(5.0), 6, 4, 0.1, 1).film_mm(torch.tensor([[2.5, 1.5], [3.5, 1.5]], dtype=D))
+    at = Camera(lens.Pinhole(5.0), 6, 4, 0.1, 1).film_mm(
+        torch.tensor([[2.5, 1.5], [3.5, 1.5]], dtype=D)
+    )
     assert at.tolist() == [[0, 0], [pytest.approx(0.1), 0]]
 
 

@@ -1,4 +1,5 @@
-"""Which side of a surface is seen, under transforms that mirror: as Mitsuba's own integrator has it."""
+"""Which side of a surface is seen, under transforms that mirror: as Mitsuba's own integrator has
+it."""
 
 from typing import Any
 
@@ -28,13 +29,19 @@ def shape(mi, folder, kind, seed, **more) -> dict[str, Any]:
     scale[random.integers(3)] *= random.choice([-1, -1, 1])
     T = np.eye(4)
     T[:3, :3] = Rotation.random(random_state=seed).as_matrix() * scale
-    entry = {"type": kind, "to_world": mi.ScalarTransform4f(T), "flip_normals": bool(random.integers(2))}
+    entry = {
+        "type": kind,
+        "to_world": mi.ScalarTransform4f(T),
+        "flip_normals": bool(random.integers(2)),
+    }
     if kind in ("ply", "obj"):
         import trimesh
 
         file = folder / f"ball.{kind}"
         # .ply comes with its normals, and Mitsuba works out those of an .obj
-        trimesh.creation.icosphere(2).export(file, **({"vertex_normal": True} if kind == "ply" else {}))
+        trimesh.creation.icosphere(2).export(
+            file, **({"vertex_normal": True} if kind == "ply" else {})
+        )
         entry["filename"] = str(file)
     return {**entry, **more}
 
@@ -51,9 +58,11 @@ def test_what_glows_shows_the_side_that_mitsuba_shows(tmp_path, kind, seed):
     mi = backend.mitsuba()
     glowing = {"a": shape(mi, tmp_path, kind, seed, emitter={"type": "area", "radiance": 100.0})}
     ours, theirs = (
-        seen(scene, seed) for scene in (render.MitsubaScene(glowing), light.PathScene(glowing, max_depth=1))
+        seen(scene, seed)
+        for scene in (render.MitsubaScene(glowing), light.PathScene(glowing, max_depth=1))
     )
-    # Mitsuba stores the normals of vertices to 1 %, by which a face seen nearly edge-on is lit or not
+    # Mitsuba stores the normals of vertices to 1 %, by which a face seen nearly edge-on is lit or
+    # not
     assert float((ours - theirs).abs().mean()) < 0.02 * 100
     found = read(mi, mi.load_dict({"type": "scene", **glowing}).shapes()[0])
     if kind not in EQUAL:  # faces of the outline point to where the light goes
@@ -61,7 +70,8 @@ def test_what_glows_shows_the_side_that_mitsuba_shows(tmp_path, kind, seed):
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         ahead = across / np.linalg.norm(across, axis=1, keepdims=True)
         rays = [
-            mi.Float(np.float32(v)) for v in np.concatenate([corners.mean(1) + 0.01 * ahead, -ahead], 1).T
+            mi.Float(np.float32(v))
+            for v in np.concatenate([corners.mean(1) + 0.01 * ahead, -ahead], 1).T
         ]
         light_there = light.PathScene(glowing, max_depth=1).radiance(
             mi, mi.Point3f(*rays[:3]), mi.Vector3f(*rays[3:])
@@ -108,7 +118,9 @@ def test_a_back_shows_its_own_picture_however_often_the_front_repeats_its():
     as_it_is = Placement(torch.eye(3, dtype=torch.float64))
     behind = look_at((0.2, 0.1, -2.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))[None]
     plain, repeated = (
-        render.frames(CAMERA, SidedScene({"wall": wall(front)}, {"wall": back.emitter()}, as_it_is), behind)
+        render.frames(
+            CAMERA, SidedScene({"wall": wall(front)}, {"wall": back.emitter()}, as_it_is), behind
+        )
         for front in ({"type": "rgb", "value": 50.0}, picture(2.0))
     )
     assert float(plain.std()) > 10

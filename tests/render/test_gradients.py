@@ -1,4 +1,5 @@
-"""Gradients of frames to pose and lens: float64 on the analytic plane, float32 in the textured room."""
+"""Gradients of frames to pose and lens: float64 on the analytic plane, float32 in the textured
+room."""
 
 import pytest
 import torch
@@ -19,13 +20,15 @@ def triplet():
 
 
 def make_frames(scene, camera, start):
-    """Function of (twist of the whole path [6], relative changes of curvatures [6] and thicknesses [6]) ->
-    frames, float64."""
+    """Function of (twist of the whole path [6], relative changes of curvatures [6] and thicknesses
+    [6]) -> frames, float64."""
     c = camera.lens.curvature_per_mm.detach()
     t = camera.lens.thickness_mm.detach()
 
     def frames(twist, curvature, thickness):
-        changed = camera.lens.replace(curvature_per_mm=c * (1 + curvature), thickness_mm=t * (1 + thickness))
+        changed = camera.lens.replace(
+            curvature_per_mm=c * (1 + curvature), thickness_mm=t * (1 + thickness)
+        )
         return render.frames(
             camera.with_lens(changed), scene, start @ se3_exp(twist) @ se3_exp(MOVES)
         ).double()
@@ -35,14 +38,16 @@ def make_frames(scene, camera, start):
 
 def test_frames_of_the_analytic_plane_in_double_precision(generator):
     camera = Camera(triplet(), 12, 10, 0.1, 8)
-    frames = make_frames(worlds.smooth_plane(3), camera, look_at((0.2, 0.1, 2.0), (0, 0, 0), down=(0, 1, 0)))
+    frames = make_frames(
+        worlds.smooth_plane(3), camera, look_at((0.2, 0.1, 2.0), (0, 0, 0), down=(0, 1, 0))
+    )
     weights = torch.randn(2, 10, 12, generator=generator, dtype=D)
 
     def loss(*parameters):
         return (frames(*parameters) * weights).sum()
 
-    # exp of cosines is smooth: steps of 1e-6 m move phases by 1e-4, so differences bend by 1e-9; rounding
-    # 1e-13 of the loss over 1e-6
+    # exp of cosines is smooth: steps of 1e-6 m move phases by 1e-4, so differences bend by 1e-9;
+    # rounding 1e-13 of the loss over 1e-6
     assert_gradients(loss, [torch.zeros(6, dtype=D)] * 3, [1e-6] * 3, 1e-7)
 
 
@@ -77,9 +82,9 @@ def photometric(scene, camera, view):
 
 @pytest.mark.parametrize("view", ROOM_VIEWS)
 def test_photometric_loss_in_the_textured_room(view, room):
-    # One per cent is asked for; 0.1 to 0.3 % is found. Bilinear texels have kinks that differences straddle
-    # (noise that grows as the root of the step), and float32 poses of 1 m round to 1e-7 (noise that falls as
-    # its inverse): steps of 0.1 to 0.3 mm lie between.
+    # One per cent is asked for; 0.1 to 0.3 % is found. Bilinear texels have kinks that differences
+    # straddle (noise that grows as the root of the step), and float32 poses of 1 m round to 1e-7
+    # (noise that falls as its inverse): steps of 0.1 to 0.3 mm lie between.
     loss = photometric(room, Camera(triplet(), 48, 48, 0.0555, 16), view)
     assert_gradients(loss, [torch.zeros(6, dtype=D)] * 3, (1e-4, 2e-4, 2e-4), 0.01)
 

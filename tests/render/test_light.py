@@ -1,5 +1,5 @@
-"""Light levels: closed forms of radiative transfer, baked light against path tracing, and the choice between
-levels."""
+"""Light levels: closed forms of radiative transfer, baked light against path tracing, and the
+choice between levels."""
 
 import itertools
 import math
@@ -30,7 +30,11 @@ def grey(albedo, radiance=0.0) -> Any:
 
 def square(centre, normal, side=1.0, up=(0, 1, 0), **surface: Any):
     target = [c + n for c, n in zip(centre, normal, strict=True)]
-    frame = backend.mitsuba().ScalarTransform4f().look_at(origin=list(centre), target=target, up=list(up))
+    frame = (
+        backend.mitsuba()
+        .ScalarTransform4f()
+        .look_at(origin=list(centre), target=target, up=list(up))
+    )
     return {"type": "rectangle", "to_world": frame.scale([side / 2, side / 2, 1]), **surface}
 
 
@@ -59,7 +63,11 @@ def grid(n=32):
 def test_a_white_furnace_has_emission_over_one_minus_albedo(albedo):
     faces = {
         f"face-{axis}{sign + 1}": square(
-            sign * np.eye(3)[axis], -sign * np.eye(3)[axis], 2.0, np.eye(3)[axis - 2], **grey(albedo, 20.0)
+            sign * np.eye(3)[axis],
+            -sign * np.eye(3)[axis],
+            2.0,
+            np.eye(3)[axis - 2],
+            **grey(albedo, 20.0),
         )
         for axis in range(3)
         for sign in (-1, 1)
@@ -71,8 +79,8 @@ def test_a_white_furnace_has_emission_over_one_minus_albedo(albedo):
         (light.bake(faces, texel_m=0.25, samples=512, max_depth=64), 2e-3),
     ):
         image = render.frames(camera, scene, look_at((0.1, 0.2, 0.3), (0, 1, 0))[None]).double()
-        # a path's light has a relative spread of about 0.5; 100,000 paths and some 60 texels of 512 paths:
-        # 0.0002 and 0.003 / 5 at 1 sigma
+        # a path's light has a relative spread of about 0.5; 100,000 paths and some 60 texels of 512
+        # paths: 0.0002 and 0.003 / 5 at 1 sigma
         assert float(image.mean()) == pytest.approx(truth, rel=5 * relative / 2)
         assert float((image / truth - 1).abs().max()) < 0.25
 
@@ -80,7 +88,11 @@ def test_a_white_furnace_has_emission_over_one_minus_albedo(albedo):
 PARALLEL = (
     2
     / math.pi
-    * (math.log(2 / math.sqrt(3)) + 2 * math.sqrt(2) * math.atan(1 / math.sqrt(2)) - 2 * math.atan(1))
+    * (
+        math.log(2 / math.sqrt(3))
+        + 2 * math.sqrt(2) * math.atan(1 / math.sqrt(2))
+        - 2 * math.atan(1)
+    )
 )
 PERPENDICULAR = (
     2 * math.atan(1) - math.sqrt(2) * math.atan(1 / math.sqrt(2)) + 0.25 * math.log(0.75)
@@ -89,18 +101,21 @@ PERPENDICULAR = (
 
 @pytest.mark.parametrize(
     ("centre", "normal", "up", "form_factor"),
-    [((0, 0, 1), (0, 0, -1), (0, 1, 0), PARALLEL), ((0.5, 0, 0.5), (-1, 0, 0), (0, 1, 0), PERPENDICULAR)],
+    [
+        ((0, 0, 1), (0, 0, -1), (0, 1, 0), PARALLEL),
+        ((0.5, 0, 0.5), (-1, 0, 0), (0, 1, 0), PERPENDICULAR),
+    ],
 )
 def test_squares_exchange_light_by_their_form_factor(centre, normal, up, form_factor):
-    # Source: Howell, A catalog of radiation transfer configuration factors, C-11 and C-14 (unit squares,
-    # distance 1; with a common edge)
+    # Source: Howell, A catalog of radiation transfer configuration factors, C-11 and C-14 (unit
+    # squares, distance 1; with a common edge)
     scene = {
         "source": square(centre, normal, 1.0, up, **grey(0.0, 100.0)),
         "receiver": square((0, 0, 0), (0, 0, 1), **grey(0.5)),
     }
     truth = 0.5 * 100 * form_factor  # mean irradiance is pi L F for equal areas
-    # direct light has a relative spread below 1: 65,536 paths; near the common edge it is largest, and texels
-    # of 5 cm sum it exactly
+    # direct light has a relative spread below 1: 65,536 paths; near the common edge it is largest,
+    # and texels of 5 cm sum it exactly
     baked = light.bake(scene, samples=256, texel_m=1 / 32)
     for made, points in ((light.PathScene(scene, samples=64), grid()), (baked, grid(64))):
         found = radiance_at(made, points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), 1e-4)
@@ -125,7 +140,9 @@ def tetrahedron(mi, uv):
 def still_life():
     mi = backend.mitsuba()
     T = mi.ScalarTransform4f
-    picture = mi.Bitmap(textures.softened(textures.speckle(1, 64, finest_px=16.0), 2.0)[..., None] / 300)
+    picture = mi.Bitmap(
+        textures.softened(textures.speckle(1, 64, finest_px=16.0), 2.0)[..., None] / 300
+    )
     patterned: Any = grey(0.0)
     patterned["bsdf"]["reflectance"] = {"type": "bitmap", "bitmap": picture, "raw": True}
     cube = T().translate([0.7, 0.2, 0.201]).rotate([0, 0, 1], 25).scale([0.2, 0.15, 0.2])
@@ -156,8 +173,12 @@ def baked_still_life(still_life):
     return light.bake(still_life, texel_m=0.04, samples=256)
 
 
-@pytest.mark.parametrize("name", ["floor", "ball", "tube", "cap", "lamp", "cube", "bare", "unwrapped"])
-def test_baked_light_is_path_traced_light_on_every_kind_of_shape(still_life, baked_still_life, name):
+@pytest.mark.parametrize(
+    "name", ["floor", "ball", "tube", "cap", "lamp", "cube", "bare", "unwrapped"]
+)
+def test_baked_light_is_path_traced_light_on_every_kind_of_shape(
+    still_life, baked_still_life, name
+):
     """Face by face of meshes, whatever texture coordinates they have."""
     mi = backend.mitsuba()
     reference = light.PathScene(still_life, samples=256)
@@ -169,11 +190,12 @@ def test_baked_light_is_path_traced_light_on_every_kind_of_shape(still_life, bak
     for face in np.unique(normals[inside].round(3), axis=0) if many else [None]:
         there = inside if face is None else inside & (np.abs(normals - face).max(1) < 0.01)
         ours, theirs = (
-            radiance_at(scene, points[there], normals[there], 5e-4) for scene in (baked_still_life, reference)
+            radiance_at(scene, points[there], normals[there], 5e-4)
+            for scene in (baked_still_life, reference)
         )
-        # 131,072 paths per face, 16 to 6000 texels of 256 paths: below 0.5 %; 50 texels of a mesh's face:
-        # below 1 %, and light that falls off within a texel towards the floor is smeared. Over the floor
-        # there is next to no light
+        # 131,072 paths per face, 16 to 6000 texels of 256 paths: below 0.5 %; 50 texels of a mesh's
+        # face: below 1 %, and light that falls off within a texel towards the floor is smeared.
+        # Over the floor there is next to no light
         least, share = (5.0, 0.01) if made else (0.5 / 0.03, 0.03)
         assert abs(float((ours - theirs).mean())) < share * max(float(theirs.mean()), least)
 
@@ -191,13 +213,17 @@ def test_of_faces_in_a_strip_those_with_the_longest_edge_are_one_cell():
         cells = cells_of(corners, np.array(faces))
         assert cells.area().tolist() == [2.0, 1.0]
         # the rectangle, whose diagonal is longer than the edge between the other two
-        assert np.linalg.norm(cells.along_u + cells.along_v, axis=1)[0] == pytest.approx(math.sqrt(5))
+        assert np.linalg.norm(cells.along_u + cells.along_v, axis=1)[0] == pytest.approx(
+            math.sqrt(5)
+        )
 
 
 def test_the_sky_is_the_same_at_every_level():
     scene = {"sky": sky(backend.mitsuba(), textures.sky(3, 64))}
     camera = Camera(lens.Pinhole(3.0), 24, 18, 0.2, 4)
-    poses = torch.stack([look_at((0, 0, 1), at) for at in ((1, 0, 1.2), (0, 1, 2.0), (-1, -1, 0.6))])
+    poses = torch.stack(
+        [look_at((0, 0, 1), at) for at in ((1, 0, 1.2), (0, 1, 2.0), (-1, -1, 0.6))]
+    )
     plain, traced = (
         render.frames(camera, made, poses)
         for made in (MitsubaScene(scene), light.PathScene(scene, samples=1))
@@ -210,7 +236,9 @@ def test_the_sky_is_the_same_at_every_level():
 def test_equal_seeds_give_equal_frames_and_others_do_not(still_life):
     scene = light.PathScene(still_life, samples=2)
     camera = Camera(lens.Pinhole(6.0), 8, 6, 0.6, 2)
-    first, again, other = (render.frames(camera, made, VIEW) for made in (scene, scene, scene.with_seed(1)))
+    first, again, other = (
+        render.frames(camera, made, VIEW) for made in (scene, scene, scene.with_seed(1))
+    )
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
@@ -238,8 +266,8 @@ def test_noise_of_the_reference_is_not_taken_for_error(still_life):
     truth = light.PathScene(still_life, samples=512, seed=9)
     error = light.level_error(truth, light.PathScene(still_life, samples=8), wide(2), VIEW)
     assert float(error.noise) > 0.01
-    # the products of independent errors average to nothing: over 1728 pixels their mean is below 5 /
-    # sqrt(1728) of the noise's square, plus the truth's own
+    # the products of independent errors average to nothing: over 1728 pixels their mean is below 5
+    # / sqrt(1728) of the noise's square, plus the truth's own
     assert float(error.rms) < float(error.noise) * (5 * 2 / 1728**0.5 + 16 / 512) ** 0.5
 
 
@@ -251,5 +279,8 @@ def test_the_cheapest_level_within_the_tolerance_is_chosen_and_says_why():
     assert "plain 0.1" in strict.reason
     assert loose.name == min(levels, key=lambda name: loose.cpu_s[name])
     assert (
-        light.choose(levels, CAMERA, POSES, 0.01, after_gain=True).errors["plain"].rms_after_gain.max() < 0.01
+        light.choose(levels, CAMERA, POSES, 0.01, after_gain=True)
+        .errors["plain"]
+        .rms_after_gain.max()
+        < 0.01
     )

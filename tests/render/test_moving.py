@@ -1,5 +1,5 @@
-"""Moving objects: the same world seen from the object's own axes, what is nearest by hand, and gradients to
-object poses."""
+"""Moving objects: the same world seen from the object's own axes, what is nearest by hand, and
+gradients to object poses."""
 
 import pytest
 import torch
@@ -32,7 +32,9 @@ def at(x_m, z_m):
 
 
 def plane(seed, height_m=0.0):
-    return TexturedPlane(*textures.waves(seed, finest_period_m=0.2), T_world_plane=at(0.0, height_m))
+    return TexturedPlane(
+        *textures.waves(seed, finest_period_m=0.2), T_world_plane=at(0.0, height_m)
+    )
 
 
 def even(radiance, z_m=0.0):
@@ -41,8 +43,8 @@ def even(radiance, z_m=0.0):
 
 @pytest.mark.parametrize("optics", [lens.Pinhole(8.0), TRIPLET])
 def test_an_object_is_seen_as_from_its_own_axes(optics):
-    """Only relative motion is seen: the card before the wall through the moving camera is the still card
-    through the camera in the card's axes."""
+    """Only relative motion is seen: the card before the wall through the moving camera is the still
+    card through the camera in the card's axes."""
     cam = camera(12, 8, 4, optics)
     found = render.frames(cam, MovingScene(plane(2, -3.0), {"card": (plane(1), OBJECTS)}), POSES)
     # the poses are multiplied in another order: rounding times the phase gradient
@@ -52,12 +54,14 @@ def test_an_object_is_seen_as_from_its_own_axes(optics):
 
 
 def test_nearest_of_several_objects_and_the_background_where_nothing_is_met():
-    """The near ball is 8.04 px wide each way, 0.2 / sqrt(4 - 0.04) under 8 mm, and its middle 4 px to one
-    side."""
+    """The near ball is 8.04 px wide each way, 0.2 / sqrt(4 - 0.04) under 8 mm, and its middle 4 px
+    to one side."""
 
     def ball(radiance, *place):
         glow = area(radiance)
-        return MitsubaScene({"ball": {"type": "sphere", "radius": 0.2, "emitter": glow}}), at(*place)[None]
+        return MitsubaScene({"ball": {"type": "sphere", "radius": 0.2, "emitter": glow}}), at(
+            *place
+        )[None]
 
     scene = MovingScene(even(70.0), {"far": ball(10.0, 0.0, 5.0), "near": ball(20.0, 0.1, 4.0)})
     away = look_at((0, 0, 2.0), (0, 0, 5.0), down=(0, 1, 0))[None]
@@ -78,4 +82,6 @@ def test_the_nearest_of_many_is_seen_whatever_their_order(order):
 def test_a_scene_without_objects_is_its_world():
     empty = MovingScene(plane(1), {})
     assert empty.names == ()
-    assert torch.equal(render.frames(camera(), empty, POSES), render.frames(camera(), plane(1), POSES))
+    assert torch.equal(
+        render.frames(camera(), empty, POSES), render.frames(camera(), plane(1), POSES)
+    )

@@ -1,4 +1,5 @@
-"""Curves along which shapes pass through each other: closed forms, and gradients against differences."""
+"""Curves along which shapes pass through each other: closed forms, and gradients against
+differences."""
 
 import itertools
 import math
@@ -36,7 +37,9 @@ def intersection(**shapes):
     (found,) = [curve for curve in curves(**shapes) if isinstance(curve, Intersections)]
     index, bounds = found.pieces(EYE, 0.05)
     s = bounds[:, :1] + torch.linspace(0, 1, 9, dtype=F64) * (bounds[:, 1:] - bounds[:, :1])
-    y = found.points(index[:, None].expand(s.shape).reshape(-1), s.reshape(-1), EYE).reshape(*s.shape, 3)
+    y = found.points(index[:, None].expand(s.shape).reshape(-1), s.reshape(-1), EYE).reshape(
+        *s.shape, 3
+    )
     assert bool((found.aside_rad(index, EYE) > 0.9e-5).all())
     return y.reshape(-1, 3), float((y[:, 1:] - y[:, :-1]).norm(dim=2).sum())
 
@@ -52,10 +55,12 @@ def test_a_box_through_a_floor_and_through_a_box():
         "type": "cube",
         "to_world": place().translate([0.2, 0.1, 0.3]).rotate([0, 0, 1], 20).scale([0.4, 0.6, 0.5]),
     }
-    assert total_length(curves(box=box, floor=floor)) == pytest.approx(24 + 8 * 1.5 + 4 * 1.0, abs=1e-4)
+    assert total_length(curves(box=box, floor=floor)) == pytest.approx(
+        24 + 8 * 1.5 + 4 * 1.0, abs=1e-4
+    )
     other = {"type": "cube", "to_world": place().translate([0.9, 0.8, 0.7])}
-    # cubes of side 2 whose corners overlap by 1.1 x 1.2 x 1.3 m: three pairs of faces cross along each of
-    # these
+    # cubes of side 2 whose corners overlap by 1.1 x 1.2 x 1.3 m: three pairs of faces cross along
+    # each of these
     assert total_length(curves(a={"type": "cube"}, b=other)) == pytest.approx(
         48 + 2 * (1.1 + 1.2 + 1.3), abs=1e-4
     )
@@ -63,10 +68,13 @@ def test_a_box_through_a_floor_and_through_a_box():
 
 @pytest.mark.parametrize("sunk_m", [0.0, 1e-7, -1e-7, 5e-5])
 def test_what_stands_on_a_floor_has_its_edges_once(sunk_m):
-    """A box and a pole that touch the floor, to rounding or to a hair: no curve beside the box's edges and
-    the rim, which are read from beyond the hair."""
+    """A box and a pole that touch the floor, to rounding or to a hair: no curve beside the box's
+    edges and the rim, which are read from beyond the hair."""
     floor = {"type": "rectangle", "to_world": place().scale(3)}
-    box = {"type": "cube", "to_world": place().translate([0.5, 0.1, 0.5 - sunk_m]).scale([0.2, 0.3, 0.5])}
+    box = {
+        "type": "cube",
+        "to_world": place().translate([0.5, 0.1, 0.5 - sunk_m]).scale([0.2, 0.3, 0.5]),
+    }
     pole = {"type": "cylinder", "p0": [-0.5, 0.0, -sunk_m], "p1": [-0.5, 0.0, 1.0], "radius": 0.1}
     found = curves(floor=floor, box=box, pole=pole)
     assert total_length(found) == pytest.approx(24 + 4 * (0.4 + 0.6 + 1.0), abs=1e-3)
@@ -76,8 +84,8 @@ def test_what_stands_on_a_floor_has_its_edges_once(sunk_m):
 
 
 def test_half_a_ball_of_triangles_sunk_to_its_very_equator_has_it_as_an_edge():
-    """A smooth mesh with a ring of vertices in the floor's plane: its edges there are no creases, and
-    count."""
+    """A smooth mesh with a ring of vertices in the floor's plane: its edges there are no creases,
+    and count."""
     n = 24
     turn = 2 * np.pi * np.arange(n) / n
     rings = [
@@ -92,20 +100,23 @@ def test_half_a_ball_of_triangles_sunk_to_its_very_equator_has_it_as_an_edge():
 
 
 def test_meshes_that_do_not_cross_themselves_have_no_crossing():
-    """A bumpy sheet: neighbours touch along edges and at corners only; and a cube inside another."""
+    """A bumpy sheet: neighbours touch along edges and at corners only; and a cube inside
+    another."""
     n = 30
     x, y = np.mgrid[:n, :n]
     vertices = np.stack([x, y, np.random.default_rng(0).normal(size=(n, n))], 2).reshape(-1, 3)
     sheet = Mesh("sheet", vertices, squares(n, n), None)
     assert len(find_crossings([sheet])[0].start) == 0
-    nested = Mesh("nested", np.concatenate([CORNERS, 0.5 * CORNERS]), np.concatenate([CUBE, CUBE + 8]), None)
+    nested = Mesh(
+        "nested", np.concatenate([CORNERS, 0.5 * CORNERS]), np.concatenate([CUBE, CUBE + 8]), None
+    )
     assert len(find_crossings([nested])[0].start) == 0
 
 
 @pytest.mark.parametrize("shift", [0.0, 1e-7])
 def test_faces_in_one_plane_are_refused_where_they_are_seen(shift):
-    """A picture hung into the plane of its wall; not where both show one radiance, or are tiles side by side,
-    or seen from behind, or out of view."""
+    """A picture hung into the plane of its wall; not where both show one radiance, or are tiles
+    side by side, or seen from behind, or out of view."""
     T = place()
 
     def tile(x, value, half=0.5, height=0.0):
@@ -124,14 +135,20 @@ def test_faces_in_one_plane_are_refused_where_they_are_seen(shift):
     assert not seen(tile(0.1, 2.0, 0.1, 1e-3), [0.0, 0.0, 3.0])
     beside = tile(0.0, 2.0)
     beside["to_world"] = (
-        T.translate([0.0, 0.2, shift]).rotate([0, 0, 1], 20).translate([1.0, 0.3, 0]).scale([0.5, 0.5, 1])
+        T.translate([0.0, 0.2, shift])
+        .rotate([0, 0, 1], 20)
+        .translate([1.0, 0.3, 0])
+        .scale([0.5, 0.5, 1])
     )
     assert not seen(beside, [0.0, 0.0, 3.0])
-    scene = MitsubaScene({"wall": tile(0.0, 1.0), "picture": tile(0.1, 2.0, 0.1, shift)}, merge=False)
+    scene = MitsubaScene(
+        {"wall": tile(0.0, 1.0), "picture": tile(0.1, 2.0, 0.1, shift)}, merge=False
+    )
     camera = render.Camera(Pinhole(11.0), 16, 16, 0.5, 4)
     above = pose.look_at((0.0, -0.3, 2.0), (0.0, 0.2, 0.0))[None].requires_grad_(True)
     with pytest.raises(
-        DomainError, match=r"faces of shapes '(wall|picture)' and '(wall|picture)' lie in one plane near"
+        DomainError,
+        match=r"faces of shapes '(wall|picture)' and '(wall|picture)' lie in one plane near",
     ):
         render.frames(camera, scene, above, gradient="boundary")
     away = pose.look_at((0.0, -0.3, 2.0), (0.0, -9.0, 2.0))[None].requires_grad_(True)
@@ -147,7 +164,9 @@ def test_what_two_triangles_in_a_plane_share_has_its_middle_where_its_corners_sa
     """Corners: where lines of two of the six sides meet that lie within all six."""
     p, q = (torch.rand(60, 3, 2, generator=generator, dtype=F64).numpy() for _ in range(2))
     normal = np.tile([0.0, 0.0, 1.0], (60, 1))
-    rows, middle, end = overlaps(*(np.pad(v, ((0, 0), (0, 0), (0, 1))) for v in (p, q)), normal, 1e-6)
+    rows, middle, end = overlaps(
+        *(np.pad(v, ((0, 0), (0, 0), (0, 1))) for v in (p, q)), normal, 1e-6
+    )
     for k in range(60):
         corners = np.array(list(shared(p[k], q[k])))
         assert (k in rows) == (len(corners) > 2)
@@ -221,8 +240,8 @@ MEET = (0.6**2 + 0.5**2 - 0.4**2) / (2 * 0.6)  # of two spheres, from the first 
             ellipse(0.2 / math.cos(LEAN), 0.2),
             1e-4,
         ),
-        # two ellipses in the planes x = +z and x = -z, half axes r and r sqrt(2); they cross where surfaces
-        # touch
+        # two ellipses in the planes x = +z and x = -z, half axes r and r sqrt(2); they cross where
+        # surfaces touch
         (
             cylinder((1.0, 0, 0), 0.3),
             cylinder((0, 0, 1.0), 0.3),

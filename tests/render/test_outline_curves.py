@@ -1,5 +1,5 @@
-"""Curves as seen from a point: tangency, both lines of a cylinder from end to end, and how far beside the
-true outline Mitsuba's float32 rays find it."""
+"""Curves as seen from a point: tangency, both lines of a cylinder from end to end, and how far
+beside the true outline Mitsuba's float32 rays find it."""
 
 import numpy as np
 import pytest
@@ -71,14 +71,15 @@ def units(rng, count):
 def hits(scene, origin, direction):
     mi = backend.mitsuba()
     origin, direction = (
-        [mi.Float(np.ascontiguousarray(c, dtype=np.float32)) for c in v.T] for v in (origin, direction)
+        [mi.Float(np.ascontiguousarray(c, dtype=np.float32)) for c in v.T]
+        for v in (origin, direction)
     )
     return np.array(scene.ray_test(mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*direction))))
 
 
 def last_hits(scene, eyes, along, aside, low, high):
-    """Angles [n] at which rays turned aside by them meet the scene no more, by bisection between low and high
-    [n]."""
+    """Angles [n] at which rays turned aside by them meet the scene no more, by bisection between
+    low and high [n]."""
     for _ in range(26):
         middle = (low + high) / 2
         hit = hits(scene, eyes, np.cos(middle)[:, None] * along + np.sin(middle)[:, None] * aside)
@@ -93,7 +94,8 @@ def readings(curve, eyes):
 @pytest.mark.parametrize("kind", ["sphere", "cylinder"])
 @pytest.mark.parametrize(("ratio", "offset_m"), [(5, 0), (20, 100), (600, 0), (2000, 1)])
 def test_float32_rays_find_the_edge_within_the_reading_angle(kind, ratio, offset_m):
-    """The law is 2^-23 d / r: a reading at twice that lies outside the error, and inside the shape."""
+    """The law is 2^-23 d / r: a reading at twice that lies outside the error, and inside the
+    shape."""
     rng = np.random.default_rng(7)
     worst = 0.0
     for _ in range(3):
@@ -109,21 +111,28 @@ def test_float32_rays_find_the_edge_within_the_reading_angle(kind, ratio, offset
 
 
 def seen_across(kind, ratio, offset_m, rng, count):
-    """A shape of radius 0.1 m seen across from ``ratio`` radii: Mitsuba scene, curve, eyes, directions to the
-    middle and aside, and the true angle of its outline."""
+    """A shape of radius 0.1 m seen across from ``ratio`` radii: Mitsuba scene, curve, eyes,
+    directions to the middle and aside, and the true angle of its outline."""
     radius = float(np.float32(0.1))
-    centre, axis = (np.float32(v).astype(np.float64) for v in (offset_m * units(rng, 1)[0], units(rng, 1)[0]))
+    centre, axis = (
+        np.float32(v).astype(np.float64) for v in (offset_m * units(rng, 1)[0], units(rng, 1)[0])
+    )
     ends = [np.float32(centre + sign * axis).astype(np.float64) for sign in (-1, 1)]
     out = units(rng, count)
     if kind == "cylinder":
         shape = {"p0": ends[0], "p1": ends[1]}
-        axis, centre = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0]), (ends[0] + ends[1]) / 2
+        axis, centre = (
+            (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0]),
+            (ends[0] + ends[1]) / 2,
+        )
         out = np.cross(out, axis)
         curve = Cylinders(row(*ends[0]), row(*ends[1]), torch.tensor([radius]), torch.ones(1))
     else:
         shape = {"center": centre}
         curve = ball(centre, radius)
-    scene = backend.mitsuba().load_dict({"type": "scene", "shape": {"type": kind, "radius": radius, **shape}})
+    scene = backend.mitsuba().load_dict(
+        {"type": "scene", "shape": {"type": kind, "radius": radius, **shape}}
+    )
     eyes = np.float32(centre + ratio * radius * out / np.linalg.norm(out, axis=1, keepdims=True))
     along = centre - eyes
     if kind == "cylinder":
@@ -138,7 +147,9 @@ def test_what_float32_rays_cannot_find_is_refused():
     eye = torch.tensor([2.5, 0.0, 0.0], dtype=F64)
     for curve in (ball((0, 0, 0), 1e-3), pole(end=(0.0, 0.0, 1.0), radius=1e-3)):
         index, _ = curve.pieces(eye, 0.01)  # listed, since nothing says yet that it is seen
-        with pytest.raises(DomainError, match=r"of radius 0.001 m near .* too far for float32 rays"):
+        with pytest.raises(
+            DomainError, match=r"of radius 0.001 m near .* too far for float32 rays"
+        ):
             curve.aside_rad(index, eye)
 
 
@@ -161,31 +172,43 @@ def test_float32_rays_find_straight_edges_within_the_reading_angle(offset_m, dis
         eyes = place + distance_m * units(rng, 64)
         along = (place - eyes) / distance_m
         outward = np.cross(along, along_edge)
-        outward *= (-np.sign(((corners[2] - eyes) * outward).sum(1)) / np.linalg.norm(outward, axis=1))[
-            :, None
-        ]
-        fair = hits(scene, eyes, along - 1e-3 * outward) & ~hits(scene, eyes, along + 1e-3 * outward)
-        error = np.abs(last_hits(scene, eyes, along, outward, np.full(64, -1e-3), np.full(64, 1e-3)))
+        outward *= (
+            -np.sign(((corners[2] - eyes) * outward).sum(1)) / np.linalg.norm(outward, axis=1)
+        )[:, None]
+        fair = hits(scene, eyes, along - 1e-3 * outward) & ~hits(
+            scene, eyes, along + 1e-3 * outward
+        )
+        error = np.abs(
+            last_hits(scene, eyes, along, outward, np.full(64, -1e-3), np.full(64, 1e-3))
+        )
         assert fair.mean() > 0.5
         assert (error < readings(curve, eyes))[fair].all()
 
 
-@pytest.mark.parametrize("eye", [(0.3, 0.4, 0.9), (3.0, 0.4, 1e-3), (0.5, 0.2, 1e-4), (0.0, 0.0, 2.0)])
+@pytest.mark.parametrize(
+    "eye", [(0.3, 0.4, 0.9), (3.0, 0.4, 1e-3), (0.5, 0.2, 1e-4), (0.0, 0.0, 2.0)]
+)
 def test_no_piece_of_a_rim_turns_back(eye):
-    """A piece that went out and came back would look short: seen from the viewpoint, no piece bends by more
-    than a quarter turn, however nearly edge-on, and together they are the whole rim."""
-    rim = Circles(row(0.1, 0, 0), row(0.2, 0.1, 0), row(-0.15, 0.3, 0), row(0, 0, 0), torch.zeros(1))
+    """A piece that went out and came back would look short: seen from the viewpoint, no piece bends
+    by more than a quarter turn, however nearly edge-on, and together they are the whole rim."""
+    rim = Circles(
+        row(0.1, 0, 0), row(0.2, 0.1, 0), row(-0.15, 0.3, 0), row(0, 0, 0), torch.zeros(1)
+    )
     eye = torch.tensor(eye, dtype=F64)
     index, bounds = rim.pieces(eye, 0.01)
     assert float((bounds[:, 1] - bounds[:, 0]).sum()) == pytest.approx(1, abs=1e-12)
     s = bounds[:, :1] + torch.linspace(0, 1, 41, dtype=F64) * (bounds[:, 1:] - bounds[:, :1])
-    y = rim.points(index[:, None].expand(s.shape).reshape(-1), s.reshape(-1), eye).reshape(*s.shape, 3)
+    y = rim.points(index[:, None].expand(s.shape).reshape(-1), s.reshape(-1), eye).reshape(
+        *s.shape, 3
+    )
     seen = normalize(y - eye, dim=2)
     length = (seen[:, 1:] - seen[:, :-1]).norm(dim=2).sum(1)
     assert float(((seen[:, -1] - seen[:, 0]).norm(dim=1) / length).min()) > 0.7
 
 
-@pytest.mark.parametrize("towards", [(0.2, 1.5, 0.2), (0.0, 1.0, 0.0), (1.0, 1.0, 1.0), (-2.0, 0.3, 0.3)])
+@pytest.mark.parametrize(
+    "towards", [(0.2, 1.5, 0.2), (0.0, 1.0, 0.0), (1.0, 1.0, 1.0), (-2.0, 0.3, 0.3)]
+)
 def test_a_place_on_a_sphere_has_one_name_from_all_points_of_a_pupil(towards, generator):
     """A pupil of 2 mm before a ball of 0.3 m: the same parameters are the same places, to some
     millimetres."""

@@ -1,4 +1,5 @@
-"""Edges of meshes: which of them may part two radiances, however the mesh is written; and what coincides."""
+"""Edges of meshes: which of them may part two radiances, however the mesh is written; and what
+coincides."""
 
 import math
 
@@ -23,7 +24,9 @@ LIGHT = area(1.0)
 def tube(sides=64):
     """Vertices and faces of an open prism about the z axis."""
     angle = 2 * np.pi * np.arange(sides) / sides
-    ring = np.concatenate([np.stack([np.cos(angle), np.sin(angle), 0 * angle + z], 1) for z in (0.0, 1.0)])
+    ring = np.concatenate(
+        [np.stack([np.cos(angle), np.sin(angle), 0 * angle + z], 1) for z in (0.0, 1.0)]
+    )
     return ring, solids.squares(2, sides, around=True)
 
 
@@ -102,8 +105,8 @@ def test_an_edge_of_three_faces_counts_from_every_side():
 
 
 def test_edges_between_faces_of_unequal_radiance_count_even_where_flat():
-    """A flat grid of n x n squares in rows of one radiance: n - 1 lines of n edges between rows, and the
-    rim."""
+    """A flat grid of n x n squares in rows of one radiance: n - 1 lines of n edges between rows,
+    and the rim."""
     n = 7
     vertices = np.stack([*np.mgrid[: n + 1, : n + 1], np.zeros((n + 1, n + 1))], 2).reshape(-1, 3)
     faces = solids.squares(n + 1, n + 1)
@@ -127,8 +130,8 @@ def lines(*ends):
 
 @pytest.mark.parametrize("shift", [0.0, 3e-5, 0.49999e-4, 0.5e-4])
 def test_where_edges_overlap_does_not_hang_on_rounding(shift):
-    """Stretches of a slanted line from many intervals, moved about by less than the tolerance: their union,
-    once."""
+    """Stretches of a slanted line from many intervals, moved about by less than the tolerance:
+    their union, once."""
     rng = np.random.default_rng(5)
     along = np.array([0.36, 0.48, 0.8])
     begin = rng.uniform(0, 3, 12)
@@ -155,8 +158,8 @@ def test_edges_that_count_as_one_are_read_from_beyond_both():
 
 
 def test_boxes_of_different_sizes_that_touch_share_their_edges():
-    """Two boxes side by side, fronts and floors flush: along the lower's edges every stretch once. Total
-    length by hand: two boxes' edges less what both have."""
+    """Two boxes side by side, fronts and floors flush: along the lower's edges every stretch once.
+    Total length by hand: two boxes' edges less what both have."""
     mi = backend.mitsuba()
     T = mi.ScalarTransform4f
     low = {
@@ -172,15 +175,17 @@ def test_boxes_of_different_sizes_that_touch_share_their_edges():
     curves = MitsubaScene({"low": low, "tall": tall}, merge=False).outline()
     (edges,) = [curve for curve in curves if isinstance(curve, Segments)]
     length = (edges.end - edges.start).norm(dim=1)
-    # edges of 1 x 1 x 0.5 and of 1 x 0.5 x 1 m; at x = 1 they share 0.5 m of the floor's and 0.5 m of the
-    # front's
+    # edges of 1 x 1 x 0.5 and of 1 x 0.5 x 1 m; at x = 1 they share 0.5 m of the floor's and 0.5 m
+    # of the front's
     assert float(length.sum()) == pytest.approx(4 * 2.5 + 4 * 2.5 - 0.5 - 0.5, abs=1e-5)
 
 
 def test_a_pole_and_its_lid_have_one_rim():
     mi = backend.mitsuba()
     tube_of, lid = pole(mi, (0.1, 0.2, 0.0), (0.4, 0.1, 1.3), 0.05)
-    curves = MitsubaScene({"tube": {**tube_of, "emitter": LIGHT}, "lid": {**lid, "emitter": LIGHT}}).outline()
+    curves = MitsubaScene(
+        {"tube": {**tube_of, "emitter": LIGHT}, "lid": {**lid, "emitter": LIGHT}}
+    ).outline()
     (rims,) = [curve for curve in curves if isinstance(curve, Circles)]
     assert rims.centre.shape[0] == 2
     turned = np.array([[0.0, 0.0, 1.0]] * 3)
@@ -192,7 +197,13 @@ def test_a_pole_and_its_lid_have_one_rim():
 
 def test_the_far_end_of_a_tube_is_hidden_by_its_near_wall():
     """Seen from above and aside: all of the upper rim, and of the lower one what faces the eye."""
-    tube_of = {"type": "cylinder", "p0": [0, 0, 0], "p1": [0, 0, 1], "radius": 0.1, "emitter": LIGHT}
+    tube_of = {
+        "type": "cylinder",
+        "p0": [0, 0, 0],
+        "p1": [0, 0, 1],
+        "radius": 0.1,
+        "emitter": LIGHT,
+    }
     curves = MitsubaScene({"tube": tube_of}).outline()
     (rims,) = [curve for curve in curves if isinstance(curve, Circles)]
     index = torch.arange(2).repeat_interleave(50)

@@ -1,6 +1,6 @@
-"""Worlds whose gradient was once wrong without a word: thin poles near and far, a mesh with one radiance per
-face, an edge of a floor against two walls. Against closed forms and differences with common random
-numbers."""
+"""Worlds whose gradient was once wrong without a word: thin poles near and far, a mesh with one
+radiance per face, an edge of a floor against two walls. Against closed forms and differences with
+common random numbers."""
 
 import math
 from types import SimpleNamespace
@@ -50,9 +50,9 @@ def judged(turn_rad, pitch_mm, nearest_m, **shapes):
 
 
 def loss_of_a_pole(task, start, end, radius, radiance, twist):
-    """The task's loss for a bright pole that crosses the picture from top to bottom, before black: along
-    every line across the picture the pole lies between two planes through the eye; the weights are constant
-    within a pixel."""
+    """The task's loss for a bright pole that crosses the picture from top to bottom, before black:
+    along every line across the picture the pole lies between two planes through the eye; the
+    weights are constant within a pixel."""
     T = (task.pose @ pose.se3_exp(torch.tensor(twist, dtype=F64)[None]))[0].numpy()
     eye = T[:3, 3]
     axis = (end - start) / np.linalg.norm(end - start)
@@ -103,7 +103,10 @@ def test_poles_however_thin_and_far(ratio):
     ]
     truth = torch.tensor(truth, dtype=F64) * SCALE
     # two lines a fraction of a pixel apart, sampled apart: a single estimate is noisy
-    whole = torch.stack([task.gradient("pose", 1, seed, "boundary", 32.0) for seed in range(16)]) * SCALE
+    whole = (
+        torch.stack([task.gradient("pose", 1, seed, "boundary", 32.0) for seed in range(16)])
+        * SCALE
+    )
     noise = float(whole.std(0).norm() / 4 / truth.norm())
     assert float((whole.mean(0) - truth).norm() / truth.norm()) < 0.01 + 2 * noise
     assert noise < 0.04
@@ -112,11 +115,15 @@ def test_poles_however_thin_and_far(ratio):
 def test_the_outline_of_a_fine_mesh_through_a_wide_pupil():
     """An aperture of 5 mm sees the outline of a ball of 20,480 faces move over edges next to it."""
     vertices, faces = icosphere(5)
-    ball = emissive_mesh(backend.mitsuba(), 0.3 * vertices + [0, 0.1, 0.9], faces, np.full(len(faces), 200.0))
+    ball = emissive_mesh(
+        backend.mitsuba(), 0.3 * vertices + [0, 0.1, 0.9], faces, np.full(len(faces), 200.0)
+    )
     task = Task(MitsubaScene({"wall": wall(), "ball": ball}), "thin")
     truth = torch.stack([task.differences("pose", 256, seed) for seed in (11, 12)]) * SCALE
     noise = float((truth[0] - truth[1]).norm() / 2 / truth.mean(0).norm())
-    plain, whole = (task.gradient("pose", 256, 13, way, 16.0) * SCALE for way in ("interior", "boundary"))
+    plain, whole = (
+        task.gradient("pose", 256, 13, way, 16.0) * SCALE for way in ("interior", "boundary")
+    )
     assert float((plain - truth.mean(0)).norm() / truth.mean(0).norm()) > 0.3
     assert float((whole - truth.mean(0)).norm() / truth.mean(0).norm()) < 0.03 + 2 * noise
     assert noise < 0.04
@@ -127,20 +134,29 @@ def test_lines_without_width_between_faces_are_no_jumps():
     vertices, faces = icosphere(4)
     ball = emissive_mesh(backend.mitsuba(), 0.5 * vertices + [0, 2, 0], faces, area(200))
     camera = render.Camera(lens.Pinhole(11.0), 32, 32, 0.3575, 4)
-    frames = render.frames(camera, MitsubaScene({"ball": ball, "sky": SKY}), AHEAD[None], gradient="boundary")
+    frames = render.frames(
+        camera, MitsubaScene({"ball": ball, "sky": SKY}), AHEAD[None], gradient="boundary"
+    )
     assert not bool(frames.isnan().any())
 
 
 @pytest.mark.parametrize("ratio", [5, 100])
 def test_a_dark_ball_through_a_mesh_however_far(ratio):
-    """A mesh of 320 faces with a black ball of half its radius before its centre, the film narrower the
-    further it is. The ball's outline lies just within the mesh and the curve along which the two meet just
-    behind the ball, both nearer to what is seen than rays pass beside them."""
+    """A mesh of 320 faces with a black ball of half its radius before its centre, the film narrower
+    the further it is. The ball's outline lies just within the mesh and the curve along which the
+    two meet just behind the ball, both nearer to what is seen than rays pass beside them."""
     radius, distance = 0.3, 0.3 * ratio
     vertices, faces = icosphere(2)
-    ball = {"type": "sphere", "center": [0.06, distance - 0.24, 0.03], "radius": 0.15, "emitter": area(0)}
+    ball = {
+        "type": "sphere",
+        "center": [0.06, distance - 0.24, 0.03],
+        "radius": 0.15,
+        "emitter": area(0),
+    }
     mesh = emissive_mesh(backend.mitsuba(), radius * vertices + [0, distance, 0], faces, area(200))
-    found = judged(0.3, 22 * radius / distance / 12, distance - radius, mesh=mesh, ball=ball, sky=SKY)
+    found = judged(
+        0.3, 22 * radius / distance / 12, distance - radius, mesh=mesh, ball=ball, sky=SKY
+    )
     assert found.error < 0.05 + 2 * found.noise
     assert found.noise < 0.05
 
@@ -151,8 +167,9 @@ def test_a_dark_ball_through_a_mesh_however_far(ratio):
     ids=["6 m aside", "13 degrees of turning", "0.3 m aside of what is near"],
 )
 def test_a_view_is_looked_at_though_another_was_right(twist, nearer, monkeypatch):
-    """A wall at 100 m that alone is seen at first, and a ball that moves through a cube 10 m ahead, aside, or
-    as much smaller and nearer. A camera that moves by a thousandth of that is not looked through again."""
+    """A wall at 100 m that alone is seen at first, and a ball that moves through a cube 10 m ahead,
+    aside, or as much smaller and nearer. A camera that moves by a thousandth of that is not looked
+    through again."""
     T = backend.mitsuba().ScalarTransform4f
     far = T().translate([0, 0, 100.0]).rotate([1, 0, 0], 180).scale(80.0)
     aside = T().scale(1 / nearer).translate([-7.2, 0, 10.0]).rotate([1, 1, 0], 40).scale(0.8)
@@ -167,7 +184,9 @@ def test_a_view_is_looked_at_though_another_was_right(twist, nearer, monkeypatch
     camera = render.Camera(lens.Pinhole(11.0), 32, 32, 0.35, 4)
     looks = []
     listings = occlusion_check.listings
-    monkeypatch.setattr(occlusion_check, "listings", lambda *given: looks.append(given) or listings(*given))
+    monkeypatch.setattr(
+        occlusion_check, "listings", lambda *given: looks.append(given) or listings(*given)
+    )
     for share in (0.0, 1e-3):
         small = pose.se3_exp(share * torch.tensor([twist], dtype=F64))
         render.frames(camera, world, small, gradient="boundary")
@@ -182,7 +201,11 @@ def test_no_surface_is_nearer_than_it_is_said(kind, generator):
     """Against points spread over the shape, from outside and within."""
     centre = torch.tensor([0.3, -0.2, 0.5], dtype=F64)
     place = (
-        backend.mitsuba().ScalarTransform4f().translate(centre.tolist()).rotate([0.6, 0.8, 0], 50).scale(0.4)
+        backend.mitsuba()
+        .ScalarTransform4f()
+        .translate(centre.tolist())
+        .rotate([0.6, 0.8, 0], 50)
+        .scale(0.4)
     )
     scene = MitsubaScene({"thing": {"type": kind, "to_world": place, "emitter": area(1)}})
     at = torch.randn(40_000, 2, 3, generator=generator, dtype=F64)
@@ -196,12 +219,15 @@ def test_no_surface_is_nearer_than_it_is_said(kind, generator):
 
 
 def test_an_edge_that_is_seen_end_on_is_no_line_in_the_picture():
-    """Of an edge along the optical axis and one across it only the second jumps, upwards at its own place."""
+    """Of an edge along the optical axis and one across it only the second jumps, upwards at its own
+    place."""
     world = torch.tensor([[0.0, 0, 5], [0.3, 0.1, 5]], dtype=F64)
     ahead = world + torch.tensor([[0.0, 0, 0.01], [0, 0.01, 0]], dtype=F64)
     one, none = torch.ones(2, dtype=F64), torch.zeros(2, dtype=torch.long)
     faces = 1e-4 * one, 1e-4 * one, torch.inf * one, torch.full((2, 2, 3), torch.nan, dtype=F64)
-    points = CurvePoints(world, ahead, one, *faces, torch.zeros(2, 2, dtype=F64), none, none, none, none)
+    points = CurvePoints(
+        world, ahead, one, *faces, torch.zeros(2, 2, dtype=F64), none, none, none, none
+    )
     camera = render.Camera(lens.Pinhole(8.0), 33, 25, 0.05)
     scene = render.TexturedPlane([[0.7, 0.3]], [0.4], [0.2])
     found = jumps(camera, scene, torch.eye(4, dtype=F64)[None, None], points)
@@ -216,11 +242,20 @@ def test_an_edge_that_is_seen_end_on_is_no_line_in_the_picture():
 def test_rays_that_meet_a_chord_are_near_its_piece_wherever_the_eye_is(eye_m, generator):
     """Chords 0.2 m long 1 m before the eye, and rays from it to points all along them."""
     eye = torch.tensor([0.0, 0.0, eye_m], dtype=F64)
-    start = torch.rand(40, 3, generator=generator, dtype=F64) * 0.4 + eye + torch.tensor([0.0, 0.0, 1.0])
-    along = 0.2 * torch.nn.functional.normalize(torch.randn(40, 3, generator=generator, dtype=F64), dim=1)
+    start = (
+        torch.rand(40, 3, generator=generator, dtype=F64) * 0.4
+        + eye
+        + torch.tensor([0.0, 0.0, 1.0])
+    )
+    along = 0.2 * torch.nn.functional.normalize(
+        torch.randn(40, 3, generator=generator, dtype=F64), dim=1
+    )
     curve = SimpleNamespace(points=lambda index, s, eye: start[index] + s[:, None] * along[index])
     piece = torch.arange(40).repeat(9)
-    to = curve.points(piece, torch.linspace(0.02, 0.98, 9, dtype=F64).repeat_interleave(40), eye) - eye
+    to = (
+        curve.points(piece, torch.linspace(0.02, 0.98, 9, dtype=F64).repeat_interleave(40), eye)
+        - eye
+    )
     distance = to.norm(dim=1)
     bounds = torch.tensor([[0.0, 1.0]], dtype=F64).expand(40, 2)
     rays = eye.expand_as(to), to / distance[:, None], distance

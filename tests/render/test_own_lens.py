@@ -1,5 +1,5 @@
-"""A lens of the user's own behind every way to frames, rays that are traced once for many calls, and cameras
-whose film gets no light."""
+"""A lens of the user's own behind every way to frames, rays that are traced once for many calls,
+and cameras whose film gets no light."""
 
 import pytest
 import torch
@@ -20,8 +20,8 @@ PLANE = TexturedPlane(*textures.waves(1, finest_period_m=0.2))
 
 
 class Barrel(torch.nn.Module):
-    """A pinhole whose rays leave with slopes s (1 + k |s|^2), s the position on the film over the focal
-    length."""
+    """A pinhole whose rays leave with slopes s (1 + k |s|^2), s the position on the film over the
+    focal length."""
 
     dtype = D
 
@@ -33,7 +33,9 @@ class Barrel(torch.nn.Module):
     def camera_rays(self, film_mm, pupil, wavelength_um=None, aim=False):
         s = film_mm / self.efl_mm_
         slope = s * (1 + self.k * s.square().sum(1, keepdim=True))
-        direction = torch.nn.functional.normalize(torch.cat([slope, torch.ones_like(slope[:, :1])], 1), dim=1)
+        direction = torch.nn.functional.normalize(
+            torch.cat([slope, torch.ones_like(slope[:, :1])], 1), dim=1
+        )
         return Rays(0 * direction, direction, torch.ones_like(direction[:, 0]))
 
     def film_points(self, points_mm, pupil, wavelength_um=None):
@@ -79,7 +81,8 @@ def test_the_gradient_of_silhouettes_reaches_a_lens_of_ones_own(generator):
             ]
         )
     plain = gradient("interior")
-    # of what is missing without the term; as in test_boundary, differences of 1024 samples know 1 to 2 %
+    # of what is missing without the term; as in test_boundary, differences of 1024 samples know 1
+    # to 2 %
     assert float(((gradient("boundary") - truth) / (plain - truth)).abs().max()) < 0.05
 
 
@@ -106,9 +109,12 @@ def test_truth_goes_through_a_lens_of_ones_own():
 
 
 def test_a_lens_that_says_nothing_of_illumination_takes_light_of_several_colours():
-    """Its rays have no irradiance; the same lens in every colour gives the picture of one colour."""
+    """Its rays have no irradiance; the same lens in every colour gives the picture of one
+    colour."""
     mono, poly = (
-        render.frames(Camera(Barrel(), 8, 8, 0.2, samples_per_pixel=6, spectrum=light), PLANE, POSES)
+        render.frames(
+            Camera(Barrel(), 8, 8, 0.2, samples_per_pixel=6, spectrum=light), PLANE, POSES
+        )
         for light in (None, lens.Spectrum.visible_FdC())
     )
     torch.testing.assert_close(mono, poly, rtol=1e-6, atol=0)
@@ -127,7 +133,9 @@ def test_given_rays_make_the_same_frames_and_gradients(way, generator):
     weights = torch.rand(12, 12, generator=generator)
 
     def gradient(frames):
-        return torch.autograd.grad((frames * weights).sum(), [geo.curvature_per_mm, geo.thickness_mm])
+        return torch.autograd.grad(
+            (frames * weights).sum(), [geo.curvature_per_mm, geo.thickness_mm]
+        )
 
     alone = render.frames(camera, scene, CUBES_POSE, way)
     rays = camera.rays()
@@ -162,7 +170,10 @@ def test_recorded_rays_end_the_gradient_at_themselves(generator):
 
 
 def test_a_film_that_gets_light_everywhere_passes():
-    for optics, pitch_mm in ((lens.Pinhole(8.0), 5.0), (lens.load("cooke-triplet").scaled(0.2), 0.05)):
+    for optics, pitch_mm in (
+        (lens.Pinhole(8.0), 5.0),
+        (lens.load("cooke-triplet").scaled(0.2), 0.05),
+    ):
         camera = Camera(optics, 64, 48, pitch_mm, 4)
         assert camera.check() is camera
 

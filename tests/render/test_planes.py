@@ -28,14 +28,20 @@ def poses():
     base = look_at((0.4, -0.5, 2.6), (0.1, 0.1, 0.3), down=(0.2, 1.0, 0.1))
     moved = base @ se3_exp(torch.tensor([0.05, -0.03, 0.08, 0.02, -0.03, 0.05], dtype=D))
     # from below the plane shows its front, mirrored
-    return torch.stack([base, moved, look_at((0.1, 0.2, -2.6), (0.1, 0.1, 0.3), down=(0.2, 1.0, 0.1))])
+    return torch.stack(
+        [base, moved, look_at((0.1, 0.2, -2.6), (0.1, 0.1, 0.3), down=(0.2, 1.0, 0.1))]
+    )
 
 
 def homography(pose, plane):
-    """Pixel (x, y, 1) -> plane coordinates (X, Y, 1) up to scale: the inverse of K [r1 r2 t] (Hartley and
-    Zisserman, 8.1)."""
+    """Pixel (x, y, 1) -> plane coordinates (X, Y, 1) up to scale: the inverse of K [r1 r2 t]
+    (Hartley and Zisserman, 8.1)."""
     K = np.array(
-        [[FOCAL_MM / PITCH_MM, 0, (WIDTH - 1) / 2], [0, FOCAL_MM / PITCH_MM, (HEIGHT - 1) / 2], [0, 0, 1]]
+        [
+            [FOCAL_MM / PITCH_MM, 0, (WIDTH - 1) / 2],
+            [0, FOCAL_MM / PITCH_MM, (HEIGHT - 1) / 2],
+            [0, 0, 1],
+        ]
     )
     T = np.linalg.inv(pose.numpy()) @ plane.T_world_plane.numpy()
     return np.linalg.inv(K @ T[:3, [0, 1, 3]])
@@ -59,8 +65,8 @@ def pixel_grid():
 @pytest.mark.parametrize("samples", [1, 8])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(D, 1e-11), (torch.float32, 2e-4)])
 def test_frames_equal_the_texture_through_the_homography(samples, dtype, tolerance):
-    # float64: rounding times the phase gradient (2 pi 20 per metre at 3 m); float32: the same with 1e-7
-    # instead of 1e-16
+    # float64: rounding times the phase gradient (2 pi 20 per metre at 3 m); float32: the same with
+    # 1e-7 instead of 1e-16
     plane = tilted_plane(dtype)
     found = render.frames(
         Camera(lens.Pinhole(FOCAL_MM), WIDTH, HEIGHT, PITCH_MM, samples, seed=5), plane, poses()
@@ -69,7 +75,11 @@ def test_frames_equal_the_texture_through_the_homography(samples, dtype, toleran
     offsets = film_pupil_pattern(samples, 5)[0].numpy()
     for image, pose in zip(found.double(), poses(), strict=True):
         truth = np.mean(
-            [radiance(plane, plane_points(pose, plane, pixel_grid() + offset)) for offset in offsets], 0
+            [
+                radiance(plane, plane_points(pose, plane, pixel_grid() + offset))
+                for offset in offsets
+            ],
+            0,
         )
         np.testing.assert_allclose(image.numpy().ravel(), truth, rtol=tolerance)
 
@@ -79,10 +89,12 @@ def test_the_sample_pattern_covers_the_pixel_and_the_pupil_evenly():
     assert bool((offset >= -0.5).all())
     assert bool((offset < 0.5).all())
     assert float(pupil.square().sum(1).max()) <= 1
-    # moments of a unit square and a unit disc; 1024 low-discrepancy points are good to about 1/1024 times
-    # some logarithms
+    # moments of a unit square and a unit disc; 1024 low-discrepancy points are good to about 1/1024
+    # times some logarithms
     torch.testing.assert_close(offset.mean(0), torch.zeros(2, dtype=D), rtol=0, atol=2e-3)
-    torch.testing.assert_close(offset.T @ offset / 1024, torch.eye(2, dtype=D) / 12, rtol=0, atol=2e-3)
+    torch.testing.assert_close(
+        offset.T @ offset / 1024, torch.eye(2, dtype=D) / 12, rtol=0, atol=2e-3
+    )
     torch.testing.assert_close(pupil.mean(0), torch.zeros(2, dtype=D), rtol=0, atol=5e-3)
     torch.testing.assert_close(pupil.T @ pupil / 1024, torch.eye(2, dtype=D) / 4, rtol=0, atol=5e-3)
     radius = pupil.square().sum(1)  # uniform on [0, 1] for an area-preserving map

@@ -1,5 +1,5 @@
-"""Point spread functions of a camera, and frames by them, against closed forms, forward traces and traced
-frames."""
+"""Point spread functions of a camera, and frames by them, against closed forms, forward traces and
+traced frames."""
 
 import math
 
@@ -45,9 +45,13 @@ def test_blur_of_a_thin_lens_is_the_circle_of_confusion():
     behind_mm = 1 / (1 / 10.0 - 1 / 1000.0)
     radius_px = 1.0 * behind_mm * (1 / (1e3 * distance_m) - 1 / 1000.0).abs() / PITCH_MM
     offsets = psf.offsets_px(1 / distance_m)
-    # points in the middle of 16 x 16 equal parts of a disc: the outermost lie at 15/16 of its radius
-    torch.testing.assert_close(offsets.norm(dim=-1).amax(2), (radius_px * 15 / 16)[:, None].expand(5, 4))
-    # the second moment of a disc is its radius squared over 4; the parts' middles have 2 / 16^2 less of it
+    # points in the middle of 16 x 16 equal parts of a disc: the outermost lie at 15/16 of its
+    # radius
+    torch.testing.assert_close(
+        offsets.norm(dim=-1).amax(2), (radius_px * 15 / 16)[:, None].expand(5, 4)
+    )
+    # the second moment of a disc is its radius squared over 4; the parts' middles have 2 / 16^2
+    # less of it
     second = radius_px**2 / 4 * (1 - 2 / 256)
     torch.testing.assert_close(
         offsets.square().mean(2), second[:, None, None].expand(5, 4, 2), rtol=1e-6, atol=1e-9
@@ -75,7 +79,9 @@ def test_blur_of_a_traced_lens_is_that_of_light_traced_forwards():
         film, _, _ = optics.film_points(
             points_mm.repeat_interleave(len(pupil), 0), pupil.repeat(len(points_mm), 1)
         )
-        offsets = (film.reshape(len(points_mm), -1, 2) - cam.film_mm(psf.nodes_px)[:, None]) / PITCH_MM
+        offsets = (
+            film.reshape(len(points_mm), -1, 2) - cam.film_mm(psf.nodes_px)[:, None]
+        ) / PITCH_MM
         # the two sample the pupil differently (entrance and exit pupil), the more so off the axis
         forward = (offsets - offsets.mean(1, keepdim=True)).norm(dim=-1).square().mean(1).sqrt()
         ours = (found[d] - found[d].mean(1, keepdim=True)).norm(dim=-1).square().mean(1).sqrt()
@@ -97,7 +103,8 @@ def test_lateral_colour_is_in_it():
     slope = [d[0, :2] / d[0, 2] for d in back]
     per_px = psf.slope_per_px[0]
     chief = torch.linalg.solve(per_px, slope[1] - slope[0])
-    # coma differs a little between the colours, so the mean of the blur is not quite its chief ray's
+    # coma differs a little between the colours, so the mean of the blur is not quite its chief
+    # ray's
     torch.testing.assert_close(found[0, 0] - found[0, 1], chief, atol=0.05, rtol=0.1)
 
 
@@ -116,8 +123,8 @@ def test_vignetting_is_that_of_traced_frames():
     traced = render.frames(cam, even, FRONT[None]).detach()
     assert float(traced.min()) < 0.7 * float(traced.max())
     found = render.psf_frames(cam, even, FRONT[None]).detach()
-    # an aperture's hard edge passes over the 16 x 16 points of the pupil up to a row at a time, 1/16 of the
-    # light
+    # an aperture's hard edge passes over the 16 x 16 points of the pupil up to a row at a time,
+    # 1/16 of the light
     away = (found - traced).abs() / traced.max()
     assert float(away.max()) < 1 / 16
     assert float(away.square().mean().sqrt()) < 0.01
@@ -160,22 +167,28 @@ ABOVE = look_at((0.0, 0.0, 1.5), (0, 0, 0), down=(0, 1, 0))
 
 
 def test_more_rays_per_pixel_for_hard_edges():
-    """The edge of a card before a pinhole: 16 rays per pixel are the means of the parts they lie in."""
-    seen = half_before(100.0, 50.0), (ABOVE @ se3_exp(torch.tensor([0, 0, 0, 0, 0, 0.3], dtype=D)))[None]
+    """The edge of a card before a pinhole: 16 rays per pixel are the means of the parts they lie
+    in."""
+    seen = (
+        half_before(100.0, 50.0),
+        (ABOVE @ se3_exp(torch.tensor([0, 0, 0, 0, 0, 0.3], dtype=D)))[None],
+    )
     cam = camera(lens.Pinhole(10.0), 24, 20)
     few, many = (
-        render.psf_frames(cam, *seen, render.psf_map(cam, rays_per_px=n)) - render.frames(cam, *seen)
+        render.psf_frames(cam, *seen, render.psf_map(cam, rays_per_px=n))
+        - render.frames(cam, *seen)
         for n in (4, 64)
     )
-    # the share of a pixel behind an edge is known to half a row of points, 1 / 16, with 64 in a square
+    # the share of a pixel behind an edge is known to half a row of points, 1 / 16, with 64 in a
+    # square
     assert float(many.abs().max()) < 50 / 16 + 0.5
     assert float(many.norm()) < 0.5 * float(few.norm())
 
 
 @pytest.mark.parametrize("blurred", ["front", "behind"])
 def test_the_edge_of_a_near_card(blurred):
-    """A blurred card before a sharp wall: the integral of a disc; a sharp card before a blurred wall: a sharp
-    edge, nothing of the wall on the card."""
+    """A blurred card before a sharp wall: the integral of a disc; a sharp card before a blurred
+    wall: a sharp edge, nothing of the wall on the card."""
     cam = camera(lens.ThinLens(10.0, 2.0).focus_at(1.5 if blurred == "front" else 0.5), 41, 8)
     row = render.psf_frames(cam, half_before(100.0, 50.0), ABOVE[None])[0, 4]
     row = row if float(row[0]) > 75 else row.flip(0)
@@ -194,8 +207,8 @@ def test_the_edge_of_a_near_card(blurred):
 
 
 def functional(make, weights):
-    """Scalar of frames of a slanted plane as a function of relative changes of curvature and thickness, and a
-    twist; and its leaves."""
+    """Scalar of frames of a slanted plane as a function of relative changes of curvature and
+    thickness, and a twist; and its leaves."""
     nominal = triplet().focus_at(0.9)
     c = nominal.curvature_per_mm.detach()
     t = nominal.thickness_mm.detach()
@@ -203,7 +216,9 @@ def functional(make, weights):
     start = FRONT @ se3_exp(torch.tensor([0.1, 0, 0.6, 0.4, 0.2, 0.1], dtype=D))
 
     def loss(curvature, thickness, twist):
-        optics = nominal.replace(curvature_per_mm=c * (1 + curvature), thickness_mm=t * (1 + thickness))
+        optics = nominal.replace(
+            curvature_per_mm=c * (1 + curvature), thickness_mm=t * (1 + thickness)
+        )
         return (make(camera(optics, 24, 20), world, (start @ se3_exp(twist))[None]) * weights).sum()
 
     return loss, [torch.zeros(6, dtype=D, requires_grad=True) for _ in range(3)]
@@ -211,7 +226,9 @@ def functional(make, weights):
 
 def test_gradients_are_those_of_differences_and_near_those_of_traced_frames(generator):
     coarse = torch.randn(1, 1, 4, 4, generator=generator, dtype=D)
-    weights = torch.nn.functional.interpolate(coarse, size=(20, 24), mode="bilinear", align_corners=True)[0]
+    weights = torch.nn.functional.interpolate(
+        coarse, size=(20, 24), mode="bilinear", align_corners=True
+    )[0]
     loss, at = functional(lambda *stage: render.psf_frames(*stage), weights)
     assert_gradients(loss, [torch.zeros(6, dtype=D)] * 3, [1e-6] * 3, 1e-5)
     found = torch.autograd.grad(loss(*at), at)
@@ -228,5 +245,7 @@ def test_depth_of_mitsuba_scenes_has_the_gradient_of_tangent_planes():
     _, per_m = light_and_nearness(cam.rays(), views_of(scene, poses))
     depth, truth = 1 / per_m[0].double(), render.view(cam, scene, poses, 0).depth_m.reshape(-1)
     torch.testing.assert_close(depth, truth, rtol=1e-5, atol=0)
-    found, truth = (torch.autograd.grad(v.sum(), twist, retain_graph=True)[0] for v in (depth, truth))
+    found, truth = (
+        torch.autograd.grad(v.sum(), twist, retain_graph=True)[0] for v in (depth, truth)
+    )
     torch.testing.assert_close(found, truth, rtol=1e-4, atol=1e-4 * float(truth.norm()))

@@ -26,11 +26,15 @@ def plated_map(plate):
 
 
 def test_the_map_of_a_plated_lens_is_that_of_its_rays():
-    plate = diffraction.ZernikePlate({4: 0.3, 7: 0.8, 8: 0.9, 9: -0.6, 10: 0.6}, 0.9).requires_grad_(False)
+    plate = diffraction.ZernikePlate(
+        {4: 0.3, 7: 0.8, 8: 0.9, 9: -0.6, 10: 0.6}, 0.9
+    ).requires_grad_(False)
     plated, found = plated_map(plate)
     for at_m in (0.3, 5.0):
         mean, square = moments(found.energy(torch.tensor([at_m]))[0, 0])
         # rays the other way, on the axis; the picture is upright, the film is not
-        truth, truth_square = moments(geometric_psf(plated, 0.0, PITCH, 64, at_m=at_m, grid=64).energy)
+        truth, truth_square = moments(
+            geometric_psf(plated, 0.0, PITCH, 64, at_m=at_m, grid=64).energy
+        )
         torch.testing.assert_close(mean, -truth, rtol=0, atol=0.02)
         torch.testing.assert_close(square, truth_square, rtol=0.05, atol=0.02)

@@ -91,7 +91,9 @@ def unpainted():
 def unlit():
     """Shapes that Mitsuba joins, as they look alike."""
     dull = {"type": "cube", "bsdf": {"type": "diffuse"}}
-    return MitsubaScene({"lamp": {"type": "cube", "emitter": area(3.0)}, "table": dull, "chair": dull})
+    return MitsubaScene(
+        {"lamp": {"type": "cube", "emitter": area(3.0)}, "table": dull, "chair": dull}
+    )
 
 
 def loaded():
@@ -100,16 +102,32 @@ def loaded():
 
 
 test_scenes_that_cannot_be = refusals(
-    (lambda: mesh(with_vertex(math.nan)), DomainError, r"1 of 4 vertices are NaN .*\(first number 3\)"),
-    (lambda: mesh(faces=np.array([[0, 1, 4]]), radiance=[1.0]), DomainError, "but it has 4, counted from 0"),
+    (
+        lambda: mesh(with_vertex(math.nan)),
+        DomainError,
+        r"1 of 4 vertices are NaN .*\(first number 3\)",
+    ),
+    (
+        lambda: mesh(faces=np.array([[0, 1, 4]]), radiance=[1.0]),
+        DomainError,
+        "but it has 4, counted from 0",
+    ),
     (lambda: mesh(radiance=[1.0, 2.0, 3.0]), ShapeError, "3 values of radiance per face for 2"),
     (placed_nowhere, DomainError, "shape 'ball': its place or size is NaN or infinite"),
     (unpainted, DomainError, "'painted': the mesh has no attribute 'face_colour'"),
     (unlit, DomainError, r"shape '(table|chair)', '(table|chair)' has no emitter"),
     (lambda: MitsubaScene(loaded()), DomainError, "'wall' has no emitter"),
-    (lambda: MitsubaScene({"a": {"type": "no-such"}}), DomainError, "Mitsuba cannot build the scene"),
+    (
+        lambda: MitsubaScene({"a": {"type": "no-such"}}),
+        DomainError,
+        "Mitsuba cannot build the scene",
+    ),
     (lambda: show.MitsubaScene("scene.xml"), DomainError, "got a str; .* worlds.from_mitsuba"),
-    (lambda: worlds.wall(np.full((4, 4), math.nan)), DomainError, "texture of the scene: NaN or infinite"),
+    (
+        lambda: worlds.wall(np.full((4, 4), math.nan)),
+        DomainError,
+        "texture of the scene: NaN or infinite",
+    ),
     (lambda: moving(1.1 * STILL), DomainError, "object 'card': poses are not rigid"),
     (lambda: moving(STILL[0]), ShapeError, "object 'card': poses must be"),
     (
@@ -125,7 +143,11 @@ test_scenes_that_cannot_be = refusals(
     ),
     (lambda: show.MovingScene(PLANE, {"a": PLANE}), DomainError, "objects are a dictionary"),
     (lambda: TexturedPlane([[math.nan, 1]], [1.0], [0.0]), DomainError, "frequency_per_m"),
-    (lambda: TexturedPlane([[1, 1], [1, 2]], [1.0], [0.0, 1.0]), DomainError, "2 frequencies, 1 amplitudes"),
+    (
+        lambda: TexturedPlane([[1, 1], [1, 2]], [1.0], [0.0, 1.0]),
+        DomainError,
+        "2 frequencies, 1 amplitudes",
+    ),
 )
 
 
@@ -165,8 +187,12 @@ def test_files_are_looked_at_before_they_end_the_process(tmp_path):
         "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
         "0 0 0\n1 0 0\n0 1 0\n3 0 1 9999999\n"
     )
-    with pytest.raises(DomainError, match="mesh 'part': its faces name vertices 0 to 9999999, but it has 3"):
-        MitsubaScene({"part": {"type": "ply", "filename": str(tmp_path / "part.ply"), "emitter": area(1.0)}})
+    with pytest.raises(
+        DomainError, match="mesh 'part': its faces name vertices 0 to 9999999, but it has 3"
+    ):
+        MitsubaScene(
+            {"part": {"type": "ply", "filename": str(tmp_path / "part.ply"), "emitter": area(1.0)}}
+        )
     (tmp_path / "broken.png").write_bytes(b"not a picture")
     with pytest.raises(FileFormatError, match=r"broken\.png cannot be read"):
         textures.photo(tmp_path / "broken.png")
@@ -182,7 +208,9 @@ def test_radiance_is_finite_and_at_least_0_wherever_it_stands(value):
         {"type": "checkerboard", "color1": rgb},
     ):
         with pytest.raises(DomainError, match=r"radiance of 'wrong': .* negative, NaN or infinite"):
-            MitsubaScene({"wrong": {"type": "cube", "emitter": {"type": "area", "radiance": light_of}}})
+            MitsubaScene(
+                {"wrong": {"type": "cube", "emitter": {"type": "area", "radiance": light_of}}}
+            )
     for entry in (
         {"type": "constant", "radiance": rgb},
         {"type": "point", "intensity": rgb},
@@ -215,7 +243,9 @@ def test_an_unknown_device_is_refused_wherever_one_is_taken(device):
 
 def test_devices_may_be_those_of_torch():
     assert backend.device_name(torch.device("cpu")) == "cpu"
-    assert {backend.device_name(name) for name in ("cuda", "cuda:0", torch.device("cuda", 0))} == {"cuda"}
+    assert {backend.device_name(name) for name in ("cuda", "cuda:0", torch.device("cuda", 0))} == {
+        "cuda"
+    }
     if not torch.cuda.is_available():
         with pytest.raises(BackendError, match="torch sees no CUDA device"):
             MitsubaScene({}, "cuda:0")
@@ -233,7 +263,12 @@ def test_numpy_arrays_and_lists_are_poses_too():
         lambda poses: render.view(CAMERA, PLANE, poses, 1).points_world_m,
         lambda poses: render.psf_frames(CAMERA, PLANE, poses),
     ):
-        for given in (POSES.numpy(), POSES.tolist(), list(POSES), [POSES[0].numpy(), POSES[1].numpy()]):
+        for given in (
+            POSES.numpy(),
+            POSES.tolist(),
+            list(POSES),
+            [POSES[0].numpy(), POSES[1].numpy()],
+        ):
             assert torch.equal(tell(given), tell(POSES))
     assert as_poses(np.eye(4, dtype=np.float32)).dtype == torch.float64
 
@@ -286,7 +321,10 @@ def test_scenes_and_poses_that_do_not_fit(call, scene, poses, sentence):
 @pytest.mark.parametrize(
     ("scene", "sentence"),
     [
-        ({"a": {"type": "sphere"}}, r"the scene is a dict, .* render.MitsubaScene\(description\) builds one"),
+        (
+            {"a": {"type": "sphere"}},
+            r"the scene is a dict, .* render.MitsubaScene\(description\) builds one",
+        ),
         (None, "the scene is a NoneType, .* give a MitsubaScene"),
         ((PLANE for _ in range(2)), "the scene is a generator, .* or a list of them"),
         (render.TexturedPlane, r"make one, as by TexturedPlane\(...\)"),
@@ -337,7 +375,11 @@ test_cameras_and_frames_that_cannot_be = refusals(
         DomainError,
         "gradient must be one of 'interior', 'boundary'",
     ),
-    (lambda: show.frames(CAMERA, PLANE, POSES, rays=3), DomainError, "the rays must be a Rays, got an int"),
+    (
+        lambda: show.frames(CAMERA, PLANE, POSES, rays=3),
+        DomainError,
+        "the rays must be a Rays, got an int",
+    ),
     (
         lambda: show.frames(CAMERA, PLANE, POSES, rays=NARROW.rays()),
         ShapeError,
@@ -359,9 +401,17 @@ test_cameras_and_frames_that_cannot_be = refusals(
         DomainError,
         "per_px must be ",
     ),
-    (lambda: show.shade(CAMERA.rays(), PLANE, POSES, 5), ShapeError, "48 rays are not a whole number"),
+    (
+        lambda: show.shade(CAMERA.rays(), PLANE, POSES, 5),
+        ShapeError,
+        "48 rays are not a whole number",
+    ),
     (too_many, DomainError, r"4294967296 rays .* \(frame_chunks\)"),
-    (lambda: show.view(CAMERA, PLANE, POSES, 2), DomainError, "frame must be .* from -2 to 1, got 2"),
+    (
+        lambda: show.view(CAMERA, PLANE, POSES, 2),
+        DomainError,
+        "frame must be .* from -2 to 1, got 2",
+    ),
     *(
         (
             lambda n=n: show.true_flow(CAMERA, PLANE, POSES, n),
@@ -370,9 +420,21 @@ test_cameras_and_frames_that_cannot_be = refusals(
         )
         for n in (0, 2, 1.5)
     ),
-    (lambda: show.project(CAMERA, torch.ones(3, 2)), ShapeError, r"points .* \[..., N, 3\], got \(3, 2\)"),
-    (lambda: render.project(CAMERA, torch.tensor([[0.0, 0.0, -1.0]])), DomainError, "behind the camera"),
-    (lambda: render.project(CAMERA, torch.full((1, 3), math.nan)), DomainError, "points to project"),
+    (
+        lambda: show.project(CAMERA, torch.ones(3, 2)),
+        ShapeError,
+        r"points .* \[..., N, 3\], got \(3, 2\)",
+    ),
+    (
+        lambda: render.project(CAMERA, torch.tensor([[0.0, 0.0, -1.0]])),
+        DomainError,
+        "behind the camera",
+    ),
+    (
+        lambda: render.project(CAMERA, torch.full((1, 3), math.nan)),
+        DomainError,
+        "points to project",
+    ),
 )
 
 
@@ -403,11 +465,19 @@ def half_a_turn():
 
 test_times_that_cannot_be = refusals(
     (jumping, DomainError, "jumps by"),
-    (lambda: render.frame_chunks(CAMERA, moving(STILL), POSES, 1), ShapeError, "'card' has 3 poses for 2"),
+    (
+        lambda: render.frame_chunks(CAMERA, moving(STILL), POSES, 1),
+        ShapeError,
+        "'card' has 3 poses for 2",
+    ),
     (lambda: render.camera_velocity(STILL, [0.0, 1.0]), ShapeError, "one time per pose"),
     (lambda: render.camera_velocity(STILL[:1], [0.0]), ShapeError, "at least two"),
     (lambda: render.camera_velocity(STILL, [0.0, 1.0, 1.0]), DomainError, "must increase"),
-    (lambda: render.camera_velocity(half_a_turn(), [0.0, 1.0]), DomainError, "turns by 178 degrees"),
+    (
+        lambda: render.camera_velocity(half_a_turn(), [0.0, 1.0]),
+        DomainError,
+        "turns by 178 degrees",
+    ),
 )
 
 
@@ -427,14 +497,28 @@ def covered():
     """A sheet less than the height above it from which it would be looked at."""
     place = backend.mitsuba().ScalarTransform4f()
     sheets = {"a": place.scale(0.5), "b": place.translate([0, 0, 4.5e-5])}
-    return light.bake({n: {**SHEET, "to_world": at, "bsdf": GREY} for n, at in sheets.items()}, samples=1)
+    return light.bake(
+        {n: {**SHEET, "to_world": at, "bsdf": GREY} for n, at in sheets.items()}, samples=1
+    )
 
 
 test_light_that_cannot_be = refusals(
-    (lambda: baked(bsdf={"type": "conductor"}), DomainError, "shape 'a', a .*, lies behind it or before it"),
-    (lambda: baked(bsdf={"type": "mask", "bsdf": GREY}), DomainError, "shape 'a', a .*, lies behind it"),
+    (
+        lambda: baked(bsdf={"type": "conductor"}),
+        DomainError,
+        "shape 'a', a .*, lies behind it or before it",
+    ),
+    (
+        lambda: baked(bsdf={"type": "mask", "bsdf": GREY}),
+        DomainError,
+        "shape 'a', a .*, lies behind it",
+    ),
     (lambda: baked(interior={"type": "homogeneous"}), DomainError, "shape 'a' holds a medium"),
-    (lambda: light.bake(COPIES), DomainError, r"a Instance, has no texture chart here; .*copies instead"),
+    (
+        lambda: light.bake(COPIES),
+        DomainError,
+        r"a Instance, has no texture chart here; .*copies instead",
+    ),
     (covered, DomainError, "nothing of shape 'a' can be seen"),
     (lambda: light.choose({}, CAMERA, POSES, 0.1), DomainError, "no level"),
     (lambda: light.level_error(flat(1.0), flat(0.0), CAMERA, POSES), DomainError, "black"),
@@ -467,10 +551,16 @@ test_point_spread_functions_that_cannot_be = refusals(
         DomainError,
         "between 0 and 1 per metre, .* smaller nearest_m",
     ),
-    (lambda: psf().energy(torch.tensor([2.0]), size_px=3), DomainError, "3 x 3 pixels .* odd number"),
+    (
+        lambda: psf().energy(torch.tensor([2.0]), size_px=3),
+        DomainError,
+        "3 x 3 pixels .* odd number",
+    ),
     (lambda: psf().energy(2.0), ShapeError, r"distances must be a list \[D\]"),
     (
-        lambda: render.psf_frames(THIN, PLANE, look_at((0, 0, 0.5), (0, 0, 0), down=(0, 1, 0))[None], psf()),
+        lambda: render.psf_frames(
+            THIN, PLANE, look_at((0, 0, 0.5), (0, 0, 0), down=(0, 1, 0))[None], psf()
+        ),
         DomainError,
         "0.5 m away, nearer than the 1 m of the map",
     ),
@@ -481,7 +571,11 @@ test_point_spread_functions_that_cannot_be = refusals(
     ),
     (lambda: render.psf_map(THIN, rays_per_px=9), DomainError, "rays_per_px = 9"),
     (lambda: render.psf_map(hollow()), DomainError, "central obstruction, .* traced frames"),
-    (lambda: render.psf_frames(CAMERA, PLANE, POSES, psf()), ShapeError, "make the map of this camera"),
+    (
+        lambda: render.psf_frames(CAMERA, PLANE, POSES, psf()),
+        ShapeError,
+        "make the map of this camera",
+    ),
     (lambda: show.psf_frames(THIN, Glow(), POSES, psf()), DomainError, "does not say how far away"),
 )
 

@@ -1,5 +1,5 @@
-"""Gradients of frames from the slopes of every ray's light: kept, or worked out again; and which rays visit
-what."""
+"""Gradients of frames from the slopes of every ray's light: kept, or worked out again; and which
+rays visit what."""
 
 import pytest
 import torch
@@ -19,9 +19,12 @@ def plane():
 
 @pytest.fixture
 def rays(generator):
-    """Eight rays of two pixels about the camera's axis, in float64, with all of their numbers asking."""
+    """Eight rays of two pixels about the camera's axis, in float64, with all of their numbers
+    asking."""
     aside = 0.2 * torch.randn(8, 2, dtype=torch.float64, generator=generator)
-    direction = torch.nn.functional.normalize(torch.cat([aside, torch.ones(8, 1).double()], 1), dim=1)
+    direction = torch.nn.functional.normalize(
+        torch.cat([aside, torch.ones(8, 1).double()], 1), dim=1
+    )
     origin = 0.01 * torch.randn(8, 3, dtype=torch.float64, generator=generator)
     weight = 0.5 + torch.rand(8, dtype=torch.float64, generator=generator)
     return [value.requires_grad_() for value in (origin, direction, weight)]
@@ -37,8 +40,8 @@ def motion(generator):
 
 
 def pictures(origin, direction, weight, camera, thing):
-    """Two pixels of a camera three metres before a plane; another plane moves before it in the second frame,
-    and behind it in the others."""
+    """Two pixels of a camera three metres before a plane; another plane moves before it in the
+    second frame, and behind it in the others."""
     behind = torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1)
     behind[:, 2, 3] = torch.tensor([0.8, -0.8, 0.8])
     scene = render.MovingScene(plane(), {"thing": (plane(), behind @ pose.se3_exp(thing))})
@@ -46,7 +49,9 @@ def pictures(origin, direction, weight, camera, thing):
     return shade(Rays(origin, direction, weight), scene, down @ pose.se3_exp(camera), 4)
 
 
-def test_gradient_to_rays_weights_and_poses_of_camera_and_object_is_that_of_differences(rays, motion):
+def test_gradient_to_rays_weights_and_poses_of_camera_and_object_is_that_of_differences(
+    rays, motion
+):
     assert torch.autograd.gradcheck(pictures, (*rays, *motion))
 
 

@@ -1,5 +1,5 @@
-"""Exposures against closed-form blur, adaptive times against dense flow and exact crossings, chunks against
-the whole."""
+"""Exposures against closed-form blur, adaptive times against dense flow and exact crossings, chunks
+against the whole."""
 
 import math
 
@@ -77,8 +77,8 @@ def sweeping(speed_px_s):
 
 
 def test_a_moving_edge_blurs_to_a_ramp_of_the_length_of_its_motion():
-    """A bright card over the dark, by 12 px in an exposure: the share of it that a pixel's ray meets the
-    card; midpoints step, by at most half a sample."""
+    """A bright card over the dark, by 12 px in an exposure: the share of it that a pixel's ray
+    meets the card; midpoints step, by at most half a sample."""
     speed, exposure, samples = 400.0, 0.03, 20
     scene = sweeping(speed)
     t_s = torch.tensor([0.0, 0.005], dtype=D)
@@ -91,8 +91,8 @@ def test_a_moving_edge_blurs_to_a_ramp_of_the_length_of_its_motion():
 
 
 def test_the_motion_of_a_blurred_edge_is_in_the_boundary_gradient(generator):
-    """Each midpoint's edge lies speed * time px from the middle: the pixel that holds it brightens by the
-    step of light times the share of the sample, for every px that it comes further."""
+    """Each midpoint's edge lies speed * time px from the middle: the pixel that holds it brightens
+    by the step of light times the share of the sample, for every px that it comes further."""
     exposure, samples, t_s = 0.03, 20, torch.tensor([0.0, 0.005], dtype=D)
     speed = torch.tensor(400.0, dtype=D, requires_grad=True)
     scene = sweeping(speed)
@@ -111,8 +111,8 @@ def test_the_motion_of_a_blurred_edge_is_in_the_boundary_gradient(generator):
 
 @pytest.mark.parametrize(("exposure", "samples"), [(0.0, 1), (0.004, 12)])
 def test_a_rolling_shutter_shifts_a_moving_grating_row_by_row(exposure, samples):
-    """The grating as it stands at the middles of each row's exposure; of a window, at that of its rows on the
-    sensor."""
+    """The grating as it stands at the middles of each row's exposure; of a window, at that of its
+    rows on the sensor."""
     period, speed, line, contrast = 9.0, 300.0, 2e-4, 0.8
     film = Film(24, 12, 10, 4, PITCH_MM, ((3, 1), (14, 8)))
     whole, windows = (
@@ -125,10 +125,17 @@ def test_a_rolling_shutter_shifts_a_moving_grating_row_by_row(exposure, samples)
             samples,
             line_s=line,
         )
-        for cam in (camera(height=12), Camera(lens.Pinhole(FOCAL_MM), 24, 12, PITCH_MM, 1, film=film))
+        for cam in (
+            camera(height=12),
+            Camera(lens.Pinhole(FOCAL_MM), 24, 12, PITCH_MM, 1, film=film),
+        )
     )
     row = torch.arange(12, dtype=D)[:, None, None]
-    times = torch.tensor([0.0, 0.01], dtype=D)[:, None, None, None] + line * row + middles(samples) * exposure
+    times = (
+        torch.tensor([0.0, 0.01], dtype=D)[:, None, None, None]
+        + line * row
+        + middles(samples) * exposure
+    )
     x = torch.arange(24, dtype=D)[:, None] - 11.5 + speed * times
     truth = 100 * torch.exp(contrast * torch.cos(2 * math.pi * x / period + 0.3))
     torch.testing.assert_close(whole, truth.mean(-1), rtol=1e-10, atol=0)
@@ -149,7 +156,8 @@ def test_a_line_time_without_end_is_refused():
 
 
 def dense_displacement_px(cam, scene, trajectory, times):
-    """Largest motion of any pixel between successive times, forwards and backwards, over all pixels."""
+    """Largest motion of any pixel between successive times, forwards and backwards, over all
+    pixels."""
     found = []
     for pair in (times.unfold(0, 2, 1), times.unfold(0, 2, 1).flip(1)):
         for both in pair:
@@ -198,7 +206,11 @@ def test_a_world_at_rest_needs_few_times():
 
 def test_the_coarse_grid_spans_every_window():
     grid = coarse_pixels(Film(40, 30, 12, 9, 0.1, ((0, 0), (20, 11))), 4)
-    assert [grid.amin(0).tolist(), grid.amax(0).tolist(), len(grid)] == [[0, 0], [31, 19], 2 * 3 * 4]
+    assert [grid.amin(0).tolist(), grid.amax(0).tolist(), len(grid)] == [
+        [0, 0],
+        [31, 19],
+        2 * 3 * 4,
+    ]
     whole = Film(7, 5, 7, 5, 0.1)
     assert torch.equal(coarse_pixels(whole, 1), whole.pixels())
 
@@ -207,14 +219,18 @@ def test_the_coarse_grid_spans_every_window():
 
 
 @pytest.mark.bits
-@pytest.mark.parametrize(("kind", "size"), [("room", 3), ("plane", 1), ("moving", 7), ("moving", 20)])
+@pytest.mark.parametrize(
+    ("kind", "size"), [("room", 3), ("plane", 1), ("moving", 7), ("moving", 20)]
+)
 def test_chunks_joined_are_the_sequence_bit_for_bit(kind, size):
     cam = camera(13, 9, 4, lens.load("cooke-triplet").scaled(0.1))
     t_s = trajectories.times(7, 100.0)
     poses = trajectories.translation(look_at((0.5, -1.2, 1.4), (0, 1, 0.8)), (1.0, 0.3, 0.5), t_s)
     scene = worlds.smooth_plane(3) if kind == "plane" else worlds.room()
     if kind == "moving":
-        card = trajectories.translation(look_at((0.0, 0.5, 1.0), (0.5, -1.2, 1.4)), (-1.0, 0.5, 0.2), t_s)
+        card = trajectories.translation(
+            look_at((0.0, 0.5, 1.0), (0.5, -1.2, 1.4)), (-1.0, 0.5, 0.2), t_s
+        )
         scene = MovingScene(scene, {"card": (worlds.smooth_plane(1), card)})
     chunks = list(render.frame_chunks(cam, scene, poses, size))
     assert [len(c) for c in chunks] == [min(size, 7 - k) for k in range(0, 7, size)]
@@ -226,7 +242,9 @@ def test_the_lens_is_traced_once_and_its_gradient_is_the_sum_over_chunks(monkeyp
     cam = camera(9, 6, 4, geo)
     scene = worlds.smooth_plane(3)
     poses = sliding(50.0)(trajectories.times(5, 100.0))
-    (truth,) = torch.autograd.grad(render.frames(cam, scene, poses).square().sum(), geo.curvature_per_mm)
+    (truth,) = torch.autograd.grad(
+        render.frames(cam, scene, poses).square().sum(), geo.curvature_per_mm
+    )
     traced = []
     rays = cam.rays
     monkeypatch.setattr(cam, "rays", lambda: traced.append(1) or rays())
@@ -245,11 +263,15 @@ def test_no_exposure_is_the_frame_and_the_lens_keeps_its_gradient(generator):
     scene = worlds.smooth_plane(3)
     t_s = torch.tensor([0.0, 0.01], dtype=D)
     unblurred = render.exposed_frames(cam, scene, sliding(100.0), t_s, 0.0, 3)
-    torch.testing.assert_close(unblurred, render.frames(cam, scene, sliding(100.0)(t_s)), rtol=1e-13, atol=0)
+    torch.testing.assert_close(
+        unblurred, render.frames(cam, scene, sliding(100.0)(t_s)), rtol=1e-13, atol=0
+    )
     weights = torch.randn(2, 8, 12, generator=generator, dtype=D)
 
     def loss(speed, curvature):
-        changed = cam.with_lens(geo.replace(curvature_per_mm=geo.curvature_per_mm.detach() * (1 + curvature)))
+        changed = cam.with_lens(
+            geo.replace(curvature_per_mm=geo.curvature_per_mm.detach() * (1 + curvature))
+        )
 
         def path(t):
             return above() @ se3_exp(t[:, None] * torch.cat([speed, torch.zeros(3, dtype=D)]))

@@ -1,5 +1,5 @@
-"""Ground truth through the lens: closed-form flow, points under pixels, gradients, and where there is no
-truth."""
+"""Ground truth through the lens: closed-form flow, points under pixels, gradients, and where there
+is no truth."""
 
 from dataclasses import replace
 
@@ -44,24 +44,29 @@ def test_what_leaves_the_field_or_meets_nothing_is_invalid_zero_and_without_grad
     def loss(twist, curvature, thickness):
         changed = geo.replace(curvature_per_mm=curvature, thickness_mm=thickness)
         # 17 degrees either side, turned by as much again
-        flow, valid = true_flow(Camera(changed, 12, 10, 0.5, 1), upright_plane(), poses @ se3_exp(twist))
+        flow, valid = true_flow(
+            Camera(changed, 12, 10, 0.5, 1), upright_plane(), poses @ se3_exp(twist)
+        )
         assert 0 < int(valid.sum()) < valid.numel()
         return flow.square().sum()
 
     at = [torch.zeros(2, 6, dtype=D), geo.curvature_per_mm.detach(), geo.thickness_mm.detach()]
-    # the points that leave the field carry no gradient, and the steps are too short to change which they are
+    # the points that leave the field carry no gradient, and the steps are too short to change which
+    # they are
     assert_gradients(loss, at, (1e-6, 1e-7, 1e-5), 1e-5)
 
 
 def test_points_of_one_flat_ground_never_hide_each_other():
-    """Seen from 2 cm above it, out to cosines of incidence of a few thousandths, where single precision moves
-    the point that a ray meets along the ground by its rounding over that cosine; the ground lies askew, so
-    that all its coordinates round."""
+    """Seen from 2 cm above it, out to cosines of incidence of a few thousandths, where single
+    precision moves the point that a ray meets along the ground by its rounding over that cosine;
+    the ground lies askew, so that all its coordinates round."""
     mi = backend.mitsuba()
     T_world_ground = se3_exp(torch.tensor([3.0, -2.0, 1.5, 0.5, 0.3, -0.4], dtype=D))
     to_world = mi.ScalarTransform4f(T_world_ground.numpy()).scale([200, 200, 1])
     scene = MitsubaScene({"ground": {"type": "rectangle", "to_world": to_world}}, emissive=False)
-    poses = torch.stack([look_at((0.03 * k, 0.01 * k, 0.02), (8.0, 0.3 * k, 0.0)) for k in range(4)])
+    poses = torch.stack(
+        [look_at((0.03 * k, 0.01 * k, 0.02), (8.0, 0.3 * k, 0.0)) for k in range(4)]
+    )
     camera = Camera(lens.Pinhole(8.0), 48, 40, 0.1, 1)
     for stride in (1, 3):
         truth = flow_and_occlusion(camera, scene, T_world_ground @ poses, stride)
@@ -75,7 +80,9 @@ def test_depth_is_measured_from_the_origin_of_the_camera_wherever_rays_start():
 
         def camera_rays(self, *args, **options):
             rays = super().camera_rays(*args, **options)
-            return replace(rays, origin_m=rays.origin_m + 0.05 * rays.direction / rays.direction[:, 2:])
+            return replace(
+                rays, origin_m=rays.origin_m + 0.05 * rays.direction / rays.direction[:, 2:]
+            )
 
     poses = motions([0.1, 0.0, 0.2, 0.0, 0.3, 0.1])
     plain, hooded = (

@@ -1,5 +1,5 @@
-"""Camera velocity from poses: constant twists come back, world axes by differences, and the logarithm against
-the matrix logarithm."""
+"""Camera velocity from poses: constant twists come back, world axes by differences, and the
+logarithm against the matrix logarithm."""
 
 import math
 
@@ -31,11 +31,13 @@ def test_a_constant_twist_comes_back_at_any_spacing():
 
 
 def test_velocity_in_world_axes_is_that_of_the_centre_and_the_spin_at_the_middle():
-    # by central differences of the position and of the rotation about the middle time: they bend by (1e-4)^2
-    # of the motion
+    # by central differences of the position and of the rotation about the middle time: they bend by
+    # (1e-4)^2 of the motion
     t_s = torch.tensor([0.2, 0.6], dtype=D)
     _, world = camera_velocity(trajectories.body_twist(start(), TWIST, t_s), t_s)
-    around = trajectories.body_twist(start(), TWIST, torch.tensor([0.4 - 1e-4, 0.4, 0.4 + 1e-4], dtype=D))
+    around = trajectories.body_twist(
+        start(), TWIST, torch.tensor([0.4 - 1e-4, 0.4, 0.4 + 1e-4], dtype=D)
+    )
     velocity = (around[2, :3, 3] - around[0, :3, 3]) / 2e-4
     spin = (around[2, :3, :3] - around[0, :3, :3]) / 2e-4 @ around[1, :3, :3].T
     omega = torch.stack([spin[2, 1], spin[0, 2], spin[1, 0]])
@@ -50,7 +52,9 @@ def test_logarithm_is_that_of_the_matrix(angle, generator):
     # the angle comes of a sine that is small near half a turn
     torch.testing.assert_close(found, twist, rtol=0, atol=2e-15 / max(math.sin(angle), 0.1))
     L = torch.from_numpy(np.real(logm(se3_exp(twist).numpy())))
-    torch.testing.assert_close(found, torch.stack([*L[:3, 3], L[2, 1], L[0, 2], L[1, 0]]), rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        found, torch.stack([*L[:3, 3], L[2, 1], L[0, 2], L[1, 0]]), rtol=0, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-9, 1e-5, 4e-3, 0.5])

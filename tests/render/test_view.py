@@ -87,7 +87,8 @@ def motion(count=3, height_m=0.4):
 
 
 def test_points_depth_normals_and_objects_of_a_view_by_hand():
-    """A ball of 0.25 m at (0.1, 0, 0.5) over the ground, seen from 2 m; in frame 0 it is elsewhere."""
+    """A ball of 0.25 m at (0.1, 0, 0.5) over the ground, seen from 2 m; in frame 0 it is
+    elsewhere."""
     cam = Camera(lens.Pinhole(8.0), 61, 41, 0.1, 1)
     centre = torch.tensor([0.1, 0.0, 0.5], dtype=D)
     places = shifted((3.0, 0, 0.5), centre.tolist())
@@ -103,7 +104,8 @@ def test_points_depth_normals_and_objects_of_a_view_by_hand():
     assert torch.equal(found.object_id.reshape(-1)[clear], meets.long()[clear])
     up = torch.tensor([0.0, 0.0, 1.0], dtype=D)
     normal = torch.where(meets[:, None], (points - centre) / 0.25, up)
-    # float32 geometry: 1e-7 of 2 m, divided by the cosine at the ball's rim (0.04 with the limit above)
+    # float32 geometry: 1e-7 of 2 m, divided by the cosine at the ball's rim (0.04 with the limit
+    # above)
     for seen, truth, tolerance in (
         (found.points_world_m.reshape(-1, 3), points, 1e-5),
         (found.depth_m.reshape(-1, 1), 2 - points[:, 2:], 1e-5),
@@ -120,7 +122,10 @@ def test_points_of_a_view_project_to_their_pixels(name):
     poses = path(2)[1:]
     ball = sphere(0.016 if name == "la1509" else 0.1)  # a field of 2 degrees, or 20
     found = view(
-        cam, MovingScene(plane(2, -0.5), {"ball": (ball, poses @ shifted((0.0, 0.0, 1.6)))}), poses, 0
+        cam,
+        MovingScene(plane(2, -0.5), {"ball": (ball, poses @ shifted((0.0, 0.0, 1.6)))}),
+        poses,
+        0,
     )
     assert found.depth_m.shape == (3, 7, 9)
     assert set(found.object_id[found.valid].unique().tolist()) == {0, 1}
@@ -141,20 +146,27 @@ def test_pixels_that_meet_nothing_are_zero_and_without_object():
 # ---- flow
 
 
-@pytest.mark.parametrize(("card", "tolerance_px"), [(plane, 1e-9), (lambda: rectangle(3.0, 3.0), 1e-4)])
+@pytest.mark.parametrize(
+    ("card", "tolerance_px"), [(plane, 1e-9), (lambda: rectangle(3.0, 3.0), 1e-4)]
+)
 def test_flow_of_a_moving_plane_is_its_homography(card, tolerance_px):
     """Plane coordinates (X, Y, 1) to pixels (Hartley and Zisserman, 8.1)."""
-    # asked for: 1e-3. Float32 geometry shifts a point along its ray by 2e-7 of 2 m, which shows as less than
-    # 1e-5 px of flow
+    # asked for: 1e-3. Float32 geometry shifts a point along its ray by 2e-7 of 2 m, which shows as
+    # less than 1e-5 px of flow
     cam = Camera(lens.Pinhole(8.0), 24, 16, 0.1, 1)
     flow, valid = true_flow(cam, MovingScene(plane(2, -3.0), {"card": (card(), motion())}), path())
     assert bool(valid.all())
     K = torch.tensor([[80.0, 0, 11.5], [0, 80.0, 7.5], [0, 0, 1]], dtype=D)
     seen = K @ (inverse(path()) @ motion())[:, :3, [0, 1, 3]]
     pixels = cam.film.pixels()
-    h = torch.cat([pixels, torch.ones_like(pixels[:, :1])], 1) @ (seen[1:] @ torch.linalg.inv(seen[:-1])).mT
+    h = (
+        torch.cat([pixels, torch.ones_like(pixels[:, :1])], 1)
+        @ (seen[1:] @ torch.linalg.inv(seen[:-1])).mT
+    )
     truth = (h[..., :2] / h[..., 2:] - pixels).mT
-    torch.testing.assert_close(flow.flatten(2), truth, rtol=0, atol=tolerance_px, check_stride=False)
+    torch.testing.assert_close(
+        flow.flatten(2), truth, rtol=0, atol=tolerance_px, check_stride=False
+    )
 
 
 # ---- occlusion
@@ -162,13 +174,14 @@ def test_flow_of_a_moving_plane_is_its_homography(card, tolerance_px):
 
 @pytest.mark.parametrize("optics", [lens.Pinhole(8.0), lens.load("cooke-triplet").scaled(0.16)])
 def test_a_card_that_moves_hides_what_it_comes_to_cover(optics):
-    """A card of 0.3 x 0.2 m at half height, 0.25 m to the right and 0.06 m up between the frames: ground
-    points are hidden where they lie in its later shadow."""
+    """A card of 0.3 x 0.2 m at half height, 0.25 m to the right and 0.06 m up between the frames:
+    ground points are hidden where they lie in its later shadow."""
     cam = Camera(optics, 48, 40, 0.05, 1)
     offsets = torch.tensor([[-0.1, 0.02, 1.0], [0.15, -0.04, 1.0]], dtype=D)
     card = rectangle(0.15, 0.1)
     scene = MovingScene(
-        worlds.ground(np.full((8, 8), 50.0, dtype=np.float32)), {"card": (card, shifted(*offsets.tolist()))}
+        worlds.ground(np.full((8, 8), 50.0, dtype=np.float32)),
+        {"card": (card, shifted(*offsets.tolist()))},
     )
     found = flow_and_occlusion(cam, scene, above(count=2))
     seen = view(cam, scene, above(count=2), 0)
@@ -199,8 +212,8 @@ def test_points_of_a_ball_that_turns_are_hidden_when_they_face_away():
     back = above()[0, :3, 3] - later
     facing = (back * later / 0.4).sum(1) / back.norm(dim=1)
     ball = seen.object_id.reshape(-1) == 1
-    # the tolerance is 2e-6 x 2 m over the cosine, the ball's own depth behind the surface 0.8 m x cosine:
-    # they part at cosines of 3e-3
+    # the tolerance is 2e-6 x 2 m over the cosine, the ball's own depth behind the surface 0.8 m x
+    # cosine: they part at cosines of 3e-3
     clear = ball & (facing.abs() > 5e-3)
     assert int(clear.sum()) > 700
     assert int((facing[clear] < 0).sum()) > 100
@@ -210,8 +223,8 @@ def test_points_of_a_ball_that_turns_are_hidden_when_they_face_away():
 
 @pytest.mark.parametrize("world", ["room", "corridor", "outdoor"])
 def test_a_pinhole_that_turns_about_itself_uncovers_nothing(world, generator):
-    # what is in front of what along a ray through one point depends on that point alone; the rays are other
-    # ones to float32, so rounding gets its chance
+    # what is in front of what along a ray through one point depends on that point alone; the rays
+    # are other ones to float32, so rounding gets its chance
     cam = Camera(lens.Pinhole(3.0), 160, 120, 0.03, 1)
     turns = torch.zeros(3, 2, 6, dtype=D)
     turns[..., 3:] = 0.3 * torch.randn(3, 2, 3, generator=generator, dtype=D)
@@ -233,10 +246,19 @@ def test_gradients_of_flow_and_points_to_object_poses_camera_poses_and_lens(gene
         poses = path(2) @ se3_exp(moved)
         found = view(cam, scene, poses, 1)
         flow, _ = true_flow(cam, scene, poses)
-        points = (found.points_world_m * cloud[..., :3]).sum() + (found.depth_m * cloud[..., 3]).sum()
+        points = (found.points_world_m * cloud[..., :3]).sum() + (
+            found.depth_m * cloud[..., 3]
+        ).sum()
         return (flow * weights).sum() + points
 
-    twists = torch.tensor([[0.01, 0, 0, 0, 0.01, 0], [0.03, -0.02, 0.05, 0.01, -0.02, 0.03]], dtype=D)
-    at = (twists, torch.zeros(2, 6, dtype=D), geo.curvature_per_mm.detach(), geo.thickness_mm.detach())
+    twists = torch.tensor(
+        [[0.01, 0, 0, 0, 0.01, 0], [0.03, -0.02, 0.05, 0.01, -0.02, 0.03]], dtype=D
+    )
+    at = (
+        twists,
+        torch.zeros(2, 6, dtype=D),
+        geo.curvature_per_mm.detach(),
+        geo.thickness_mm.detach(),
+    )
     # rounding: 1e-11 px over 1e-5; the projection's Jacobian is good to 1e-7
     assert_gradients(loss, at, (1e-5, 1e-5, 1e-6, 1e-4), 1e-6)

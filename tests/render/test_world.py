@@ -19,8 +19,8 @@ def quadrants(size=64):
 
 
 def corners_seen(scene, pose, spread_px=10):
-    """Radiance a little away from the image's middle, as [[top left, top right], [bottom left, bottom
-    right]]."""
+    """Radiance a little away from the image's middle, as [[top left, top right],
+    [bottom left, bottom right]]."""
     camera = Camera(lens.Pinhole(8.0), 64, 64, 0.05, 1)
     image = render.frames(camera, scene, pose[None])[0]
     at = [32 - spread_px, 31 + spread_px]
@@ -30,9 +30,17 @@ def corners_seen(scene, pose, spread_px=10):
 @pytest.mark.parametrize(
     ("scene", "eye", "down"),
     [
-        (lambda: worlds.wall(quadrants(512), texel_m=16 / 512, half_width_m=8.0), (0, -2, 0), (0, 0, -1)),
+        (
+            lambda: worlds.wall(quadrants(512), texel_m=16 / 512, half_width_m=8.0),
+            (0, -2, 0),
+            (0, 0, -1),
+        ),
         # for one who faces north
-        (lambda: worlds.ground(quadrants(512), texel_m=24 / 512, half_width_m=12.0), (0, 0, 2), (0, -1, 0)),
+        (
+            lambda: worlds.ground(quadrants(512), texel_m=24 / 512, half_width_m=12.0),
+            (0, 0, 2),
+            (0, -1, 0),
+        ),
     ],
 )
 def test_a_picture_is_upright_and_not_mirrored(scene, eye, down):
@@ -49,9 +57,13 @@ def test_pictures_in_the_room_are_upright_and_each_on_its_wall(wall, target):
     pictures = [np.full((64, 64), level, dtype=np.float32)] * 6
     pictures[wall] = quadrants()
     scene = worlds.room(photos=pictures, objects=False)
-    np.testing.assert_allclose(corners_seen(scene, look_at((0, 0, 1.3), target)), CORNERS, rtol=1e-6)
+    np.testing.assert_allclose(
+        corners_seen(scene, look_at((0, 0, 1.3), target)), CORNERS, rtol=1e-6
+    )
     behind = [-c for c in target[:2]]
-    np.testing.assert_allclose(corners_seen(scene, look_at((0, 0, 1.3), (*behind, 1.3))), level, rtol=1e-6)
+    np.testing.assert_allclose(
+        corners_seen(scene, look_at((0, 0, 1.3), (*behind, 1.3))), level, rtol=1e-6
+    )
 
 
 def test_the_room_has_no_holes_at_its_seams():
@@ -63,7 +75,8 @@ def test_the_room_has_no_holes_at_its_seams():
 
 
 def test_texels_have_the_size_they_are_given():
-    # black and bright squares of 0.1 m; from 2 m with 8 mm and 0.05 mm pixels one square is 8 pixels wide
+    # black and bright squares of 0.1 m; from 2 m with 8 mm and 0.05 mm pixels one square is 8
+    # pixels wide
     camera = Camera(lens.Pinhole(8.0), 64, 8, 0.05, 1)
     row = render.frames(
         camera, worlds.checkerboard(square_m=0.1), look_at((0.05, -2, 0.05), (0.05, 0, 0.05))[None]
@@ -86,11 +99,15 @@ def test_a_static_camera_sees_equal_frames_and_the_seed_decides_the_samples():
 
 
 def test_ten_kilometres_away_single_precision_still_renders():
-    """A wall at 10 km with texels of 10 m: pixel means and flow of a scene 5000 times closer and finer."""
+    """A wall at 10 km with texels of 10 m: pixel means and flow of a scene 5000 times closer and
+    finer."""
     texture = textures.speckle(0, 64, finest_px=6.0)
     camera = Camera(lens.Pinhole(50.0), 16, 12, 0.1, 4)
     near, far = (
-        (worlds.wall(texture, *size), torch.stack([look_at((x, -d, 0), (x, 0, 0)) for x in (0.0, d / 1e3)]))
+        (
+            worlds.wall(texture, *size),
+            torch.stack([look_at((x, -d, 0), (x, 0, 0)) for x in (0.0, d / 1e3)]),
+        )
         for d, *size in ((2.0, 0.002, 0.064), (1e4, 10.0, 320.0))
     )
     # positions on the wall round to 1e-4 texels, contrasts per texel are below 5
@@ -118,7 +135,9 @@ def test_a_photograph_is_linearised_as_srgb(tmp_path):
     imageio.imwrite(tmp_path / "gray.png", values)
     # IEC 61966-2-1 by hand: 10/255 is on the straight part, 188 is linear 0.5029
     linear = np.array([0.0, 10 / 255 / 12.92, 0.502886, 1.0])
-    np.testing.assert_allclose(textures.photo(tmp_path / "gray.png")[0], 2 + 253 * linear, rtol=2e-6)
+    np.testing.assert_allclose(
+        textures.photo(tmp_path / "gray.png")[0], 2 + 253 * linear, rtol=2e-6
+    )
     colour = np.zeros((2, 2, 3), dtype=np.uint8)
     colour[..., 1] = 255
     imageio.imwrite(tmp_path / "green.png", colour)
@@ -126,10 +145,12 @@ def test_a_photograph_is_linearised_as_srgb(tmp_path):
     np.testing.assert_allclose(textures.photo(tmp_path / "green.png"), 2 + 253 * 0.7152, rtol=2e-6)
 
 
-@pytest.mark.parametrize(("size_px", "shape"), [(4, (2, 4)), (9, (4, 9)), (10, (5, 10)), (12, (6, 12))])
+@pytest.mark.parametrize(
+    ("size_px", "shape"), [(4, (2, 4)), (9, (4, 9)), (10, (5, 10)), (12, (6, 12))]
+)
 def test_a_large_picture_is_averaged_not_cut(tmp_path, size_px, shape):
-    """Every texel repeated as often as the new picture has rows (columns), and means of as many as the old
-    one has: averages over areas without a fraction of a texel."""
+    """Every texel repeated as often as the new picture has rows (columns), and means of as many as
+    the old one has: averages over areas without a fraction of a texel."""
     import imageio.v3 as imageio
 
     values = np.random.default_rng(3).integers(0, 256, (6, 12), dtype=np.uint8)
@@ -157,7 +178,8 @@ def test_a_tall_picture_keeps_its_proportions(tmp_path):
 
 def test_speckle_keeps_its_band_and_contrast():
     field = np.log(
-        textures.speckle(5, 256, finest_px=4.0, coarsest_px=32.0, contrast=0.3).astype(np.float64) / 60
+        textures.speckle(5, 256, finest_px=4.0, coarsest_px=32.0, contrast=0.3).astype(np.float64)
+        / 60
     )
     assert field.std() == pytest.approx(0.3, rel=1e-5)
     power = np.abs(np.fft.fft2(field)) ** 2

@@ -1,5 +1,6 @@
-"""Five scenes as other people write them in Mitsuba: y up, white at 1, surfaces that shine, mirror and let light
-through, lamps of every kind. They need no files and stand for those that come from elsewhere."""
+"""Five scenes as other people write them in Mitsuba: y up, white at 1, surfaces that shine, mirror
+and let light through, lamps of every kind. They need no files and stand for those that come from
+elsewhere."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,8 +18,8 @@ def cornell() -> dict[str, Any]:
 
 
 def terrace() -> dict[str, Any]:
-    """A tiled floor, a glossy vase of triangles, a ball of `principled` and a table of two-sided sheets under a sky
-    from a picture."""
+    """A tiled floor, a glossy vase of triangles, a ball of `principled` and a table of two-sided
+    sheets under a sky from a picture."""
     mi = backend.mitsuba()
     T = mi.ScalarTransform4f()
     wood = {"type": "principled", "base_color": _picture(mi, 3), "roughness": 0.6, "specular": 0.4}
@@ -26,10 +27,16 @@ def terrace() -> dict[str, Any]:
     return {
         "sensor": _sensor(mi, [1.6, 1.5, 2.4], [0, 0.35, 0], 45),
         "floor": _sheet(
-            mi, [0, 0, 0], [0, 1, 0], 6, {"type": "diffuse", "reflectance": _picture(mi, 1, tiles=3)}
+            mi,
+            [0, 0, 0],
+            [0, 1, 0],
+            6,
+            {"type": "diffuse", "reflectance": _picture(mi, 1, tiles=3)},
         ),
         "top": _sheet(mi, [0, 0.5, 0], [0, 1, 0], 0.9, {"type": "twosided", "bsdf": wood}),
-        "back": _sheet(mi, [0, 0.25, -0.4], [0, 0, 1], 0.45, {"type": "twosided", "bsdf": _grey(0.6)}),
+        "back": _sheet(
+            mi, [0, 0.25, -0.4], [0, 0, 1], 0.45, {"type": "twosided", "bsdf": _grey(0.6)}
+        ),
         "vase": _turned(mi, [0.15, 0.501, 0.05], vase),
         "ball": {
             "type": "sphere",
@@ -46,7 +53,8 @@ def terrace() -> dict[str, Any]:
 
 
 def cellar() -> dict[str, Any]:
-    """A closed room of two-sided walls, a textured cube, a pillar and a mesh, lit by a point lamp and a spot."""
+    """A closed room of two-sided walls, a textured cube, a pillar and a mesh, lit by a point lamp
+    and a spot."""
     mi = backend.mitsuba()
     T = mi.ScalarTransform4f()
     wall = {"type": "twosided", "bsdf": _grey(0.7)}
@@ -86,7 +94,9 @@ def mirrors() -> dict[str, Any]:
     """The cellar with a mirror on its wall, a ball of glass and one of rough metal."""
     mi = backend.mitsuba()
     return cellar() | {
-        "mirror": _sheet(mi, [-1.99, 1.2, -0.6], [1, 0, 0], 1.0, {"type": "conductor", "material": "Ag"}),
+        "mirror": _sheet(
+            mi, [-1.99, 1.2, -0.6], [1, 0, 0], 1.0, {"type": "conductor", "material": "Ag"}
+        ),
         "glass": {
             "type": "sphere",
             "center": [0.1, 0.222, 0.3],
@@ -103,12 +113,27 @@ def mirrors() -> dict[str, Any]:
 
 
 def market() -> dict[str, Any]:
-    """What exporters write: bumps, blends and masks on meshes and sheets, beside a sun and an even sky."""
+    """What exporters write: bumps, blends and masks on meshes and sheets, beside a sun and an even
+    sky."""
     mi = backend.mitsuba()
     T = mi.ScalarTransform4f()
-    bumps = {"type": "bumpmap", "arbitrary": _picture(mi, 5, tiles=2), "scale": 0.02, "bsdf": _grey(0.6)}
-    blend = {"type": "blendbsdf", "weight": _picture(mi, 6), "a": _grey(0.7), "b": {"type": "roughplastic"}}
-    leaves = {"type": "mask", "opacity": _picture(mi, 7), "bsdf": {"type": "twosided", "bsdf": _grey(0.4)}}
+    bumps = {
+        "type": "bumpmap",
+        "arbitrary": _picture(mi, 5, tiles=2),
+        "scale": 0.02,
+        "bsdf": _grey(0.6),
+    }
+    blend = {
+        "type": "blendbsdf",
+        "weight": _picture(mi, 6),
+        "a": _grey(0.7),
+        "b": {"type": "roughplastic"},
+    }
+    leaves = {
+        "type": "mask",
+        "opacity": _picture(mi, 7),
+        "bsdf": {"type": "twosided", "bsdf": _grey(0.4)},
+    }
     return {
         "sensor": _sensor(mi, [1.2, 1.2, 2.6], [0, 0.5, 0], 42),
         "ground": _sheet(mi, [0, 0, 0], [0, 1, 0], 5, bumps),
@@ -117,9 +142,15 @@ def market() -> dict[str, Any]:
             "to_world": T.translate([-0.5, 0.402, -0.2]).scale([0.3, 0.4, 0.3]),
             "bsdf": blend,
         },
-        "vase": _turned(mi, [0.35, 0.001, 0.2], {"type": "principled", "base_color": _rgb(0.3, 0.6, 0.3)}),
+        "vase": _turned(
+            mi, [0.35, 0.001, 0.2], {"type": "principled", "base_color": _rgb(0.3, 0.6, 0.3)}
+        ),
         "hedge": _sheet(mi, [0.4, 0.5, -0.7], [0, 0, 1], 0.9, leaves),
-        "sun": {"type": "directional", "direction": [0.4, -1.0, -0.5], "irradiance": _rgb(2.0, 1.9, 1.7)},
+        "sun": {
+            "type": "directional",
+            "direction": [0.4, -1.0, -0.5],
+            "irradiance": _rgb(2.0, 1.9, 1.7),
+        },
         "sky": {"type": "constant", "radiance": _rgb(0.3, 0.35, 0.45)},
     }
 
@@ -164,7 +195,11 @@ def _sheet(mi, centre, normal, size, bsdf):
     up = [0, 0, -1] if normal[1] else [0, 1, 0]
     target = [c + n for c, n in zip(centre, normal, strict=True)]
     frame = mi.ScalarTransform4f().look_at(origin=centre, target=target, up=up)
-    return {"type": "rectangle", "to_world": frame @ mi.ScalarTransform4f().scale(size / 2), "bsdf": bsdf}
+    return {
+        "type": "rectangle",
+        "to_world": frame @ mi.ScalarTransform4f().scale(size / 2),
+        "bsdf": bsdf,
+    }
 
 
 def _turned(mi, foot, bsdf):

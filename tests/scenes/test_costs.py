@@ -1,5 +1,5 @@
-"""What a whole design pays: noise against v2e's law, a bus against the binomial law, light, and a mast that
-bends."""
+"""What a whole design pays: noise against v2e's law, a bus against the binomial law, light, and a
+mast that bends."""
 
 import math
 
@@ -19,7 +19,9 @@ def test_noise_follows_the_fit_of_v2e():
     # at a rate of twice the bandwidth the fit is its constant: 10^0.321
     assert threshold_to_noise(400.0, 200.0) == pytest.approx(10**0.321, rel=1e-12)
     for rate_hz in (1e-3, 0.7, 5.0, 300.0):
-        assert noise_rate_hz(threshold_to_noise(rate_hz, 120.0), 120.0) == pytest.approx(rate_hz, rel=1e-9)
+        assert noise_rate_hz(threshold_to_noise(rate_hz, 120.0), 120.0) == pytest.approx(
+            rate_hz, rel=1e-9
+        )
 
 
 def test_the_nominal_sensor_keeps_its_rate_and_noise_grows_with_bandwidth_and_sensitivity():
@@ -32,7 +34,8 @@ def test_the_nominal_sensor_keeps_its_rate_and_noise_grows_with_bandwidth_and_se
     assert at[0.25, 200.0] == pytest.approx(SENSOR.shot_rate_hz, rel=1e-9)
     assert at[0.15, 100.0] > at[0.25, 100.0]
     assert at[0.25, 200.0] > at[0.25, 100.0]
-    # half of the bandwidth has 1 / sqrt(2) of the noise: a threshold as much lower makes half of the rate
+    # half of the bandwidth has 1 / sqrt(2) of the noise: a threshold as much lower makes half of
+    # the rate
     lower = costs.sensor(SENSOR, 0.25 / math.sqrt(2), 100.0).shot_rate_hz
     assert lower == pytest.approx(SENSOR.shot_rate_hz / 2, rel=1e-9)
     assert Costs(noise=False).sensor(SENSOR, 0.1, 200.0).shot_rate_hz == SENSOR.shot_rate_hz
@@ -81,7 +84,8 @@ def test_a_bus_keeps_what_it_can_read_by_the_binomial_law():
 
 
 def test_a_mast_bends_as_a_cantilever():
-    """Under a load P at its tip a cantilever deflects by P L^3 / 3 E I and slopes by P L^2 / 2 E I."""
+    """Under a load P at its tip a cantilever deflects by P L^3 / 3 E I and slopes by P L^2 / 2 E
+    I."""
     pose = torch.eye(4, dtype=F)
     pose[:3, 3] = torch.tensor([0.4, 0.1, 0.7])
     deviates = torch.tensor([[0.3, -1.2], [1.0, 0.5]], dtype=F)
@@ -99,7 +103,9 @@ def test_a_mast_bends_as_a_cantilever():
     assert not Costs().sway(pose, 0.8, torch.ones(2, dtype=F), deviates).any()
 
 
-@pytest.mark.parametrize("wrong", [{"light": 0.0}, {"light": 1.5}, {"bus_hz": 0.0}, {"sway_per_m_s": -1.0}])
+@pytest.mark.parametrize(
+    "wrong", [{"light": 0.0}, {"light": 1.5}, {"bus_hz": 0.0}, {"sway_per_m_s": -1.0}]
+)
 def test_costs_out_of_range_are_refused(wrong):
     with pytest.raises(DomainError, match=next(iter(wrong))):
         Costs(**wrong)

@@ -1,4 +1,5 @@
-"""Scenes as others write them: worlds made of them against mi.render, baked light against paths, gradients."""
+"""Scenes as others write them: worlds made of them against mi.render, baked light against paths,
+gradients."""
 
 import math
 from itertools import combinations, product
@@ -30,7 +31,8 @@ def rms(image):
 
 
 def references(scene, view, camera):
-    """Pictures [PICTURES, H, W] of mi.render through the sensor of the scene, with the camera's film."""
+    """Pictures [PICTURES, H, W] of mi.render through the sensor of the scene, with the camera's
+    film."""
     mi = backend.mitsuba()
     film = camera.film
     own = mi.traverse(scene.sensors()[0])
@@ -53,7 +55,9 @@ def references(scene, view, camera):
     )
     integrator = scene.integrator() or mi.load_dict({"type": "path"})
     images = [
-        np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=PATHS, seed=100 + k))[..., 0]
+        np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=PATHS, seed=100 + k))[
+            ..., 0
+        ]
         for k in range(PICTURES)
     ]
     return torch.from_numpy(np.stack(images)).double()
@@ -82,7 +86,8 @@ def test_a_world_is_the_picture_that_mitsuba_makes_and_baked_light_is_near_it(na
 
 
 def test_the_gradient_of_a_baked_scene_is_that_of_differences():
-    """Of a random smooth loss to the pose, with common random numbers; without the term of silhouettes it is not."""
+    """Of a random smooth loss to the pose, with common random numbers; without the term of
+    silhouettes it is not."""
     scene = foreign.loaded(backend.mitsuba(), FOREIGN["terrace"](), {}, merge=False)
     view = worlds.view_of(scene)
     poses = view.T_world_cam[None]

@@ -1,4 +1,5 @@
-"""Worlds from mesh files: what a camera reads back of them against the numbers that were written."""
+"""Worlds from mesh files: what a camera reads back of them against the numbers that were
+written."""
 
 import base64
 import json
@@ -33,13 +34,18 @@ def seen(scene, point, eye=(0.0, -2.5, 0.0)):
 
     arr = arrays("cpu", torch.float32)
     origin = torch.tensor([eye], dtype=torch.float64)
-    direction = torch.nn.functional.normalize(torch.tensor([point], dtype=torch.float64) - origin, dim=1)
-    ray = [arr.Array3(*[arr.Float(v.float()) for v in part.unbind(1)]) for part in (origin, direction)]
+    direction = torch.nn.functional.normalize(
+        torch.tensor([point], dtype=torch.float64) - origin, dim=1
+    )
+    ray = [
+        arr.Array3(*[arr.Float(v.float()) for v in part.unbind(1)]) for part in (origin, direction)
+    ]
     return float(scene.radiance(arr, *ray).numpy()[0])
 
 
 def write_obj(folder, vertices, faces, name="q.obj", kd="1 1 1", picture="p.png"):
-    """A square or another mesh with texture coordinates 0, 0; 1, 0; 1, 1; 0, 1 at its first four corners."""
+    """A square or another mesh with texture coordinates 0, 0; 1, 0; 1, 1; 0, 1 at its first four
+    corners."""
     PIL.Image.fromarray(PICTURE).save(folder / "p.png")
     map_kd = f"map_Kd {picture}\n" if picture else ""
     (folder / "q.mtl").write_text(f"newmtl m\nKd {kd}\n{map_kd}")
@@ -59,16 +65,23 @@ CORNERS = {(-0.5, 0, 0.5): 0, (0.5, 0, 0.5): 64, (-0.5, 0, -0.5): 128, (0.5, 0, 
 
 
 def write_gltf(folder, kind, sampler=None, uv=((0, 1), (1, 1), (1, 0), (0, 0)), **changes):
-    """The upright square in glTF's axes (y up, towards +z), v down, with a node that moves it 0.5 m up."""
+    """The upright square in glTF's axes (y up, towards +z), v down, with a node that moves it 0.5 m
+    up."""
     blob = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], dtype="<f4").tobytes()
-    blob += np.array(uv, dtype="<f4").tobytes() + np.array([0, 1, 2, 0, 2, 3], dtype="<u2").tobytes()
+    blob += (
+        np.array(uv, dtype="<f4").tobytes() + np.array([0, 1, 2, 0, 2, 3], dtype="<u2").tobytes()
+    )
     PIL.Image.fromarray(PICTURE).save(folder / "p.png")
     tree = {
         "asset": {"version": "2.0"},
         "scenes": [{"nodes": [0]}],
         "nodes": [{"translation": [0, 0.5, 0], "children": [1]}, {"mesh": 0}],
         "meshes": [
-            {"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}]}
+            {
+                "primitives": [
+                    {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}
+                ]
+            }
         ],
         "materials": [
             {
@@ -81,7 +94,9 @@ def write_gltf(folder, kind, sampler=None, uv=((0, 1), (1, 1), (1, 0), (0, 0)), 
         "textures": [{"source": 0, **({} if sampler is None else {"sampler": 0})}],
         "samplers": [sampler or {}],
         "images": [{"uri": "p.png"}],
-        "buffers": [{"byteLength": len(blob), "uri": "data:;base64," + base64.b64encode(blob).decode()}],
+        "buffers": [
+            {"byteLength": len(blob), "uri": "data:;base64," + base64.b64encode(blob).decode()}
+        ],
         "bufferViews": [
             {"buffer": 0, "byteOffset": 0, "byteLength": 48},
             {"buffer": 0, "byteOffset": 48, "byteLength": 32},
@@ -108,7 +123,9 @@ def write_gltf(folder, kind, sampler=None, uv=((0, 1), (1, 1), (1, 0), (0, 0)), 
     for tag, data, pad in ((b"JSON", json.dumps(tree).encode(), b" "), (b"BIN\0", blob, b"\0")):
         data += pad * (-len(data) % 4)
         chunks += len(data).to_bytes(4, "little") + tag + data
-    path.write_bytes(b"glTF" + (2).to_bytes(4, "little") + (12 + len(chunks)).to_bytes(4, "little") + chunks)
+    path.write_bytes(
+        b"glTF" + (2).to_bytes(4, "little") + (12 + len(chunks)).to_bytes(4, "little") + chunks
+    )
     return path
 
 
@@ -136,7 +153,9 @@ def test_a_picture_goes_on_as_its_sampler_says(tmp_path, wrap, expected):
     twice = ((0, 1), (2, 1), (2, 0), (0, 0))  # two pictures side by side
     scene = worlds.from_mesh(write_gltf(tmp_path, "gltf", sampler, twice))
     # u = 1.25, the middle of the second picture's first column, in the upper row
-    assert seen(scene, (0.25, 0, 1.0)) == pytest.approx(2 + 0.5 * (radiance_of(expected) - 2), rel=1e-4)
+    assert seen(scene, (0.25, 0, 1.0)) == pytest.approx(
+        2 + 0.5 * (radiance_of(expected) - 2), rel=1e-4
+    )
 
 
 def test_axes_and_units(tmp_path):
@@ -179,7 +198,9 @@ def test_a_dae_says_its_unit_and_its_axis(tmp_path):
     np.testing.assert_allclose(part.colour, 0.2126, rtol=1e-6)  # red of BT.709
     assert len(part.vertices_m) == 4  # one vertex for each place
     [part] = mesh_files.read(dae(tmp_path, 1, "Y_UP"))
-    np.testing.assert_allclose([part.vertices_m.min(0), part.vertices_m.max(0)], [[0, -2, 0], [1, 0, 1]])
+    np.testing.assert_allclose(
+        [part.vertices_m.min(0), part.vertices_m.max(0)], [[0, -2, 0], [1, 0, 1]]
+    )
     [part] = mesh_files.read(tmp_path / "t.dae", 2.0, "z")
     np.testing.assert_allclose(part.vertices_m.max(0), [2, 2, 4])
 
@@ -212,7 +233,8 @@ def test_colours_of_faces_and_vertices_are_shown_in_the_light_of_a_plain_sky(tmp
 
 
 def cube(folder, kind, size=0.5):
-    """A cube whose three lower coordinates are 0, facing outwards, written by hand as .obj or by trimesh."""
+    """A cube whose three lower coordinates are 0, facing outwards, written by hand as .obj or by
+    trimesh."""
     import trimesh
 
     mesh = trimesh.creation.box(extents=[size] * 3)
@@ -241,7 +263,8 @@ def test_a_mirrored_node_keeps_its_outside_outside(tmp_path):
 
 @pytest.mark.parametrize("inside", [False, True])
 def test_the_boundary_gradient_of_a_loaded_mesh_is_that_of_differences(tmp_path, inside):
-    """Of outlines; and, inside a cube whose normals point outwards, as rooms are often exported, of creases."""
+    """Of outlines; and, inside a cube whose normals point outwards, as rooms are often exported, of
+    creases."""
     if inside:
         scene = worlds.from_mesh(cube(tmp_path, "ply", 2.0))
         ends = ((2, 1, 1), (1, 2, 1), (1, 1, 2))
@@ -252,7 +275,9 @@ def test_the_boundary_gradient_of_a_loaded_mesh_is_that_of_differences(tmp_path,
         scene = worlds.from_mesh(cube(tmp_path, "obj"), background=30.0)
         pose = look_at((0.6, -1.4, 0.7), (0.25, 0.25, 0.25))
     camera = render.Camera(lens.Pinhole(4.0 if inside else 8.0), 24, 24, 0.3, samples_per_pixel=256)
-    weight = torch.linspace(0.2, 1.4, 24, dtype=torch.float64)[:, None] * torch.linspace(1.3, 0.1, 24)
+    weight = torch.linspace(0.2, 1.4, 24, dtype=torch.float64)[:, None] * torch.linspace(
+        1.3, 0.1, 24
+    )
 
     def loss(twist, gradient: Any = "interior"):
         image = render.frames(camera, scene, (pose @ se3_exp(twist))[None], gradient=gradient)[0]
@@ -266,23 +291,29 @@ def test_the_boundary_gradient_of_a_loaded_mesh_is_that_of_differences(tmp_path,
     step = 0.01 * torch.eye(6).double()
     with torch.no_grad():
         expected = torch.stack([loss(e) - loss(-e) for e in step]) / 0.02
-    # 256 samples per pixel over some 60 px of outline or creases: a few per cent of noise; leaving it out loses
-    # nearly all, since faces of one radiance have no gradient inside
+    # 256 samples per pixel over some 60 px of outline or creases: a few per cent of noise; leaving
+    # it out loses nearly all, since faces of one radiance have no gradient inside
     assert float((gradient("boundary") - expected).norm() / expected.norm()) < 0.05
     assert float(gradient("interior").norm()) < 0.01 * float(expected.norm())
 
 
 def test_lit_levels_of_a_mesh_agree_on_a_white_furnace(tmp_path):
-    """Under an even sky a convex body of albedo a sends a times the sky's radiance, whichever way it is computed."""
+    """Under an even sky a convex body of albedo a sends a times the sky's radiance, whichever way
+    it is computed."""
     path = write_ply(tmp_path / "f.ply", face_colors=grey(255, 188))
     levels = (partial(build.path, samples=30000), partial(build.baked, samples=8000, texel_m=0.5))
     for level in levels:
         scene = worlds.from_mesh(path, light=level, background=100.0)
         for point, code in (((0.5, 0, -0.5), 255), ((-0.5, 0, 0.5), 188)):
-            # half the energy of a path is noise of choosing light or surface: 0.5 / sqrt(30000) = 0.3 %
-            assert seen(scene, point) == pytest.approx(100 * 0.95 * radiance_of(code) / 255, rel=0.01)
+            # half the energy of a path is noise of choosing light or surface: 0.5 / sqrt(30000) =
+            # 0.3 %
+            assert seen(scene, point) == pytest.approx(
+                100 * 0.95 * radiance_of(code) / 255, rel=0.01
+            )
     under_the_sun = worlds.from_mesh(path, light="path")
-    assert seen(under_the_sun, (0.5, 0, -0.5)) > seen(under_the_sun, (0.5, 0, -0.5), (0, 2.5, 0)) > 10
+    assert (
+        seen(under_the_sun, (0.5, 0, -0.5)) > seen(under_the_sun, (0.5, 0, -0.5), (0, 2.5, 0)) > 10
+    )
 
 
 def test_files_that_are_no_whole_meshes_are_refused(tmp_path):
@@ -294,7 +325,10 @@ def test_files_that_are_no_whole_meshes_are_refused(tmp_path):
         "high.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "cannot be read|asks for vertex"),
         "zero.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "index 0"),
         "back.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\n", "index -3"),
-        "two.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 2\n", "2 faces, of which 1 cannot be read"),
+        "two.obj": (
+            "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 2\n",
+            "2 faces, of which 1 cannot be read",
+        ),
         "flat.obj": ("v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "cannot be read|2 coordinates"),
         "points.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no faces"),
         "line.obj": ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no faces"),
@@ -303,7 +337,10 @@ def test_files_that_are_no_whole_meshes_are_refused(tmp_path):
             "cannot be read .* as STL",
         ),
         "cut.stl": ("solid t\nfacet\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n", "no faces"),
-        "large.ply": ("ply\nformat ascii 1.0\nelement face 10000000\n", "10,000,000 faces, more than"),
+        "large.ply": (
+            "ply\nformat ascii 1.0\nelement face 10000000\n",
+            "10,000,000 faces, more than",
+        ),
         "index.ply": (
             "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
             "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n3 0 0 7\n",
@@ -351,7 +388,9 @@ def test_pictures_that_cannot_be_had_are_named(tmp_path, picture, sentence):
     assert str(path) in str(told.value)
     assert worlds.from_mesh(path, radiance=50.0).scene.shapes()  # nothing else is asked for
     changed = write_gltf(tmp_path / "in", "gltf", images=[{"uri": picture}])
-    with pytest.raises(FileFormatError, match=sentence if "mtl" not in picture else "cannot be read"):
+    with pytest.raises(
+        FileFormatError, match=sentence if "mtl" not in picture else "cannot be read"
+    ):
         worlds.from_mesh(changed)
 
 
@@ -359,7 +398,9 @@ def test_a_wider_folder_is_named_by_root(tmp_path):
     PIL.Image.fromarray(PICTURE).save(tmp_path / "wall.png")
     (tmp_path / "meshes").mkdir()
     path = write_obj(tmp_path / "meshes", UPRIGHT, SQUARE, picture="../wall.png")
-    assert seen(worlds.from_mesh(path, root=tmp_path), (0.5, 0, -0.5)) == pytest.approx(255, rel=1e-5)
+    assert seen(worlds.from_mesh(path, root=tmp_path), (0.5, 0, -0.5)) == pytest.approx(
+        255, rel=1e-5
+    )
 
 
 @pytest.mark.parametrize(
@@ -367,17 +408,30 @@ def test_a_wider_folder_is_named_by_root(tmp_path):
     [
         ("KHR_draco_mesh_compression", {"extensionsRequired": ["KHR_draco_mesh_compression"]}),
         ("KHR_texture_transform", {"extensionsUsed": ["KHR_texture_transform"]}),
-        ("lies on a network", {"buffers": [{"byteLength": 92, "uri": "https://127.0.0.1:9/a.bin"}]}),
-        ("neither PNG nor JPEG", {"textures": [{"extensions": {"EXT_texture_webp": {"source": 0}}}]}),
+        (
+            "lies on a network",
+            {"buffers": [{"byteLength": 92, "uri": "https://127.0.0.1:9/a.bin"}]},
+        ),
+        (
+            "neither PNG nor JPEG",
+            {"textures": [{"extensions": {"EXT_texture_webp": {"source": 0}}}]},
+        ),
         ("no whole glTF", {"images": [{"uri": "data:image/png;base64,AAAA"}]}),
         ("'a.bin' is missing", {"buffers": [{"byteLength": 92, "uri": "a.bin"}]}),
         (
             "TEXCOORD_1",
-            {"materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 1}}}]},
+            {
+                "materials": [
+                    {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 1}}}
+                ]
+            },
         ),
         ("node 0 has two parents, or is below itself", {"nodes": [{"mesh": 0, "children": [0]}]}),
         ("no quaternion", {"nodes": [{"mesh": 0, "rotation": [0, 0, 0, 0]}]}),
-        ("one way along u", {"samplers": [{"wrapS": 33071}], "textures": [{"source": 0, "sampler": 0}]}),
+        (
+            "one way along u",
+            {"samplers": [{"wrapS": 33071}], "textures": [{"source": 0, "sampler": 0}]},
+        ),
     ],
 )
 def test_gltf_that_would_be_read_in_part_is_refused(tmp_path, sentence, changes):
@@ -405,12 +459,15 @@ def test_pictures_are_textures_in_one_line(tmp_path):
     PIL.Image.fromarray(np.full((16, 16), 188, dtype=np.uint8)).save(tmp_path / "grey.png")
     scene = worlds.wall(tmp_path / "grey.png")
     assert seen(scene, (0.3, 0, 0.2)) == pytest.approx(radiance_of(188), rel=1e-5)
-    # the format of Greg Ward's Radiance: mantissas of 8 bits with one exponent, 128 / 256 * 2^(e - 128)
+    # the format of Greg Ward's Radiance: mantissas of 8 bits with one exponent, 128 / 256 * 2^(e -
+    # 128)
     row = bytes([128, 128, 128, 129]) * 2 + bytes([192, 192, 192, 130]) * 2
     header = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 4\n"
     (tmp_path / "a.hdr").write_bytes(header + row * 2)  # 1 1 3 3, twice
     # mean 80
-    np.testing.assert_allclose(textures.photo(tmp_path / "a.hdr"), [[40.0, 40, 120, 120]] * 2, rtol=1e-5)
+    np.testing.assert_allclose(
+        textures.photo(tmp_path / "a.hdr"), [[40.0, 40, 120, 120]] * 2, rtol=1e-5
+    )
 
 
 def test_real_robot_bodies_are_read(shared):

@@ -1,4 +1,5 @@
-"""Worlds from Mitsuba scenes: the same picture as Mitsuba's own sensor, units and axes, and what is refused."""
+"""Worlds from Mitsuba scenes: the same picture as Mitsuba's own sensor, units and axes, and what is
+refused."""
 
 import math
 from typing import Any
@@ -50,10 +51,18 @@ def described(mi, bright=2.0) -> dict[str, Any]:
             "to_world": T.look_at(origin=[1.5, 2, 4], target=[0.2, 0.5, 0], up=[0, 1, 0]),
             "film": {"type": "hdrfilm", "width": 24, "height": 16},
         },
-        "floor": {"type": "rectangle", "to_world": T.scale(2).rotate([1, 0, 0], -90), "bsdf": plastic},
+        "floor": {
+            "type": "rectangle",
+            "to_world": T.scale(2).rotate([1, 0, 0], -90),
+            "bsdf": plastic,
+        },
         "ball": {"type": "sphere", "center": [0, 0.6, 0], "radius": 0.5, "bsdf": red},
         "sky": {"type": "constant", "radiance": {"type": "rgb", "value": bright}},
-        "lamp": {"type": "point", "position": [2, 3, 1], "intensity": {"type": "rgb", "value": 20.0}},
+        "lamp": {
+            "type": "point",
+            "position": [2, 3, 1],
+            "intensity": {"type": "rgb", "value": 20.0},
+        },
     }
 
 
@@ -87,11 +96,15 @@ def test_a_file_a_dictionary_and_a_loaded_scene_are_one_world(path):
 
 
 @pytest.mark.parametrize(("unit_m", "up"), [(0.01, "y"), (1.0, "z"), (0.25, "z")])
-def test_units_and_the_up_axis_change_where_the_camera_stands_and_not_what_it_sees(path, unit_m, up):
+def test_units_and_the_up_axis_change_where_the_camera_stands_and_not_what_it_sees(
+    path, unit_m, up
+):
     view = worlds.view_of(path, unit_m=unit_m, up=up)
     plain = worlds.view_of(path, up="z")
     eye = [1.5, 2, 4] if up == "z" else [1.5, -4, 2]
-    torch.testing.assert_close(view.T_world_cam[:3, 3], unit_m * torch.tensor(eye, dtype=torch.float64))
+    torch.testing.assert_close(
+        view.T_world_cam[:3, 3], unit_m * torch.tensor(eye, dtype=torch.float64)
+    )
     world = worlds.from_mitsuba(path, "path", unit_m=unit_m, up=up, gain=3.0, samples=2)
     torch.testing.assert_close(
         seen(world, view),
@@ -118,7 +131,11 @@ def test_a_room_in_centimetres_is_told(path):
     [
         ('"principled"', '"chrome"', "chrome"),
         ("</scene>", "", "Start-end tags mismatch"),
-        ('<shape type="sphere">', '<shape type="ply"><string name="filename" value="no.ply"/>', "no.ply"),
+        (
+            '<shape type="sphere">',
+            '<shape type="ply"><string name="filename" value="no.ply"/>',
+            "no.ply",
+        ),
         ('name="radius"', 'name="girth"', "girth"),
         ('<rgb name="base_color" value="0.8, 0.3, 0.2"/>', PICTURE.format("no.png"), r"no\.png"),
         ('"$bright"', '"$dark"', r"\$dark"),
@@ -161,7 +178,10 @@ def test_a_picture_that_would_end_the_process_is_a_sentence(path, name, sentence
 
 @pytest.mark.parametrize(
     ("trial", "sentence"),
-    [("import os; os.abort()", "Mitsuba itself ends"), ("import time; time.sleep(60)", "within 1 s")],
+    [
+        ("import os; os.abort()", "Mitsuba itself ends"),
+        ("import time; time.sleep(60)", "within 1 s"),
+    ],
 )
 def test_whatever_ends_mitsuba_ends_a_trial(path, monkeypatch, trial, sentence):
     monkeypatch.setattr(trial_load, "TRIAL", trial)
@@ -213,7 +233,9 @@ def test_a_scene_of_another_variant_is_refused_with_what_to_do():
     mi = backend.mitsuba()
     mi.set_variant("scalar_rgb")
     try:
-        scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}, "sky": {"type": "constant"}})
+        scene = mi.load_dict(
+            {"type": "scene", "ball": {"type": "sphere"}, "sky": {"type": "constant"}}
+        )
     finally:
         mi.set_variant(backend.variant())
     for source in (scene, {"ball": scene.shapes()[0]}):
@@ -235,7 +257,8 @@ def test_paths_have_no_gradient(path):
 
 
 def grid(mi, n, bsdf):
-    """A unit square of n x n cells in z = 0 as a mesh whose texture coordinates all lie on each other."""
+    """A unit square of n x n cells in z = 0 as a mesh whose texture coordinates all lie on each
+    other."""
     at = np.linspace(-0.5, 0.5, n + 1)
     vertices = np.stack([*(v.reshape(-1) for v in np.meshgrid(at, at)), np.zeros((n + 1) ** 2)], 1)
     corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).reshape(-1)
@@ -254,7 +277,9 @@ def test_a_mesh_of_any_fineness_shows_the_falloff_of_a_lamp(cells):
     intensity, height, albedo = 5.0, 0.8, 0.5
     # 64: finer than the texels, so light at vertices
     scene = {
-        "mesh": grid(mi, cells, {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}}),
+        "mesh": grid(
+            mi, cells, {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}}
+        ),
         "lamp": {
             "type": "point",
             "position": [0, 0, height],
@@ -269,7 +294,8 @@ def test_a_mesh_of_any_fineness_shows_the_falloff_of_a_lamp(cells):
     square = pixel[:, None] ** 2 + pixel[None] ** 2
     truth = albedo / math.pi * intensity * height / (square + height**2) ** 1.5
     inside = (pixel[:, None].abs() < 0.47) & (pixel[None].abs() < 0.47)
-    # 16 points per texel, over which light changes by less than 6 %: 0.4 %, and bilinear between texels
+    # 16 points per texel, over which light changes by less than 6 %: 0.4 %, and bilinear between
+    # texels
     assert float((image / truth - 1)[inside].abs().max()) < 0.02
 
 
@@ -281,7 +307,9 @@ def test_a_baked_scene_in_centimetres_stands_where_its_paths_do(path):
     scene = described(mi) | {
         "sky": {
             "type": "envmap",
-            "bitmap": mi.Bitmap(np.float32(np.linspace(0.5, 3, 16 * 32).reshape(16, 32, 1)).repeat(3, 2)),
+            "bitmap": mi.Bitmap(
+                np.float32(np.linspace(0.5, 3, 16 * 32).reshape(16, 32, 1)).repeat(3, 2)
+            ),
         },
     }
     scene["floor"]["bsdf"] = scene["ball"]["bsdf"] = matte
@@ -321,7 +349,10 @@ def test_gloss_is_as_it_is_from_the_place_it_is_baked_towards():
     paths = worlds.from_mitsuba(scene, "path", up="z", samples=64)
     mean, there = (
         light.level_error(
-            worlds.from_mitsuba(scene, "baked", up="z", towards_m=place, texel_m=0.05), paths, camera, pose
+            worlds.from_mitsuba(scene, "baked", up="z", towards_m=place, texel_m=0.05),
+            paths,
+            camera,
+            pose,
         )
         for place in (None, eye)
     )
@@ -362,14 +393,21 @@ def test_mirrors_glass_and_masks_name_the_level_to_choose_and_may_be_matte(bsdf)
         },
         "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 2.0}},
     }
-    with pytest.raises(DomainError, match=r"shape 'sheet', a .*; use the level 'path', or matte=True"):
+    with pytest.raises(
+        DomainError, match=r"shape 'sheet', a .*; use the level 'path', or matte=True"
+    ):
         worlds.from_mitsuba(scene, up="z")
     world = worlds.from_mitsuba(scene, up="z", matte=True, texel_m=0.5, samples=256)
     image = render.frames(
-        Camera(lens.Pinhole(8.0), 4, 4, 0.2, 1), world, look_at((0, 0, 2), (0, 0, 0), down=(0, -1, 0))[None]
+        Camera(lens.Pinhole(8.0), 4, 4, 0.2, 1),
+        world,
+        look_at((0, 0, 2), (0, 0, 0), down=(0, -1, 0))[None],
     )
-    # an even sky of 2 is 2 in a perfect mirror and through glass; a mask shows half of it and half of albedo 0.5
-    low, high = {"conductor": (1.99, 2.01), "thindielectric": (1.99, 2.01), "mask": (1.4, 1.6)}[bsdf]
+    # an even sky of 2 is 2 in a perfect mirror and through glass; a mask shows half of it and half
+    # of albedo 0.5
+    low, high = {"conductor": (1.99, 2.01), "thindielectric": (1.99, 2.01), "mask": (1.4, 1.6)}[
+        bsdf
+    ]
     assert low < float(image.mean()) < high
 
 
@@ -385,5 +423,7 @@ def test_instances_are_named_with_the_level_that_shows_them():
         worlds.from_mitsuba(copies, up="z")
     world = worlds.from_mitsuba(copies, "path", up="z", samples=256)
     camera = Camera(lens.Pinhole(8.0), 4, 4, 0.2, 1)
-    image = render.frames(camera, world, look_at((0.1, 0.2, 2), (0.1, 0.2, 0), down=(0, -1, 0))[None])
+    image = render.frames(
+        camera, world, look_at((0.1, 0.2, 2), (0.1, 0.2, 0), down=(0, -1, 0))[None]
+    )
     assert float(image.mean()) == pytest.approx(0.5 * 2, rel=0.02)  # albedo 0.5, 16 x 4096 paths

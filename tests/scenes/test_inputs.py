@@ -1,5 +1,5 @@
-"""What users bring into worlds: pictures in linear light against Mitsuba's reader, and one sentence for what has no
-meaning."""
+"""What users bring into worlds: pictures in linear light against Mitsuba's reader, and one sentence
+for what has no meaning."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,9 @@ def test_pictures_in_linear_light_hold_what_mitsuba_reads(tmp_path, name):
     made = {"new.hdr": seeds_scenes.hdr(), "flat.hdr": FLAT, "sky.exr": seeds_scenes.exr()}
     (tmp_path / name).write_bytes(made[name])
     theirs = np.array(backend.mitsuba().Bitmap(str(tmp_path / name)))[..., :3]
-    np.testing.assert_array_equal(rgbe.read(tmp_path / name).astype(np.float32), theirs.astype(np.float32))
+    np.testing.assert_array_equal(
+        rgbe.read(tmp_path / name).astype(np.float32), theirs.astype(np.float32)
+    )
 
 
 WHOLE = seeds_scenes.hdr()
@@ -55,7 +57,10 @@ def test_a_damaged_hdr_ends_in_a_sentence(tmp_path, damage):
         (lambda: worlds.wall(EVEN, half_width_m=-1), "half_width_m must be .* got -1"),
         (lambda: worlds.room(size_m=(4, -4, 2.6)), "width_m|height_m"),
         (lambda: build.ball(backend.mitsuba(), 0, 0, 0, -0.1), "radius_m must be .* got -0.1"),
-        (lambda: worlds.from_mitsuba({"a": {"type": "sphere"}}, samples=0), "samples must be .* got 0"),
+        (
+            lambda: worlds.from_mitsuba({"a": {"type": "sphere"}}, samples=0),
+            "samples must be .* got 0",
+        ),
     ],
 )
 def test_what_has_no_meaning_ends_in_a_sentence(call, says):
@@ -69,7 +74,9 @@ def test_an_array_of_bytes_says_how_it_is_coded(tmp_path):
     pixels = np.full((8, 8), 188, dtype=np.uint8)
     imageio.imwrite(tmp_path / "grey.png", pixels)
     np.testing.assert_allclose(
-        textures.picture(pixels, encoding="srgb"), textures.picture(tmp_path / "grey.png"), rtol=1e-6
+        textures.picture(pixels, encoding="srgb"),
+        textures.picture(tmp_path / "grey.png"),
+        rtol=1e-6,
     )
     assert float(textures.picture(pixels, encoding="linear").max()) == 188
 

@@ -153,7 +153,9 @@ require:
 """
         )
     )
-    start = robot_pair.Design(5.0, 1.2, 0.4, 0.29, 0.0, 0.325, math.radians(5), math.radians(30), 0.0)
+    start = robot_pair.Design(
+        5.0, 1.2, 0.4, 0.29, 0.0, 0.325, math.radians(5), math.radians(30), 0.0
+    )
     assert found.design.mount().allclose(start.mount(), rtol=0, atol=1e-12)
     assert replace(found.design, x_m=0.29, z_m=0.325) == start
     assert found.low.z_m == 0.25
@@ -169,7 +171,8 @@ require:
     assert (clearance.housing, clearance.margin_m) == (Housing(0.03), 0.01)
     assert isinstance(own_body, OwnBody)
     assert own_body.largest_share == 0.1
-    # seven of the rover's eight shapes, from the ends of its wheels at 1 mm up to the top of its mast
+    # seven of the rover's eight shapes, from the ends of its wheels at 1 mm up to the top of its
+    # mast
     corners = np.concatenate([mesh.vertices_m for mesh in found.bodies.values()])
     assert len(found.bodies) == 7
     assert corners[:, 2].min() == pytest.approx(0.001, abs=1e-9)
@@ -190,7 +193,9 @@ def test_a_robot_stands_on_the_ground_wherever_its_origin_is(page):
     # 1e-15 m over 2.9 ms
     torch.testing.assert_close(seen, twist[:, None].expand_as(seen), rtol=0, atol=1e-9)
     middle = poses[:, 0] @ pose.se3_exp(robot_pair.MIDDLE_S * twist)
-    torch.testing.assert_close(middle[:, 2, 3], torch.full((4,), 0.058, dtype=D), rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        middle[:, 2, 3], torch.full((4,), 0.058, dtype=D), rtol=0, atol=1e-12
+    )
     corners = torch.from_numpy(next(iter(found.bodies.values())).vertices_m)
     assert float(pose.apply(poses.flatten(0, 1), corners)[..., 2].min()) > 0
     assert found.ground_z_m == pytest.approx(-0.058, abs=1e-4)  # it heaves by 0.03 m/s for 1.4 ms
@@ -215,8 +220,8 @@ def test_windows_of_a_screw_have_its_twist(page):
 
 
 def test_windows_of_uneven_motion_have_their_mean_velocity(page, tmp_path):
-    """x = t^2 / 2 sampled every millisecond: from t to u the mean velocity is (t + u) / 2; chords of 1 ms lie within
-    1.25e-7 m of the parabola, so velocities over 20 ms within 1.25e-5."""
+    """x = t^2 / 2 sampled every millisecond: from t to u the mean velocity is (t + u) / 2; chords
+    of 1 ms lie within 1.25e-7 m of the parabola, so velocities over 20 ms within 1.25e-5."""
     t_s = np.linspace(0, 1.5, 1501)
     poses = torch.eye(4, dtype=D).repeat(len(t_s), 1, 1)
     poses[:, 0, 3] = torch.from_numpy(t_s**2 / 2)
@@ -224,10 +229,14 @@ def test_windows_of_uneven_motion_have_their_mean_velocity(page, tmp_path):
     poses, twist = own_pair(page(PAGE + "motion: gains.csv\n")).drive(3, 6)
     at = (2 * poses[:, 1:, 0, 3]).sqrt()
     torch.testing.assert_close(twist[:, 0], (at[:, 0] + at[:, -1]) / 2, rtol=0, atol=1.3e-5)
-    torch.testing.assert_close(at[:, -1] - at[:, 0], torch.full((6,), 0.02, dtype=D), rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        at[:, -1] - at[:, 0], torch.full((6,), 0.02, dtype=D), rtol=0, atol=1e-4
+    )
 
 
-@pytest.mark.parametrize(("write", "world"), [(textured_room, "room.obj"), (textured_floor, "floor.xml")])
+@pytest.mark.parametrize(
+    ("write", "world"), [(textured_room, "room.obj"), (textured_floor, "floor.xml")]
+)
 def test_rendered_flow_of_a_world_of_ones_own_gives_the_twist_back(write, world, page, tmp_path):
     write(tmp_path)
     low = PAGE.replace("pitch_deg: 30", "pitch_deg: 70")
@@ -240,13 +249,16 @@ def test_rendered_flow_of_a_world_of_ones_own_gives_the_twist_back(write, world,
     )
     with torch.no_grad():
         velocity = system.begin(drives)["estimate"].velocity
-    # depth is read up to 1.5 ms from the middle of the flow: 0.6 mm of 0.6 m and more, a thousandth of 0.4 m/s
+    # depth is read up to 1.5 ms from the middle of the flow: 0.6 mm of 0.6 m and more, a thousandth
+    # of 0.4 m/s
     torch.testing.assert_close(velocity, drives.twist, rtol=0, atol=4e-4)
 
 
 def test_settings_need_no_file():
     box = CameraBox((0.05, 0.0, 0.4), (0.25, 0.0, 0.6), pitch_deg=(20.0, 20.0))
-    found = own_pair(OwnRobot(str(robots.ROVER), box, ("camera_link",), Start(z_m=0.5), world="flight"))
+    found = own_pair(
+        OwnRobot(str(robots.ROVER), box, ("camera_link",), Start(z_m=0.5), world="flight")
+    )
     assert found.axes == FREE
     assert found.ranges.held.tolist() == [False, True, False, False, True, False]
     assert found.design.pitch_rad == math.radians(20)
@@ -306,13 +318,17 @@ def test_a_fault_gets_one_sentence_before_the_first_frame(fault, page):
 
 def test_a_robot_in_millimetres_has_no_room_in_the_worlds_of_pairs(page, tmp_path):
     (tmp_path / "box.obj").write_text(obj(bodies.box((400.0, 300.0, 200.0), (0.0, 0.0, 50.0))))
-    with pytest.raises(DomainError, match=r"reaches 250 m from its origin, .* give a mesh in metres"):
+    with pytest.raises(
+        DomainError, match=r"reaches 250 m from its origin, .* give a mesh in metres"
+    ):
         own_pair(page(PAGE))
 
 
 def test_a_mesh_counts_in_the_unit_that_the_page_says(page, tmp_path):
     (tmp_path / "box.obj").write_text(obj(bodies.box((400.0, 300.0, 200.0), (0.0, 0.0, 50.0))))
-    said = own_pair(page(PAGE + "unit_m: 0.001\nworld: room.obj\nworld_unit_m: 0.5\nmotion: screw.csv\n"))
+    said = own_pair(
+        page(PAGE + "unit_m: 0.001\nworld: room.obj\nworld_unit_m: 0.5\nmotion: screw.csv\n")
+    )
     [body] = said.bodies.values()
     assert body.vertices_m.max(0).tolist() == pytest.approx([0.2, 0.15, 0.15])
     assert said.world(0).scene.bbox().max.x == pytest.approx(1.5)
@@ -330,7 +346,9 @@ def test_a_package_of_a_urdf_lies_where_the_page_says(page, tmp_path):
         own_pair(page(urdf))
     [body] = own_pair(page(urdf + "packages:\n  mine: parts\n")).bodies.values()
     assert body.vertices_m.max(0).tolist() == pytest.approx([0.2, 0.15, 0.15])
-    with pytest.raises(FileFormatError, match=r"packages: there is no folder for 'mine' in '.*prts'"):
+    with pytest.raises(
+        FileFormatError, match=r"packages: there is no folder for 'mine' in '.*prts'"
+    ):
         own_pair(page(urdf + "packages:\n  mine: prts\n"))
     with pytest.raises(DomainError, match=r"packages are of URDFs, and 'box.obj' is none"):
         own_pair(page(PAGE + "packages:\n  mine: parts\n"))
@@ -367,7 +385,8 @@ def test_a_pair_made_by_hand_is_looked_at_too():
 
 @pytest.mark.parametrize(("scale", "textured"), [(1.0, True), (1 / 255, False)])
 def test_a_world_too_dark_for_the_sensor_has_no_texture(scale, textured):
-    """Below 20 of 255 the sensor's level is linear in radiance: between 0 and 1 it spans a seventh, log(20) / 20."""
+    """Below 20 of 255 the sensor's level is linear in radiance: between 0 and 1 it spans a seventh,
+    log(20) / 20."""
     picture = scale * textures.speckle(3, finest_px=3.0, coarsest_px=128.0)
 
     def ground(number):
@@ -377,7 +396,9 @@ def test_a_world_too_dark_for_the_sensor_has_no_texture(scale, textured):
     if textured:
         check_pair(pair)
     else:
-        with pytest.raises(DomainError, match="world 0 has no texture where the camera looks: 0% of blocks"):
+        with pytest.raises(
+            DomainError, match="world 0 has no texture where the camera looks: 0% of blocks"
+        ):
             check_pair(pair)
 
 
@@ -389,5 +410,7 @@ def test_a_horizon_alone_is_no_texture():
         above = build.sky(mi, np.full((4, 8), 150.0))
         return build.emissive(build.World({"ground": (ground, paint)}, {"sky": above}))
 
-    with pytest.raises(DomainError, match=r"world 0 has no texture where the camera looks: \d% of blocks"):
+    with pytest.raises(
+        DomainError, match=r"world 0 has no texture where the camera looks: \d% of blocks"
+    ):
         check_pair(replace(PAIRS["outdoors"](), world=ground_and_sky))

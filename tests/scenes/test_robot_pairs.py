@@ -1,4 +1,5 @@
-"""Robots and their worlds: bodies by volume, drives by closed forms, flow by two roads, variants by number."""
+"""Robots and their worlds: bodies by volume, drives by closed forms, flow by two roads, variants by
+number."""
 
 import math
 from dataclasses import fields, replace
@@ -38,7 +39,9 @@ def test_boxes_and_cylinders_have_their_volumes_and_stand_where_they_are_asked_t
     around = bodies.AROUND
     # of the regular polygon in a circle of radius 1
     area = around / 2 * math.sin(2 * math.pi / around)
-    assert volume_m3(bodies.box((2.0, 1.0, 0.5), (3.0, 2.0, 1.0), 30.0)) == pytest.approx(1.0, rel=1e-12)
+    assert volume_m3(bodies.box((2.0, 1.0, 0.5), (3.0, 2.0, 1.0), 30.0)) == pytest.approx(
+        1.0, rel=1e-12
+    )
     for axis, name in enumerate("xyz"):
         body = bodies.cylinder(0.1, 0.04, (1.0, 2.0, 3.0), name)
         assert volume_m3(body) == pytest.approx(area * 0.01 * 0.04, rel=1e-9)
@@ -68,7 +71,8 @@ def test_poses_follow_the_true_velocity(drives):
 
 
 def test_the_ground_is_where_the_estimator_takes_it(pair, drives):
-    """Where a robot on flat ground is said to know depth by the ground, most of what it sees lies there."""
+    """Where a robot on flat ground is said to know depth by the ground, most of what it sees lies
+    there."""
     if pair.depth != "ground":
         pytest.skip("depth comes from the scene")
     camera = pair.design.camera()
@@ -86,12 +90,17 @@ def test_one_cast_gives_the_depth_that_is_believed_and_the_true_one(pair, drives
     pixels = camera.film.pixels()[::37].expand(3, -1, 2)
     poses = drives.T_world_body[0, :, robot_pair.FRAMES // 2] @ pair.design.mount()
     believed, true = ground_and_scene_depth(camera, pixels, poses, drives.scene)
-    torch.testing.assert_close(believed, ground_depth(camera, pixels, poses, drives.scene), rtol=0, atol=0)
-    torch.testing.assert_close(true, scene_depth(camera, pixels, poses, drives.scene), rtol=0, atol=0)
+    torch.testing.assert_close(
+        believed, ground_depth(camera, pixels, poses, drives.scene), rtol=0, atol=0
+    )
+    torch.testing.assert_close(
+        true, scene_depth(camera, pixels, poses, drives.scene), rtol=0, atol=0
+    )
 
 
 def test_another_world_of_a_pair_needs_no_kernel_of_its_own(pair):
-    """Repeats of pictures, boxes and places are data; what is compiled depends on the kinds of shapes alone."""
+    """Repeats of pictures, boxes and places are data; what is compiled depends on the kinds of
+    shapes alone."""
     camera = pair.design.camera()
     mount = pair.design.mount()
 
@@ -101,7 +110,9 @@ def test_another_world_of_a_pair_needs_no_kernel_of_its_own(pair):
             dr.kernel_history_clear()
             render.frames(camera, world, driven[0] @ mount)
             return {
-                kernel["hash"] for kernel in dr.kernel_history() if kernel.get("operation_count", 0) > LARGE
+                kernel["hash"]
+                for kernel in dr.kernel_history()
+                if kernel.get("operation_count", 0) > LARGE
             }
 
     assert compiled(21) == compiled(22) != set()
@@ -162,7 +173,9 @@ def test_speeds_and_rates_are_those_of_the_hard_regime():
     even = (torch.arange(400, dtype=D) + 0.5) / 400
     torch.testing.assert_close(share.sort().values, even, rtol=0, atol=0.5 / 400)
     normal = 0.5 * (1 + torch.erf(deviates / math.sqrt(2)))
-    torch.testing.assert_close(normal.sort(0).values, even[:, None].expand(-1, 3), rtol=0, atol=0.5 / 400)
+    torch.testing.assert_close(
+        normal.sort(0).values, even[:, None].expand(-1, 3), rtol=0, atol=0.5 / 400
+    )
 
 
 def test_the_design_starts_inside_its_bounds_and_others_are_refused(pair):
@@ -183,12 +196,15 @@ def test_the_default_design_keeps_what_a_mount_has_to_keep(pair):
     nearest = min(
         float(Body([(mesh.vertices_m, mesh.faces)]).distance_m(at)) for mesh in pair.bodies.values()
     )
-    found = next(each for each in wanted if each.name == "clearance").exact(pair.design.mount(), None)
+    found = next(each for each in wanted if each.name == "clearance").exact(
+        pair.design.mount(), None
+    )
     assert float(found.min()) == pytest.approx(nearest - 0.02 - 0.005, abs=1e-12)
 
 
 def test_an_estimate_of_exact_flow_is_the_true_velocity(pair, drives):
-    """Rendered truth through the design's own windows, where the scene's depth is known, gives back the twist."""
+    """Rendered truth through the design's own windows, where the scene's depth is known, gives back
+    the twist."""
     mount = pair.design.mount()
     exact = EgoVelocity(FREE, (1e3,) * 6, "scene", outlier=1.0, steps=20)
     slow = replace(drives, T_world_body=slowed(drives, 0.05))
@@ -204,19 +220,23 @@ def slowed(drives, share):
     """Poses of the same drives at a share of their velocity, about the middle of the window."""
     middle = drives.T_world_body[:, :, robot_pair.FRAMES // 2]
     twist = share * drives.twist.unflatten(0, middle.shape[:2])
-    return robot_pair.moved(middle.flatten(0, 1), twist.flatten(0, 1)).unflatten(0, middle.shape[:2])
+    return robot_pair.moved(middle.flatten(0, 1), twist.flatten(0, 1)).unflatten(
+        0, middle.shape[:2]
+    )
 
 
 def test_a_pair_sees_through_a_family_of_traced_lenses():
-    """What the lens of a family costs reaches the frames: the corner windows are darker than behind a thin lens, and
-    its variables carry gradients, as differences say."""
+    """What the lens of a family costs reaches the frames: the corner windows are darker than behind
+    a thin lens, and its variables carry gradients, as differences say."""
     family_pair = replace(PAIRS["corridor"](), family="retrofocus-4")
     assert family_pair.system(family_pair.design).camera.lens.name == "retrofocus-4"
     start, scene = family_pair.design, worlds.smooth_plane(5)
     pose_at = pose.look_at((0.2, 0.1, 1.0), (0, 0, 0), down=(0, 1, 0))[None]
 
     def frames(efl_mm, fno):
-        return render.frames(family_pair.camera(replace(start, efl_mm=efl_mm, fno=fno)), scene, pose_at)
+        return render.frames(
+            family_pair.camera(replace(start, efl_mm=efl_mm, fno=fno)), scene, pose_at
+        )
 
     at = [torch.tensor(v, dtype=D) for v in (start.efl_mm, 1.6)]
     weights = torch.randn(frames(*at).shape, generator=torch.Generator().manual_seed(0), dtype=D)

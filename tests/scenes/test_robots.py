@@ -1,4 +1,5 @@
-"""Robots from URDF: joint by joint against closed forms, bodies by volume, and what a mounted camera sees."""
+"""Robots from URDF: joint by joint against closed forms, bodies by volume, and what a mounted
+camera sees."""
 
 import math
 
@@ -49,7 +50,11 @@ def test_a_planar_arm_reaches_where_its_closed_form_says(tmp_path):
     robot = robots.from_urdf(arm(tmp_path), {"shoulder": a, "elbow": b, "slide": d})
     tip = robot.frame("tip").numpy()
     reach = 0.4 + d
-    expected = [0.7 * math.cos(a) + reach * math.cos(a + b), 0.7 * math.sin(a) + reach * math.sin(a + b), 0.5]
+    expected = [
+        0.7 * math.cos(a) + reach * math.cos(a + b),
+        0.7 * math.sin(a) + reach * math.sin(a + b),
+        0.5,
+    ]
     np.testing.assert_allclose(tip[:3, 3], expected, atol=1e-15)
     # URDF: roll, pitch, yaw about fixed axes
     fixed = turn("z", 0.5) @ turn("y", -0.4) @ turn("x", 0.3)
@@ -109,7 +114,9 @@ def test_meshes_are_found_by_package_and_path_at_their_scale(tmp_path):
         "../meshes/t.stl",
         f"file://{tmp_path}/my_robot/meshes/t.stl",
     ):
-        path = arm(tmp_path / "my_robot" / "urdf", f'<mesh filename="{name}" scale="0.1 -0.2 0.3"/>')
+        path = arm(
+            tmp_path / "my_robot" / "urdf", f'<mesh filename="{name}" scale="0.1 -0.2 0.3"/>'
+        )
         [part] = robots.from_urdf(path).parts
         assert volume_m3(part) == pytest.approx(0.006, rel=1e-6)  # mirrored, and still outwards
     mesh_of(tmp_path / "elsewhere" / "meshes", size=2.0)
@@ -124,7 +131,9 @@ def test_collision_shapes_stand_in_and_are_shown_on_request():
     assert sum(volume_m3(p) for p in seen.parts if p.name == "chassis") == pytest.approx(
         0.5 * 0.32 * 0.12 + 0.2 * 0.2 * 0.08
     )
-    assert sum(volume_m3(p) for p in solid.parts if p.name == "chassis") == pytest.approx(0.5 * 0.32 * 0.2)
+    assert sum(volume_m3(p) for p in solid.parts if p.name == "chassis") == pytest.approx(
+        0.5 * 0.32 * 0.2
+    )
     # wheels have visual shapes alone
     assert {p.name for p in solid.parts} == {p.name for p in seen.parts}
 
@@ -210,7 +219,10 @@ def test_shapes_that_cannot_be_are_refused(tmp_path, geometry, sentence):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"joint_angles": {"hip": 0.1}}, "no joint 'hip' that can be set; it has shoulder, elbow, slide"),
+        (
+            {"joint_angles": {"hip": 0.1}},
+            "no joint 'hip' that can be set; it has shoulder, elbow, slide",
+        ),
         ({"joint_angles": {"shoulder": 2.5}}, "'shoulder' at 2.5 lies outside its limits, -2 to 2"),
         ({"joint_angles": {"shoulder": math.nan}}, "'shoulder' at nan lies outside"),
         ({"base": "leg"}, "no frame 'leg'; it has base, upper"),
@@ -222,7 +234,9 @@ def test_joints_and_frames_that_are_not_there_are_refused(tmp_path, options, sen
 
 
 def test_files_that_are_no_robots_are_refused(tmp_path):
-    with pytest.raises(DomainError, match="no frame 'hand'; it has base, upper, lower, finger, tip"):
+    with pytest.raises(
+        DomainError, match="no frame 'hand'; it has base, upper, lower, finger, tip"
+    ):
         robots.from_urdf(arm(tmp_path)).frame("hand")
     (tmp_path / "bare.urdf").write_text('<robot name="a"><link name="b"/></robot>')
     with pytest.raises(DomainError, match="nothing to see"):
@@ -267,8 +281,18 @@ SECOND = '<link name="c"/><joint name="{}" type="continuous"><parent link="{}"/>
         ("bendy", "", "", "of the type 'bendy', which is none of revolute"),
         ("fixed", "", SECOND.format("k", "c", ""), "in a loop through c;"),
         ("fixed", "", '<link name="c"/>', "2 root links instead of 1: a, c"),
-        ("continuous", '<mimic joint="zz"/>', "", "'j' mimics 'zz', which is no joint that moves by itself"),
-        ("continuous", '<mimic joint="k"/>', SECOND.format("k", "a", '<mimic joint="j"/>'), "'j' mimics 'k'"),
+        (
+            "continuous",
+            '<mimic joint="zz"/>',
+            "",
+            "'j' mimics 'zz', which is no joint that moves by itself",
+        ),
+        (
+            "continuous",
+            '<mimic joint="k"/>',
+            SECOND.format("k", "a", '<mimic joint="j"/>'),
+            "'j' mimics 'k'",
+        ),
     ],
 )
 def test_joints_that_make_no_robot_are_one_sentence(tmp_path, kind, inside, more, sentence):

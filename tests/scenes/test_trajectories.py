@@ -12,7 +12,16 @@ from codesign.errors import DomainError, ShapeError
 from codesign.mount import Mount
 from codesign.pose import check_poses, inverse, look_at, se3_exp
 from scenes import trajectories
-from scenes.trajectories import Driving, Flying, Orbital, Swinging, Waves, body_at, minimum_snap, mounted
+from scenes.trajectories import (
+    Driving,
+    Flying,
+    Orbital,
+    Swinging,
+    Waves,
+    body_at,
+    minimum_snap,
+    mounted,
+)
 
 D = torch.float64
 START = look_at((0.3, -2.0, 1.1), (0.0, 0.0, 1.0))
@@ -33,7 +42,9 @@ def flying():
 
 
 FAMILIES = {
-    "orbital": lambda: Orbital((0.2, 0.5, 1.0), 1.5, 0.6, -0.8, 0.3, radius_swing=0.2, rate_swing=0.4),
+    "orbital": lambda: Orbital(
+        (0.2, 0.5, 1.0), 1.5, 0.6, -0.8, 0.3, radius_swing=0.2, rate_swing=0.4
+    ),
     "radial": lambda: Swinging.radial(BODY, 0.2, 0.7),
     "vertical": lambda: Swinging.vertical(BODY, 0.2, 0.7),
     "driving": driving,
@@ -50,10 +61,13 @@ def test_a_path_is_rigid_led_by_its_velocity_and_the_same_for_the_same_seed(fami
     poses = path(t)
     check_poses(poses)
     step = 1e-4
-    # a twist constant over the step differs from the path by the third derivative: step^3 / 24 times
-    # (2 pi 9 Hz)^3 * 0.008 rad and the like
+    # a twist constant over the step differs from the path by the third derivative: step^3 / 24
+    # times (2 pi 9 Hz)^3 * 0.008 rad and the like
     assert_close(
-        inverse(path(t - step / 2)) @ path(t + step / 2), se3_exp(step * path.velocity(t)), rtol=0, atol=1e-9
+        inverse(path(t - step / 2)) @ path(t + step / 2),
+        se3_exp(step * path.velocity(t)),
+        rtol=0,
+        atol=1e-9,
     )
     assert torch.equal(FAMILIES[family]()(t), poses)
     order = torch.randperm(157, generator=seeded())
@@ -82,7 +96,9 @@ def test_orbits_have_their_radius_rate_and_view():
     t = torch.linspace(0, 8, 801, dtype=D)
     poses = orbit(t)
     away = poses[:, :3, 3] - torch.tensor(centre, dtype=D)
-    assert_close(away[:, :2].norm(dim=1), 2 * (1 + 0.25 * (2 * pi * t / 1.7).sin()), rtol=1e-14, atol=0)
+    assert_close(
+        away[:, :2].norm(dim=1), 2 * (1 + 0.25 * (2 * pi * t / 1.7).sin()), rtol=1e-14, atol=0
+    )
     assert_close(away[:, 2], torch.full_like(t, 0.7), rtol=0, atol=1e-15)
     assert_close(poses[:, :3, 0], -away / away.norm(dim=1, keepdim=True), rtol=0, atol=1e-14)
     # level: the left axis is horizontal, up is up
@@ -96,7 +112,9 @@ def test_orbits_have_their_radius_rate_and_view():
     assert_close(rate, 1.3 * (1 + 0.5 * (2 * pi * middle / 2.9).cos()), rtol=1e-4, atol=0)
     # without swings: the closed form of a circle's velocity
     circle = Orbital((0.0, 0.0, 0.0), 2.0, 0.0, 1.3).velocity(t)
-    assert_close(circle, torch.tensor([0, -2.6, 0, 0, 0, 1.3], dtype=D).expand(801, 6), rtol=0, atol=1e-13)
+    assert_close(
+        circle, torch.tensor([0, -2.6, 0, 0, 0, 1.3], dtype=D).expand(801, 6), rtol=0, atol=1e-13
+    )
 
 
 def test_swings_keep_their_axis_and_speed_limit():
@@ -108,7 +126,9 @@ def test_swings_keep_their_axis_and_speed_limit():
         shift = 0.3 * (2 * pi * 0.8 * t).sin()
         assert_close(swing(t)[:, :3, 3] - BODY[:3, 3], shift[:, None] * axis, rtol=0, atol=1e-14)
         velocity = swing.velocity(t)
-        assert float(velocity[:, :3].norm(dim=1).max()) == pytest.approx(2 * pi * 0.8 * 0.3, rel=1e-6)
+        assert float(velocity[:, :3].norm(dim=1).max()) == pytest.approx(
+            2 * pi * 0.8 * 0.3, rel=1e-6
+        )
         assert float(velocity[:, 3:].abs().max()) == 0
 
 
@@ -150,7 +170,9 @@ def test_a_robot_without_slip_obeys_its_wheels():
     end = torch.tensor([0.3, -0.1], dtype=D) + torch.stack([step @ yaw.cos(), step @ yaw.sin()])
     poses = robot(t)
     assert_close(poses[-1, :2, 3], end, rtol=0, atol=1e-12)
-    assert_close(poses[0], body_at((0.3, -0.1, 0.3), (0.3 + math.cos(0.4), -0.1 + math.sin(0.4), 0.3)))
+    assert_close(
+        poses[0], body_at((0.3, -0.1, 0.3), (0.3 + math.cos(0.4), -0.1 + math.sin(0.4), 0.3))
+    )
 
 
 def test_slip_slows_and_slides_outwards_and_the_shake_stays_in_its_bounds():
@@ -174,8 +196,8 @@ def test_slip_slows_and_slides_outwards_and_the_shake_stays_in_its_bounds():
 
 
 def test_minimum_snap_obeys_euler_and_lagrange():
-    """Degree 7 through the points, rest at both ends and six continuous derivatives: these conditions have one
-    solution, and it is the one of least snap."""
+    """Degree 7 through the points, rest at both ends and six continuous derivatives: these
+    conditions have one solution, and it is the one of least snap."""
     points = torch.randn(6, 3, generator=seeded(7), dtype=D)
     path = minimum_snap(points, torch.tensor([0.0, 0.8, 2.1, 2.9, 4.4, 5.0], dtype=D))
     t = path.knots_s
@@ -247,9 +269,17 @@ REFUSED = [
     (DomainError, "radius_m = 0.*above", lambda: Orbital((0, 0, 0), 0.0, 0.5, 1.0)),
     (DomainError, "rate_rad_s = 0", lambda: Orbital((0, 0, 0), 1.0, 0.5, 0.0)),
     (DomainError, "radius_swing = 1", lambda: Orbital((0, 0, 0), 1.0, 0.5, 1.0, radius_swing=1.0)),
-    (DomainError, "rate_swing = -0.1.*at least", lambda: Orbital((0, 0, 0), 1.0, 0.5, 1.0, rate_swing=-0.1)),
+    (
+        DomainError,
+        "rate_swing = -0.1.*at least",
+        lambda: Orbital((0, 0, 0), 1.0, 0.5, 1.0, rate_swing=-0.1),
+    ),
     (ShapeError, "one time each", lambda: minimum_snap(torch.zeros(3, 3), [0.0, 1.0])),
-    (DomainError, "at most 200 points", lambda: minimum_snap(torch.zeros(201, 1), torch.arange(201.0))),
+    (
+        DomainError,
+        "at most 200 points",
+        lambda: minimum_snap(torch.zeros(201, 1), torch.arange(201.0)),
+    ),
     (DomainError, "increase strictly", lambda: minimum_snap(torch.zeros(3, 3), [0.0, 1.0, 1.0])),
     (DomainError, "NaN", lambda: minimum_snap(torch.zeros(3, 3), [0.0, 1.0, math.nan])),
     (DomainError, "100 times", lambda: minimum_snap(torch.zeros(3, 3), [0.0, 0.001, 5.0])),

@@ -1,5 +1,5 @@
-"""TUM trajectory files: round trips, what is tolerated, what is refused; and the path between recorded
-poses."""
+"""TUM trajectory files: round trips, what is tolerated, what is refused; and the path between
+recorded poses."""
 
 import math
 
@@ -24,7 +24,10 @@ def some_poses(count, size=1.0):
 
 def test_round_trip_keeps_every_digit(tmp_path):
     # epoch times
-    t = torch.cumsum(torch.rand(200, generator=torch.Generator().manual_seed(1), dtype=D) + 1e-3, 0) + 1.7e9
+    t = (
+        torch.cumsum(torch.rand(200, generator=torch.Generator().manual_seed(1), dtype=D) + 1e-3, 0)
+        + 1.7e9
+    )
     poses = some_poses(200, 2.0)
     write_tum(tmp_path / "path.txt", t, poses)
     t_back, back = read_tum(tmp_path / "path.txt")
@@ -48,7 +51,9 @@ def test_comments_tabs_and_line_ends_do_not_matter(tmp_path):
     t, poses = read_tum(tmp_path / "a.txt")
     assert t.tolist() == [0.5, 1.5]
     assert poses[:, :3, 3].tolist() == [[1, 2, 3], [-1, 2, 0.5]]
-    torch.testing.assert_close(poses[:, :3, :3], torch.eye(3, dtype=D).expand(2, 3, 3), rtol=0, atol=0)
+    torch.testing.assert_close(
+        poses[:, :3, :3], torch.eye(3, dtype=D).expand(2, 3, 3), rtol=0, atol=0
+    )
 
 
 @pytest.mark.parametrize(
@@ -58,7 +63,9 @@ def test_tables_with_commas_are_read_alike(header, tmp_path):
     rows = "0.5,1,2,3,0,0,0,1\n1.5, -1, 2.5e-1, 3, 0, 0, 1, 0\n"
     (tmp_path / "a.csv").write_text(header + rows)
     (tmp_path / "a.txt").write_text(rows.replace(",", " "))
-    for found, expected in zip(read_tum(tmp_path / "a.csv"), read_tum(tmp_path / "a.txt"), strict=True):
+    for found, expected in zip(
+        read_tum(tmp_path / "a.csv"), read_tum(tmp_path / "a.txt"), strict=True
+    ):
         assert torch.equal(found, expected)
 
 

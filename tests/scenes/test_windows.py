@@ -41,7 +41,9 @@ QUIET = Sensors(
 
 @functools.cache
 def worlds():
-    return WorldWindows(("room", "tabletop"), seed=4, size_px=48, intervals=16, flow_px=(2.0, 3.0), samples=4)
+    return WorldWindows(
+        ("room", "tabletop"), seed=4, size_px=48, intervals=16, flow_px=(2.0, 3.0), samples=4
+    )
 
 
 def warped(layers):
@@ -55,7 +57,9 @@ BLURRED = Draws("fine", layers=(0, 0), flow_px=(2.0, 5.0), scale=(0.7, 0.9), blu
 # bilinear lookup of sharp edges.
 SOURCES = {
     "layers": (
-        lambda: RenderedWindows(Draws(layers=(2, 2), flow_px=(3.0, 6.0)), seed=3, height_px=48, width_px=64),
+        lambda: RenderedWindows(
+            Draws(layers=(2, 2), flow_px=(3.0, 6.0)), seed=3, height_px=48, width_px=64
+        ),
         0.35,
         0.05,
     ),
@@ -80,7 +84,9 @@ def test_the_flow_leads_to_the_same_radiance(kind):
         at = pixel_grid(*last.shape[1:], last) + flow_px
         both = torch.stack([last, torch.ones_like(last)], 1)
         brought, inside = read_at(both, at, "zeros").unbind(1)
-        return [miss[here] for miss, here in zip((brought - first).abs(), inside > 0.999, strict=True)]
+        return [
+            miss[here] for miss, here in zip((brought - first).abs(), inside > 0.999, strict=True)
+        ]
 
     for right, still, wrong in zip(misses(1), misses(0), misses(-1), strict=True):
         assert right.mean() < mean_share * still.mean()
@@ -98,13 +104,18 @@ def test_a_sample_is_the_same_in_any_batch(kind):
     assert torch.equal(together.frames[1:], alone.frames)
     # a volume is a matrix product: sums of at most 32 terms >= 0, each rounded twice by half an eps
     eps = torch.finfo(torch.float32).eps
-    torch.testing.assert_close(together.volume.counts[1:], alone.volume.counts, rtol=2 * 32 * eps, atol=1e-6)
+    torch.testing.assert_close(
+        together.volume.counts[1:], alone.volume.counts, rtol=2 * 32 * eps, atol=1e-6
+    )
     assert not torch.equal(together.volume.counts[0], together.volume.counts[1])
 
 
 def test_every_pixel_has_the_flow_of_the_layer_it_shows():
-    """Layers looked up pixel by pixel with scipy: where the nearest that covers a pixel leads it."""
-    source = RenderedWindows(Draws(layers=(1, 3), distortion=(0.0, 0.0)), seed=6, height_px=40, width_px=56)
+    """Layers looked up pixel by pixel with scipy: where the nearest that covers a pixel leads
+    it."""
+    source = RenderedWindows(
+        Draws(layers=(1, 3), distortion=(0.0, 0.0)), seed=6, height_px=40, width_px=56
+    )
     y, x = np.mgrid[:40, :56]
     points = np.stack([(x - 27.5).ravel(), (y - 19.5).ravel(), np.ones(x.size)])
     for index in range(4):
@@ -114,7 +125,9 @@ def test_every_pixel_has_the_flow_of_the_layer_it_shows():
             size = layer.crop.shape[-1]
             # row, column
             on_texture = ((layer.place.double().numpy() @ points)[1::-1] * size + size - 1) / 2
-            cover = map_coordinates(layer.crop[1].double().numpy(), on_texture, order=1, mode="reflect")
+            cover = map_coordinates(
+                layer.crop[1].double().numpy(), on_texture, order=1, mode="reflect"
+            )
             end = layer.motion.homographies[-1].double().numpy() @ points
             expected = np.where(cover > 0.5, end[:2] / end[2] - points[:2], expected)
             sure &= abs(cover - 0.5) > 1e-3  # where rounding does not choose the layer
@@ -139,8 +152,8 @@ def test_events_are_the_log_change_over_the_threshold(ratio):
 
 
 def test_noise_is_as_frequent_as_asked():
-    """A still sensor before a uniform wall: only noise. 1 % per pixel, polarity and eighth gives 0.08 per
-    pixel and polarity; Poisson within 5 sigma."""
+    """A still sensor before a uniform wall: only noise. 1 % per pixel, polarity and eighth gives
+    0.08 per pixel and polarity; Poisson within 5 sigma."""
     draws = replace(planes(noise=(0.01, 0.01)), contrast=(1e-6, 1e-6))
     counts = RenderedWindows(draws, seed=1).batch(range(8)).volume.counts
     expected = 0.08 * 64 * 64 * 8
@@ -149,8 +162,8 @@ def test_noise_is_as_frequent_as_asked():
 
 
 def test_packets_hold_the_events_asked_for():
-    """Without noise: the number asked for within the events of a few frame intervals, unless the whole motion
-    holds fewer; twice the events take longer."""
+    """Without noise: the number asked for within the events of a few frame intervals, unless the
+    whole motion holds fewer; twice the events take longer."""
     draws = replace(EVERYDAY, motion="camera", layers=(0, 2), noise=NOISELESS, textures="fine")
     lengths = []
     for density in (0.1, 0.2, 1.0):
@@ -167,10 +180,12 @@ def test_packets_hold_the_events_asked_for():
 
 @pytest.mark.parametrize(("asked", "expected"), [(0.4, 0.4**2 / 2), (3.0, 3.0 - 0.5)])
 def test_memorised_levels_start_as_after_a_long_time(asked, expected):
-    """All pixels brighten by ``asked`` thresholds. From a triangular start D between the thresholds, the mean
-    of floor(asked + D) is asked^2 / 2 below one threshold and asked - 1/2 from one on. Standard error of
-    16,384 pixels: 0.002 and 0.004."""
-    source = SensorWindows(Draws("fine"), replace(QUIET, density=(asked, asked), imbalance=(1.0, 1.0 + 1e-9)))
+    """All pixels brighten by ``asked`` thresholds. From a triangular start D between the
+    thresholds, the mean of floor(asked + D) is asked^2 / 2 below one threshold and asked - 1/2 from
+    one on. Standard error of 16,384 pixels: 0.002 and 0.004."""
+    source = SensorWindows(
+        Draws("fine"), replace(QUIET, density=(asked, asked), imbalance=(1.0, 1.0 + 1e-9))
+    )
     ramp = torch.linspace(0, 1, source.intervals + 1)
     frames = torch.cat([torch.zeros(LEAD), ramp]).mul(2.0).exp()[:, None, None].expand(-1, 128, 128)
     counts = source._events(np.random.default_rng(4), frames)
@@ -179,10 +194,14 @@ def test_memorised_levels_start_as_after_a_long_time(asked, expected):
 
 
 def test_noise_of_a_sensor_is_a_share_of_the_scene_at_most():
-    """Still scenes with the noisiest sensors: no more events than half of what contrast was set for, plus
-    leaks and hot pixels."""
+    """Still scenes with the noisiest sensors: no more events than half of what contrast was set
+    for, plus leaks and hot pixels."""
     sensors = Sensors(
-        density=(0.2, 0.2), shot_rate_hz=(1e3, 1e3), leak_rate_hz=(1e-3, 2e-3), hot_share=0.0, pace=0.0
+        density=(0.2, 0.2),
+        shot_rate_hz=(1e3, 1e3),
+        leak_rate_hz=(1e-3, 2e-3),
+        hot_share=0.0,
+        pace=0.0,
     )
     draws = Draws("fine", "similarity", (0, 0), (0.0, 0.0))
     counts = SensorWindows(draws, sensors, seed=6).batch(range(8)).volume.counts

@@ -40,11 +40,13 @@ def test_the_flow_of_a_camera_before_planes_is_as_long_as_asked():
 
 
 def test_a_turning_camera_keeps_the_angles_between_rays():
-    """H = K R K^-1: for the right focal length K^-1 H K is orthonormal up to its scale, whatever R."""
+    """H = K R K^-1: for the right focal length K^-1 H K is orthonormal up to its scale, whatever
+    R."""
     found = motion.rotation(np.random.default_rng(2), TIMES, 64, 48, (4.0, 4.0))[0]
     np.testing.assert_allclose(found[2], np.eye(3), atol=1e-12)
     h = found[-1] / np.cbrt(np.linalg.det(found[-1]))
-    # rows 1 and 2 of R: f-scaled products vanish for one f; solve r1 . r2 = 0 for f^2 and check the rest
+    # rows 1 and 2 of R: f-scaled products vanish for one f; solve r1 . r2 = 0 for f^2 and check the
+    # rest
     f2 = -(h[0, 2] * h[1, 2]) / (h[0, 0] * h[1, 0] + h[0, 1] * h[1, 1])
     k = np.diag([f2**0.5, f2**0.5, 1.0])
     turn = np.linalg.inv(k) @ h @ k
@@ -85,7 +87,8 @@ def test_the_stretch_of_a_field_is_that_of_its_differences():
     points = pixels(5, 7).double() * 6
     step = 1e-4
     columns = [
-        (field.displacement(points + step * axis) - field.displacement(points - step * axis)) / (2 * step)
+        (field.displacement(points + step * axis) - field.displacement(points - step * axis))
+        / (2 * step)
         for axis in torch.eye(2, dtype=torch.float64)
     ]
     truth = torch.linalg.matrix_norm(torch.stack(columns, -1), 2)
@@ -123,7 +126,9 @@ def test_a_bent_layer_begins_flat_and_shows_at_the_end_what_it_showed_at_the_sta
     assert float((end - start).norm(dim=-1).mean()) > 2.0
     seen = layer.texels(torch.eye(3), end)[-1].movedim(0, -1)
     torch.testing.assert_close(seen, start, rtol=0, atol=1e-4)
-    torch.testing.assert_close(layer.texels(torch.eye(3), start)[0].movedim(0, -1), start, rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        layer.texels(torch.eye(3), start)[0].movedim(0, -1), start, rtol=0, atol=1e-5
+    )
 
 
 def test_displacements_have_the_length_asked_for_unless_they_were_steep():
@@ -135,8 +140,8 @@ def test_displacements_have_the_length_asked_for_unless_they_were_steep():
 
 
 def test_pace_keeps_both_ends_and_changes_speed_by_no_more_than_asked():
-    """d/dt of swing sin(2 pi f t + phase) is at most 2 pi f swing <= most; the line that keeps the ends adds
-    as much."""
+    """d/dt of swing sin(2 pi f t + phase) is at most 2 pi f swing <= most; the line that keeps the
+    ends adds as much."""
     t = np.linspace(0, 1, 401)
     for seed in range(20):
         found = motion.pace(np.random.default_rng(seed), t, 0.3)

@@ -1,5 +1,5 @@
-"""Worlds: what they promise about gaps, levels, seeds and the negative control; meshes and skies from
-files."""
+"""Worlds: what they promise about gaps, levels, seeds and the negative control; meshes and skies
+from files."""
 
 import itertools
 
@@ -34,14 +34,17 @@ def test_every_world_shows_something_in_range_from_its_viewpoint(name):
 
 @pytest.mark.parametrize(
     "level",
-    [build.emissive, lambda world, device: build.baked(world, device, samples=64, max_depth=16, texel_m=0.4)],
+    [
+        build.emissive,
+        lambda world, device: build.baked(world, device, samples=64, max_depth=16, texel_m=0.4),
+    ],
 )
 def test_the_blank_room_shows_one_radiance_whatever_moves(level):
     start = look_at(*worlds.VIEWS["blank-room"])
     scene = worlds.blank_room(40.0, light=level)
     image = render.frames(CAMERA, scene, start @ se3_exp(0.2 * torch.eye(6, dtype=torch.float64)))
-    # emissive: rounding. Baked: 64 paths of a furnace per texel, relative spread 0.5: 6 %, of which a log
-    # threshold of 0.2 sees nothing
+    # emissive: rounding. Baked: 64 paths of a furnace per texel, relative spread 0.5: 6 %, of which
+    # a log threshold of 0.2 sees nothing
     assert float((image / 40 - 1).abs().max()) < (1e-5 if level is build.emissive else 0.15)
 
 
@@ -81,9 +84,13 @@ def test_nothing_interpenetrates_and_gaps_are_a_millimetre(name):
             clouds[shape] = points[there]
     boxes = {shape: (cloud.min(0), cloud.max(0)) for shape, cloud in clouds.items()}
     for one, other in itertools.permutations(solid, 2):
-        if (boxes[one][0] > boxes[other][1] + 0.01).any() or (boxes[one][1] < boxes[other][0] - 0.01).any():
+        if (boxes[one][0] > boxes[other][1] + 0.01).any() or (
+            boxes[one][1] < boxes[other][0] - 0.01
+        ).any():
             continue
-        assert not inside(solid[other][0], solid[other][1], clouds[one], 0.9e-3).any(), f"{one} in {other}"
+        assert not inside(solid[other][0], solid[other][1], clouds[one], 0.9e-3).any(), (
+            f"{one} in {other}"
+        )
     for one, cloud in clouds.items():
         for sheet, matrix in sheets.items():
             local = (cloud - matrix[:3, 3]) @ np.linalg.inv(matrix[:3, :3]).T
@@ -109,7 +116,9 @@ def test_a_lit_room_is_brightest_at_its_ceiling_and_darker_than_its_lamp():
     up, ahead = render.frames(
         CAMERA,
         scene,
-        torch.stack([look_at((0.3, -1.2, 1.0), (0.1, 0.0, 2.6)), look_at((0.3, -1.2, 1.3), (0, 1, 0.8))]),
+        torch.stack(
+            [look_at((0.3, -1.2, 1.0), (0.1, 0.0, 2.6)), look_at((0.3, -1.2, 1.3), (0, 1, 0.8))]
+        ),
     )
     assert 250 < float(up.max()) < 400
     assert 2 < float(ahead.mean()) < 60
@@ -176,9 +185,9 @@ def test_a_sky_from_a_file_has_its_mean_and_its_east_in_the_east(tmp_path):
         assert float((values * weight).mean() / weight.mean()) == pytest.approx(30, rel=1e-5)
     scene = worlds.outdoor(clutter=0, environment=tmp_path / "sky.exr")
     views = [look_at((0, 0, 1), (x, y, 1)) for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1))]
-    brightest = render.frames(Camera(lens.Pinhole(8.0), 16, 12, 0.3, 4), scene, torch.stack(views)).amax(
-        (1, 2)
-    )
+    brightest = render.frames(
+        Camera(lens.Pinhole(8.0), 16, 12, 0.3, 4), scene, torch.stack(views)
+    ).amax((1, 2))
     assert int(brightest.argmax()) == 0
     assert float(brightest[0]) > 20 * float(brightest[1:].max())
 

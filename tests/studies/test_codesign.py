@@ -1,5 +1,5 @@
-"""The joint study: designs and their shares, slopes against rendered differences, arms on a known valley, and the whole of
-it, resumed."""
+"""The joint study: designs and their shares, slopes against rendered differences, arms on a known
+valley, and the whole of it, resumed."""
 
 import json
 import math
@@ -88,7 +88,8 @@ def test_a_swaying_mast_is_an_error_that_is_expected(drawn, space):
 
 
 class Valley:
-    """An objective whose error is known, in place of a rendered one: lens and mount pull at each other."""
+    """An objective whose error is known, in place of a rendered one: lens and mount pull at each
+    other."""
 
     def __init__(self, space):
         self.space = space
@@ -119,7 +120,8 @@ def test_joint_descent_reaches_the_bottom_of_a_valley_that_one_pass_over_the_blo
     begun[0], begun[4] = 0.1, 0.9
     valley = Valley(space)
     ends = {
-        name: ARMS[name](Task(valley, begun, 48, 0, 0))[0] for name in ("joint", "lens > mount > read-out")
+        name: ARMS[name](Task(valley, begun, 48, 0, 0))[0]
+        for name in ("joint", "lens > mount > read-out")
     }
     errors = {name: float(valley.error(share)) for name, share in ends.items()}
     assert errors["joint"] < 2e-3
@@ -128,7 +130,8 @@ def test_joint_descent_reaches_the_bottom_of_a_valley_that_one_pass_over_the_blo
 
 
 def test_a_read_out_is_settled_at_the_bottom_of_what_recorded_frames_tell(space):
-    """Expected errors that are known, in place of flow's: least at given shares of sensor and estimator."""
+    """Expected errors that are known, in place of flow's: least at given shares of sensor and
+    estimator."""
     bottom = space.share(theta=0.2, cutoff_hz=300.0, prior_px=4.0)
     free = space.block("sensor") + space.block("network")
 
@@ -138,7 +141,9 @@ def test_a_read_out_is_settled_at_the_bottom_of_what_recorded_frames_tell(space)
             return SimpleNamespace(expected=away.square().sum()[None])
 
     begun = space.share(theta=0.3, cutoff_hz=150.0, prior_px=6.0)
-    way = Way(recorded=[SimpleNamespace(run={"frames": None}, samples=None, whole=space.made(begun))])
+    way = Way(
+        recorded=[SimpleNamespace(run={"frames": None}, samples=None, whole=space.made(begun))]
+    )
     task = Task(SimpleNamespace(drawn=Known(), space=space), begun, 16, 0, 0, 60)
     found = read_out(task, begun, way)
     held = [k for k in range(len(begun)) if k not in free]
@@ -147,8 +152,8 @@ def test_a_read_out_is_settled_at_the_bottom_of_what_recorded_frames_tell(space)
 
 
 def test_couplings_of_a_known_valley_are_its_own(space, tmp_path):
-    """A quadratic valley in which lens and mount pull at each other: its curvature, its canonical coupling, and what one
-    pass leaves, all in closed form."""
+    """A quadratic valley in which lens and mount pull at each other: its curvature, its canonical
+    coupling, and what one pass leaves, all in closed form."""
     size = len(space.free)
     true = torch.eye(size, dtype=F)
     lens_at, mount_at = space.block("lens")[0], space.block("mount")[0]
@@ -174,8 +179,11 @@ def test_couplings_of_a_known_valley_are_its_own(space, tmp_path):
     assert torch.allclose(found, true, atol=1e-9)
     assert float(spread.max()) < 1e-9
     assert couplings.bowl(-true) is None
-    # ten numbers that stand alone, each mixed difference known to 0.1: the largest of twelve such values is about 0.3
-    chance = couplings.by_noise(space, torch.eye(size, dtype=F), torch.full((size, size), 0.1, dtype=F))
+    # ten numbers that stand alone, each mixed difference known to 0.1: the largest of twelve such
+    # values is about 0.3
+    chance = couplings.by_noise(
+        space, torch.eye(size, dtype=F), torch.full((size, size), 0.1, dtype=F)
+    )
     assert 0.2 < chance["lens and mount"] < 0.5
     assert error == pytest.approx(0.1)
     pulls = couplings.coupled(space, found)
@@ -211,13 +219,19 @@ def test_the_book_takes_the_longest_lens_that_sees_ahead_and_focuses_it_hyperfoc
 
 def test_the_comparison_is_of_pairs():
     rows = [
-        {"arm": arm, "seed": seed, "errors": [scale * (1 + 0.1 * seed + 0.02 * world) for world in range(4)]}
+        {
+            "arm": arm,
+            "seed": seed,
+            "errors": [scale * (1 + 0.1 * seed + 0.02 * world) for world in range(4)],
+        }
         for seed in range(6)
         for arm, scale in (("joint", 0.8), ("book", 1.0), ("random", 0.8))
     ]
     found = compared(rows)
     over, p = found["book"]
-    assert (math.exp(over.value), math.exp(over.low), math.exp(over.high)) == pytest.approx((0.8, 0.8, 0.8))
+    assert (math.exp(over.value), math.exp(over.low), math.exp(over.high)) == pytest.approx(
+        (0.8, 0.8, 0.8)
+    )
     # of 64 signs two are as extreme, and two tests were made
     assert p == pytest.approx(2 * 2 / 64)
     assert found["random"][0].outcome == "ties"
@@ -268,7 +282,9 @@ def test_agreement_of_slopes_is_that_of_their_means():
 def test_a_held_lens_is_focused_by_the_book_as_what_it_is():
     held = Space.of("outdoors", None, light=0.1, held={"fno": 4.0})
     found = chosen_by_the_book(held, [])
-    assert found["focus_per_m"] == pytest.approx(1e3 * 4.0 * robot_pair.PITCH_MM / found["efl_mm"] ** 2)
+    assert found["focus_per_m"] == pytest.approx(
+        1e3 * 4.0 * robot_pair.PITCH_MM / found["efl_mm"] ** 2
+    )
 
 
 def test_a_small_race_says_that_it_decides_nothing(tmp_path, monkeypatch):
@@ -323,7 +339,9 @@ def test_answers_of_an_earlier_run_are_not_raced_again(tmp_path, monkeypatch, ca
     free = ["--free", "efl_mm", "z_m", "theta", "--arms", "joint", "default"]
 
     def raced(folder, *more):
-        code = main(codesign.study, codesign.Config, [*given, *free, *more, "--out", str(tmp_path / folder)])
+        code = main(
+            codesign.study, codesign.Config, [*given, *free, *more, "--out", str(tmp_path / folder)]
+        )
         return code, (tmp_path / folder / "answers.jsonl").read_text().splitlines()
 
     code, one = raced("here")

@@ -1,5 +1,5 @@
-"""Measures of the study of flow's quality, against numbers worked out by hand; and its quick form from the
-command line."""
+"""Measures of the study of flow's quality, against numbers worked out by hand; and its quick form
+from the command line."""
 
 import json
 import math
@@ -15,7 +15,15 @@ from codesign.flow.export import evenly_timed
 from codesign.types import FlowField, FlowWindows
 from studies.flow_quality import __main__ as flow_quality
 from studies.flow_quality.__main__ import Config, judged, study
-from studies.flow_quality.measures import SHARES, figures, join, measure, sparsified, spearman, warp_loss
+from studies.flow_quality.measures import (
+    SHARES,
+    figures,
+    join,
+    measure,
+    sparsified,
+    spearman,
+    warp_loss,
+)
 from studies.frame.run import main
 
 
@@ -29,17 +37,22 @@ def one_window(error_px, confidence=None, variance_px2=None, truth_px=2.0):
     if variance_px2 is not None:
         covariance = torch.stack([variance_px2, torch.zeros_like(variance_px2), variance_px2])[None]
     valid = torch.ones(1, *error_px.shape, dtype=torch.bool)
-    field = FlowField(flow, valid, 1.0, None if confidence is None else confidence[None], covariance)
+    field = FlowField(
+        flow, valid, 1.0, None if confidence is None else confidence[None], covariance
+    )
     counts = torch.zeros(1, 2, 4, *error_px.shape)
     return field, FlowWindows(evenly_timed(counts), FlowField(truth, valid, 1.0))
 
 
 def test_errors_claims_and_ranks_of_two_windows():
-    """Errors 0.5, 1, 1.5, 2 of a flow of 2 px; then 6 px everywhere: 5 / 4 and 6 / 2 of zero flow."""
+    """Errors 0.5, 1, 1.5, 2 of a flow of 2 px; then 6 px everywhere: 5 / 4 and 6 / 2 of zero
+    flow."""
     error = torch.tensor([[0.5, 1.0], [1.5, 2.0]])
     variance = error.square() / 2 / 4  # errors are twice what is claimed
     rising = measure(*one_window(error, 1 - error / 10, variance))
-    even = measure(*one_window(torch.full((2, 2), 6.0), torch.full((2, 2), 0.5), torch.full((2, 2), 18.0)))
+    even = measure(
+        *one_window(torch.full((2, 2), 6.0), torch.full((2, 2), 0.5), torch.full((2, 2), 18.0))
+    )
     first = figures(rising)
     both = figures(join([rising, even]))
     assert first["ratio"] == pytest.approx(1.25 / 2)
@@ -64,21 +77,24 @@ def test_errors_claims_and_ranks_of_two_windows():
 
 def test_what_is_not_claimed_has_no_figures():
     plain = figures(measure(*one_window(torch.tensor([[0.5, 1.0]]))))
-    assert not {name for name in plain if "claim" in name or "rank" in name or name == "normalised_square"}
+    assert not {
+        name for name in plain if "claim" in name or "rank" in name or name == "normalised_square"
+    }
 
 
 def test_ranks_and_sparsification_by_hand():
     # d = 0, 2, 1, -1, -2: 1 - 6 * 10 / (5 * 24)
     ranks = spearman(np.array([1.0, 4, 4.5, 3.5, 2]), np.array([10.0, 20, 40, 50, 60]))
     assert ranks == pytest.approx(1 - 6 * (0 + 4 + 4 + 1 + 9) / (5 * 24))
-    # ten pixels of error 1 to 10: taking out the largest half leaves a mean of 3, the smallest half 8; equal
-    # doubt leaves the mean whatever the share
+    # ten pixels of error 1 to 10: taking out the largest half leaves a mean of 3, the smallest half
+    # 8; equal doubt leaves the mean whatever the share
     error = np.arange(1.0, 11)
     half = int(np.argmin(abs(SHARES - 0.5)))
     assert sparsified(error, error)[[0, half]] == pytest.approx([5.5, 3.0])
     assert sparsified(error, -error)[half] == pytest.approx(8.0)
     np.testing.assert_allclose(sparsified(error, np.zeros(10)), 5.5)
-    # for many errors even on 0..1 the oracle's curve is 1 - s, chance's is 1: the area to s = 0.95 is 0.95^2 / 2
+    # for many errors even on 0..1 the oracle's curve is 1 - s, chance's is 1: the area to s = 0.95
+    # is 0.95^2 / 2
     even = torch.linspace(0, 1, 4000).reshape(40, 100)
     chance = figures(measure(*one_window(even, torch.full((40, 100), 0.5))))
     assert chance["ause"] == pytest.approx(0.95**2 / 2, rel=2e-3)
@@ -100,12 +116,21 @@ def test_warp_loss_of_bins_is_that_of_their_events(generator):
 
 @pytest.mark.skipif(not DELIVERED["refiner"].exists(), reason="no trained refiner in this checkout")
 def test_quick_form(tmp_path, monkeypatch):
-    """The delivered refiner beats zero flow on fine textures and in the worlds by far: a broken file or a
-    wrong convention would not."""
+    """The delivered refiner beats zero flow on fine textures and in the worlds by far: a broken
+    file or a wrong convention would not."""
     # pictures and their tables take a third of the time
     monkeypatch.setattr(flow_quality, "SHOWN", 1)
     chosen = ["fine_theta_0.1", "worlds", "layers_0.3", "mixed_theta_0.2_noise_0.002"]
-    options = ["--quick", "--sets", *chosen, "--models", "affine", "constant", "--out", str(tmp_path)]
+    options = [
+        "--quick",
+        "--sets",
+        *chosen,
+        "--models",
+        "affine",
+        "constant",
+        "--out",
+        str(tmp_path),
+    ]
     assert main(study, Config, options) == 0
     found = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))
     assert found["fine_theta_0.1_refiner_ratio"] < 0.2
@@ -127,7 +152,10 @@ def test_quick_form(tmp_path, monkeypatch):
         (["--windows", "1"], "at least 2 are needed"),
         (["--sets", "roads"], "--sets roads is unknown"),
         (["--models", "constant"], "affine is needed"),
-        (["--recording", "nowhere", "--packets", "1", "--packet-events", "400"], "nothing lies at nowhere"),
+        (
+            ["--recording", "nowhere", "--packets", "1", "--packet-events", "400"],
+            "nothing lies at nowhere",
+        ),
     ],
 )
 def test_unfit_options_are_refused(tmp_path, capsys, options, said):

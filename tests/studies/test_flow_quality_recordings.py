@@ -1,5 +1,5 @@
-"""Recordings of the study of flow's quality: made streams against the geometry they were made with, and the
-contrast maximisation against events placed by hand."""
+"""Recordings of the study of flow's quality: made streams against the geometry they were made with,
+and the contrast maximisation against events placed by hand."""
 # pyright: reportAssignmentType=false
 
 import math
@@ -35,7 +35,9 @@ Y, X = np.mgrid[: SIZE[0], : SIZE[1]] - (np.array(SIZE)[:, None, None] - 1) / 2
 def packet(x, y, t_us, height=SIZE[0], width=SIZE[1]):
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     t_us, x, y = (torch.from_numpy(values[inside].astype(np.int64)) for values in (t_us, x, y))
-    return Packet("by hand", ordered(t_us, x, y, torch.ones_like(x), height, width), 0, 10_000, None)
+    return Packet(
+        "by hand", ordered(t_us, x, y, torch.ones_like(x), height, width), 0, 10_000, None
+    )
 
 
 def dots(move, count=60):
@@ -59,9 +61,15 @@ def turning(x, y, time, focal=60.0):
     [
         # exact pinhole geometry; the events' rounding to pixels is 0.3 px, over many dots
         (turning, lambda packet: sharpest.rotation(packet, 60.0), 0.25),
-        # with a zoom of 0.12: at the end of the window a pixel of the start has moved by just that share
-        (lambda x, y, t: (x + t * (2.0 + 0.12 * x), y + t * (-1.5 + 0.12 * y)), sharpest.affine, 0.35),
-        # events of dots that move by 1.5 px stay on two or three pixels, and unmoved each lies on one
+        # with a zoom of 0.12: at the end of the window a pixel of the start has moved by just that
+        # share
+        (
+            lambda x, y, t: (x + t * (2.0 + 0.12 * x), y + t * (-1.5 + 0.12 * y)),
+            sharpest.affine,
+            0.35,
+        ),
+        # events of dots that move by 1.5 px stay on two or three pixels, and unmoved each lies on
+        # one
         (lambda x, y, t: (x + 1.5 * t, y), lambda packet: sharpest.rotation(packet, 1e4), 0.35),
     ],
 )
@@ -99,14 +107,17 @@ def test_the_flow_of_a_turn_is_that_of_its_rays():
     flow = made.truth(2_000, 18_000).flow_px[0].double().numpy()
     assert np.hypot(*flow).mean() > 0.3
     focal = np.full_like(X, made.focal_px)
-    rays = [np.stack([x, y, focal]).reshape(3, -1).T for x, y in ((X, Y), (X + flow[0], Y + flow[1]))]
+    rays = [
+        np.stack([x, y, focal]).reshape(3, -1).T for x, y in ((X, Y), (X + flow[0], Y + flow[1]))
+    ]
     before, after = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in rays)
     turn, _ = streams.Rotation.align_vectors(after, before)
     np.testing.assert_allclose(turn.apply(before), after, rtol=0, atol=3e-7)
 
 
 def test_events_of_a_made_recording_follow_its_flow(slid):
-    """Warped by the true flow the events are sharper than as they came, and than by the reversed flow."""
+    """Warped by the true flow the events are sharper than as they came, and than by the reversed
+    flow."""
     stream = slid.stream
     t0_us, t1_us = 0, 30_000
     true_px = slid.truth(t0_us, t1_us).flow_px
@@ -120,7 +131,9 @@ def test_packets_of_a_recording(slid, tmp_path):
     first, second = recordings.cut(slid, 400, 2)
     assert len(first.stream) == len(second.stream) == 400
     assert first.t1_us <= second.t0_us
-    case = recordings.Case("slid", first, partial(recordings.in_context, slid, first, False), "affine")
+    case = recordings.Case(
+        "slid", first, partial(recordings.in_context, slid, first, False), "affine"
+    )
 
     def nothing_moves(volume):
         shape = (1, 2, *volume.counts.shape[3:])
@@ -134,8 +147,12 @@ def test_packets_of_a_recording(slid, tmp_path):
     volume = events.from_stream(first.stream, first.t0_us, first.t1_us, 4)
     mask = metrics.event_mask(volume)[0]
     assert first.truth is not None
-    assert still["aee_px"] == pytest.approx(float(first.truth.flow_px[0].norm(dim=0)[mask].mean()), rel=1e-5)
-    packets = [{"refiner": {**still, "fwl": value}, "closed_form_quadratic": still} for value in (1.0, 2.0)]
+    assert still["aee_px"] == pytest.approx(
+        float(first.truth.flow_px[0].norm(dim=0)[mask].mean()), rel=1e-5
+    )
+    packets = [
+        {"refiner": {**still, "fwl": value}, "closed_form_quadratic": still} for value in (1.0, 2.0)
+    ]
     run = open_run("flow_quality", Config(out=tmp_path))
     recordings.record(run, "slid", packets)
     assert run.metrics["slid_refiner_fwl"] == 1.5

@@ -1,5 +1,5 @@
-"""The study of event flow on a recording: its made-up recording against its homographies, its figures against
-known cases, its errors."""
+"""The study of event flow on a recording: its made-up recording against its homographies, its
+figures against known cases, its errors."""
 
 import json
 
@@ -31,7 +31,9 @@ def test_the_made_recording_says_what_its_homographies_say(recording):
         (packet,) = read_packets(
             folder, truth, PacketOptions(window_s=0.04, start_s=0.0, count=1, size_px=SIZE)
         )
-        there = whole.truth(*(t_us - round(made.START_S * 1e6) for t_us in (packet.t0_us, packet.t1_us)))
+        there = whole.truth(
+            *(t_us - round(made.START_S * 1e6) for t_us in (packet.t0_us, packet.t1_us))
+        )
         assert float(there.flow_px.norm(dim=1).mean()) > 2
         # float32 places of 60 px; rates between samples 1 ms apart
         assert float((true(packet).flow_px - there.flow_px).norm(dim=1).max()) < 2e-4
@@ -57,7 +59,9 @@ def run(folder, recording, options=""):
 
 def test_figures_of_a_run(recording, tmp_path):
     threads = torch.get_num_threads()
-    code, metrics = run(tmp_path / "run", recording[0], "--window-ms 20 --start-s 0.005 --packets 2")
+    code, metrics = run(
+        tmp_path / "run", recording[0], "--window-ms 20 --start-s 0.005 --packets 2"
+    )
     torch.set_num_threads(threads)
     assert code == 0
     options = PacketOptions(window_s=0.02, start_s=0.005, count=2, size_px=SIZE)
@@ -86,7 +90,9 @@ def test_the_true_flow_is_sharper_than_none_and_without_error(recording):
     )
     _, right = study.measured(packet, lambda _: packet.truth, 8)
     _, none = study.measured(
-        packet, lambda _: FlowField(torch.zeros_like(true(packet).flow_px), true(packet).valid, 0.04), 8
+        packet,
+        lambda _: FlowField(torch.zeros_like(true(packet).flow_px), true(packet).valid, 0.04),
+        8,
     )
     assert right["aee_px"] == right["aee_dense_px"] == right["outlier_percent"] == 0
     assert right["angular_error_deg"] < 0.05  # of float32
@@ -115,7 +121,9 @@ def test_a_video_of_all_windows(recording, tmp_path):
     assert code == 0
     held = read_recording(recording[0], PacketOptions(size_px=SIZE))
     assert metrics["video_events"] == len(held)
-    assert metrics["video_event_s"] == pytest.approx((held.t_us[-1] - held.t_us[0]) * 1e-6, abs=2e-6)
+    assert metrics["video_event_s"] == pytest.approx(
+        (held.t_us[-1] - held.t_us[0]) * 1e-6, abs=2e-6
+    )
     assert metrics["video_real_time_factor"] == pytest.approx(
         metrics["video_processor_s"] / metrics["video_event_s"]
     )
@@ -129,7 +137,9 @@ def test_arrows_are_the_flow_per_second_where_events_are(recording):
     t0_us = int(held.t_us[0])
     y, x = torch.meshgrid(torch.arange(45.0), torch.arange(60.0), indexing="ij")
     linear = torch.stack([x / 10, 3 + 0 * y])[None]
-    field = FlowField(linear, torch.ones(1, *SIZE, dtype=torch.bool), 0.01, torch.full((1, *SIZE), 0.5))
+    field = FlowField(
+        linear, torch.ones(1, *SIZE, dtype=torch.bool), 0.01, torch.full((1, *SIZE), 0.5)
+    )
     found = video.arrows(held, flow.TrackedWindow(t0_us, t0_us + 10_000, 9, field, False, 0.0), 1)
     part = held.window(t0_us, t0_us + 10_000)
     places = {(float(a), float(b)) for a, b in zip(part.x.tolist(), part.y.tolist(), strict=True)}
@@ -172,7 +182,10 @@ def test_a_slider_has_no_error_against_its_rotation(tmp_path):
 def test_bad_input_is_one_sentence_and_exit_code_2(options, sentence, recording, tmp_path, capsys):
     base = [] if "--recording" in options else ["--recording", str(recording[0])]
     size = [] if "--width-px" in options else PIXELS
-    assert main(study.study, study.Config, ["--out", str(tmp_path / "run"), *base, *size, *options]) == 2
+    assert (
+        main(study.study, study.Config, ["--out", str(tmp_path / "run"), *base, *size, *options])
+        == 2
+    )
     error = capsys.readouterr().err
     assert sentence in error
     assert error.count("\n") == 1

@@ -1,4 +1,5 @@
-"""What studies share: sweeps that go on where they ended, intervals against closed forms, times, charts."""
+"""What studies share: sweeps that go on where they ended, intervals against closed forms, times,
+charts."""
 
 import json
 import math
@@ -202,14 +203,19 @@ def test_student_against_the_published_table():
     half = 2.776 * math.sqrt(2.5 / 5)
     assert (found.value, found.count) == (3, 5)
     assert (found.high - 3, 3 - found.low) == pytest.approx((half, half), rel=2e-4)
-    assert student([1.0, 2.0, 3.0, 4.0, 5.0], 0.9).high == pytest.approx(3 + 2.132 * math.sqrt(0.5), rel=2e-4)
+    assert student([1.0, 2.0, 3.0, 4.0, 5.0], 0.9).high == pytest.approx(
+        3 + 2.132 * math.sqrt(0.5), rel=2e-4
+    )
     assert student([2.0]) == Interval(2, -math.inf, math.inf, 1)
 
 
 def test_wilson_against_the_published_example():
-    """0 of 10: 0 to 27.75 %; 5 of 10: 23.66 to 76.34 % (Newcombe, Stat. Med. 17 (1998), method 3)."""
+    """0 of 10: 0 to 27.75 %; 5 of 10: 23.66 to 76.34 % (Newcombe, Stat. Med. 17 (1998), method
+    3)."""
     assert compare.share(0, 10).high == pytest.approx(0.2775, abs=1e-4)
-    assert (compare.share(5, 10).low, compare.share(5, 10).high) == pytest.approx((0.2366, 0.7634), abs=1e-4)
+    assert (compare.share(5, 10).low, compare.share(5, 10).high) == pytest.approx(
+        (0.2366, 0.7634), abs=1e-4
+    )
 
 
 def test_a_bootstrapped_mean_has_the_standard_error_of_the_sample(generator):
@@ -252,7 +258,9 @@ def test_the_pooled_interval_is_the_wider_of_cases_and_seeds():
     over_seeds = torch.tensor([[0.3, 0.3, 0.3], [-0.1, -0.1, -0.1]], dtype=torch.float64)
     half = 12.7062 * stdev([0.3, -0.1]) / math.sqrt(2)  # one degree of freedom
     found = compare.pooled(over_seeds)
-    assert (found.value, found.high - found.value, found.count) == pytest.approx((0.1, half, 3), rel=1e-5)
+    assert (found.value, found.high - found.value, found.count) == pytest.approx(
+        (0.1, half, 3), rel=1e-5
+    )
     assert compare.pooled(over_seeds.T).high - 0.1 == pytest.approx(half, rel=1e-5)
     assert compare.pooled(over_seeds[:1]) == student(over_seeds[0])
 
@@ -298,20 +306,27 @@ def test_processor_time_leaves_waiting_out():
 
 def test_functions_take_turns():
     order = []
-    found = turns({name: lambda name=name: order.append(name) for name in "ab"}, rounds=2, repeats=2, warm=0)
+    found = turns(
+        {name: lambda name=name: order.append(name) for name in "ab"}, rounds=2, repeats=2, warm=0
+    )
     assert "".join(order) == "aaabbbaabb"
     assert {len(timing.wall_s) for timing in found.values()} == {4}
 
 
 def told(name, peak_of):
-    """A variable of the environment, and the peaks of calls with so many megabytes and with none."""
+    """A variable of the environment, and the peaks of calls with so many megabytes and with
+    none."""
     calls = (lambda: np.ones(peak_of * 10**6, dtype=np.uint8).sum(), lambda: None)
     return [os.environ.get(name), *map(bench.peak_mb, calls)]
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not start the count of a peak anew")
+@pytest.mark.skipif(
+    sys.platform != "linux", reason="other systems do not start the count of a peak anew"
+)
 def test_a_function_in_its_own_process_and_the_memory_that_it_takes():
-    variable, peak, nothing = apart(told, "CODESIGN_TEST", peak_of=50, environment={"CODESIGN_TEST": "set"})
+    variable, peak, nothing = apart(
+        told, "CODESIGN_TEST", peak_of=50, environment={"CODESIGN_TEST": "set"}
+    )
     assert variable == "set"
     assert peak == pytest.approx(50, abs=5)
     assert nothing < 5
@@ -337,7 +352,11 @@ def test_tables_out_of_long_rows():
 
 
 def test_what_was_asked_and_missed(run):
-    figures = [Asked("speed", 12.0, least=10), Asked("memory, MB", 6.0, most=5), Asked("error", 0.5)]
+    figures = [
+        Asked("speed", 12.0, least=10),
+        Asked("memory, MB", 6.0, most=5),
+        Asked("error", 0.5),
+    ]
     assert show.asked(run, figures) == "**Missed in this run:** memory, MB 6 (≤ 5)."
     assert show.asked(run, figures[:1]) == "All figures are met."
     assert not Asked("number", math.nan, most=1).met
@@ -358,11 +377,16 @@ def test_figures_hold_what_they_are_given():
     assert (left.get_xscale(), left.get_yscale(), right.get_yscale()) == ("log", "log", "linear")
     assert [np.asarray(line.get_ydata()).tolist() for line in left.lines] == [[3, 4], [2, 2]]
     image = np.linspace(0, 1, 12).reshape(3, 4)
-    grid = show.pictures({"r": {"i": image, "s": image - 0.5}, "q": {"i": np.ones((3, 4, 3))}}, signed=["s"])
+    grid = show.pictures(
+        {"r": {"i": image, "s": image - 0.5}, "q": {"i": np.ones((3, 4, 3))}}, signed=["s"]
+    )
     assert [axis.axison for axis in grid.axes] == [True, True, True, False]
     low, high = grid.axes[1].images[0].get_clim()
     assert low == -high == pytest.approx(-0.5, abs=0.01)
     drawn = show.bars({"a": 2.0, "b": Interval(1, 0.5, 2, 9)}, "s", log=True, level=1.5)
-    assert [bar.get_width() for bar in drawn.axes[0].patches if isinstance(bar, Rectangle)] == [2, 1]
+    assert [bar.get_width() for bar in drawn.axes[0].patches if isinstance(bar, Rectangle)] == [
+        2,
+        1,
+    ]
     for figure in (chart, grid, drawn):
         show.plt.close(figure)

@@ -1,5 +1,5 @@
-"""The study of gradients: its judges against enumeration, closed forms and made-up numbers, its core in
-a few seconds, and that it goes on where it was cut."""
+"""The study of gradients: its judges against enumeration, closed forms and made-up numbers, its
+core in a few seconds, and that it goes on where it was cut."""
 
 import dataclasses
 import math
@@ -92,8 +92,8 @@ def test_the_mean_over_beginnings_is_that_of_enumeration(on, off):
     found = compare.Judge(events.SensorModel(on, off), count=16).mean(
         frames, T_S, lambda counts: counts.flatten(0, 1)
     )
-    # evenly spread, a pixel's mean is off by at most 1/16 for each place where its count jumps; 256 pixels
-    # with independent starts are off by that over 16
+    # evenly spread, a pixel's mean is off by at most 1/16 for each place where its count jumps; 256
+    # pixels with independent starts are off by that over 16
     assert found.mean((1, 2)).numpy() == pytest.approx(truth.flatten(), abs=4 / 16 / 16)
 
 
@@ -112,8 +112,8 @@ def test_cosine_and_scale_of_known_vectors(generator):
 
 
 def test_derivatives_over_sections_add_up_to_the_difference():
-    """Of a quadratic function of the frames, whose difference over a section is exactly the derivative
-    in its middle."""
+    """Of a quadratic function of the frames, whose difference over a section is exactly the
+    derivative in its middle."""
     ends = torch.rand(5, 3, 8, 8, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
     def square(frames, t_s):
@@ -136,12 +136,15 @@ def test_a_physical_layer_and_its_judge_draw_the_same_thresholds():
     distance D at the start."""
     frames = climbing(16, 1.503, 0.0)
     sensor = events.SensorModel(0.15, 0.15, theta_sigma=0.05)
-    on, off = events.draw_thresholds(sensor, (16, 16), torch.Generator().manual_seed(0), dtype=torch.float64)
+    on, off = events.draw_thresholds(
+        sensor, (16, 16), torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     layer, truth = topics.physical_maps(sensor)
     torch.testing.assert_close(layer(frames, T_S)[0], (1.503 / on).floor(), rtol=0, atol=0)
     place = (torch.arange(4000, dtype=torch.float64)[:, None, None] + 0.5) / 4000
     exact = ((1.503 + place * (on + off) / 2 - off / 2) / on).floor().mean(0)
-    # the mean over evenly spread places is off by at most one of them for every place where the count jumps
+    # the mean over evenly spread places is off by at most one of them for every place where the
+    # count jumps
     jumps = ((on + off) / 2 / on).ceil()
     assert ((truth(frames, T_S)[0] - exact).abs() <= jumps / compare.BEGINNINGS + 0.001).all()
 
@@ -161,7 +164,10 @@ def test_the_timing_judge_sees_what_the_stream_shows(generator):
     volume = events.from_stream(stream, 0, end_us, topics.BINS, dtype=torch.float64).counts[0]
     assert torch.equal(found[:2], volume.sum(1).round())
     # times are off by at most half a tenth of a millisecond
-    assert float((found[2:] - volume.flatten(0, 1)).abs().max()) <= float(volume.sum(1).max()) * 5e-5 / 0.025
+    assert (
+        float((found[2:] - volume.flatten(0, 1)).abs().max())
+        <= float(volume.sum(1).max()) * 5e-5 / 0.025
+    )
 
 
 # ---- silhouettes through the chain
@@ -177,8 +183,8 @@ def test_hard_counts_are_whole_and_in_the_mean_the_smooth_ones_of_a_rise(case):
     frames = 60 * level.exp()  # above 20 the front end is a logarithm
     hard = case.hard(frames, case.places(64, 0)).sum(0)
     assert torch.equal(hard, hard.round())
-    # one threshold from the middle of its place, half a threshold is not yet reached: floor(x - u) over
-    # a unit of u
+    # one threshold from the middle of its place, half a threshold is not yet reached: floor(x - u)
+    # over a unit of u
     expected = 1.7 / case.theta - 0.5
     assert float((hard[0].mean(0) - expected).abs().max()) <= 1 / 64
     assert float(hard[1].abs().max()) == 0
@@ -188,7 +194,9 @@ def test_hard_counts_are_whole_and_in_the_mean_the_smooth_ones_of_a_rise(case):
 def test_the_judge_finds_the_error_noise_and_cosine_that_were_put_in(generator):
     truth = torch.randn(3, 1, 6, generator=generator, dtype=D)
     noise = torch.randn(3, 400, 6, generator=generator, dtype=D)
-    values = torch.stack([truth + 0.5 * noise, 0 * noise - truth, 1.25 * truth + 0 * noise, 0 * noise], 2)
+    values = torch.stack(
+        [truth + 0.5 * noise, 0 * noise - truth, 1.25 * truth + 0 * noise, 0 * noise], 2
+    )
     row = flow.judged(values)
     size = float(truth.norm())
     # 18 numbers of a standard error of 0.5 / 20 each, known to 1 in sqrt(2 x 18 x 399)

@@ -1,4 +1,5 @@
-"""Runs that are interrupted, end on signals or full disks, and go on with the same numbers and times."""
+"""Runs that are interrupted, end on signals or full disks, and go on with the same numbers and
+times."""
 
 import contextlib
 import errno
@@ -15,8 +16,8 @@ from studies.frame.run import Run
 from tests.studies.smallest_study import Config, numbers
 
 ROOT = Path(__file__).resolve().parents[2]
-# a noisy descent: its numbers depend on the generator, the momentum and the step counter, so a wrong resume
-# shows
+# a noisy descent: its numbers depend on the generator, the momentum and the step counter, so a
+# wrong resume shows
 WALK = '''
 """A walk that can be interrupted."""
 import sys, time
@@ -133,7 +134,9 @@ def test_second_interrupt_ends_at_once(run):
         (ImportError("while a library was loaded"), None, None, ""),
     ],
 )
-def test_what_libraries_make_of_a_full_disk_or_a_signal(out, command, error, number, code, sentence):
+def test_what_libraries_make_of_a_full_disk_or_a_signal(
+    out, command, error, number, code, sentence
+):
     def study(run):
         if number:
             with contextlib.suppress(KeyboardInterrupt):
@@ -146,7 +149,9 @@ def test_what_libraries_make_of_a_full_disk_or_a_signal(out, command, error, num
         return
     ended, complaint = command("--out", out, study=study)
     assert ended == code
-    assert complaint.startswith(f"{sentence}; go on with: python -m studies.smallest_study --resume")
+    assert complaint.startswith(
+        f"{sentence}; go on with: python -m studies.smallest_study --resume"
+    )
 
 
 def test_a_reader_that_goes_away_gets_no_traceback(tmp_path):

@@ -1,5 +1,5 @@
-"""The examples of docs/lens_analysis.md run as they stand, in one go, and every function the page names
-exists."""
+"""The examples of docs/lens_analysis.md run as they stand, in one go, and every function the page
+names exists."""
 
 import re
 from pathlib import Path
@@ -8,7 +8,9 @@ import matplotlib.pyplot as plt
 
 from codesign.lens import analysis, paraxial, seidel
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "lens_analysis.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "lens_analysis.md").read_text(
+    encoding="utf-8"
+)
 
 
 def test_the_examples_run(tmp_path, monkeypatch):
@@ -37,5 +39,6 @@ def test_the_page_names_every_function():
     named = re.findall(r"`(paraxial|seidel)\.(\w+)\(", PAGE)
     assert named
     assert all(
-        hasattr({"paraxial": paraxial, "seidel": seidel}[module], function) for module, function in named
+        hasattr({"paraxial": paraxial, "seidel": seidel}[module], function)
+        for module, function in named
     )

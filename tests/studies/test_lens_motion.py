@@ -1,4 +1,5 @@
-"""A lens for the motion: contrast along a direction, flow directions, forms, what is chosen, a quick run, refusals."""
+"""A lens for the motion: contrast along a direction, flow directions, forms, what is chosen, a
+quick run, refusals."""
 
 import json
 import math
@@ -66,7 +67,9 @@ def test_forward_flow_is_radial_and_that_of_a_turn_horizontal():
     assert torch.allclose(moved[:, 1], -1e-4 * 9.0 / PITCH_MM * sideways, rtol=1e-3)
 
 
-@pytest.mark.parametrize(("name", "turned", "axial"), [("forward", False, 1.0), ("forward", True, 0.0)])
+@pytest.mark.parametrize(
+    ("name", "turned", "axial"), [("forward", False, 1.0), ("forward", True, 0.0)]
+)
 def test_directions_lie_along_the_radius_and_across_it_when_turned(name, turned, axial):
     motion = Motion(name, 9.0, turned)
     along = motion.directions_rad(200).cos().abs()
@@ -137,9 +140,19 @@ def test_the_smallest_detectable_change_is_seen_four_times_in_five():
     assert float((mean + half < 0).double().mean()) == pytest.approx(0.8, abs=0.02)
 
 
-def test_a_quick_run_is_reached_from_the_main_job_and_says_that_it_decides_nothing(tmp_path, capsys):
+def test_a_quick_run_is_reached_from_the_main_job_and_says_that_it_decides_nothing(
+    tmp_path, capsys
+):
     out = tmp_path / "run"
-    command = ["--motion", "turn", "--quick", "--steps=2", "--developed=1", "--judged=2", "--judged-turned=2"]
+    command = [
+        "--motion",
+        "turn",
+        "--quick",
+        "--steps=2",
+        "--developed=1",
+        "--judged=2",
+        "--judged-turned=2",
+    ]
     assert lens_opt.start([*command, "--out", str(out)]) == 0
     metrics = json.loads((out / "metrics.json").read_text())
     for name in ("refocused", "spots", "mtf", "mtf_along", "edge"):
@@ -153,7 +166,10 @@ def test_a_quick_run_is_reached_from_the_main_job_and_says_that_it_decides_nothi
     )
     assert metrics["log_ratio_spots"] == pytest.approx(log_ratio(own, other).value)
     assert main(lens_motion.study, lens_motion.Config, ["--resume", str(out)]) == 0
-    assert json.loads((out / "metrics.json").read_text())["log_ratio_spots"] == metrics["log_ratio_spots"]
+    assert (
+        json.loads((out / "metrics.json").read_text())["log_ratio_spots"]
+        == metrics["log_ratio_spots"]
+    )
     capsys.readouterr()
 
 
@@ -166,7 +182,9 @@ def test_a_quick_run_is_reached_from_the_main_job_and_says_that_it_decides_nothi
         (["--motion", "turn", "--judged", "1"], "--judged is 1; at least 2 is needed"),
     ],
 )
-def test_bad_input_is_refused_in_a_sentence_before_the_first_frame(arguments, sentence, tmp_path, capsys):
+def test_bad_input_is_refused_in_a_sentence_before_the_first_frame(
+    arguments, sentence, tmp_path, capsys
+):
     assert lens_opt.start([*arguments, "--out", str(tmp_path / "run")]) == 2
     assert sentence in capsys.readouterr().err
     assert not list((tmp_path / "run").glob("*.jsonl"))

@@ -1,4 +1,5 @@
-"""The main job: its start, its rivals' limits, who wins, what goes together, and a run that is resumed after its end."""
+"""The main job: its start, its rivals' limits, who wins, what goes together, and a run that is
+resumed after its end."""
 
 import html
 import json
@@ -33,7 +34,8 @@ def task():
 
 def squared_spot(optics, shift_mm, task):
     moved = optics.replace(
-        thickness_mm=optics.thickness_mm + shift_mm * torch.eye(len(optics.thickness_mm)).double()[-1]
+        thickness_mm=optics.thickness_mm
+        + shift_mm * torch.eye(len(optics.thickness_mm)).double()[-1]
     )
     return float(spot_rays(moved, task.fields_rad, DISTANCE_M, LIGHT).rms_mm().square().sum())
 
@@ -75,7 +77,9 @@ def test_rivals_keep_focal_length_aperture_and_floors_of_the_design(task):
     for variant in (*refocused, *spots):
         made = variant.optics
         assert float(made.first_order().efl_mm) == pytest.approx(design.efl_mm, rel=1e-9)
-        assert float(made.first_order().fno) == pytest.approx(float(task.nominal.first_order().fno), rel=1e-9)
+        assert float(made.first_order().fno) == pytest.approx(
+            float(task.nominal.first_order().fno), rel=1e-9
+        )
         assert bool((made.thickness_mm >= design.floor_mm).all())
         # the hinge gives way a little
         assert bool((edge_thickness_mm(made) > design.edge_floor_mm - 0.002).all())
@@ -88,7 +92,10 @@ def test_rivals_keep_focal_length_aperture_and_floors_of_the_design(task):
 def test_a_spot_designer_that_finds_nothing_ends_at_the_start_and_says_so(task, monkeypatch):
     monkeypatch.setattr(rivals, "_solved", lambda *_: SimpleNamespace(loss=math.inf))
     (found,) = rivals.shrink_spots(task, lambda optics: 7.0, 5, 2, 0)
-    assert "finds no smaller spot from 2 starts in 5 steps, so its lens is the start" in found.complaint
+    assert (
+        "finds no smaller spot from 2 starts in 5 steps, so its lens is the start"
+        in found.complaint
+    )
     assert torch.equal(found.optics.curvature_per_mm, task.design.reference.curvature_per_mm)
     assert found.error_mrad == 7.0
 
@@ -104,8 +111,13 @@ def test_the_first_words_say_who_wins():
     design = [0.60, 0.62, 0.59]
     rows |= {"refocusing alone": [0.59, 0.62, 0.60], "the edge": design}
     said = verdict("the flow design", {name: log_ratio(design, row) for name, row in rows.items()})
-    assert said.startswith("The spot designer wins: the flow error of the flow design against it is +20")
-    assert "; refocusing alone and the edge tie: the flow error of the flow design against them is +0" in said
+    assert said.startswith(
+        "The spot designer wins: the flow error of the flow design against it is +20"
+    )
+    assert (
+        "; refocusing alone and the edge tie: the flow error of the flow design against them is +0"
+        in said
+    )
     assert said.endswith("and +0.0 % (+0.0 to +0.0 %) on 3 unseen cases.")
 
 
@@ -115,7 +127,12 @@ def test_the_first_words_say_who_wins():
         ("closed-form", True, "flow", "has no weights, so there is nothing to train"),
         ("flownet", False, "flow", "random weights, whose flow means nothing; add --train-network"),
         ("refiner", True, "edge", "looks at event frames only"),
-        ("nothing.safetensors", False, "flow", "neither a network file nor one of closed-form, refiner"),
+        (
+            "nothing.safetensors",
+            False,
+            "flow",
+            "neither a network file nor one of closed-form, refiner",
+        ),
     ],
 )
 def test_what_makes_no_sense_is_refused_with_the_reason(name, train, objective, sentence):
@@ -178,14 +195,23 @@ def test_a_run_killed_while_it_judges_goes_on_there_and_ends_with_the_same_figur
     assert main(lens_opt.study, lens_opt.Config, ["--resume", str(folder)]) == 0
     again = json.loads((folder / "metrics.json").read_text())
     assert (folder / "report.html").exists()
-    for name in ("flow_error_mrad_hard_optimised", "rms_spot_um_optimised", "rms_spot_um_spots", "steps"):
+    for name in (
+        "flow_error_mrad_hard_optimised",
+        "rms_spot_um_optimised",
+        "rms_spot_um_spots",
+        "steps",
+    ):
         assert again[name] == pytest.approx(first[name], rel=1e-6)
     for name in ("seconds_per_step", "log_ratio_edge", "log_ratio_after_spots_over_spots_high"):
         assert again[name] == pytest.approx(first[name], rel=1e-6)
 
 
 def test_sizes_below_one_are_refused(tmp_path, capsys):
-    assert main(lens_opt.study, lens_opt.Config, ["--steps", "0", "--out", str(tmp_path / "x")]) == 2
+    assert (
+        main(lens_opt.study, lens_opt.Config, ["--steps", "0", "--out", str(tmp_path / "x")]) == 2
+    )
     assert "--steps is 0; at least 1 is needed" in capsys.readouterr().err
-    assert main(lens_opt.study, lens_opt.Config, ["--samples", "6", "--out", str(tmp_path / "y")]) == 2
+    assert (
+        main(lens_opt.study, lens_opt.Config, ["--samples", "6", "--out", str(tmp_path / "y")]) == 2
+    )
     assert "--samples is 6; the light has 4 wavelengths" in capsys.readouterr().err

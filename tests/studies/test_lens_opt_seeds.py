@@ -25,14 +25,25 @@ def finished(run, seed):
     errors = {name: [RATIO.get(name, 1.0) * e for e in cases_mrad] for name in LENSES}
     errors["optimised"] = [e * w for e, w in zip(errors["optimised"], WOBBLE[seed], strict=True)]
     found = {name: [{"flow_error_mrad": e} for e in row] for name, row in errors.items()}
-    metrics = {f"{key}_{name}": 1.0 for key in ("flow_error_mrad_hard", "rms_spot_um") for name in LENSES}
-    return SimpleNamespace(metrics=metrics, load_state=lambda: SimpleNamespace(numbers={"found": found}))
+    metrics = {
+        f"{key}_{name}": 1.0 for key in ("flow_error_mrad_hard", "rms_spot_um") for name in LENSES
+    }
+    return SimpleNamespace(
+        metrics=metrics, load_state=lambda: SimpleNamespace(numbers={"found": found})
+    )
 
 
-def test_differences_of_all_seeds_are_pooled_and_the_page_says_who_wins(tmp_path, monkeypatch, capsys):
+def test_differences_of_all_seeds_are_pooled_and_the_page_says_who_wins(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(lens_opt_seeds, "_one", finished)
     folder = tmp_path / "seeds"
-    assert main(lens_opt_seeds.study, lens_opt_seeds.Config, ["--seeds", "0", "1", "--out", str(folder)]) == 0
+    assert (
+        main(
+            lens_opt_seeds.study, lens_opt_seeds.Config, ["--seeds", "0", "1", "--out", str(folder)]
+        )
+        == 0
+    )
     metrics = json.loads((folder / "metrics.json").read_text())
     mean = math.log(0.9) + (math.log(0.99) + math.log(1.01)) / 3
     assert metrics["spots_log_ratio"] == pytest.approx(mean, rel=1e-9)

@@ -19,20 +19,31 @@ NAMES = list(listing.studies())
 def python(*arguments, cwd=ROOT):
     """Run Python with ``arguments``; returns the finished process."""
     return subprocess.run(
-        [sys.executable, *arguments], capture_output=True, text=True, check=False, timeout=300, cwd=cwd
+        [sys.executable, *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+        cwd=cwd,
     )
 
 
 def test_every_folder_and_file_that_runs_is_listed_once():
-    folders = [path.name for path in (ROOT / "studies").iterdir() if (path / "__main__.py").is_file()]
+    folders = [
+        path.name for path in (ROOT / "studies").iterdir() if (path / "__main__.py").is_file()
+    ]
     files = [
-        path.stem for path in (ROOT / "studies").glob("*.py") if path.stem not in ("__init__", "__main__")
+        path.stem
+        for path in (ROOT / "studies").glob("*.py")
+        if path.stem not in ("__init__", "__main__")
     ]
     listed = [name for members in listing.by_group().values() for name in members]
     assert sorted(listed) == sorted(folders + files)
     assert {"lens_opt", "train_flow", "stability"} <= set(listed)
     assert list(listing.GROUPS) == ["lens", "render", "events", "flow", "whole chain"]
-    missing = [name for members in listing.GROUPS.values() for name in members if name not in listed]
+    missing = [
+        name for members in listing.GROUPS.values() for name in members if name not in listed
+    ]
     assert not missing, "groups name studies that are gone"
 
 
@@ -48,7 +59,9 @@ def test_the_list_shows_the_question_of_every_study():
 
 
 def test_a_study_without_a_group_is_listed_too(tmp_path, monkeypatch):
-    (tmp_path / "new.py").write_text('"""Is it new? It is."""\n\nif __name__ == "__main__":\n    pass\n')
+    (tmp_path / "new.py").write_text(
+        '"""Is it new? It is."""\n\nif __name__ == "__main__":\n    pass\n'
+    )
     (tmp_path / "part.py").write_text('"""No study."""\n')
     monkeypatch.setattr(listing, "FOLDER", tmp_path)
     assert listing.by_group()[listing.OTHERS] == ["new"]
@@ -98,7 +111,9 @@ def test_what_is_no_study_is_refused_in_a_sentence(name, sentence):
 @pytest.mark.parametrize("name", NAMES)
 def test_quick_sets_options_of_the_study(name):
     folder = listing.studies()[name].name == "__main__.py"
-    kind = importlib.import_module(f"studies.{name}.__main__" if folder else f"studies.{name}").Config
+    kind = importlib.import_module(
+        f"studies.{name}.__main__" if folder else f"studies.{name}"
+    ).Config
     assert issubclass(kind, StudyConfig)
     usual = configured(kind, quick=False)
     quick = configured(kind, quick=True)
@@ -107,5 +122,7 @@ def test_quick_sets_options_of_the_study(name):
         for field in dataclasses.fields(kind)
         if getattr(quick, field.name) != getattr(usual, field.name)
     }
-    assert changed == {"quick", *kind.QUICK}, "what --quick sets are options, at other values than usual"
+    assert changed == {"quick", *kind.QUICK}, (
+        "what --quick sets are options, at other values than usual"
+    )
     to_json(name, quick)

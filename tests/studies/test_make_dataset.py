@@ -1,5 +1,5 @@
-"""Data sets: the fast truth against the slow one, files against their definitions, and runs that are killed
-at any moment."""
+"""Data sets: the fast truth against the slow one, files against their definitions, and runs that
+are killed at any moment."""
 
 import hashlib
 import json
@@ -62,7 +62,8 @@ def camera(name="cooke-triplet", size=24, level: Literal["traced", "thin", "pinh
 def poses(count):
     start = look_at((0.1, -1.0, 1.1), (0.0, 0.8, 0.5))
     return start @ se3_exp(
-        torch.arange(count, dtype=D)[:, None] * torch.tensor([0.03, 0.01, 0.05, 0.02, -0.03, 0.04], dtype=D)
+        torch.arange(count, dtype=D)[:, None]
+        * torch.tensor([0.03, 0.01, 0.05, 0.02, -0.03, 0.04], dtype=D)
     )
 
 
@@ -121,7 +122,9 @@ def test_segments_are_the_shapes_of_the_scene():
         assert float((distance[on_ball] - 0.25).abs().max()) < 5e-3
         on_floor = segment_id[0] == index["static/floor"]
         assert torch.equal(on_floor, points[..., 2].abs() < 1e-5)
-        assert torch.equal(segment_id[0] == index["static/north"], (points[..., 1] - 2).abs() < 1e-5)
+        assert torch.equal(
+            segment_id[0] == index["static/north"], (points[..., 1] - 2).abs() < 1e-5
+        )
 
 
 @pytest.mark.parametrize("world", list(worlds.WORLDS))
@@ -166,9 +169,15 @@ def test_the_manifest_holds_the_hash_of_every_file(dataset):
     own |= {f"flow/forward/{k:06d}.{kind}" for k in range(13) for kind in ("png", "flo")}
     own.add("flow/forward_timestamps.txt")
     for name in manifest["sequences"]:
-        files = {path.relative_to(dataset / name) for path in (dataset / name).rglob("*") if path.is_file()}
+        files = {
+            path.relative_to(dataset / name)
+            for path in (dataset / name).rglob("*")
+            if path.is_file()
+        }
         assert {path.as_posix() for path in files} == own
-    assert set(manifest["files"]) == {f"{name}/{file}" for name in manifest["sequences"] for file in own}
+    assert set(manifest["files"]) == {
+        f"{name}/{file}" for name in manifest["sequences"] for file in own
+    }
     for name, entry in manifest["files"].items():
         content = (dataset / name).read_bytes()
         assert entry == {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
@@ -183,7 +192,9 @@ def test_events_are_those_of_the_stored_frames_whatever_the_chunks(dataset):
         ):
             t_s = torch.from_numpy(frames["t_s"][()])
             torch.testing.assert_close(t_s, torch.arange(14, dtype=D) / 90, rtol=0, atol=1e-15)
-            np.testing.assert_array_equal(frames["timestamps"][()], np.rint(np.arange(14) / 90 * 1e6))
+            np.testing.assert_array_equal(
+                frames["timestamps"][()], np.rint(np.arange(14) / 90 * 1e6)
+            )
             whole = simulate(
                 torch.from_numpy(frames["frames"][()]),
                 t_s,
@@ -210,14 +221,18 @@ def test_flow_files_hold_the_flow_and_the_truth_is_the_renderers(dataset):
     cam = camera()
     for name in names(dataset):
         with store.h5(dataset / name / "frames.h5") as frames:
-            T, flow, valid = (torch.from_numpy(frames[key][()]) for key in ("poses", "flow", "valid"))
+            T, flow, valid = (
+                torch.from_numpy(frames[key][()]) for key in ("poses", "flow", "valid")
+            )
             with torch.no_grad():
                 slow = flow_and_occlusion(cam, scene, T)
                 images = render.frames(cam, scene, T)
             assert torch.equal(valid, slow.valid)
             # the chart's, and float32
             torch.testing.assert_close(flow.double(), slow.flow_px, rtol=0, atol=2e-6)
-            torch.testing.assert_close(torch.from_numpy(frames["frames"][()]), images, rtol=0, atol=1e-4)
+            torch.testing.assert_close(
+                torch.from_numpy(frames["frames"][()]), images, rtol=0, atol=1e-4
+            )
             torch.testing.assert_close(
                 torch.from_numpy(frames["depth"][3]).double(),
                 view(cam, scene, T, 3).depth_m,
@@ -227,8 +242,8 @@ def test_flow_files_hold_the_flow_and_the_truth_is_the_renderers(dataset):
             step = inverse(T[:-1]) @ T[1:]
             velocity = torch.from_numpy(frames["velocity"][()])
             middle = se3_exp((velocity[:-1] + velocity[1:]) / 180)
-            # trapezium rule over 1/90 s: dt^3/12 of the jerk, which for a swing of 0.3 m at 0.7 Hz is 26
-            # m/s^3
+            # trapezium rule over 1/90 s: dt^3/12 of the jerk, which for a swing of 0.3 m at 0.7 Hz
+            # is 26 m/s^3
             torch.testing.assert_close(step, middle, rtol=0, atol=3e-6)
         for k in range(13):
             for kind, tolerance in (("png", 1 / 256), ("flo", 0)):
@@ -250,8 +265,8 @@ def test_the_calibration_is_the_cameras(dataset):
         for name, values in (("direction", rays.direction), ("origin_m", rays.origin_m)):
             stored = file[name][()].reshape(-1, 3)
             np.testing.assert_allclose(stored, values.detach().numpy(), rtol=0, atol=1e-15)
-        # near the axis the lens is the pinhole of K; at 0.7 px its distortion, some percent at the border 17
-        # px away, is 0.002 of that
+        # near the axis the lens is the pinhole of K; at 0.7 px its distortion, some percent at the
+        # border 17 px away, is 0.002 of that
         seen = file["K"][()] @ (file["direction"][12, 12] / file["direction"][12, 12, 2])
         np.testing.assert_allclose(seen, [12, 12, 1], rtol=0, atol=1e-4)
         # the film stands off the focal plane by a little
@@ -261,8 +276,8 @@ def test_the_calibration_is_the_cameras(dataset):
 
 
 def kill_when(folder, appears, *options):
-    """Start the study and end it with SIGKILL as soon as a file matching ``appears`` is there; False when it
-    ended first."""
+    """Start the study and end it with SIGKILL as soon as a file matching ``appears`` is there;
+    False when it ended first."""
     command = [sys.executable, "-m", "studies.make_dataset", *options]
     silent = subprocess.DEVNULL
     process = subprocess.Popen(command, cwd=ROOT, stdout=silent, stderr=silent)
@@ -290,7 +305,9 @@ def test_a_run_killed_many_times_ends_with_the_same_bytes(dataset, tmp_path):
         assert (folder / "manifest.json").read_bytes() == (dataset / "manifest.json").read_bytes()
     for name in json.loads((folder / "manifest.json").read_text())["files"]:
         assert (folder / name).read_bytes() == (dataset / name).read_bytes()
-    assert not [path for path in folder.rglob("*") if path.name.startswith(".") or path.name == store.PARTS]
+    assert not [
+        path for path in folder.rglob("*") if path.name.startswith(".") or path.name == store.PARTS
+    ]
 
 
 def test_folders_with_other_things_and_damaged_parts_are_refused_in_one_sentence(tmp_path, capsys):
@@ -327,7 +344,9 @@ def test_paths_that_cannot_keep_clear_are_refused():
     # at the wall
     stage = Stage(low_m=(0.0, 1.99, 1.0), high_m=(0.0, 1.995, 1.0), target_m=(0.0, 3.0, 1.0))
     with pytest.raises(DomainError, match="none of 200 radial paths"):
-        motions.motion("radial", stage, worlds.room(), camera(size=16), 1.0, torch.Generator().manual_seed(0))
+        motions.motion(
+            "radial", stage, worlds.room(), camera(size=16), 1.0, torch.Generator().manual_seed(0)
+        )
 
 
 def test_the_example_of_the_documentation_runs(dataset):

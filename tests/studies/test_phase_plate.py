@@ -22,7 +22,8 @@ def test_contrast_is_the_transfer_of_a_perfect_lens():
     config = configured(phase_plate.Config, quick=True, pixel_um=6.0)
     found = phase_plate.contrast(config, perfect(4.0), math.inf, 0.0)
     truth = ideal_mtf([1 / (p * 6e-3) for p in phase_plate.PERIODS_PX], 12.5)
-    # 1 % of an Airy pattern at f/12.5 lies beyond the 0.19 mm of samples, which lifts the rest as much
+    # 1 % of an Airy pattern at f/12.5 lies beyond the 0.19 mm of samples, which lifts the rest as
+    # much
     torch.testing.assert_close(found, truth.to(found), rtol=0, atol=0.015)
 
 
@@ -42,7 +43,10 @@ def test_a_defocused_lens_has_the_contrast_of_its_blur():
 @pytest.mark.slow
 def test_a_short_run_improves_the_plate(tmp_path):
     out = tmp_path / "run"
-    assert main(phase_plate.study, phase_plate.Config, ["--quick", "--steps", "4", "--out", str(out)]) == 0
+    assert (
+        main(phase_plate.study, phase_plate.Config, ["--quick", "--steps", "4", "--out", str(out)])
+        == 0
+    )
     metrics = json.loads((out / "metrics.json").read_text())
     gain = metrics["plate_over_open_contrast_8px"]
     assert gain > 1.2

@@ -1,5 +1,5 @@
-"""The placement study: its descent on a noisy valley, draws of samples, gradients against differences,
-controls that see nothing, its bad input, and the whole of it, resumed."""
+"""The placement study: its descent on a noisy valley, draws of samples, gradients against
+differences, controls that see nothing, its bad input, and the whole of it, resumed."""
 
 import contextlib
 import csv
@@ -91,8 +91,8 @@ def test_draws_see_all_worlds_and_are_the_same_for_every_mount(problem):
 
 
 def test_differences_of_geometry_are_those_of_rendered_mounts():
-    """In the corridor, with the forks in view: height, and pitch, whose slope at the mount itself points the
-    other way."""
+    """In the corridor, with the forks in view: height, and pitch, whose slope at the mount itself
+    points the other way."""
     problem = Problem(PAIRS["corridor"](), robot_pair.training(6), spread=6, per_world=4)
     samples = problem.draw(0)
     rendered = torch.zeros(6, dtype=F)
@@ -111,7 +111,8 @@ def test_differences_of_geometry_are_those_of_rendered_mounts():
 
 
 def test_differences_end_at_a_wall(problem):
-    """Of h^2 over a step of 0.12 to both sides, or to one: (0.62^2 - 0.38^2) / 0.24 and (1 - 0.88^2) / 0.12."""
+    """Of h^2 over a step of 0.12 to both sides, or to one: (0.62^2 - 0.38^2) / 0.24 and
+    (1 - 0.88^2) / 0.12."""
     watched = replace(problem)
     watched._carried = lambda field, here, samples, poses: problem.ranges.share_at(poses)[:, 2] ** 2
     for height, expected in ((0.5, 1.0), (1.0, 1.88)):
@@ -154,9 +155,9 @@ def test_wrong_input_is_one_sentence_before_the_first_frame(given, said, tmp_pat
 
 
 def test_ratios_are_of_paired_starts_and_worlds():
-    """Medians with an even number of starts are the mean of two; drives in a world err alike: means of four
-    worlds 0, 1, 2, 3 deviate by sqrt(5 / 3), over the root of four; a ratio over worlds is one of means, 4 /
-    6 of 1 / 2 and 3 / 4."""
+    """Medians with an even number of starts are the mean of two; drives in a world err alike: means
+    of four worlds 0, 1, 2, 3 deviate by sqrt(5 / 3), over the root of four; a ratio over worlds is
+    one of means, 4 / 6 of 1 / 2 and 3 / 4."""
     found = outcome.paired(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2.0, 2.5, 2.0]))
     assert (found.median, found.ahead, found.count) == (pytest.approx(0.8), 2, 3)
     assert (found.low, found.high) == pytest.approx((0.5, 1.5))
@@ -166,7 +167,10 @@ def test_ratios_are_of_paired_starts_and_worlds():
     errors = torch.arange(4.0, dtype=F).repeat_interleave(6)
     assert outcome.standard_error(errors, 4) == pytest.approx((5 / 3) ** 0.5 / 2)
     assert outcome.standard_error(errors[:1], 1) == 0.0
-    ours, theirs = torch.tensor([0.5, 1.5, 2.0, 4.0], dtype=F), torch.tensor([1.0, 3.0, 4.0, 4.0], dtype=F)
+    ours, theirs = (
+        torch.tensor([0.5, 1.5, 2.0, 4.0], dtype=F),
+        torch.tensor([1.0, 3.0, 4.0, 4.0], dtype=F),
+    )
     assert outcome.over_worlds(ours, theirs, 2) == pytest.approx((4 / 6, 0.5, 0.75))
 
 
@@ -177,7 +181,10 @@ def test_a_run_that_goes_on_is_the_one_that_was_begun(tmp_path):
     begun = json.loads(json.dumps(fingerprints(pair)))
     check_same(begun, fingerprints(pair))
     for changed, said in (
-        (replace(pair, page="world_unit_m=0.01"), "the robot's page changed since this run was begun"),
+        (
+            replace(pair, page="world_unit_m=0.01"),
+            "the robot's page changed since this run was begun",
+        ),
         (replace(pair, files=()), r"room\.obj' changed since .*, now not there"),
     ):
         with pytest.raises(DomainError, match=said):
@@ -188,8 +195,8 @@ def test_a_run_that_goes_on_is_the_one_that_was_begun(tmp_path):
 
 
 def test_searches_look_only_at_what_is_allowed_and_free(problem):
-    """Outdoors most of the cube looks down too far to see ahead; held numbers stay; rivals see always the
-    same drives."""
+    """Outdoors most of the cube looks down too far to see ahead; held numbers stay; rivals see
+    always the same drives."""
     pair = problem.pair
     held = {name: getattr(pair.design, name) for name in ("x_m", "y_m", "yaw_rad", "roll_rad")}
     narrow = replace(pair, low=replace(pair.low, **held), high=replace(pair.high, **held))
@@ -210,7 +217,9 @@ def test_searches_look_only_at_what_is_allowed_and_free(problem):
         assert [seed for _, seed in looked] == [2000] * 8
         assert all(kept(watched, share) for share in found)
         assert len({tuple(row) for row in found[:, ~watched.ranges.held].tolist()}) == 8
-        assert torch.equal(found[:, watched.ranges.held], watched.start[watched.ranges.held].expand(8, 4))
+        assert torch.equal(
+            found[:, watched.ranges.held], watched.start[watched.ranges.held].expand(8, 4)
+        )
 
 
 def test_starts_are_those_given_and_others_at_random(problem):
@@ -218,7 +227,9 @@ def test_starts_are_those_given_and_others_at_random(problem):
     given, *others = feasible(problem, 3, 5, [problem.start])
     assert torch.equal(given, problem.start)
     assert torch.equal(torch.stack(others), torch.stack(feasible(problem, 2, 5)))
-    fixed = Problem(replace(problem.pair, low=problem.pair.design, high=problem.pair.design), range(1), 1, 1)
+    fixed = Problem(
+        replace(problem.pair, low=problem.pair.design, high=problem.pair.design), range(1), 1, 1
+    )
     with pytest.raises(DomainError, match="hold all six"):
         feasible(fixed, 1, 0)
 
@@ -226,7 +237,12 @@ def test_starts_are_those_given_and_others_at_random(problem):
 def test_the_answer_says_that_the_default_stays():
     """Of one descent and of three."""
     problem = Problem(PAIRS["flight"](), robot_pair.training(1), 1, 1)
-    told = {"race": SimpleNamespace(problem=problem), "unseen": problem, "share": problem.start, "best": None}
+    told = {
+        "race": SimpleNamespace(problem=problem),
+        "unseen": problem,
+        "share": problem.start,
+        "best": None,
+    }
     errors = {"error": 0.5, "default_error": 0.5}
     one, three = (answer(SimpleNamespace(**told, **errors, starts=count)) for count in (1, 3))
     assert "on training drives the one descent does not end at a better place (error 0.500" in one
@@ -257,7 +273,9 @@ def test_a_traced_lens_has_the_focal_length_and_focus_asked_for():
     pair = PAIRS["outdoors"]()
     optics = traced_camera(pair, "cooke-triplet").lens
     assert float(optics.first_order().efl_mm) == pytest.approx(pair.design.efl_mm)
-    nearer = traced_camera(replace(pair, design=replace(pair.design, focus_per_m=4.0)), "cooke-triplet").lens
+    nearer = traced_camera(
+        replace(pair, design=replace(pair.design, focus_per_m=4.0)), "cooke-triplet"
+    ).lens
     shift_mm = float(nearer.thickness_mm[-1] - optics.thickness_mm[-1])
     newton_mm = pair.design.efl_mm**2 * 1e-3 * (4.0 - pair.design.focus_per_m)
     assert shift_mm == pytest.approx(newton_mm, rel=0.05)
@@ -276,7 +294,9 @@ def test_the_whole_study_and_its_resumption(tmp_path):
     assert {int(row["samples"]) for row in rows if row["search"] in ("gradient", "random")} == {2}
     handed = load_hand_over(out / "mount.yaml")
     row = next(
-        row for row in rows if row["search"] == ("default" if found["chosen_start"] < 0 else "gradient")
+        row
+        for row in rows
+        if row["search"] == ("default" if found["chosen_start"] < 0 else "gradient")
     )
     assert handed.mount()[2, 3].item() == pytest.approx(float(row["z_m"]), abs=1e-4)
     assert math.isfinite(found["control_no_texture_error"])

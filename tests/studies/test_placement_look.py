@@ -20,9 +20,13 @@ def test_the_page_shows_the_robot_and_counts_its_body_in_view(tmp_path):
         "camera:\n  low_m: [0.1, -0.1, 0.5]\n  high_m: [0.3, 0.1, 0.9]\n"
     )
     out = tmp_path / "run"
-    assert main(placement.study, placement.Config, ["--robot", str(page), "--look", "--out", str(out)]) == 0
+    assert (
+        main(placement.study, placement.Config, ["--robot", str(page), "--look", "--out", str(out)])
+        == 0
+    )
     metrics = json.loads((out / "metrics.json").read_text())
-    # four wheels and a mast of 48-gons (2 x 48 + 2 x 48 triangles), two boxes of 12 without the camera's
+    # four wheels and a mast of 48-gons (2 x 48 + 2 x 48 triangles), two boxes of 12 without the
+    # camera's
     assert metrics["faces"] == 5 * 4 * 48 + 2 * 12
     assert 0 <= metrics["own_body_share"] < 0.5
     assert 0 < metrics["downward_forward_m_s"] < metrics["forward_forward_m_s"]
@@ -33,7 +37,8 @@ def test_the_page_shows_the_robot_and_counts_its_body_in_view(tmp_path):
 def test_the_drawn_view_is_that_of_the_camera():
     camera = render.Camera(lens.Pinhole(4.0), 40, 20, 0.1, 1)
     lines = robot_figures.view_lines(camera, robots.T_LINK_OPTICAL, 2.0)
-    # 2 m ahead the film of 4 x 2 mm behind 4 mm is 2 x 1 m wide, in the axes of a link: x ahead, y left, z up
+    # 2 m ahead the film of 4 x 2 mm behind 4 mm is 2 x 1 m wide, in the axes of a link: x ahead, y
+    # left, z up
     corners = [[2, 1, 0.5], [2, -1, 0.5], [2, -1, -0.5], [2, 1, -0.5]]
     np.testing.assert_allclose(lines[:4, 1], corners, atol=1e-12)
     assert not lines[:4, 0].any()
@@ -49,4 +54,6 @@ def test_cut_triangles_cover_what_they_were_cut_from():
     def areas(of):
         return np.linalg.norm(np.cross(of[:, 1] - of[:, 0], of[:, 2] - of[:, 0]), axis=1) / 2
 
-    np.testing.assert_allclose(np.bincount(shade.astype(int), areas(parts)), areas(triangles), rtol=1e-12)
+    np.testing.assert_allclose(
+        np.bincount(shade.astype(int), areas(parts)), areas(triangles), rtol=1e-12
+    )

@@ -16,7 +16,9 @@ from tests.studies.smallest_study import Config, numbers
 def test_state_returns_every_bit(run, generator):
     tensors = {
         "float32": torch.randn(3, 4, generator=generator).T,
-        "float64/odd name": torch.tensor([0.1, torch.nan, -0.0, torch.inf, 5e-324], dtype=torch.float64),
+        "float64/odd name": torch.tensor(
+            [0.1, torch.nan, -0.0, torch.inf, 5e-324], dtype=torch.float64
+        ),
         "int64": torch.tensor([2**62 + 1, -1]),
         "bool": torch.tensor([True, False]),
         "scalar": torch.tensor(1 / 3),
@@ -61,7 +63,10 @@ def test_the_state_of_another_run_is_refused(tmp_path):
 
     mine = folder("mine")
     assert resumed().numbers == {"step": 1}
-    for other, reason in ((folder("a", "other"), "study"), (folder("b", limit=2.0), "configuration")):
+    for other, reason in (
+        (folder("a", "other"), "study"),
+        (folder("b", limit=2.0), "configuration"),
+    ):
         (mine / "state.npz").write_bytes((other / "state.npz").read_bytes())
         with pytest.raises(FileFormatError, match=f"another {reason}"):
             resumed()
@@ -84,7 +89,8 @@ def test_metrics_are_finite_numbers(run):
 def test_page_holds_everything_and_loads_nothing(run):
     run.card("RMS spot", "12.3 µm", "detuned: 41 µm")
     run.section(
-        "Result", "The **lens** is `sharp` <script>alert(1)</script> https://example.org\n\n- one\n- two"
+        "Result",
+        "The **lens** is `sharp` <script>alert(1)</script> https://example.org\n\n- one\n- two",
     )
     figure, axes = plt.subplots()
     axes.plot([0, 1], [1, 0])

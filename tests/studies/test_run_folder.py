@@ -24,7 +24,14 @@ def test_command_leaves_what_the_contract_names(tmp_path, monkeypatch, command):
     config = stored(folder, "config")
     # the device is the one that computed
     assert config.pop("device") in ("cpu", "cuda")
-    given = {"quick": False, "out": None, "seed": 0, "resume": None, "limit": 0.5, "sizes": [3, 4, 5]}
+    given = {
+        "quick": False,
+        "out": None,
+        "seed": 0,
+        "resume": None,
+        "limit": 0.5,
+        "sizes": [3, 4, 5],
+    }
     assert config == {"study": "smallest_study", **given}
     metrics = stored(folder, "metrics")
     assert metrics["limit"] == 0.5
@@ -142,7 +149,11 @@ def test_resume_takes_the_stored_configuration_and_metrics(tmp_path):
 def test_what_is_typed_comes_before_what_quick_sets(out, command, typed, ran):
     assert command("--out", out, *typed)[0] == 0
     config = stored(out, "config")
-    assert (numbers(out)["limit"], config["limit"], config["quick"]) == (ran, ran, "--quick" in typed)
+    assert (numbers(out)["limit"], config["limit"], config["quick"]) == (
+        ran,
+        ran,
+        "--quick" in typed,
+    )
 
 
 def test_resume_refuses_only_what_differs_from_the_stored_run(out, command):
@@ -178,7 +189,14 @@ def test_wrong_options_exit_with_two_and_help_explains_them(command, capsys, mon
             main(record_one, Config, arguments)
         assert ended.value.code == code
     shown = capsys.readouterr().out
-    for option in ("--quick", "--out", "--seed", "--device", "--limit", "Folder of an interrupted run"):
+    for option in (
+        "--quick",
+        "--out",
+        "--seed",
+        "--device",
+        "--limit",
+        "Folder of an interrupted run",
+    ):
         assert option in shown
     said = "error: option --limit is inf; give a finite number, or leave the option out.\n"
     assert command("--limit", "inf") == (2, said)

@@ -1,4 +1,5 @@
-"""Searches without gradients on functions whose minimum is known: how near they come, and what they keep to."""
+"""Searches without gradients on functions whose minimum is known: how near they come, and what they
+keep to."""
 
 import math
 import sys
@@ -34,8 +35,8 @@ def search(request):
 
 
 def test_a_quadratic_is_solved():
-    """Of the cube 5.8 % has an error below 0.2, so that 200 random points miss it once in 100,000 searches, and 0.02 %
-    one below 0.01, which needs more than chance."""
+    """Of the cube 5.8 % has an error below 0.2, so that 200 random points miss it once in 100,000
+    searches, and 0.02 % one below 0.01, which needs more than chance."""
     limits = {"random": 0.2, "CMA-ES": 1e-2, "TPE": 1e-2}
     for name, limit in limits.items():
         for seed in range(2):
@@ -65,8 +66,8 @@ def test_what_is_refused_costs_no_look(search):
 
 
 def test_the_valley_is_followed():
-    """From its far end at (-1.2, 1), where the error is 24. Of the square 1.5 % is below 1, which 250 random points miss
-    once in 40 searches, and 0.2 % below 0.1. CMA-ES learns its bend."""
+    """From its far end at (-1.2, 1), where the error is 24. Of the square 1.5 % is below 1, which
+    250 random points miss once in 40 searches, and 0.2 % below 0.1. CMA-ES learns its bend."""
     start = torch.tensor([0.2, 0.75], dtype=D)
     limits = {"random": (250, 1.0), "CMA-ES": (500, 1e-2), "TPE": (250, 0.1)}
     for name, (count, limit) in limits.items():
@@ -86,7 +87,8 @@ def test_a_minimum_in_a_corner_is_found_and_bounds_are_kept(search, corner):
     assert trail.share[0].tolist() == [1 - corner] * 3
     assert float(trail.share.min()) >= 0
     assert float(trail.share.max()) <= 1
-    # the best of 150 even points in a unit cube has 150 V = 1 at the corner's simplex, V = e^3 / 6: e = 0.34
+    # the best of 150 even points in a unit cube has 150 V = 1 at the corner's simplex, V = e^3 / 6:
+    # e = 0.34
     assert float(trail.error.min()) < 0.6
 
 
@@ -131,7 +133,9 @@ def test_a_missing_library_is_one_sentence_before_the_first_call(monkeypatch, na
 
 
 def test_what_cannot_be_searched_is_refused(search):
-    with pytest.raises(DomainError, match="search 'cmaes' is unknown; choose from random, CMA-ES, TPE"):
+    with pytest.raises(
+        DomainError, match="search 'cmaes' is unknown; choose from random, CMA-ES, TPE"
+    ):
         available(["random", "cmaes"])
     with pytest.raises(NonFiniteError, match="the judge says nan of the shares"):
         search(lambda share: math.nan, START, 3, 0)

@@ -1,4 +1,5 @@
-"""The fitted sensor against closed forms and thresholds that are known; the study against its files."""
+"""The fitted sensor against closed forms and thresholds that are known; the study against its
+files."""
 
 import json
 import math
@@ -20,7 +21,10 @@ D = torch.float64
 
 def test_the_loss_and_the_figures_equal_values_by_hand():
     recorded = torch.zeros(1, 2, 1, 3)
-    recorded[0, 0, 0], recorded[0, 1, 0] = torch.tensor([4.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 9.0])
+    recorded[0, 0, 0], recorded[0, 1, 0] = (
+        torch.tensor([4.0, 0.0, 0.0]),
+        torch.tensor([0.0, 0.0, 9.0]),
+    )
     # twice the counts: correlation 1; log ratios ln(9/5) and ln(19/10)
     logs = math.log(9 / 5), math.log(19 / 10)
     mean_square = (logs[0] ** 2 + logs[1] ** 2) / 2
@@ -33,7 +37,8 @@ def test_the_loss_and_the_figures_equal_values_by_hand():
 
 
 def drifting(t_s):
-    """Gratings that drift over a bright and a dark ground, 0.4 rad per 40 ms: [T, 32, 32], never below 3."""
+    """Gratings that drift over a bright and a dark ground, 0.4 rad per 40 ms: [T, 32, 32], never
+    below 3."""
     y, x = torch.meshgrid(torch.arange(32, dtype=D), torch.arange(32, dtype=D), indexing="ij")
     ground = torch.where(y < 16, 70.0, 18.0)
     return ground * (1 + 0.8 * torch.sin((x - 30 * t_s[:, None, None]) / 3.0 + 0.4 * y))
@@ -58,8 +63,9 @@ def test_the_fit_recovers_thresholds_that_are_known():
         fit.step()
     found = {name: float(value.detach()) for name, value in sensor.values().items()}
     # A swing between turning points is some 8 thresholds, of which whole ones count: with the known
-    # parameters the 8 intervals' event numbers are off by up to 2 % where 40 ms samples move a turning point.
-    # Frames 40 ms apart miss turning points, which the dark offset answers for: it is known to a fifth.
+    # parameters the 8 intervals' event numbers are off by up to 2 % where 40 ms samples move a
+    # turning point. Frames 40 ms apart miss turning points, which the dark offset answers for: it
+    # is known to a fifth.
     assert found["theta_on"] == pytest.approx(thetas[0], rel=0.04)
     assert found["theta_off"] == pytest.approx(thetas[1], rel=0.04)
     assert found["dark_offset"] == pytest.approx(dark_offset, rel=0.2)
@@ -101,21 +107,25 @@ def test_a_fit_that_was_stopped_goes_on_as_one_that_was_not(tmp_path):
     second.sensor.save(tmp_path / "sensor.json")
     loaded = FittedSensor.load(tmp_path / "sensor.json")
     for name, value in whole.sensor.values().items():
-        assert float(loaded.values()[name].detach()) == pytest.approx(float(value.detach()), rel=1e-15)
+        assert float(loaded.values()[name].detach()) == pytest.approx(
+            float(value.detach()), rel=1e-15
+        )
     (tmp_path / "sensor.json").write_text("{}")
     with pytest.raises(FileFormatError, match="no fitted sensor"):
         FittedSensor.load(tmp_path / "sensor.json")
 
 
 def write_recording(path, **changed):
-    """A made-up recording of 40 x 48 pixels with 7 frames: a bright bar passes; events of a sensor with θ
-    0.15 and 0.2."""
+    """A made-up recording of 40 x 48 pixels with 7 frames: a bright bar passes; events of a sensor
+    with θ 0.15 and 0.2."""
     fine_s = torch.arange(0, 261, dtype=D) * 1e-3
     x = torch.arange(48, dtype=D)
-    frames = (10 + 100 * torch.exp(-((x - 4 - 150 * fine_s[:, None]) / 4).square()))[:, None].expand(
-        -1, 40, -1
+    frames = (10 + 100 * torch.exp(-((x - 4 - 150 * fine_s[:, None]) / 4).square()))[
+        :, None
+    ].expand(-1, 40, -1)
+    stream = events.simulate(
+        (frames + 8).log(), fine_s, events.SensorModel(0.15, 0.2), log_input=True
     )
-    stream = events.simulate((frames + 8).log(), fine_s, events.SensorModel(0.15, 0.2), log_input=True)
     middle_us = 10_000 + 40_000 * np.arange(7)
     seen = frames[10::40][:7].round().to(torch.uint8)
     exposure_us = np.stack((middle_us - 2000, middle_us + 2000), 1)
@@ -128,7 +138,9 @@ def write_recording(path, **changed):
         "exposure": exposure_us,
     }
     kept: dict[str, Any] = {
-        name: np.asarray(value) for name, value in {**entries, **changed}.items() if value is not None
+        name: np.asarray(value)
+        for name, value in {**entries, **changed}.items()
+        if value is not None
     }
     np.savez(path, **kept)
     return stream
@@ -190,7 +202,8 @@ def test_the_study_records_what_the_files_say(tmp_path, capsys):
     with np.load(path) as data:
         frames = data["frames"].astype(np.float64)
     level = np.where(frames <= 20, frames * math.log(20) / 20, np.log(np.maximum(frames, 20)))
-    # the memorised level of every pixel follows in whole thresholds; the second half: intervals 3 to 5
+    # the memorised level of every pixel follows in whole thresholds; the second half: intervals 3
+    # to 5
     on = 0
     memory = level[0]
     for k, now in enumerate(level[1:]):

@@ -1,5 +1,5 @@
-"""The Spike-ESIM study: figures of judgement, thesis variants, digits and saccades against closed forms and
-values worked out by hand; a run that goes on where it stopped."""
+"""The Spike-ESIM study: figures of judgement, thesis variants, digits and saccades against closed
+forms and values worked out by hand; a run that goes on where it stopped."""
 
 import json
 import math
@@ -36,7 +36,9 @@ DT_S = 2e-3
 
 
 def made(pictures, counts):
-    return train.Sequence("made", pictures, torch.arange(len(pictures), dtype=D) * DT_S, counts, counts)
+    return train.Sequence(
+        "made", pictures, torch.arange(len(pictures), dtype=D) * DT_S, counts, counts
+    )
 
 
 def sequence(counts):
@@ -68,8 +70,8 @@ def test_figures_of_silence_of_the_target_and_of_its_multiples():
 
 
 def test_two_draws_of_one_poisson_rate_lie_twice_their_variance_apart():
-    # per pixel E(a - b)^2 = 2 m for the difference; for silence the mean m adds: ratio = 2 m e / (m e + (m
-    # K)^2) with e = sum eps_k^2, K = sum eps_k
+    # per pixel E(a - b)^2 = 2 m for the difference; for silence the mean m adds: ratio = 2 m e / (m
+    # e + (m K)^2) with e = sum eps_k^2, K = sum eps_k
     mean = 0.05
     steps = 2000
     h = DT_S / judge.TAU_S
@@ -79,8 +81,8 @@ def test_two_draws_of_one_poisson_rate_lie_twice_their_variance_apart():
     area = float(eps.sum())
     truth = 2 * mean * power / (mean * power + (mean * area) ** 2)
     found = judge.distance([(noise(1, mean, steps), sequence(noise(2, mean, steps)))])
-    # 512 pixels and 2000 steps of a correlation time of about 10: 1e5 independent terms, so 1 %; the first
-    # steps, not yet full, 1 % more
+    # 512 pixels and 2000 steps of a correlation time of about 10: 1e5 independent terms, so 1 %;
+    # the first steps, not yet full, 1 % more
     assert found == pytest.approx(truth, rel=0.03)
 
 
@@ -99,7 +101,8 @@ def test_flicker_is_the_power_above_fifty_hertz():
         return 10 + torch.sin(2 * math.pi * 10 * t_s) + high * torch.sin(2 * math.pi * 100 * t_s)
 
     power = [
-        judge.flicker(wave(high)[:, None, None, None].expand(-1, 2, 16, 16), DT_S) for high in (2.0, 1.0)
+        judge.flicker(wave(high)[:, None, None, None].expand(-1, 2, 16, 16), DT_S)
+        for high in (2.0, 1.0)
     ]
     # the taper leaks below 1e-6 at this distance
     assert power[0] / power[1] == pytest.approx(4.0, rel=1e-6)
@@ -119,7 +122,9 @@ def test_an_ideal_generator_follows_an_ideal_sensor_through_every_threshold(monk
     monkeypatch.setattr(study, "SENSOR", noisy)
     rows = study.swept(SpikeEsim(0.18, 0.22), [made(walk(16), None)])
     # some 5000 events; a level within rounding of a threshold may tell one more or less
-    assert [row["rate_ratio"] for row in rows] == pytest.approx([1.0] * len(study.FACTORS), abs=1e-3)
+    assert [row["rate_ratio"] for row in rows] == pytest.approx(
+        [1.0] * len(study.FACTORS), abs=1e-3
+    )
 
 
 def test_delay_is_found_with_its_sign():
@@ -163,22 +168,26 @@ def test_saccades_go_round_an_equilateral_triangle_at_the_speed_of_their_closed_
     corners = position_px(torch.tensor([0, LEG_S, 2 * LEG_S, 3 * LEG_S], dtype=D))
     assert corners[0].tolist() == [0, 0]
     assert torch.allclose(corners[3], corners[0], atol=1e-12)
-    assert (corners[1:] - corners[:-1]).norm(dim=1).tolist() == pytest.approx([SIDE_PX] * 3, abs=1e-12)
-    # half of the way after half of the time, at 15/8 of the mean speed; central differences of 1 us err by
-    # h^2 s'''/6 = 2e-8 px/s
+    assert (corners[1:] - corners[:-1]).norm(dim=1).tolist() == pytest.approx(
+        [SIDE_PX] * 3, abs=1e-12
+    )
+    # half of the way after half of the time, at 15/8 of the mean speed; central differences of 1 us
+    # err by h^2 s'''/6 = 2e-8 px/s
     for leg in range(3):
         middle_s = (leg + 0.5) * LEG_S
         before, at, after = position_px(middle_s + torch.tensor([-1e-6, 0, 1e-6], dtype=D))
         assert torch.allclose(at, (corners[leg] + corners[leg + 1]) / 2, atol=1e-12)
-        assert float((after - before).norm()) / 2e-6 == pytest.approx(15 / 8 * SIDE_PX / LEG_S, rel=1e-6)
+        assert float((after - before).norm()) / 2e-6 == pytest.approx(
+            15 / 8 * SIDE_PX / LEG_S, rel=1e-6
+        )
     still = position_px(LEG_S + torch.tensor([-1e-5, 1e-5], dtype=D))
     # at rest at the corners: 10 u^3 of 4 px with u = 1.7e-4 is 2e-10 px
     assert float((still[1] - still[0]).norm()) < 1e-9
 
 
 def test_frames_of_waves_are_those_waves_moved():
-    # 5 and 3 periods across and down a tile of 64 px: band-limited, so every sub-pixel shift has a closed
-    # form
+    # 5 and 3 periods across and down a tile of 64 px: band-limited, so every sub-pixel shift has a
+    # closed form
     at = torch.arange(64, dtype=D)
 
     def wave(x, y):
@@ -196,7 +205,9 @@ def test_frames_of_waves_are_those_waves_moved():
 def test_the_area_of_a_digit_is_that_of_its_outlines(label):
     for font in FONTS[::2]:
         file = Path(matplotlib.get_data_path()) / "fonts" / "ttf" / f"{font}.ttf"
-        outlines = TextPath((0, 0), str(label), size=100, prop=FontProperties(fname=file)).to_polygons()
+        outlines = TextPath(
+            (0, 0), str(label), size=100, prop=FontProperties(fname=file)
+        ).to_polygons()
         low, high = (end(np.concatenate(outlines)[:, 1]) for end in (np.min, np.max))
         # signed areas: holes run the other way round than what they are holes of
         area = abs(
@@ -206,13 +217,17 @@ def test_the_area_of_a_digit_is_that_of_its_outlines(label):
             )
         )
         truth_px = area * (20 / (high - low)) ** 2
-        # a raster of quarter pixels errs by about the square root of the edge cells, some 400 of 1/16 px
-        # each: 1 px; areas are 60 to 150 px
-        assert coverage(label, font, 20.0, 10.0, (0.3, -0.7)).sum() == pytest.approx(truth_px, abs=2.5)
+        # a raster of quarter pixels errs by about the square root of the edge cells, some 400 of
+        # 1/16 px each: 1 px; areas are 60 to 150 px
+        assert coverage(label, font, 20.0, 10.0, (0.3, -0.7)).sum() == pytest.approx(
+            truth_px, abs=2.5
+        )
 
 
 def test_pictures_come_from_their_seed_and_the_lens_fades_a_wave_as_a_gaussian():
-    (first, labels), (again, _), (other, _) = (draw_pictures(12, "training", (0, k)) for k in (1, 1, 2))
+    (first, labels), (again, _), (other, _) = (
+        draw_pictures(12, "training", (0, k)) for k in (1, 1, 2)
+    )
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
     assert labels.tolist() == [*range(10), 0, 1]
@@ -220,7 +235,9 @@ def test_pictures_come_from_their_seed_and_the_lens_fades_a_wave_as_a_gaussian()
     assert float(first.min()) > 0
     at = np.arange(64)
     wave = np.sin(2 * np.pi * 8 * at / 64) * np.ones((1, 64, 1))
-    assert np.allclose(softened(wave), wave * math.exp(-2 * (math.pi * BLUR_PX / 8) ** 2), atol=1e-13)
+    assert np.allclose(
+        softened(wave), wave * math.exp(-2 * (math.pi * BLUR_PX / 8) ** 2), atol=1e-13
+    )
 
 
 def test_voxels_hold_every_event_once_and_in_its_own_picture():
@@ -235,7 +252,9 @@ def test_voxels_hold_every_event_once_and_in_its_own_picture():
         alone = events.simulate(seen[:, k], t_s, sensor)
         for polarity, sign in enumerate((1, -1)):
             # single precision sums some 500 shares of at most 1: 1e-4
-            assert float(voxels[k, polarity].sum()) == pytest.approx(int((alone.p == sign).sum()), abs=1e-3)
+            assert float(voxels[k, polarity].sum()) == pytest.approx(
+                int((alone.p == sign).sum()), abs=1e-3
+            )
     assert float(voxels.sum()) == pytest.approx(len(made), abs=1e-2)
     of_counts = classes.voxels_of(events.dense_counts(seen, t_s, sensor), t_s, 4)
     assert float(of_counts.sum()) == pytest.approx(len(made), abs=1e-2)
@@ -246,8 +265,8 @@ def test_voxels_hold_every_event_once_and_in_its_own_picture():
 
 
 def separable(count, generator):
-    """Recordings whose class is the one channel (of 2 polarities x 5 bins) that has events, at random
-    places."""
+    """Recordings whose class is the one channel (of 2 polarities x 5 bins) that has events, at
+    random places."""
     labels = torch.arange(count) % 10
     voxels = torch.zeros(count, 10, 32 * 32)
     for k, label in enumerate(labels.tolist()):
@@ -256,7 +275,9 @@ def separable(count, generator):
 
 
 @pytest.mark.bits
-def test_a_trivially_separable_set_is_learnt_completely_and_training_repeats_from_its_seed(generator):
+def test_a_trivially_separable_set_is_learnt_completely_and_training_repeats_from_its_seed(
+    generator,
+):
     voxels, labels = separable(200, generator)
     unseen, truth = separable(50, generator)
     net = classes.train(voxels, labels, 6, seed=3)
@@ -264,7 +285,9 @@ def test_a_trivially_separable_set_is_learnt_completely_and_training_repeats_fro
     torch.rand(7)  # the global generator has no say
     again = classes.train(voxels, labels, 6, seed=3)
     other = classes.train(voxels[:50], labels[:50], 1, seed=4)
-    weights = [torch.cat([p.detach().flatten() for p in each.parameters()]) for each in (net, again, other)]
+    weights = [
+        torch.cat([p.detach().flatten() for p in each.parameters()]) for each in (net, again, other)
+    ]
     assert torch.equal(weights[0], weights[1])
     assert not torch.equal(weights[0], weights[2])
 
@@ -279,8 +302,9 @@ def test_the_network_of_the_thesis_sees_each_picture_alone():
     assert float(together.sum()) > 0
     for k in range(3):
         alone = classes.spikes_of(network, seen[:, k : k + 1])
-        # a convolution of three pictures may round differently from one of one, by 9 products of 1e-7: of
-        # 27,648 potentials few are that near a threshold, and their spikes come a step later
+        # a convolution of three pictures may round differently from one of one, by 9 products of
+        # 1e-7: of 27,648 potentials few are that near a threshold, and their spikes come a step
+        # later
         assert int((together[:, :, k : k + 1] != alone).sum()) <= 1e-3 * alone.numel()
 
 
@@ -292,14 +316,18 @@ def test_a_classification_that_was_stopped_goes_on_with_what_is_left(tmp_path, m
         monkeypatch.setattr(classes, name, lambda *given: {})
     sizes = ["--training", "20", "--test", "20", "--calibration", "10", "--device", "cpu"]
     folder = tmp_path / "a"
-    assert main(study.study, study.Config, ["--classes", "--quick", *sizes, "--out", str(folder)]) == 0
+    assert (
+        main(study.study, study.Config, ["--classes", "--quick", *sizes, "--out", str(folder)]) == 0
+    )
     first = json.loads((folder / "metrics.json").read_text())
     # 20 pictures, 2 seeds
     assert first["physical_mean"] * 40 == pytest.approx(round(first["physical_mean"] * 40))
     # naive events of the very pictures, counted in another way
     tiles, _ = draw_pictures(20, "training", (0, classes.TRAINING, 0))
     steps = events.lin_log(frames(tiles, frame_times(100.0)).flatten(1, 2)).diff(dim=0)
-    assert first["naive_events_per_picture"] == pytest.approx(int((steps.abs() >= 0.2).sum()) / 20, abs=1e-3)
+    assert first["naive_events_per_picture"] == pytest.approx(
+        int((steps.abs() >= 0.2).sum()) / 20, abs=1e-3
+    )
     # every training is found again
     monkeypatch.setattr(classes, "train", None)
     assert main(study.study, study.Config, ["--resume", str(folder)]) == 0

@@ -7,7 +7,13 @@ from codesign.errors import DomainError
 from studies.speed_error import chain, events
 from studies.speed_error.levels import cheapest
 from studies.stability import __main__ as stability
-from studies.stability.systems import KINDS, differences, draw_system, errors_of_systems, worst_error
+from studies.stability.systems import (
+    KINDS,
+    differences,
+    draw_system,
+    errors_of_systems,
+    worst_error,
+)
 
 LEVELS = [
     {"level": "pinhole", "cpu_s": 1.0, "error": 0.2},
@@ -41,14 +47,15 @@ def test_where_none_is_good_enough_the_best_is_named_as_such():
 
 
 def test_gradients_of_random_lenses_with_coincidences_agree_with_differences():
-    """Equal neighbours, flats, concentric surfaces, zeros: what has no effect today has a derivative."""
+    """Equal neighbours, flats, concentric surfaces, zeros: what has no effect today has a
+    derivative."""
     errors = errors_of_systems(100, torch.Generator().manual_seed(1), alone_every=60)
     assert max(errors.values()) <= 1e-6
 
 
 def test_the_differences_see_a_wrong_gradient():
-    """Every kind's gradient moves the scalar: one that is left out, as the index of equal neighbours
-    once was, is an error of 1."""
+    """Every kind's gradient moves the scalar: one that is left out, as the index of equal
+    neighbours once was, is an error of 1."""
     system = draw_system(torch.Generator().manual_seed(2), "geaso")
     truth = differences(system) | {"glass": system.lens.glass.numpy()}
     for name in KINDS:
@@ -68,7 +75,11 @@ def test_a_miss_is_told_and_a_case_that_stops_has_its_sentence():
         raise DomainError("the lens is upside down")
 
     missed, stopped = stability.judge(refuses)
-    assert (missed["off_by"], missed["passed"], missed["seen"]) == (pytest.approx(0.05), False, "2 to 42")
+    assert (missed["off_by"], missed["passed"], missed["seen"]) == (
+        pytest.approx(0.05),
+        False,
+        "2 to 42",
+    )
     assert not stopped["passed"]
     assert "upside down" in str(stopped["seen"])
 
@@ -93,4 +104,6 @@ def test_the_stages_of_a_placement_make_up_its_step_and_gradients_arrive_everywh
     assert found["forward"] < found["step"]
     asking = {name: p for name, p in system.named_parameters() if p.requires_grad}
     assert {name.split(".")[0] for name in asking} == {"lens", "mount", "events"}
-    assert all(p.grad is not None and 0 < float(p.grad.abs().max()) < torch.inf for p in asking.values())
+    assert all(
+        p.grad is not None and 0 < float(p.grad.abs().max()) < torch.inf for p in asking.values()
+    )

@@ -45,8 +45,8 @@ def weight_of(folder):
 
 
 def test_training_finds_the_known_answer(tmp_path):
-    """At the end of a falling schedule AdamW is within about its last step sizes of the answer: 1e-2 of
-    weights of order 1."""
+    """At the end of a falling schedule AdamW is within about its last step sizes of the answer:
+    1e-2 of weights of order 1."""
     options = "--steps 250 --learning-rate 0.05 --weight-decay 0 --clip 10 --average 0 --reuse 1"
     assert train(tmp_path, options) == 0
     assert torch.allclose(weight_of(tmp_path)[:, :, 0, 0], TRUE_WEIGHTS, atol=1e-2)
@@ -84,7 +84,9 @@ def test_three_steps_and_three_are_six_bit_for_bit(tmp_path, capsys):
     assert state_of(whole / "checkpoint") == state_of(parts / "checkpoint")
     assert torch.equal(weight_of(whole), weight_of(parts))
     one, two = (metrics_of(folder) for folder in (whole, parts))
-    assert {name for name in one if one[name] != two[name]} <= {name for name in one if name[:4] == "cpu_"}
+    assert {name for name in one if one[name] != two[name]} <= {
+        name for name in one if name[:4] == "cpu_"
+    }
     assert "step 6" in capsys.readouterr().out
 
 
@@ -110,7 +112,9 @@ def test_the_loss_is_the_one_that_is_asked_for(tmp_path, kind):
         fit = losses.contrast_loss(windows.volume, flow) if kind == "contrast" else by_frames
         expected = fit + 0.3 * losses.smoothness_loss(flow)
     (path,) = (tmp_path / "run" / "checkpoint").glob("*.safetensors")
-    assert checkpoint.read_tensors(path)[0]["curve/loss"].item() == pytest.approx(float(expected), rel=1e-5)
+    assert checkpoint.read_tensors(path)[0]["curve/loss"].item() == pytest.approx(
+        float(expected), rel=1e-5
+    )
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -160,9 +164,9 @@ sys.exit(train_flow.run_here(sys.argv[1:]))
 
 @pytest.mark.usefixtures("undrawn")
 def test_two_processes_learn_what_one_does(tmp_path):
-    """Halves of a batch are averaged in another order: float32 sums of 1024 terms differ by 1e-5 at most, and
-    AdamW takes steps of at most 1e-2 times the relative change of a gradient, so three steps stay within
-    1e-5."""
+    """Halves of a batch are averaged in another order: float32 sums of 1024 terms differ by 1e-5 at
+    most, and AdamW takes steps of at most 1e-2 times the relative change of a gradient, so three
+    steps stay within 1e-5."""
     options = "--steps 3 --learning-rate 0.01"
     one, two = tmp_path / "one", tmp_path / "two"
     assert train(one, options) == 0
@@ -194,7 +198,9 @@ def test_a_race_trains_every_network_with_every_seed_and_judges_them_alike(tmp_p
 
     monkeypatch.setattr(races, "_trained", trained)
     own = "tests.flow_training_case:Own"
-    options = f"--race --own {own} --seeds 0 1 --cpu-minutes 3 --learning-rate 0.01 --final-windows 6"
+    options = (
+        f"--race --own {own} --seeds 0 1 --cpu-minutes 3 --learning-rate 0.01 --final-windows 6"
+    )
     assert train(tmp_path / "run", options) == 0
     assert sorted(commands) == [("refiner", "0"), ("refiner", "1"), (own, "0"), (own, "1")]
     assert commands[own, "1"]["--learning-rate"] == "0.01"
@@ -203,7 +209,9 @@ def test_a_race_trains_every_network_with_every_seed_and_judges_them_alike(tmp_p
     found = metrics_of(tmp_path / "run")
     assert found["unseen_refiner_ratio_seed0"] == pytest.approx(0.5, rel=1e-5)
     assert found["unseen_tests_flow_training_case_Own_ratio_seed1"] == pytest.approx(0.25, rel=1e-5)
-    assert found["unseen_refiner_over_tests_flow_training_case_Own_worst"] == pytest.approx(2, rel=1e-4)
+    assert found["unseen_refiner_over_tests_flow_training_case_Own_worst"] == pytest.approx(
+        2, rel=1e-4
+    )
     assert (found["unseen_windows"], found["worlds_windows"]) == (6, 2)
     assert (found["shares_met"], found["shares_asked"]) == (0, 2)
 
@@ -219,7 +227,10 @@ def edit(folder, **changes):
         (lambda folder: (folder / "checkpoint.json").write_text("{"), "is no whole JSON file"),
         (lambda folder: next(folder.glob("*.safetensors")).write_bytes(b"short"), "is damaged"),
         (lambda folder: edit(folder, version=9), "format version 9"),
-        (lambda folder: edit(folder, network="refiner"), "written with network refiner, this run has linear"),
+        (
+            lambda folder: edit(folder, network="refiner"),
+            "written with network refiner, this run has linear",
+        ),
         (lambda folder: edit(folder, tensors="../network.safetensors"), "outside its folder"),
     ],
 )

@@ -1,5 +1,5 @@
-"""video_to_events: closed forms for lossless frames, the sensor itself for decoded ones, runs that stop, and
-sentences for what cannot be."""
+"""video_to_events: closed forms for lossless frames, the sensor itself for decoded ones, runs that
+stop, and sentences for what cannot be."""
 
 import dataclasses
 import itertools
@@ -56,8 +56,8 @@ def waves(count=30, height=12, width=16):
 
 
 def crossings(values, fps, theta):
-    """(microsecond, polarity) of the events of one pixel, by hand: values are gray levels > 20 at an even
-    rate."""
+    """(microsecond, polarity) of the events of one pixel, by hand: values are gray levels > 20 at
+    an even rate."""
     level = [math.log(value) for value in values]
     found = []
     reference = level[0]
@@ -86,7 +86,8 @@ def test_a_ramp_of_gray_values_fires_at_known_microseconds(tmp_path, plain, caps
             truth = crossings(values, 200, 0.2)
             mine = stream.x == x
             assert stream.p[mine].tolist() == [sign for _, sign in truth]
-            # rounded to a microsecond; levels are float32 (5e-7 of a step of at least 0.03 in 5000 us)
+            # rounded to a microsecond; levels are float32 (5e-7 of a step of at least 0.03 in 5000
+            # us)
             np.testing.assert_allclose(
                 stream.t_us[mine].numpy(), [t for t, _ in truth], atol=0.5 + 5000 * 5e-7 / 0.03
             )
@@ -100,10 +101,14 @@ def test_a_ramp_of_gray_values_fires_at_known_microseconds(tmp_path, plain, caps
 
 
 # imageio leaves FFmpeg's pipes open
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
+@pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning"
+)
 def test_a_video_gives_the_events_of_its_frames_as_imageio_decodes_them(tmp_path, plain):
     path = tmp_path / "clip.mp4"
-    writer = imageio_ffmpeg.write_frames(str(path), (32, 24), fps=25, codec="libx264", macro_block_size=2)
+    writer = imageio_ffmpeg.write_frames(
+        str(path), (32, 24), fps=25, codec="libx264", macro_block_size=2
+    )
     writer.send(None)
     for frame in waves(40, 24, 32):
         writer.send(np.ascontiguousarray(np.stack([frame, frame[::-1], frame[:, ::-1]], -1)))
@@ -111,7 +116,9 @@ def test_a_video_gives_the_events_of_its_frames_as_imageio_decodes_them(tmp_path
     clock = ("--slow-motion", 10, "--start-s", 0.02, "--stop-s", 0.1)
     options = ("--preset", "clean", "--seed", 3, "--events", "e.npz")
     assert call(tmp_path / "run", "--input", path, *clock, *options) == 0
-    decoded = iio.imread(path, plugin="FFMPEG").astype(np.float64) @ np.array([0.2126, 0.7152, 0.0722])
+    decoded = iio.imread(path, plugin="FFMPEG").astype(np.float64) @ np.array(
+        [0.2126, 0.7152, 0.0722]
+    )
     t_s = np.arange(40) / 250
     used = (t_s >= 0.02) & (t_s <= 0.1 + 1e-9)
     sensor = events.SensorModel(theta_sigma=0.02)
@@ -125,8 +132,8 @@ def test_a_video_gives_the_events_of_its_frames_as_imageio_decodes_them(tmp_path
     ]
     for name in ("x", "y", "p"):
         assert torch.equal(getattr(truth, name)[order[0]], getattr(found, name)[order[1]])
-    # luminance in single precision moves a crossing by 1e-6 log units of the 0.01 or more that a frame of 4
-    # ms changes
+    # luminance in single precision moves a crossing by 1e-6 log units of the 0.01 or more that a
+    # frame of 4 ms changes
     assert (truth.t_us[order[0]] - found.t_us[order[1]]).abs().max() <= 1
 
 
@@ -135,7 +142,18 @@ def test_an_interrupted_run_goes_on_with_the_same_events(tmp_path, monkeypatch, 
     monkeypatch.setattr(study, "PIXELS_PER_CHUNK", 4 * 12 * 16)
     monkeypatch.setattr(study, "SECONDS_BETWEEN_SAVES", 0.0 if how == "killed" else 1e9)
     folder = write_folder(tmp_path / "in", waves())
-    common = ["--input", folder, "--fps", 300, "--preset", "noisy", "--events", "e.npz", "--seed", 7]
+    common = [
+        "--input",
+        folder,
+        "--fps",
+        300,
+        "--preset",
+        "noisy",
+        "--events",
+        "e.npz",
+        "--seed",
+        7,
+    ]
     assert call(tmp_path / "whole", *common) == 0
     real = events.simulate
     calls = []
@@ -202,7 +220,9 @@ def test_light_follows_the_published_curves():
         assert float(linear[value]) == pytest.approx(light, abs=5e-7)
     primaries = np.eye(3, dtype=np.uint8)[None] * 255
     seen = Light(255, False)([primaries], 0)
-    torch.testing.assert_close(seen[0, 0] / 255, torch.tensor([0.2126, 0.7152, 0.0722]), rtol=1e-6, atol=0)
+    torch.testing.assert_close(
+        seen[0, 0] / 255, torch.tensor([0.2126, 0.7152, 0.0722]), rtol=1e-6, atol=0
+    )
     assert float(Light(4095, False)([np.full((1, 1), 4095, np.uint16)], 0)) == 255
     assert float(Light(255, False)([np.full((1, 1), 300.5)], 0)) == 300.5
 
@@ -210,8 +230,8 @@ def test_light_follows_the_published_curves():
 def test_a_new_size_keeps_what_is_linear():
     y, x = np.mgrid[:48, :64].astype(np.float64)
     small = Light(255, False, (16, 12))([50 + 2 * x + y], 0)[0]
-    # the pixel centres of a quarter of the size lie at 4 k + 1.5; away from the edges, where the window is
-    # cut
+    # the pixel centres of a quarter of the size lie at 4 k + 1.5; away from the edges, where the
+    # window is cut
     truth = 50 + 2 * (4 * np.arange(16) + 1.5) + (4 * np.arange(12)[:, None] + 1.5)
     np.testing.assert_allclose(small.numpy()[1:-1, 1:-1], truth[1:-1, 1:-1], rtol=1e-6)
 
@@ -251,7 +271,10 @@ def test_presets_are_those_of_v2e_and_every_parameter_is_an_option():
         sensor = chosen_sensor(study.Config(preset=name))
         assert {field: getattr(sensor, field) for field in values} == values
         assert (sensor.theta_on, sensor.theta_off) == (0.2, 0.2)
-    given: dict[str, Any] = dataclasses.asdict(events.SensorModel()) | {"theta_off": 0.35, "timing": "v2e"}
+    given: dict[str, Any] = dataclasses.asdict(events.SensorModel()) | {
+        "theta_off": 0.35,
+        "timing": "v2e",
+    }
     assert chosen_sensor(study.Config(preset="noisy", **given)) == events.SensorModel(**given)
     with pytest.raises(DomainError, match="ideal, clean, noisy, default"):
         chosen_sensor(study.Config(preset="best"))
@@ -263,9 +286,13 @@ def test_the_log_finds_events_by_time_and_forgets_what_does_not_count(tmp_path):
     stream = ordered(t_us + 1_700_000_000_000_000, x, y, 2 * p - 1, 7, 9)
     log = EventLog(tmp_path / "log", 0, 7, 9)
     for part in (slice(0, 200), slice(200, 500)):
-        log.append(EventStream(stream.t_us[part], stream.x[part], stream.y[part], stream.p[part], 7, 9))
+        log.append(
+            EventStream(stream.t_us[part], stream.x[part], stream.y[part], stream.p[part], 7, 9)
+        )
     times = [1_700_000_000_000_000 + k for k in (-1, 0, 57, 299, 400)]
-    assert log.positions(times) == np.searchsorted(stream.t_us.numpy(), times, side="right").tolist()
+    assert (
+        log.positions(times) == np.searchsorted(stream.t_us.numpy(), times, side="right").tolist()
+    )
     for read, part in (
         (log.read(123, 321), slice(123, 321)),
         (log.pick(torch.tensor([3, 77, 499])), [3, 77, 499]),
@@ -278,13 +305,16 @@ def test_the_log_finds_events_by_time_and_forgets_what_does_not_count(tmp_path):
 
 
 def grating(count, height=24, width=56):
-    """[T, H, W] float32 whose log is a sinusoid of 14 px that moves to the right by 3 px a frame."""
+    """[T, H, W] float32 whose log is a sinusoid of 14 px that moves to the right by 3 px a
+    frame."""
     x = np.arange(width) - 3 * np.arange(count)[:, None, None]
     light = np.exp(4.5 + 0.55 * np.sin(2 * math.pi * x / 14))
     return np.broadcast_to(light, (count, height, width)).astype(np.float32)
 
 
-def test_an_upsampled_grating_fires_when_its_closed_form_crosses_in_any_chunks(tmp_path, monkeypatch, plain):
+def test_an_upsampled_grating_fires_when_its_closed_form_crosses_in_any_chunks(
+    tmp_path, monkeypatch, plain
+):
     np.save(tmp_path / "in.npy", grating(9))
     options = ("--input", tmp_path / "in.npy", "--fps", 100, *IDEAL)
     assert call(tmp_path / "up", *options, "--upsample", 0.5) == 0
@@ -294,15 +324,17 @@ def test_an_upsampled_grating_fires_when_its_closed_form_crosses_in_any_chunks(t
     assert call(tmp_path / "chunks", *options, "--upsample", 0.5) == 0
     assert (tmp_path / "chunks" / "e.npz").read_bytes() == (tmp_path / "up" / "e.npz").read_bytes()
 
-    # the truth: 2000 steps per second of the same grating; pixels whose light of the last frame was always
-    # inside the picture
+    # the truth: 2000 steps per second of the same grating; pixels whose light of the last frame was
+    # always inside the picture
     t_s = torch.arange(0, 161, dtype=torch.float64) / 2000
     x = torch.arange(56) - 300 * t_s[:, None, None]
     level = 4.5 + 0.55 * torch.sin(2 * math.pi * x / 14)
     truth = events.simulate(level.exp().expand(-1, 24, -1).contiguous(), t_s, events.SensorModel())
-    totals = [events.to_counts(each, [0.0, 0.08])[0][..., 28:-4].sum() for each in (truth, found, kept)]
-    # cut by 1 - cos(pi 0.5 / 14) = 0.6 % of 1.1 log units, an event of 0.2 more or less per half period of 5
-    # events at worst in one pixel of 30
+    totals = [
+        events.to_counts(each, [0.0, 0.08])[0][..., 28:-4].sum() for each in (truth, found, kept)
+    ]
+    # cut by 1 - cos(pi 0.5 / 14) = 0.6 % of 1.1 log units, an event of 0.2 more or less per half
+    # period of 5 events at worst in one pixel of 30
     assert abs(float(totals[1] / totals[0]) - 1) < 0.05
     # straight lines over 3 of 14 px cut 1 - cos(3 pi / 14) = 22 % off half of the peaks
     assert float(totals[2] / totals[0]) < 0.95

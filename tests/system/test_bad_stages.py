@@ -1,4 +1,5 @@
-"""Stages cut, wrapped and misshapen on purpose are named by ``check`` or refused; unusual ones that are right are not."""
+"""Stages cut, wrapped and misshapen on purpose are named by ``check`` or refused; unusual ones that
+are right are not."""
 
 import functools
 from dataclasses import replace
@@ -12,7 +13,18 @@ from codesign.errors import CodesignError
 from codesign.system import Batch
 from codesign.types import FlowField
 from tests.hostile import stages as s
-from tests.hostile.stages import BATCH, SIDE, T_S, counted, field_of, flow_of, glass, held, moved, of
+from tests.hostile.stages import (
+    BATCH,
+    SIDE,
+    T_S,
+    counted,
+    field_of,
+    flow_of,
+    glass,
+    held,
+    moved,
+    of,
+)
 
 
 def truth(px, valid=True):
@@ -39,21 +51,31 @@ BAD = {
     ),
     "objective cuts": (
         "'a'.*'estimate'",
-        of(objectives={"a": lambda estimate, field: s.error(estimate.detach()) + field.flow_px.mean()}),
+        of(
+            objectives={
+                "a": lambda estimate, field: s.error(estimate.detach()) + field.flow_px.mean()
+            }
+        ),
     ),
     "flow of one drive": ("'flow' holds 1", of(flow=lambda v: field_of(moved(v)[:1]))),
     "flow [N, 2, 1, 1]": (
         "flow",
         of(flow=lambda v: s.entry("flow_px", lambda t: t[..., :1, :1])(flow_of(v))),
     ),
-    "confidence [N, 1, H, W]": ("flow", of(flow=lambda v: replace(flow_of(v), confidence=moved(v)[:, :1]))),
+    "confidence [N, 1, H, W]": (
+        "flow",
+        of(flow=lambda v: replace(flow_of(v), confidence=moved(v)[:, :1])),
+    ),
     "covariance of two": ("flow", of(flow=lambda v: replace(flow_of(v), covariance_px2=moved(v)))),
     "truth [N, 2, 1, 1]": ("truth", truth(PX[..., :1, :1])),
     "truth [N, 1, H, W]": ("truth", truth(PX[:, :1])),
     "truth [1, 2, H, W]": ("'truth' holds 1", truth(PX[:1])),
     "truth valid of floats": ("truth", truth(PX, valid=False)),
     "frames of one drive": ("'frames' holds 1", of(render=s.picture(after=lambda f: f[:1]))),
-    "frames on 0 to 1": ("scale is 0 to 255", of(render=s.picture(after=lambda f: (f - f.min()) / 255))),
+    "frames on 0 to 1": (
+        "scale is 0 to 255",
+        of(render=s.picture(after=lambda f: (f - f.min()) / 255)),
+    ),
     "counts below 0": ("0 or more", of(events=lambda f: counted(f) - 1)),
     "rays as a tensor": ("camera", of(camera=s.Camera(glass(), lambda r: r.direction))),
     "mounts of three drives": ("mount", of(mount=held(lambda T: T.expand(3, 4, 4)))),
@@ -63,8 +85,14 @@ BAD = {
     ),
     "times in ms": ("milliseconds", of(batch=replace(BATCH, t_s=1e3 * T_S))),
     "times that stand still": ("increase strictly", of(batch=replace(BATCH, t_s=0 * T_S))),
-    "float64 network": ("float64 on cpu.*float32 on cpu.*'events'", of(flow=s.Convolution().double())),
-    "weights without values": ("'flow.0.weight' is on the device meta", of(flow=s.Convolution().to("meta"))),
+    "float64 network": (
+        "float64 on cpu.*float32 on cpu.*'events'",
+        of(flow=s.Convolution().double()),
+    ),
+    "weights without values": (
+        "'flow.0.weight' is on the device meta",
+        of(flow=s.Convolution().to("meta")),
+    ),
     "hidden in a global": ("does not see", of(flow=lambda volume: helper(volume))),
     "hidden parameter": ("does not see", of(events=lambda frames: counted(frames, GAIN))),
     "hidden mount": ("does not see", of(mount=s.closed(held()))),
@@ -73,8 +101,14 @@ BAD = {
         "does not see",
         of(objectives={"a": lambda volume: NET(volume).flow_px.mean()}),
     ),
-    "in place on the batch": ("in place", of(mount=None, render=s.picture(poses=lambda T: T.mul_(1.01)))),
-    "in place on times": ("in place", of(flow=lambda volume, t_s: (t_s.add_(1), flow_of(volume))[1])),
+    "in place on the batch": (
+        "in place",
+        of(mount=None, render=s.picture(poses=lambda T: T.mul_(1.01))),
+    ),
+    "in place on times": (
+        "in place",
+        of(flow=lambda volume, t_s: (t_s.add_(1), flow_of(volume))[1]),
+    ),
     "takes no input": ("flow.*takes no input", of(flow=lambda: None)),
     "takes another first": ("names its first argument 't", of(flow=lambda truth, volume: None)),
     "more by position": ("'t_s' by position alone", of(events=placed)),
@@ -136,7 +170,11 @@ WRAPPED = [
     ("camera", 2, functools.partial(s.Camera, glass())),
     ("render", 1, functools.partial(brighter, held())),
     ("estimate", 1, functools.partial(scaled, scale=held())),
-    ("objectives", 4, {"a": functools.partial(lambda net, volume: net(volume).flow_px.mean(), NET)}),
+    (
+        "objectives",
+        4,
+        {"a": functools.partial(lambda net, volume: net(volume).flow_px.mean(), NET)},
+    ),
 ]
 
 

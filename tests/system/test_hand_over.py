@@ -1,4 +1,5 @@
-"""A mount handed over is the same mount: transform by hand, bits by reading back, and faults of the file by sentence."""
+"""A mount handed over is the same mount: transform by hand, bits by reading back, and faults of the
+file by sentence."""
 
 import math
 from typing import Any
@@ -24,9 +25,13 @@ def found_mount(generator):
 
 CAMERAS = {
     "pinhole": lambda: render.Camera(lens.Pinhole(3.4), 32, 24, 0.1, 4, seed=3),
-    "thin": lambda: render.Camera(lens.ThinLens(8.0, 2.0).focus_at(1.3), 32, 24, 0.1, 4, falloff=True),
+    "thin": lambda: render.Camera(
+        lens.ThinLens(8.0, 2.0).focus_at(1.3), 32, 24, 0.1, 4, falloff=True
+    ),
     "variables": lambda: varied(lens.ThinLens(8.0, 2.0)),
-    "float32": lambda: render.Camera(lens.load("cooke-triplet", torch.float32).scaled(0.3), 32, 24, 0.1, 4),
+    "float32": lambda: render.Camera(
+        lens.load("cooke-triplet", torch.float32).scaled(0.3), 32, 24, 0.1, 4
+    ),
     "windows": lambda: render.Camera(
         lens.load("double-gauss").scaled(0.2),
         8,
@@ -101,7 +106,8 @@ def test_the_transform_is_the_mount_for_other_programs(tmp_path, generator):
         list(page["transform"]["translation_m"].values()), dtype=D
     )
     torch.testing.assert_close(there, pose[:3, :3] @ point + pose[:3, 3], rtol=0, atol=1e-14)
-    # URDF: fixed axes, roll about x first, then pitch about y, then yaw about z; then from link to optical axes
+    # URDF: fixed axes, roll about x first, then pitch about y, then yaw about z; then from link to
+    # optical axes
     roll, pitch, yaw = page["urdf_origin"]["rpy_rad"]
 
     def about(axis, angle):
@@ -131,7 +137,11 @@ def test_a_transform_alone_is_a_held_mount(tmp_path, generator):
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        ("  translation_m:\n    x: 0.", "  translation_m:\n    x: 7.", "apart; take out that section"),
+        (
+            "  translation_m:\n    x: 0.",
+            "  translation_m:\n    x: 7.",
+            "apart; take out that section",
+        ),
         ("format: codesign mount 1", "format: other", "no line 'format"),
         ("    w: 0.", "    w: 1.", "quaternion has length"),
         ("camera:", "lens_of_old:", "entry 'camera' is missing"),
@@ -147,7 +157,9 @@ def test_a_transform_alone_is_a_held_mount(tmp_path, generator):
 )
 def test_faults_of_the_file_get_a_sentence(tmp_path, generator, old, new, sentence):
     path = tmp_path / "mount.yaml"
-    save_hand_over(path, HandOver(found_mount(generator), CAMERAS["windows"](), events.SensorModel()))
+    save_hand_over(
+        path, HandOver(found_mount(generator), CAMERAS["windows"](), events.SensorModel())
+    )
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new))

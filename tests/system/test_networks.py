@@ -1,5 +1,5 @@
-"""Every estimator of flow in the one system: the gradient of its loss to what comes before the events and to the
-estimator's own weights is that of differences of the whole, in float64."""
+"""Every estimator of flow in the one system: the gradient of its loss to what comes before the
+events and to the estimator's own weights is that of differences of the whole, in float64."""
 
 from types import SimpleNamespace
 
@@ -59,7 +59,9 @@ def waves(rays):
     contrast, shift, speed = rays.direction[0]
     x, y = torch.meshgrid(torch.arange(SIDE, dtype=D), torch.arange(SIDE, dtype=D), indexing="xy")
     u = x - shift - speed * (T_S / T_S[-1])[:, None, None]
-    level = torch.sin(0.9 * u + 0.4 * y) + torch.sin(0.5 * u - 0.7 * y) + torch.sin(1.3 * y - 0.2 * u)
+    level = (
+        torch.sin(0.9 * u + 0.4 * y) + torch.sin(0.5 * u - 0.7 * y) + torch.sin(1.3 * y - 0.2 * u)
+    )
     return (contrast * level).exp()
 
 
@@ -119,8 +121,8 @@ def test_gradient_to_what_comes_before_the_events(name):
 
 @pytest.mark.parametrize("name", [name for name in ESTIMATORS if "closed form" not in name])
 def test_weights_learn_together_with_the_lens(name):
-    """Their gradient is that of differences (of the spiking network, that of the layers behind the last spike), and a step
-    against all gradients makes the loss of the whole smaller."""
+    """Their gradient is that of differences (of the spiking network, that of the layers behind the
+    last spike), and a step against all gradients makes the loss of the whole smaller."""
     system = system_of(name)
     weights = [
         parameter

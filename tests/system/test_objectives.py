@@ -1,4 +1,5 @@
-"""Objectives in task units: the true flow has no angular error, also of moving objects; a miss has the angle it has."""
+"""Objectives in task units: the true flow has no angular error, also of moving objects; a miss has
+the angle it has."""
 
 import math
 
@@ -27,7 +28,9 @@ def camera(film=None):
 def drives():
     t_s = torch.linspace(0, 0.05, 3, dtype=torch.float64)
     start = pose.look_at((0.0, -2.0, 0.0), (0.0, 0.0, 0.0))
-    return torch.stack([trajectories.translation(start, v, t_s) for v in ((0.6, 0.1, 0.0), (-0.3, 0.5, 0.2))])
+    return torch.stack(
+        [trajectories.translation(start, v, t_s) for v in ((0.6, 0.1, 0.0), (-0.3, 0.5, 0.2))]
+    )
 
 
 def field_of(flow_px, valid):
@@ -87,7 +90,8 @@ def test_edge_energy_of_a_step_is_that_of_the_sobel_filter():
     counts = torch.zeros(1, 2, 1, 8, 8)
     counts[:, 0, :, :, 4:] = 3.0  # a step of 3 events between columns 3 and 4
     volume = EventVolume(counts, torch.zeros(1), torch.ones(1))
-    # normalised Sobel: half of the central difference, 3 / 2, at the two columns beside the step, of eight columns
+    # normalised Sobel: half of the central difference, 3 / 2, at the two columns beside the step,
+    # of eight columns
     assert float(edge_energy(volume)) == pytest.approx((1.5**2) * 2 / 8, rel=1e-6)
     activity = float(volume.counts.sum(1).mean())
     assert float(edge_objective(volume, 0.1)) == pytest.approx(0.1 * activity - 0.5625, rel=1e-6)

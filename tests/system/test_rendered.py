@@ -1,4 +1,5 @@
-"""The system before rendered scenes: what a user brings together, and what is refused before the first step."""
+"""The system before rendered scenes: what a user brings together, and what is refused before the
+first step."""
 
 import copy
 
@@ -35,7 +36,9 @@ def system_of(geo, scene, **parts):
 
 def batch(count=2):
     velocities = torch.tensor([[0.5, 0.1, 0.0], [-0.3, 0.2, 0.1]], dtype=torch.float64)[:count]
-    return Batch(torch.stack([trajectories.translation(START, v, T_S) for v in velocities.tolist()]), T_S)
+    return Batch(
+        torch.stack([trajectories.translation(START, v, T_S) for v in velocities.tolist()]), T_S
+    )
 
 
 def triplet():
@@ -89,7 +92,9 @@ def test_a_lens_focused_once_from_its_variables_is_refused(wall):
     geo = triplet()
     variables = geo.variables("curvature")
     once = system_of(geo.focus_at(2.0), wall)
-    with pytest.raises(GradientError, match=r"computed once from other tensors \(focus_at, replace\)"):
+    with pytest.raises(
+        GradientError, match=r"computed once from other tensors \(focus_at, replace\)"
+    ):
         check(once, batch(), variables)
     kept = triplet()
     focused = kept.variables("curvature", focus_at_m=2.0)
@@ -104,4 +109,6 @@ def test_a_moving_object_has_a_truth(wall):
     truth = system_of(lens.Pinhole(8.0), scene).begin(Batch(still, T_S))["truth"]
     assert truth.interval_s == pytest.approx(0.05, rel=1e-12)
     # 0.04 m to the right at 2 m, 8 mm behind the pinhole: 0.16 mm on pixels of 37 um
-    assert float(truth.flow_px[0, 0, 16, 16]) == pytest.approx(0.8 * 0.05 / 2.0 * 8.0 / 0.037, rel=1e-3)
+    assert float(truth.flow_px[0, 0, 16, 16]) == pytest.approx(
+        0.8 * 0.05 / 2.0 * 8.0 / 0.037, rel=1e-3
+    )

@@ -1,4 +1,5 @@
-"""The system on plain algebra, where every junction's gradient is known: probes, recordings, names, refusals."""
+"""The system on plain algebra, where every junction's gradient is known: probes, recordings, names,
+refusals."""
 
 import copy
 import math
@@ -56,7 +57,9 @@ def volume_of(frames):
 
 def field_of(flow):
     """Flow along x."""
-    return FlowField(torch.cat([flow, torch.zeros_like(flow)], 1), torch.ones(1, 1, 1, dtype=torch.bool), 1.0)
+    return FlowField(
+        torch.cat([flow, torch.zeros_like(flow)], 1), torch.ones(1, 1, 1, dtype=torch.bool), 1.0
+    )
 
 
 def both(value):
@@ -160,8 +163,8 @@ def test_a_bad_value_is_named_by_its_junction():
 
 
 def test_a_bad_gradient_is_named_by_its_junction():
-    # sqrt(|x|) at 0 has a finite value and an infinite slope: the frames are the first junction from the loss
-    # back to see it
+    # sqrt(|x|) at 0 has a finite value and an infinite slope: the frames are the first junction
+    # from the loss back to see it
     system = toy(
         render=lambda rays: both(rays.direction[:, 1]),
         events=lambda frames: volume_of(frames.abs().sqrt()),
@@ -182,13 +185,19 @@ def test_a_stage_gets_what_its_signature_names():
     assert seen["t_s"] is T_S
     assert seen["camera"].seed == 5
     assert seen["theta"] == 0.2
-    torch.testing.assert_close(seen["draw"], torch.rand(3, generator=torch.Generator().manual_seed(5)))
+    torch.testing.assert_close(
+        seen["draw"], torch.rand(3, generator=torch.Generator().manual_seed(5))
+    )
 
 
 def test_parameters_of_every_part_are_the_systems():
     layer = Stage(lambda frames, gain: volume_of(gain * frames))
     system = toy(events=layer, mount=held())
-    assert {name for name, _ in system.named_parameters()} == {"lens.efl_mm", "events.gain", "mount.twist"}
+    assert {name for name, _ in system.named_parameters()} == {
+        "lens.efl_mm",
+        "events.gain",
+        "mount.twist",
+    }
     twin = system.replaced(events=doubled)
     assert {name for name, _ in twin.named_parameters()} == {"lens.efl_mm", "mount.twist"}
     assert twin.lens is system.lens
@@ -199,7 +208,8 @@ def test_estimator_and_bins_must_fit():
     network.config = {"bins": 5}
     assert toy(flow=network).bins == 5
     with pytest.raises(
-        DomainError, match=r"stage 'flow' \(Stage\) was built for 5 time bins and the system makes 9"
+        DomainError,
+        match=r"stage 'flow' \(Stage\) was built for 5 time bins and the system makes 9",
     ):
         toy(flow=network, bins=9)
 
@@ -245,7 +255,11 @@ def test_windows_of_a_film_become_samples():
 
     # [trajectory 2, T 2, window 3, 1, 1]: 100 trajectory + 10 time + window
     def render(T_world_cam):
-        shape = torch.arange(2.0)[:, None, None] * 100 + torch.arange(2.0)[:, None] * 10 + torch.arange(3.0)
+        shape = (
+            torch.arange(2.0)[:, None, None] * 100
+            + torch.arange(2.0)[:, None] * 10
+            + torch.arange(3.0)
+        )
         return shape[..., None, None]
 
     seen = []
@@ -254,17 +268,22 @@ def test_windows_of_a_film_become_samples():
         seen.append(frames[..., 0, 0])
         return frames[:, 1:, None].expand(-1, -1, 2, -1, -1)
 
-    toy(camera=camera, render=render, events=events, bins=1).begin(Batch(poses, T_S, "wall"))["volume"]
+    toy(camera=camera, render=render, events=events, bins=1).begin(Batch(poses, T_S, "wall"))[
+        "volume"
+    ]
     assert seen[0].tolist() == [[0, 10], [1, 11], [2, 12], [100, 110], [101, 111], [102, 112]]
 
 
 def test_check_finds_a_frozen_variable_and_one_that_no_objective_sees():
     system = toy()
     lens = system.lens
-    assert check(system, BATCH, torch.optim.SGD([lens.efl_mm], lr=0.1)).loss.item() == pytest.approx(9.0)
+    assert check(
+        system, BATCH, torch.optim.SGD([lens.efl_mm], lr=0.1)
+    ).loss.item() == pytest.approx(9.0)
     stray = nn.Parameter(torch.zeros(2))
     with pytest.raises(
-        GradientError, match=r"no objective \(square\) depends on variable 1 \(no parameter of the system"
+        GradientError,
+        match=r"no objective \(square\) depends on variable 1 \(no parameter of the system",
     ):
         check(system, BATCH, [lens.efl_mm, stray])
     lens.efl_mm.requires_grad_(False)

@@ -4,16 +4,25 @@
 import pytest
 import torch
 
-from codesign.train.batches import Batches, Started, pick, probe, shuffled, to_device, turned, without_truth
+from codesign.train.batches import (
+    Batches,
+    Started,
+    pick,
+    probe,
+    shuffled,
+    to_device,
+    turned,
+    without_truth,
+)
 from codesign.types import EventVolume, FlowField, FlowWindows
 from tests.flow_training_case import SIDE, Made
 
 
 @pytest.mark.parametrize("way", range(16))
 def test_turned_windows_show_the_turned_motion(way):
-    """A dot that moves by the flow of the pixel it starts on is still carried by that pixel's flow after
-    turning; its polarity changes with bit 8 alone. A start that errs by e = (1, 2) px and claims the
-    covariance e e^T still does, e turned."""
+    """A dot that moves by the flow of the pixel it starts on is still carried by that pixel's flow
+    after turning; its polarity changes with bit 8 alone. A start that errs by e = (1, 2) px and
+    claims the covariance e e^T still does, e turned."""
     counts = torch.zeros(1, 2, 2, 9, 12)
     flow = torch.zeros(1, 2, 9, 12)
     # from x = 3, y = 5 by (2, 1)
@@ -56,7 +65,9 @@ def test_windows_are_shown_as_often_as_told_and_resumed_alike():
     for group in range(8):
         block, place = divmod(group, 4)
         versions = [seen[12 * block + 4 * showing + place] for showing in range(3)]
-        assert len({version.numpy().tobytes() for version in versions}) == 3, "each time another way"
+        assert len({version.numpy().tobytes() for version in versions}) == 3, (
+            "each time another way"
+        )
         assert all(torch.allclose(version.sum(), versions[0].sum()) for version in versions)
     later = Batches(parts, 2, reuse=3, pool=4)
     assert all(torch.equal(later(step).volume.counts, seen[step]) for step in (9, 10, 17))
@@ -126,7 +137,8 @@ def test_a_start_is_estimated_once_for_all_showings():
 
 
 def test_some_begin_elsewhere():
-    """A fifth of the samples, the same ones in any batch: 0.5 to 1.2 of the start, claimed to a pixel."""
+    """A fifth of the samples, the same ones in any batch: 0.5 to 1.2 of the start, claimed to a
+    pixel."""
     source = Started(Made(), doubled, foreign=0.2)
     windows = source.batch(range(200))
     elsewhere = windows.start.covariance_px2[:, 0, 0, 0] == 1

@@ -27,8 +27,8 @@ def distance(network: Any):
 
 
 def test_a_flow_network_finds_the_known_answer():
-    """At the end of a falling schedule Adam is within about its last step sizes of the answer: 1e-2 of
-    weights of order 1."""
+    """At the end of a falling schedule Adam is within about its last step sizes of the answer: 1e-2
+    of weights of order 1."""
     network = linear().eval()
     made = train.fit(network, Made(), steps=250, batch=4, optimiser=adam(network))
     assert distance(network) < 1e-2
@@ -86,7 +86,9 @@ class Noisy(nn.Module):
     def __init__(self):
         super().__init__()
         torch.manual_seed(3)
-        self.layers = nn.Sequential(nn.Linear(2, 8), nn.BatchNorm1d(8), nn.Dropout(0.4), nn.Linear(8, 1))
+        self.layers = nn.Sequential(
+            nn.Linear(2, 8), nn.BatchNorm1d(8), nn.Dropout(0.4), nn.Linear(8, 1)
+        )
 
     def forward(self, x):
         return self.layers(x)
@@ -124,10 +126,14 @@ def test_interrupted_and_resumed_is_uninterrupted_bit_for_bit(tmp_path):
         noisy_fit(tmp_path / "parts", Noisy(), progress=stop)
     assert signal.getsignal(signal.SIGINT) == earlier
     stored = json.loads((tmp_path / "parts" / "checkpoint.json").read_text())
-    assert stored["progress"]["step"] == 5, "saved at a whole step, between those that are saved anyway"
+    assert stored["progress"]["step"] == 5, (
+        "saved at a whole step, between those that are saved anyway"
+    )
     told = []
     parts: Any = Noisy()
-    found = noisy_fit(tmp_path / "parts", parts, progress=lambda step, loss: told.append((step, loss)))
+    found = noisy_fit(
+        tmp_path / "parts", parts, progress=lambda step, loss: told.append((step, loss))
+    )
     assert told == [(step, expected.loss[step - 1]) for step in (6, 7, 8)]
     assert (found.loss, found.norm, found.rate) == (expected.loss, expected.norm, expected.rate)
     assert found.validation == expected.validation
@@ -207,9 +213,10 @@ ranks.leave()
 
 
 def test_two_processes_interrupted_and_resumed_learn_what_one_does(tmp_path):
-    """One of them is asked to stop, both do, after the same step. Halves of a batch are averaged in another
-    order: float32 sums of 1024 terms differ by 1e-5 at most, and Adam takes steps of at most 1e-2 times the
-    relative change of a gradient."""
+    """One of them is asked to stop, both do, after the same step. Halves of a batch are averaged in
+    another
+    order: float32 sums of 1024 terms differ by 1e-5 at most, and Adam takes steps of at most 1e-2
+    times the relative change of a gradient."""
     network = linear()
     options = {"average": 0.5, "validate": nearness, "validate_every": 2}
     alone = train.fit(network, Made(), steps=6, batch=4, optimiser=adam(network, 0.01), **options)

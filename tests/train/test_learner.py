@@ -40,7 +40,9 @@ def sgd(network, rate=0.1, **options):
 
 def learner(network=None, **options) -> Any:
     network = network or line()
-    return Learner(network, mean, options.pop("optimiser", None) or sgd(network), predict=apply, **options)
+    return Learner(
+        network, mean, options.pop("optimiser", None) or sgd(network), predict=apply, **options
+    )
 
 
 def test_a_step_is_that_of_plain_descent():
@@ -61,7 +63,8 @@ def test_a_long_gradient_is_shortened_to_the_limit():
 
 
 def test_the_running_average_spans_a_tenth_of_the_steps_at_first():
-    """The weight falls by 0.1 times the gradient each step, so the average can be followed by hand."""
+    """The weight falls by 0.1 times the gradient each step, so the average can be followed by
+    hand."""
     made = learner(average=0.5)
     gradient = torch.tensor([[2.0, 0.5]])
     weight = torch.tensor([[1.0, 1.0]])
@@ -127,9 +130,9 @@ def test_chance_within_a_step_is_the_seed_and_the_number_of_the_step():
 def test_a_learner_goes_on_from_its_state_bit_for_bit(kind, options, dtype):
     def fresh() -> Any:
         torch.manual_seed(1)
-        network = nn.Sequential(nn.Linear(2, 8), nn.BatchNorm1d(8), nn.Dropout(0.3), nn.Linear(8, 1)).to(
-            dtype
-        )
+        network = nn.Sequential(
+            nn.Linear(2, 8), nn.BatchNorm1d(8), nn.Dropout(0.3), nn.Linear(8, 1)
+        ).to(dtype)
         made = kind(network.parameters(), lr=0.01, **options)
         return learner(network, optimiser=made, average=0.9, validate=first_size)
 
@@ -139,7 +142,9 @@ def test_a_learner_goes_on_from_its_state_bit_for_bit(kind, options, dtype):
         whole.step(batch)
     whole.validate()
     parts = fresh()
-    parts.load_state_dict({name: tensor.detach().clone() for name, tensor in whole.state_dict().items()})
+    parts.load_state_dict(
+        {name: tensor.detach().clone() for name, tensor in whole.state_dict().items()}
+    )
     for made in (whole, parts):
         for batch in batches[3:]:
             made.step(batch)
@@ -153,7 +158,10 @@ def test_a_learner_goes_on_from_its_state_bit_for_bit(kind, options, dtype):
     ("change", "sentence"),
     [
         (lambda state: state.pop("weights/weight"), "lacks the weight 'weight'"),
-        (lambda state: state.update({"optimiser/x/lost": X}), "weight 'lost', which it does not move"),
+        (
+            lambda state: state.update({"optimiser/x/lost": X}),
+            "weight 'lost', which it does not move",
+        ),
         (lambda state: state.pop("steps"), "lacks 'steps'"),
     ],
 )

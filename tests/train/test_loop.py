@@ -41,7 +41,14 @@ def test_steps_windows_and_time_of_earlier_sessions_are_carried_on():
     learner = Learner(Linear(), Supervised(), clip=1e-9)
     progress = Progress(step=2, data_s=100.0, training_s=50.0, clipped=1, blind=5, loss=[0.5, 0.25])
     shares = []
-    loop.run(learner, half_blind, progress, Budget(steps=5, cpu_s=1e4), Cosine(), after_step=shares.append)
+    loop.run(
+        learner,
+        half_blind,
+        progress,
+        Budget(steps=5, cpu_s=1e4),
+        Cosine(),
+        after_step=shares.append,
+    )
     assert shares == [0.6, 0.8, 1.0]
     assert (progress.step, progress.clipped, progress.blind) == (5, 4, 8)
     assert progress.loss[:2] == [0.5, 0.25]
@@ -55,7 +62,14 @@ def test_steps_windows_and_time_of_earlier_sessions_are_carried_on():
 def test_a_budget_that_making_the_sources_spends_is_named():
     clock = Clock()
     clock.spent["data"] = 66.0
-    with pytest.raises(DomainError, match=r"1\.00 minutes is over before the first step: .* took 1\.10"):
+    with pytest.raises(
+        DomainError, match=r"1\.00 minutes is over before the first step: .* took 1\.10"
+    ):
         loop.run(
-            Learner(Linear(), Supervised()), half_blind, Progress(), Budget(cpu_s=60.0), Cosine(), clock=clock
+            Learner(Linear(), Supervised()),
+            half_blind,
+            Progress(),
+            Budget(cpu_s=60.0),
+            Cosine(),
+            clock=clock,
         )

@@ -13,8 +13,12 @@ from tests.flow_training_case import SIDE, Made
 
 
 def field(seed, covariance=None):
-    flow = torch.randn(4, 2, SIDE, SIDE, generator=torch.Generator().manual_seed(seed)).requires_grad_()
-    return FlowField(flow, torch.ones(4, SIDE, SIDE, dtype=torch.bool), 1.0, covariance_px2=covariance)
+    flow = torch.randn(
+        4, 2, SIDE, SIDE, generator=torch.Generator().manual_seed(seed)
+    ).requires_grad_()
+    return FlowField(
+        flow, torch.ones(4, SIDE, SIDE, dtype=torch.bool), 1.0, covariance_px2=covariance
+    )
 
 
 @pytest.mark.parametrize("objective", [Contrast(0.3), Photometric(0.3)])
@@ -31,7 +35,9 @@ def test_the_likelihood_teaches_the_claim_and_leaves_the_flow_alone():
     windows = Made().batch(range(4))
 
     def gradients(weight):
-        claim = torch.tensor([1.0, 0.0, 2.0])[:, None, None].repeat(4, 1, SIDE, SIDE).requires_grad_()
+        claim = (
+            torch.tensor([1.0, 0.0, 2.0])[:, None, None].repeat(4, 1, SIDE, SIDE).requires_grad_()
+        )
         prediction = field(0, claim)
         loss = Supervised(claim_weight=weight)([prediction], windows)
         found = torch.autograd.grad(loss, (prediction.flow_px, claim), allow_unused=True)

@@ -12,8 +12,8 @@ from tests.flow_training_case import TRUE_WEIGHTS, Linear, Made
 
 
 def test_scores_are_those_worked_out_by_hand():
-    """Two windows: true flow (3, 4) on 2 pixels and (0, 1) on 1. The estimate (3, 0) is 4, 4 and sqrt(10)
-    off; zero flow 5, 5 and 1. Then the first window once more."""
+    """Two windows: true flow (3, 4) on 2 pixels and (0, 1) on 1. The estimate (3, 0) is 4, 4 and
+    sqrt(10) off; zero flow 5, 5 and 1. Then the first window once more."""
     flow = torch.zeros(2, 2, 1, 2)
     flow[0, 0], flow[0, 1], flow[1, 1] = 3, 4, 1
     valid = torch.tensor([[[True, True]], [[False, True]]])
@@ -60,7 +60,9 @@ def test_windows_without_truth_are_judged_by_the_blur_of_their_events():
     1, and against it they part further."""
     counts = torch.zeros(1, 2, 5, 9, 15)
     counts[0, 0, torch.arange(5), 4, 5 + torch.arange(5)] = 1.0
-    volume = EventVolume(counts, torch.linspace(0, 1, 5), torch.tensor([0.125, 0.25, 0.25, 0.25, 0.125]))
+    volume = EventVolume(
+        counts, torch.linspace(0, 1, 5), torch.tensor([0.125, 0.25, 0.25, 0.25, 0.125])
+    )
     unknown = FlowField(torch.zeros(1, 2, 9, 15), torch.zeros(1, 9, 15, dtype=torch.bool), 1.0)
 
     def judged(length_px):

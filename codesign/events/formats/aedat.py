@@ -1,18 +1,18 @@
-"""AEDAT 4.0: packets of 16-byte events with 64-bit microseconds, and the frames that DAVIS cameras record
-beside them. AEDAT 2.0 as jAER reads it for DAVIS cameras, written only.
+"""AEDAT 4.0: packets of 16-byte events with 64-bit microseconds, and the frames that DAVIS cameras
+record beside them. AEDAT 2.0 as jAER reads it for DAVIS cameras, written only.
 
-Layout of 4.0: the line ``#!AER-DAT4.0``, an IOHeader (FlatBuffer: compression, position of the table, XML
-  that names the streams), packets of (stream, size) and a compressed FlatBuffer each, and a compressed
-  FileDataTable that lists the packets once more. FlatBuffers are read without generated code, every offset
-  checked.
-Source: iniVation documentation, "AEDAT file formats", AEDAT 4.0; FlatBuffers schemas of dv-processing;
-  FlatBuffers documentation, "FlatBuffer Internals".
+Layout of 4.0: the line ``#!AER-DAT4.0``, an IOHeader (FlatBuffer: compression, position of the
+  table, XML that names the streams), packets of (stream, size) and a compressed FlatBuffer each,
+  and a compressed FileDataTable that lists the packets once more. FlatBuffers are read without
+  generated code, every offset checked.
+Source: iniVation documentation, "AEDAT file formats", AEDAT 4.0; FlatBuffers schemas of
+  dv-processing; FlatBuffers documentation, "FlatBuffer Internals".
 
-Layout of 2.0: '#' lines, then big-endian pairs of 32-bit address and 32-bit microseconds. Bits of the
-  address: 22 to 30 the row, counted from the bottom; 12 to 21 the column, counted from the right; 11 the
-  polarity; 31 (frame sample) and 10 (external) are zero for an event of a pixel.
-Source: iniVation documentation, "AEDAT file formats", AEDAT 2.0; jAER, DavisBaseCamera (mirrored columns);
-  v2e, aedat2_output.
+Layout of 2.0: '#' lines, then big-endian pairs of 32-bit address and 32-bit microseconds. Bits of
+  the address: 22 to 30 the row, counted from the bottom; 12 to 21 the column, counted from the
+  right; 11 the polarity; 31 (frame sample) and 10 (external) are zero for an event of a pixel.
+Source: iniVation documentation, "AEDAT file formats", AEDAT 2.0; jAER, DavisBaseCamera
+  (mirrored columns); v2e, aedat2_output.
 """
 
 import re
@@ -114,8 +114,8 @@ class Block:
         return struct.unpack_from(code, self.data, at)[0]
 
     def root(self, identifier):
-        """The root table of a buffer that begins with its size; ``identifier`` is the four letters of its
-        schema."""
+        """The root table of a buffer that begins with its size; ``identifier`` is the four letters
+        of its schema."""
         size = self.number(0, "<I")
         if size + 4 != len(self.data) or self.data[8:12] != identifier:
             raise self.damaged(
@@ -148,8 +148,8 @@ class Table:
         return self.block.number(at, code) if at else default
 
     def array(self, place, dtype) -> np.ndarray:
-        """[N] numpy array of a vector of scalars or structs; empty when the field is absent. It shares the
-        buffer's memory."""
+        """[N] numpy array of a vector of scalars or structs; empty when the field is absent. It
+        shares the buffer's memory."""
         at = self._field(place)
         dtype = np.dtype(dtype)
         if not at:
@@ -174,14 +174,14 @@ def damaged(path, what):
 
 
 def read_container(path, kind):
-    """(root tables of the packets of the one stream of a kind, its sensor size (height_px, width_px) or
-    None).
+    """(root tables of the packets of the one stream of a kind, its sensor size
+    (height_px, width_px) or None).
 
     Args:
       path: file.
       kind: four letters, "EVTS" (events) or "FRME" (frames).
-    Raises: FileFormatError for another kind of file, damage, a file cut short, or not exactly one stream of
-      the kind.
+    Raises: FileFormatError for another kind of file, damage, a file cut short, or not exactly one
+      stream of the kind.
     """
     with open_regular(path) as file:
         data = file.read()
@@ -197,7 +197,9 @@ def read_container(path, kind):
         )
     table_at = header.scalar(1, "<q", -1)
     if table_at != -1 and not start <= table_at <= len(data):
-        raise damaged(path, f"the table of packets is said to lie at byte {table_at} of {len(data)}")
+        raise damaged(
+            path, f"the table of packets is said to lie at byte {table_at} of {len(data)}"
+        )
     wanted, size = _stream(path, header.array(2, "u1").tobytes(), kind)
     places = _places(path, data, start, len(data) if table_at == -1 else table_at)
     if table_at != -1:
@@ -227,7 +229,9 @@ def unpacked(path, data, compression):
                 raise damaged(path, f"{block} claims to hold more than {limit} bytes")
             body = unpacker.decompress(data)
     if not unpacker.eof or unpacker.unused_data:
-        raise damaged(path, f"{block} ends early, goes on too long, or holds more than {limit} bytes")
+        raise damaged(
+            path, f"{block} ends early, goes on too long, or holds more than {limit} bytes"
+        )
     return body
 
 
@@ -237,14 +241,17 @@ def _places(path, data, at, stop):
     while at < stop:
         stream, count = struct.unpack_from("<ii", data, at) if at + 8 <= stop else (0, -1)
         if count < 0 or at + 8 + count > stop:
-            raise damaged(path, f"the packet at byte {at} claims {count} bytes, {stop - at - 8} are left")
+            raise damaged(
+                path, f"the packet at byte {at} claims {count} bytes, {stop - at - 8} are left"
+            )
         places.append((stream, at + 8, count))
         at += 8 + count
     return places
 
 
 def _stream(path, text, kind):
-    """(number, (height_px, width_px) or None) of the only stream of a kind in the XML of the header."""
+    """(number, (height_px, width_px) or None) of the only stream of a kind in the XML of the
+    header."""
     with reading(f"{path}: the header's XML", "the file is damaged"):
         # decoded here, so that another encoding cannot hide a declaration
         plain = text.decode("utf-8")
@@ -282,11 +289,11 @@ def _attribute(node, key):
 
 
 def read_aedat4(path, asked):
-    """EventColumns of ``path``; the sensor size is the header's. Frames, inertial data and triggers are
-    other streams (frames: see ``read_frames``).
+    """EventColumns of ``path``; the sensor size is the header's. Frames, inertial data and triggers
+    are other streams (frames: see ``read_frames``).
 
-    Raises: FileFormatError for damage, for a file cut short, without a single stream of events, or whose
-      times go back (see arrival).
+    Raises: FileFormatError for damage, for a file cut short, without a single stream of events, or
+      whose times go back (see arrival).
     """
     packets, size = read_container(path, "EVTS")
     parts = [packet.array(0, EVENT) for packet in packets]
@@ -295,7 +302,8 @@ def read_aedat4(path, asked):
 
 
 def write_aedat4(path, stream):
-    """Write events to ``path``, LZ4-compressed with a checksum per packet, and the table of packets.
+    """Write events to ``path``, LZ4-compressed with a checksum per packet, and the table of
+    packets.
 
     Raises: FileFormatError for a sensor beyond 32768 x 32768.
     """
@@ -306,7 +314,8 @@ def write_aedat4(path, stream):
     with open(path, "wb") as file:
         file.write(MAGIC + _header(info, 0))
         parts = [
-            events[first : first + EVENTS_PER_PACKET] for first in range(0, len(events), EVENTS_PER_PACKET)
+            events[first : first + EVENTS_PER_PACKET]
+            for first in range(0, len(events), EVENTS_PER_PACKET)
         ]
         table = np.zeros(len(parts), TABLE_ENTRY)
         for entry, part in zip(table, parts, strict=True):
@@ -326,25 +335,40 @@ def _packed(body):
 
 
 def _packet(events):
-    """FlatBuffer: size, root at 20, EVTS, slots of one field at 14, table at 20 whose field points to the
-    vector at 28; events lie at 32, on 8 bytes."""
+    """FlatBuffer: size, root at 20, EVTS, slots of one field at 14, table at 20 whose field points
+    to the vector at 28; events lie at 32, on 8 bytes."""
     body = events.tobytes()
-    return struct.pack("<II4s2xHHHiII", 28 + len(body), 16, b"EVTS", 6, 8, 4, 6, 4, len(events)) + body
+    return (
+        struct.pack("<II4s2xHHHiII", 28 + len(body), 16, b"EVTS", 6, 8, 4, 6, 4, len(events)) + body
+    )
 
 
 def _header(info, table_at):
-    """FlatBuffer: size, root at 28, IOHE, slots of three fields at 18, table (compression, text, position of
-    the table), text with its closing zero."""
+    """FlatBuffer: size, root at 28, IOHE, slots of three fields at 18, table (compression, text,
+    position of the table), text with its closing zero."""
     text = info + bytes(4 - len(info) % 4)
     fields = struct.pack(
-        "<II4s6xHHHHHiiIqI", 48 + len(text), 24, b"IOHE", 10, 20, 4, 12, 8, 10, LZ4, 12, table_at, len(info)
+        "<II4s6xHHHHHiiIqI",
+        48 + len(text),
+        24,
+        b"IOHE",
+        10,
+        20,
+        4,
+        12,
+        8,
+        10,
+        LZ4,
+        12,
+        table_at,
+        len(info),
     )
     return fields + text
 
 
 def _table(entries):
-    """FlatBuffer: size, root at 32, FTAB, slots of the root at 12, slots shared by all entries at 18, root
-    table, offsets of the entries, entries."""
+    """FlatBuffer: size, root at 32, FTAB, slots of the root at 12, slots shared by all entries at
+    18, root table, offsets of the entries, entries."""
     first = 44 + 4 * len(entries)
     # entries begin four bytes before a multiple of eight, where their 64-bit numbers begin
     first += (4 - first) % 8
@@ -353,7 +377,23 @@ def _table(entries):
     offsets = (at - (44 + 4 * np.arange(len(entries)))).astype("<u4").tobytes()
     size = first + entries.nbytes
     head = struct.pack(
-        "<II4sHHHHHHHHHHiII", size - 4, 28, b"FTAB", 6, 8, 4, 14, 44, 4, 36, 12, 20, 28, 20, 4, len(entries)
+        "<II4sHHHHHHHHHHiII",
+        size - 4,
+        28,
+        b"FTAB",
+        6,
+        8,
+        4,
+        14,
+        44,
+        4,
+        36,
+        12,
+        20,
+        28,
+        20,
+        4,
+        len(entries),
     )
     return head + offsets + bytes(first - len(head) - len(offsets)) + entries.tobytes()
 
@@ -376,8 +416,8 @@ def read_frames(path: str | Path) -> RecordedFrames:
     Args:
       path: file ending in .aedat4.
     Returns: RecordedFrames.
-    Raises: FileFormatError when the file is missing, damaged, cut short, without a single stream of frames,
-      or has frames in colour or of several sizes.
+    Raises: FileFormatError when the file is missing, damaged, cut short, without a single stream of
+      frames, or has frames in colour or of several sizes.
     """
     path = check_regular(check_path(path))
     packets, size = read_container(path, "FRME")
@@ -390,7 +430,9 @@ def read_frames(path: str | Path) -> RecordedFrames:
         pixels = table.array(PIXELS, "u1")
         shown = f"{sides[1]} x {sides[0]} pixels"
         if (kind := table.scalar(FORMAT, "<b")) != GRAY:
-            raise FileFormatError(f"{path}: frame {nth} has pixel format {kind}; 0 (8-bit grey) is read.")
+            raise FileFormatError(
+                f"{path}: frame {nth} has pixel format {kind}; 0 (8-bit grey) is read."
+            )
         if min(sides) < 1 or pixels.size != sides[0] * sides[1]:
             raise damaged(path, f"frame {nth} has {pixels.size} values for {shown}")
         if sides != (size or sides) or table.scalar(LEFT, "<h") or table.scalar(TOP, "<h"):
@@ -407,22 +449,24 @@ def read_frames(path: str | Path) -> RecordedFrames:
 
 
 def _exposure_us(table):
-    """Start and end of exposure; recorders since dv-processing 1.2 give the start as the time of the frame,
-    and a duration."""
+    """Start and end of exposure; recorders since dv-processing 1.2 give the start as the time of
+    the frame, and a duration."""
     start_us = table.scalar(EXPOSURE_START, "<q")
     end_us = table.scalar(EXPOSURE_END, "<q")
     if start_us or end_us:
         return start_us, end_us
-    return table.scalar(TIMESTAMP, "<q"), table.scalar(TIMESTAMP, "<q") + table.scalar(EXPOSURE, "<q")
+    return table.scalar(TIMESTAMP, "<q"), table.scalar(TIMESTAMP, "<q") + table.scalar(
+        EXPOSURE, "<q"
+    )
 
 
 def write_aedat2(path, stream):
     """Write events to ``path``.
 
-    Where the first event would begin with the byte of '#', which readers take for one more header line, an
-    external record at the same time (bit 10 set; no event of a pixel) goes ahead of it.
-    Raises: FileFormatError for other sensors than 346 x 260 and 240 x 180, and for times outside 0 to 2^31 -
-      1 us.
+    Where the first event would begin with the byte of '#', which readers take for one more header
+    line, an external record at the same time (bit 10 set; no event of a pixel) goes ahead of it.
+    Raises: FileFormatError for other sensors than 346 x 260 and 240 x 180, and for times outside 0
+      to 2^31 - 1 us.
     """
     chip = CHIPS.get((stream.height_px, stream.width_px))
     if chip is None:
@@ -435,7 +479,11 @@ def write_aedat2(path, stream):
     width_px = stream.width_px
     t_us, x, y, p = columns(stream, "AEDAT 2.0", 2**15, 0, 2**31 - 1)
     records = np.stack(
-        ((height_px - 1 - y) << 22 | (width_px - 1 - x) << 12 | (p > 0).astype(np.int64) << 11, t_us), axis=1
+        (
+            (height_px - 1 - y) << 22 | (width_px - 1 - x) << 12 | (p > 0).astype(np.int64) << 11,
+            t_us,
+        ),
+        axis=1,
     )
     if len(records) and records[0, 0] >> 24 == ord("#"):
         records = np.concatenate(([[EXTERNAL, t_us[0]]], records))

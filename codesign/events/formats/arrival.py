@@ -1,5 +1,5 @@
-"""Events in the order a file holds them, packet by packet, checked and put in order; what columns mean where
-a format does not say (their order, the unit of times); and what a format can hold."""
+"""Events in the order a file holds them, packet by packet, checked and put in order; what columns
+mean where a format does not say (their order, the unit of times); and what a format can hold."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,8 +17,8 @@ NAMES = {
     "y": ("y", "ys"),
     "p": ("p", "ps", "pol", "polarity"),
 }
-# read-out and packet merging swap neighbours within about a frame of the read-out; more than this is another
-# fault
+# read-out and packet merging swap neighbours within about a frame of the read-out; more than this
+# is another fault
 DISORDER_US = 1000
 LAST_US = 2**61
 MOST_EVENTS = 2_000_000_000
@@ -28,7 +28,10 @@ OFF_SENSOR = "events_off_sensor"
 
 def check_asked(path, asked):
     """Raise FileFormatError unless the order and the unit asked for mean something."""
-    if not isinstance(asked.columns, str) or sorted(asked.columns) not in (list("ptxy"), sorted("auto")):
+    if not isinstance(asked.columns, str) or sorted(asked.columns) not in (
+        list("ptxy"),
+        sorted("auto"),
+    ):
         raise FileFormatError(
             f"columns {shown(asked.columns)} given for {path}; the four letters t, x, y, p in the file's "
             "order are needed, for example 'txyp'."
@@ -43,14 +46,16 @@ def check_asked(path, asked):
 def settled_order(path, table, columns, default=None):
     """Which letter of t, x, y, p stands for which column of ``table`` [N, 4].
 
-    "auto": t is the first or the third column, the one of both whose values mostly are no pixels (fractions,
-    beyond LIMIT_PX), else the one that never falls. ``default`` where neither or both are; without one,
-    FileFormatError.
+    "auto": t is the first or the third column, the one of both whose values mostly are no pixels
+    (fractions, beyond LIMIT_PX), else the one that never falls. ``default`` where neither or both
+    are; without one, FileFormatError.
     """
     if columns != "auto":
         return columns
     kinds = [table[:, order.index("t")] for order in ORDERS]
-    no_pixel = [2 * np.count_nonzero((t % 1 != 0) | (t < 0) | (t >= LIMIT_PX)) > len(t) for t in kinds]
+    no_pixel = [
+        2 * np.count_nonzero((t % 1 != 0) | (t < 0) | (t >= LIMIT_PX)) > len(t) for t in kinds
+    ]
     rising = [bool((t[1:] >= t[:-1]).all()) for t in kinds]
     for evidence in (no_pixel, rising):
         if sum(evidence) == 1:
@@ -64,8 +69,8 @@ def settled_order(path, table, columns, default=None):
 
 
 def settled_unit(t, unit, name=""):
-    """The unit of times ``t`` [N] of a column called ``name``; "auto": what the name says, else seconds where
-    a time has a fraction, else microseconds."""
+    """The unit of times ``t`` [N] of a column called ``name``; "auto": what the name says, else
+    seconds where a time has a fraction, else microseconds."""
     told = name.removeprefix("t_")
     if unit != "auto":
         return unit
@@ -75,7 +80,9 @@ def settled_unit(t, unit, name=""):
 def microseconds(t, unit):
     """Times in microseconds, rounded; whole ones stay exact."""
     return (
-        signed(t) if unit == "us" and t.dtype.kind in "iu" else np.rint(t.astype(np.float64) * UNITS_US[unit])
+        signed(t)
+        if unit == "us" and t.dtype.kind in "iu"
+        else np.rint(t.astype(np.float64) * UNITS_US[unit])
     )
 
 
@@ -90,10 +97,11 @@ def signed(t):
 class Asked:
     """What the caller says of a file.
 
-    height_px, width_px: sensor size, or None. told: (height, width) by ``told_by``, which lies beside the
-      file, or None. sensors: name -> (width, height), of which the smallest that holds the events is taken
-      where nothing tells; without any, the smallest size that does.
-    columns: order of the columns of rows, four letters, or "auto". time_unit: s, ms, us, ns or "auto".
+    height_px, width_px: sensor size, or None. told: (height, width) by ``told_by``, which lies
+      beside the file, or None. sensors: name -> (width, height), of which the smallest that holds
+      the events is taken where nothing tells; without any, the smallest size that does.
+    columns: order of the columns of rows, four letters, or "auto". time_unit: s, ms, us, ns or
+      "auto".
     skip: faults whose events are left out and counted; None: where the caller cannot ask for that.
     """
 
@@ -143,8 +151,8 @@ class Arrival:
         Args:
           t_us, x, y, p: [N] numbers; p above 0 for ON, else 0, or -1.
           places: [N] line numbers, or None.
-        Raises: FileFormatError naming the first that is no event, lies outside the sensor or more than
-          DISORDER_US before an earlier one.
+        Raises: FileFormatError naming the first that is no event, lies outside the sensor or more
+          than DISORDER_US before an earlier one.
         """
         latest_us = np.maximum(np.maximum.accumulate(t_us), self.latest_us) if len(t_us) else t_us
         if self.off is None:
@@ -190,8 +198,8 @@ class Arrival:
         self.parts.append((t_us.astype(np.int64), x.astype(np.int16), y.astype(np.int16), p > 0))
 
     def columns(self):
-        """EventColumns of all that was taken. Raises: FileFormatError where neither anything nor anybody
-        tells the sensor size."""
+        """EventColumns of all that was taken. Raises: FileFormatError where neither anything nor
+        anybody tells the sensor size."""
         t_us, x, y, on = (np.concatenate(column) for column in zip(*self.parts, strict=True))
         self.parts.clear()
         if bool((t_us[1:] < t_us[:-1]).any()):
@@ -211,7 +219,11 @@ class Arrival:
         needed = max(int(x.max()) + 1, width or 1), max(int(y.max()) + 1, height or 1)
         for name, sensor in self.asked.sensors.items():
             if sensor[0] >= needed[0] and sensor[1] >= needed[1]:
-                return sensor[1], sensor[0], f"{name}, the smallest known sensor that holds the events"
+                return (
+                    sensor[1],
+                    sensor[0],
+                    f"{name}, the smallest known sensor that holds the events",
+                )
         return height or needed[1], width or needed[0], "the events themselves"
 
     def _outside(self, name, values, limit):
@@ -236,7 +248,8 @@ def arranged(path, asked, t_us, x, y, p, size=None):
 
 
 def columns(stream, name, side_px, first_us, last_us, t0_us=None):
-    """t_us (less t0_us), x, y, p of a stream as int64 arrays, after checking that a format can hold it.
+    """t_us (less t0_us), x, y, p of a stream as int64 arrays, after checking that a format can hold
+    it.
 
     Args:
       name: the format, for messages.
@@ -254,7 +267,11 @@ def columns(stream, name, side_px, first_us, last_us, t0_us=None):
     # as Python integers, which do not wrap
     span_us = [int(t_us[at]) - (t0_us or 0) for at in (0, -1)] if t_us.size else []
     if any(not first_us <= time_us <= last_us for time_us in span_us):
-        remedy = "shift the times" if t0_us is None else "pass another start time t0_us, kept in the header,"
+        remedy = (
+            "shift the times"
+            if t0_us is None
+            else "pass another start time t0_us, kept in the header,"
+        )
         raise FileFormatError(
             f"times{f' less t0_us {t0_us}' if t0_us else ''} span {span_us[0]} to {span_us[1]} us; {name} "
             f"holds {first_us} to {last_us}; {remedy} or write .npz instead."

@@ -1,9 +1,9 @@
 """The words of Prophesee's RAW files.
 
-EVT 2.0: 32 bits, one event each, with the low six bits of its time; time-high words carry the other 28. EVT
-3.0: 16 bits that each change one part of the state (time, row, column base) or emit events from it, one or
-up to twelve at once. Hardware clocks of few bits start again at zero, and values hold until the next word
-changes them.
+EVT 2.0: 32 bits, one event each, with the low six bits of its time; time-high words carry the other
+28. EVT 3.0: 16 bits that each change one part of the state (time, row, column base) or emit events
+from it, one or up to twelve at once. Hardware clocks of few bits start again at zero, and values
+hold until the next word changes them.
 
 Source: Prophesee Metavision documentation, "EVT 2.0 Format", "EVT 3.0 Format".
 """
@@ -40,9 +40,9 @@ BIT_LIST = np.array([bit for bits in BITS for bit in bits], np.int32)
 def unwrapped(ticks, loop):
     """Count the loops of a clock.
 
-    A fall by three quarters of the loop or more is a new loop; a smaller fall is time going back, which the
-    caller judges. (A single wrong bit changes a reading by at most half a loop, so it never passes for a new
-    one.)
+    A fall by three quarters of the loop or more is a new loop; a smaller fall is time going back,
+    which the caller judges. (A single wrong bit changes a reading by at most half a loop, so it
+    never passes for a new one.)
 
     Args:
       ticks: [N] int64 readings, 0 to loop - 1.
@@ -78,14 +78,14 @@ def check_types(path, kind, known, name):
 
 
 def evt2_decoded(path, words):
-    """Events of EVT 2.0: 32-bit words, one event each, with the low six bits of its time; time-high words
-    carry the other 28.
+    """Events of EVT 2.0: 32-bit words, one event each, with the low six bits of its time; time-high
+    words carry the other 28.
 
     Args:
       path: for messages.
       words: [N] uint32.
-    Returns: t_us, x, y, p (0 or 1) in file order, and the number of events before the first time-high word,
-      which have no time and are left out.
+    Returns: t_us, x, y, p (0 or 1) in file order, and the number of events before the first
+      time-high word, which have no time and are left out.
     Raises: FileFormatError for a word of a reserved type.
     """
     kind = (words >> 28).astype(np.uint8)
@@ -103,11 +103,16 @@ def evt2_decoded(path, words):
 def evt2_encoded(t_us, x, y, p):
     """EVT 2.0 words of ordered events.
 
-    The first word sets the clock to zero: Prophesee's reader takes the first time-high word off all times.
+    The first word sets the clock to zero: Prophesee's reader takes the first time-high word off all
+    times.
     """
     high = t_us >> 6
     word = np.stack(
-        (EVT2_HIGH << 28 | high, (p > 0).astype(np.int64) << 28 | (t_us & 0x3F) << 22 | x << 11 | y), axis=1
+        (
+            EVT2_HIGH << 28 | high,
+            (p > 0).astype(np.int64) << 28 | (t_us & 0x3F) << 22 | x << 11 | y,
+        ),
+        axis=1,
     )
     present = np.stack((np.diff(high, prepend=0) != 0, np.ones_like(high, dtype=bool)), axis=1)
     return np.insert(word[present], 0, [EVT2_HIGH << 28] * bool(len(t_us))).astype(EVT2_WORD)
@@ -119,10 +124,10 @@ def evt3_decoded(path, words):
     Args:
       path: for messages.
       words: [N] uint16.
-    Returns: t_us, x, y, p (0 or 1) in file order, and the number of events before the first word that gives
-      their time, row or column base; they are left out.
-    Raises: FileFormatError for a word of a reserved type, and for a vector that leaves the 11 bits of a
-      column.
+    Returns: t_us, x, y, p (0 or 1) in file order, and the number of events before the first word
+      that gives their time, row or column base; they are left out.
+    Raises: FileFormatError for a word of a reserved type, and for a vector that leaves the 11 bits
+      of a column.
     """
     kind = (words >> 12).astype(np.uint8)
     check_types(path, kind, EVT3_TYPES, "EVT 3.0")
@@ -168,15 +173,16 @@ def _times(kind, load):
     ordinal = np.cumsum(is_high) - 1
     high = unwrapped(load[at[is_high]].astype(np.int64), 4096)
     low_at = np.maximum.accumulate(np.where(is_high, -1, np.arange(len(at))))
-    # a new high part starts its low part at zero until a time-low word says more; a repeated one leaves it
+    # a new high part starts its low part at zero until a time-low word says more; a repeated one
+    # leaves it
     moved = is_high & (np.diff(high[ordinal], prepend=-1) != 0)
     moved_at = np.maximum.accumulate(np.where(moved, np.arange(len(at)), -1))
     return at, (high[ordinal] << 12) + np.where(low_at > moved_at, load[at[low_at]], 0)
 
 
 def _columns(kind, load, is_vector, where, emitted):
-    """First column, mask of columns and polarity of each emitting word, and how many events of vectors are
-    left out for want of a base."""
+    """First column, mask of columns and polarity of each emitting word, and how many events of
+    vectors are left out for want of a base."""
     vector = is_vector[where]
     kind_there = kind[where]
     load_there = load[where]
@@ -196,9 +202,10 @@ def _columns(kind, load, is_vector, where, emitted):
 def evt3_encoded(t_us, x, y, p):
     """EVT 3.0 words of ordered events, one column word per event.
 
-    The first word sets the clock to zero: Prophesee's reader takes the first time-high word off all times.
-    Each half loop that passes is told by its last and the next reading, so that no silence hides a loop and
-    no jump is as long as those that readers take for damage (faery: 4094 of 4096 readings).
+    The first word sets the clock to zero: Prophesee's reader takes the first time-high word off all
+    times. Each half loop that passes is told by its last and the next reading, so that no silence
+    hides a loop and no jump is as long as those that readers take for damage (faery: 4094 of 4096
+    readings).
     """
     high_moved = np.diff(t_us >> 12, prepend=0) != 0
     moved = np.diff(t_us, prepend=-1) != 0
@@ -211,7 +218,9 @@ def evt3_encoded(t_us, x, y, p):
         ),
         axis=1,
     )
-    present = np.stack((high_moved, moved, np.diff(y, prepend=-1) != 0, np.ones_like(moved)), axis=1)
+    present = np.stack(
+        (high_moved, moved, np.diff(y, prepend=-1) != 0, np.ones_like(moved)), axis=1
+    )
     count = present.sum(axis=1)
     halves = np.diff(t_us // (EVT3_LOOP_US // 2), prepend=0)
     passed = 0x800 * np.arange(1, int(halves.sum()) + 1)  # high part at the start of each half

@@ -1,13 +1,13 @@
-"""Event streams in HDF5: DSEC's layout (a group ``events`` of t, x, y, p; read and written), v2e's (a dataset
-``events`` of rows t, x, y, p in microseconds) and MVSEC's (``davis/left/events``, rows x, y, t, p in
-seconds).
+"""Event streams in HDF5: DSEC's layout (a group ``events`` of t, x, y, p; read and written), v2e's
+(a dataset ``events`` of rows t, x, y, p in microseconds) and MVSEC's (``davis/left/events``, rows
+x, y, t, p in seconds).
 
-DSEC: t is uint32 microseconds since t_offset (int64), x and y uint16, p uint8 (1 ON, 0 OFF); ms_to_idx[k] is
-the first event with t >= 1000 k. What is written carries the sensor size as attributes height_px and width_px
-of the group; published files have none.
-Sources: Gehrig et al., "DSEC: A Stereo Event Camera Dataset for Driving Scenarios", RA-L 2021; its published
-  description of the data format. v2e, class EventEmulator, output ``dvs_h5`` (Hu et al., CVPRW 2021). Zhu et
-  al., "The Multivehicle Stereo Event Camera Dataset", RA-L 2018.
+DSEC: t is uint32 microseconds since t_offset (int64), x and y uint16, p uint8 (1 ON, 0 OFF);
+ms_to_idx[k] is the first event with t >= 1000 k. What is written carries the sensor size as
+attributes height_px and width_px of the group; published files have none.
+Sources: Gehrig et al., "DSEC: A Stereo Event Camera Dataset for Driving Scenarios", RA-L 2021; its
+  published description of the data format. v2e, class EventEmulator, output ``dvs_h5``
+  (Hu et al., CVPRW 2021). Zhu et al., "The Multivehicle Stereo Event Camera Dataset", RA-L 2018.
 """
 
 import numpy as np
@@ -35,7 +35,8 @@ FINE = 4096  # events that are read to find one
 
 
 def check_index(path, t, first, index):
-    """Raise FileFormatError unless ms_to_idx parts the times ``t`` of the events from number ``first`` on:
+    """Raise FileFormatError unless ms_to_idx parts the times ``t`` of the events from number
+    ``first`` on:
     none before an entry at or after its millisecond, none behind it earlier."""
     limit_us = 1000 * np.arange(len(index), dtype=np.int64)
     at = index[1:] - first
@@ -51,7 +52,11 @@ def check_index(path, t, first, index):
 def pixels(path, attributes, name):
     """A sensor side from the attributes of the group."""
     value = np.asarray(attributes.get(name))
-    if value.dtype.kind not in "iu" or value.size != 1 or not 1 <= int(value.reshape(-1)[0]) <= 2**16:
+    if (
+        value.dtype.kind not in "iu"
+        or value.size != 1
+        or not 1 <= int(value.reshape(-1)[0]) <= 2**16
+    ):
         raise FileFormatError(
             f"{path}: attribute {name} is {value}; a whole number from 1 to 65536 is needed."
         )
@@ -64,8 +69,8 @@ class Hdf5Events:
     Args:
       path: file.
       asked: see Asked.
-    size_px: (height, width) where the file tells, else None. rows: of t, x, y, p, or of all four together
-      ("rows").
+    size_px: (height, width) where the file tells, else None. rows: of t, x, y, p, or of all four
+      together ("rows").
     Raises: FileFormatError for another layout, damage, and data kept in other files.
     """
 
@@ -83,7 +88,9 @@ class Hdf5Events:
             beside = own(path, file, pictures) if not grouped and pictures in file else None
             self.size_px = tuple(beside.shape[1:]) if getattr(beside, "ndim", 0) == 3 else None
             if grouped and {"height_px", "width_px"} & set(events.attrs):
-                self.size_px = tuple(pixels(path, events.attrs, name) for name in ("height_px", "width_px"))
+                self.size_px = tuple(
+                    pixels(path, events.attrs, name) for name in ("height_px", "width_px")
+                )
             self.size_from = "the file" if grouped else "its frames"
         if not grouped:
             self.rows = {"rows": Rows(path, name, [4])}
@@ -91,7 +98,9 @@ class Hdf5Events:
             self.order = settled_order(
                 path, first, self.asked.columns, "xytp" if "davis" in names else "txyp"
             )
-            unit = "s" if "davis" in names and self.asked.time_unit == "auto" else self.asked.time_unit
+            unit = (
+                "s" if "davis" in names and self.asked.time_unit == "auto" else self.asked.time_unit
+            )
             self.unit = settled_unit(first[:, self.order.index("t")], unit)
             return
         self.rows = {"t": Rows(path, "events/t", [])}
@@ -132,12 +141,13 @@ class Hdf5Events:
         return arrival.columns()
 
     def window(self, t0_us, t1_us, size_px):
-        """EventStream of the events from t0_us to t1_us, both included, of a sensor of ``size_px``; a few
-        blocks are read, not the file."""
+        """EventStream of the events from t0_us to t1_us, both included, of a sensor of ``size_px``;
+        a few blocks are read, not the file."""
         if self.index is not None:
             edges = (t0_us - self.offset_us) // 1000, (t1_us - self.offset_us) // 1000 + 1
             low, high = (
-                int(np.append(self.index, len(self))[min(max(k, 0), len(self.index))]) for k in edges
+                int(np.append(self.index, len(self))[min(max(k, 0), len(self.index))])
+                for k in edges
             )
         else:
             low, high = self._place(t0_us - DISORDER_US), self._place(t1_us + DISORDER_US + 1)
@@ -159,15 +169,17 @@ class Hdf5Events:
 
 
 def read_hdf5(path, asked):
-    """EventColumns of ``path``. Raises: FileFormatError, as Hdf5Events, and what arrival refuses."""
+    """EventColumns of ``path``. Raises: FileFormatError, as Hdf5Events, and what arrival
+    refuses."""
     return Hdf5Events(path, asked).columns()
 
 
 def write_hdf5(path, stream):
-    """Write events to ``path`` in DSEC's layout, with checksums; t_offset is the time of the first event.
+    """Write events to ``path`` in DSEC's layout, with checksums; t_offset is the time of the first
+    event.
 
-    Raises: FileFormatError for a stream longer than 2^32 us, because t has 32 bits, and for a sensor beyond
-      65536 x 65536.
+    Raises: FileFormatError for a stream longer than 2^32 us, because t has 32 bits, and for a
+      sensor beyond 65536 x 65536.
     """
     t_us, x, y, p = columns(stream, "DSEC's layout", 2**16, -(2**61), 2**61)
     offset_us = int(t_us[0]) if t_us.size else 0
@@ -191,6 +203,8 @@ def write_hdf5(path, stream):
     # from 1.10 on, HDF5 keeps checksums of its own structure too
     with new_hdf5(path, libver=("v110", "v110")) as file:
         for name, array in arrays.items():
-            packing = PACKING | {"chunks": (min(len(array), EVENTS_PER_CHUNK),)} if array.size > 1 else {}
+            packing = (
+                PACKING | {"chunks": (min(len(array), EVENTS_PER_CHUNK),)} if array.size > 1 else {}
+            )
             file.create_dataset(name, data=array, **packing)
         file["events"].attrs.update(height_px=stream.height_px, width_px=stream.width_px)

@@ -1,9 +1,9 @@
 """HDF5 on damaged files and full disks: rows of large datasets, block by block, and new files.
 
-The library trusts its filters and its index: a block that unpacks to fewer bytes than its chunk, a filter
-without its parameters, or a damaged index while a block is read ends the process. So stored bytes are read
-past it, gzip blocks are unpacked and measured here, and Blosc blocks are handed on only when their headers
-say what the chunk needs; other filters are refused.
+The library trusts its filters and its index: a block that unpacks to fewer bytes than its chunk, a
+filter without its parameters, or a damaged index while a block is read ends the process. So stored
+bytes are read past it, gzip blocks are unpacked and measured here, and Blosc blocks are handed on
+only when their headers say what the chunk needs; other filters are refused.
 Source: HDF5 File Format Specification 3.0, "Data Object Header Messages: Filter Pipeline"; c-blosc,
   README_CHUNK_FORMAT.
 """
@@ -42,8 +42,8 @@ def chunk_bytes(dataset):
 
 
 def places_of(path, dataset, name, file_bytes):
-    """[(first indices, mask of filters left out, first byte, stored bytes)] of all blocks, which must cover the
-    dataset once and lie inside the file."""
+    """[(first indices, mask of filters left out, first byte, stored bytes)] of all blocks, which
+    must cover the dataset once and lie inside the file."""
     needed = math.prod(
         -(-length // chunk) for length, chunk in zip(dataset.shape, dataset.chunks, strict=True)
     )
@@ -59,7 +59,9 @@ def places_of(path, dataset, name, file_bytes):
     places = []
     # byte_offset counts from the start of the file, its user block included
     dataset.id.chunk_iter(
-        lambda info: places.append((tuple(info.chunk_offset), info.filter_mask, info.byte_offset, info.size))
+        lambda info: places.append(
+            (tuple(info.chunk_offset), info.filter_mask, info.byte_offset, info.size)
+        )
     )
     sides = tuple(zip(dataset.chunks, dataset.shape, strict=True))
     inside = all(
@@ -138,10 +140,13 @@ def damaged(path, name, where):
 
 
 def own(path, file, name):
-    """The object of a name, which must lie in this file, all along its path. Raises: FileFormatError."""
+    """The object of a name, which must lie in this file, all along its path. Raises:
+    FileFormatError."""
     found = file
     for part in name.split("/"):
-        if not isinstance(found, h5py.Group) or not isinstance(found.get(part, getlink=True), h5py.HardLink):
+        if not isinstance(found, h5py.Group) or not isinstance(
+            found.get(part, getlink=True), h5py.HardLink
+        ):
             raise FileFormatError(
                 f"{path}: {name} is absent or a link to another file; files must hold their own data."
             )
@@ -166,16 +171,16 @@ def scalar(path, name):
 
 
 class Rows:
-    """A dataset of numbers in a file, read by ranges of its first axis. The file is open only while it is
-    read.
+    """A dataset of numbers in a file, read by ranges of its first axis. The file is open only while
+    it is read.
 
     Args:
       path: the file.
       name: the dataset.
       columns: shape of a row (None: any).
       count: number of rows that it must have (None: any).
-    Raises: FileFormatError when it is absent, of another shape, cut, packed by a filter that is not trusted,
-      or kept in other files.
+    Raises: FileFormatError when it is absent, of another shape, cut, packed by a filter that is not
+      trusted, or kept in other files.
     """
 
     def __init__(
@@ -198,7 +203,9 @@ class Rows:
                     count if count is not None else "N",
                     *(columns if columns is not None else dataset.shape[1:]),
                 ]
-                raise FileFormatError(f"{path}: {name} has shape {list(dataset.shape)}, {wanted} is needed.")
+                raise FileFormatError(
+                    f"{path}: {name} has shape {list(dataset.shape)}, {wanted} is needed."
+                )
             self.shape = dataset.shape
             self.dtype = dataset.dtype
             self._find_blocks(dataset)
@@ -246,8 +253,8 @@ class Rows:
             )
 
     def read(self, first: int, last: int) -> np.ndarray:
-        """Rows first to last - 1 as a numpy array, in the file's type. Raises: FileFormatError for a range
-        outside, and for damaged blocks."""
+        """Rows first to last - 1 as a numpy array, in the file's type. Raises: FileFormatError for
+        a range outside, and for damaged blocks."""
         if not 0 <= first <= last <= len(self):
             raise FileFormatError(
                 f"{self.path}: rows {first} to {last} of {self.name} were asked for, which has {len(self)}."
@@ -267,7 +274,10 @@ class Rows:
                     high = min(last, at[0] + depth)
                     target = (
                         slice(low - first, high - first),
-                        *(slice(a, a + n) for a, n in zip(at[1:], self.block_shape[1:], strict=True)),
+                        *(
+                            slice(a, a + n)
+                            for a, n in zip(at[1:], self.block_shape[1:], strict=True)
+                        ),
                     )
                     room = found[target].shape[1:]  # blocks at the end reach beyond the dataset
                     found[target] = self._block(dataset, place)[
@@ -285,13 +295,17 @@ class Rows:
         if self.filters and self.filters[0][0] == BLOSC:
             check_blosc(self.path, dataset, self.name, place, self.filters[0][2])
             return np.asarray(
-                dataset[tuple(slice(a, a + n) for a, n in zip(at, self.block_shape or (), strict=True))]
+                dataset[
+                    tuple(slice(a, a + n) for a, n in zip(at, self.block_shape or (), strict=True))
+                ]
             )
         data = stored_bytes(self.path, self.name, place)
         size = chunk_bytes(dataset)
         for k in reversed(range(len(self.filters))):
             if not mask >> k & 1:
-                data = undone(self.path, self.name, self.filters[k][0], self.filters[k][2], data, size)
+                data = undone(
+                    self.path, self.name, self.filters[k][0], self.filters[k][2], data, size
+                )
         if len(data) != size:
             raise damaged(self.path, self.name, at)
         return np.frombuffer(data, dataset.dtype).reshape(self.block_shape)
@@ -306,8 +320,8 @@ def new_hdf5(path: str | Path, **options: Any) -> Iterator[Any]:
         options: of ``h5py.File``.
 
     Raises:
-        OSError: when the block ends, if something could not be written. HDF5 itself ends the process where it
-            fails while it closes a file, so it is not told.
+        OSError: when the block ends, if something could not be written. HDF5 itself ends the
+            process where it fails while it closes a file, so it is not told.
     """
     with h5py.File(path, "w"):  # HDF5 refuses a file that somebody reads
         pass

@@ -1,10 +1,10 @@
-"""Prophesee's files: an ASCII header of lines ``% keyword value``, then, little-endian, EVT 2.0 or EVT 3.0
-words (.raw), or a byte each for event type and size and 8-byte events (.dat).
+"""Prophesee's files: an ASCII header of lines ``% keyword value``, then, little-endian, EVT 2.0 or
+EVT 3.0 words (.raw), or a byte each for event type and size and 8-byte events (.dat).
 
-Hardware clocks have few bits and start again at zero: their loops are counted when reading. Prophesee's own
-readers count no loop of .dat, readers disagree on those of EVT 2.0, so none is written there; in EVT 3.0
-they are told by time words, which every reader counts. The start time (``% t0``, ``% T0``) that faery and we
-write where asked to is added to all times.
+Hardware clocks have few bits and start again at zero: their loops are counted when reading.
+Prophesee's own readers count no loop of .dat, readers disagree on those of EVT 2.0, so none is
+written there; in EVT 3.0 they are told by time words, which every reader counts. The start time
+(``% t0``, ``% T0``) that faery and we write where asked to is added to all times.
 Source: Prophesee Metavision documentation, "RAW File Format", "DAT File Format"; faery.
 """
 
@@ -18,8 +18,8 @@ from codesign.events.formats.arrival import arranged, columns
 from codesign.events.formats.evt import ENCODINGS, unwrapped
 
 LIMIT_BYTES = 65536
-# microseconds to add to every time: faery writes "t0" in .raw and "T0" in .dat, versions of codesign before
-# it "codesign_t_offset_us"
+# microseconds to add to every time: faery writes "t0" in .raw and "T0" in .dat, versions of
+# codesign before it "codesign_t_offset_us"
 START_KEYS = ("t0", "T0", "codesign_t_offset_us")
 GEOMETRY = re.compile(r"(\d{1,5})x(\d{1,5})")
 RAW_SIDE_PX = 2**11
@@ -32,10 +32,10 @@ DAT_LOOP_US = 2**32
 def read_raw(path, asked):
     """EventColumns of ``path``.
 
-    Events before the first word that gives a time or row are left out with a warning: recordings may start
-    amid the camera's words.
-    Raises: FileFormatError for another encoding, a damaged header or word, a file cut amid a word, or time
-      going back (see arrival).
+    Events before the first word that gives a time or row are left out with a warning: recordings
+    may start amid the camera's words.
+    Raises: FileFormatError for another encoding, a damaged header or word, a file cut amid a word,
+      or time going back (see arrival).
     """
     data = path.read_bytes()
     fields, start = parse_header(path, data)
@@ -53,11 +53,11 @@ def read_raw(path, asked):
 
 
 def write_raw(path, stream, *, evt=3, t0_us=0):
-    """Write events to ``path`` as EVT 3.0 or (evt=2) EVT 2.0, their times less ``t0_us``, which the header
-    tells.
+    """Write events to ``path`` as EVT 3.0 or (evt=2) EVT 2.0, their times less ``t0_us``, which the
+    header tells.
 
-    Raises: FileFormatError for a sensor beyond 2048 x 2048, another ``evt``, or times (less t0_us) below 0 or
-      beyond 2^44 us (EVT 2.0: 2^34 us).
+    Raises: FileFormatError for a sensor beyond 2048 x 2048, another ``evt``, or times (less t0_us)
+      below 0 or beyond 2^44 us (EVT 2.0: 2^34 us).
     """
     if not isinstance(evt, int) or evt not in ENCODINGS:
         raise FileFormatError(f"evt={evt!r} was given; 2 (EVT 2.0) and 3 (EVT 3.0) are written.")
@@ -76,11 +76,11 @@ def write_raw(path, stream, *, evt=3, t0_us=0):
 
 
 def read_dat(path, asked):
-    """EventColumns of ``path``. A header with nothing behind it, as faery writes for no events, is an empty
-    stream.
+    """EventColumns of ``path``. A header with nothing behind it, as faery writes for no events, is
+    an empty stream.
 
-    Raises: FileFormatError for another version or event type, a damaged header, a file cut amid an event, an
-      unknown polarity, or time going back.
+    Raises: FileFormatError for another version or event type, a damaged header, a file cut amid an
+      event, an unknown polarity, or time going back.
     """
     data = path.read_bytes()
     fields, start = parse_header(path, data)
@@ -106,13 +106,15 @@ def read_dat(path, asked):
 
 
 def write_dat(path, stream, *, t0_us=0):
-    """Write events to ``path`` as contrast-detection events, version 2, their times less ``t0_us``, which the
-    header tells.
+    """Write events to ``path`` as contrast-detection events, version 2, their times less ``t0_us``,
+    which the header tells.
 
-    Raises: FileFormatError for a sensor beyond 16384 x 16384, and times (less t0_us) below 0 or beyond 2^32
-      us.
+    Raises: FileFormatError for a sensor beyond 16384 x 16384, and times (less t0_us) below 0 or
+      beyond 2^32 us.
     """
-    t_us, x, y, p = columns(stream, "DAT", DAT_SIDE_PX, 0, DAT_LOOP_US - 1, _checked_start_us(t0_us))
+    t_us, x, y, p = columns(
+        stream, "DAT", DAT_SIDE_PX, 0, DAT_LOOP_US - 1, _checked_start_us(t0_us)
+    )
     events = np.empty(len(t_us), DAT_EVENT)
     events["t"] = t_us
     events["address"] = (p > 0).astype(np.int64) << 28 | y << 14 | x
@@ -129,7 +131,8 @@ def write_dat(path, stream, *, t0_us=0):
 def parse_header(path, data):
     """(fields, start): the values by keyword, and where the binary part of ``data`` starts.
 
-    Raises: FileFormatError for a header without an end, not ASCII, or with a keyword said twice in two ways.
+    Raises: FileFormatError for a header without an end, not ASCII, or with a keyword said twice in
+      two ways.
     """
     fields = {}
     start = 0
@@ -160,7 +163,11 @@ def parse_header(path, data):
 def whole_number(path, text, name, low, high):
     """The integer a header gives for ``name``."""
     digits = text.removeprefix("-")
-    if not (digits.isascii() and digits.isdigit()) or len(digits) > 19 or not low <= int(text) <= high:
+    if (
+        not (digits.isascii() and digits.isdigit())
+        or len(digits) > 19
+        or not low <= int(text) <= high
+    ):
         raise FileFormatError(
             f"{path}: the header gives {name} as {text[:40]!r}; a whole number from {low} to {high} is "
             "needed."
@@ -169,7 +176,8 @@ def whole_number(path, text, name, low, high):
 
 
 def start_us(path, fields):
-    """Time at which the clock of a file starts, which its words do not count: the header's ``t0``, or 0.
+    """Time at which the clock of a file starts, which its words do not count: the header's ``t0``,
+    or 0.
 
     Raises: FileFormatError when it is no whole number from 0 to 2^62, or said twice in two ways.
     """
@@ -184,7 +192,9 @@ def start_us(path, fields):
 def _checked_start_us(t0_us):
     """``t0_us`` as a header can hold it."""
     if isinstance(t0_us, bool) or not isinstance(t0_us, int) or not 0 <= t0_us <= 2**62:
-        raise FileFormatError(f"t0_us is {t0_us!r}; a whole number of microseconds from 0 to 2^62 is needed.")
+        raise FileFormatError(
+            f"t0_us is {t0_us!r}; a whole number of microseconds from 0 to 2^62 is needed."
+        )
     return t0_us
 
 
@@ -195,7 +205,9 @@ def _header(*lines):
 def _whole(path, data, start, kind, what):
     """The rest of a file as words or events, none of which was cut."""
     if (len(data) - start) % kind.itemsize:
-        raise FileFormatError(f"{path} ends amid {what} of {kind.itemsize} bytes; it was cut, copy it again.")
+        raise FileFormatError(
+            f"{path} ends amid {what} of {kind.itemsize} bytes; it was cut, copy it again."
+        )
     return np.frombuffer(data, kind, offset=start)
 
 
@@ -204,7 +216,11 @@ def _format(path, fields):
     name, *rest = fields.get("format", "").split(";")
     options = dict(part.partition("=")[::2] for part in rest)
     said = {fields["evt"]} if "evt" in fields else set()
-    said |= {f"{name[3:]}.0" if name.startswith("EVT") and name[3:].isdigit() else name} if name else set()
+    said |= (
+        {f"{name[3:]}.0" if name.startswith("EVT") and name[3:].isdigit() else name}
+        if name
+        else set()
+    )
     if len(said) != 1 or not said <= {"2.0", "3.0"}:
         raise FileFormatError(
             f"{path}: the header gives the encoding {sorted(said) or 'nowhere'}; EVT 2.0 and EVT 3.0 are "

@@ -1,8 +1,10 @@
-"""Events as text, one per line: ``t x y p`` as in the Event-Camera Dataset, or what a header line says.
+"""Events as text, one per line: ``t x y p`` as in the Event-Camera Dataset, or what a header line
+says.
 
-Times with a fraction are seconds, whole ones microseconds; p is 1 and 0, or +1 and -1. Numbers are separated
-by blanks or commas. A first line of two whole numbers is the sensor's width and height; lines that begin with
-# are skipped at the top. Written: a header line ``t,x,y,p``, t in whole microseconds, p +1 or -1.
+Times with a fraction are seconds, whole ones microseconds; p is 1 and 0, or +1 and -1. Numbers are
+separated by blanks or commas. A first line of two whole numbers is the sensor's width and height;
+lines that begin with # are skipped at the top. Written: a header line ``t,x,y,p``, t in whole
+microseconds, p +1 or -1.
 Source: Mueggler et al., IJRR 2017 (layout of events.txt).
 """
 
@@ -32,7 +34,8 @@ NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
 def write_csv(path, stream):
-    """Write events to ``path``. The format has no place for the sensor size: pass it when reading."""
+    """Write events to ``path``. The format has no place for the sensor size: pass it when
+    reading."""
     rows = columns(stream, "CSV", LIMIT_PX, 1 - LAST_US, LAST_US - 1)
     np.savetxt(path, np.stack(rows, 1), fmt="%d", delimiter=",", header="t,x,y,p", comments="")
 
@@ -40,7 +43,8 @@ def write_csv(path, stream):
 def read_text(path, asked):
     """EventColumns of a text file, eight megabytes at a time.
 
-    Raises: FileFormatError naming the line that is not four numbers, and what tables and arrival refuse.
+    Raises: FileFormatError naming the line that is not four numbers, and what tables and arrival
+      refuse.
     """
     with open(path, "rb") as file:
         # a mark that some editors put before a text
@@ -64,8 +68,8 @@ def read_text(path, asked):
 
 
 def _head(path, file):
-    """(number of the first line behind comments, a header, or a size at the top of the file; names of the
-    header, or ""; (height, width) or None)."""
+    """(number of the first line behind comments, a header, or a size at the top of the file; names
+    of the header, or ""; (height, width) or None)."""
     used = 0
     names: list[str] = []
     told = None
@@ -114,8 +118,8 @@ def _whole_lines(path, file, number):
 
 
 def _table(path, lines, number):
-    """[N, 4] int64 or float64 of whole lines, and the number of the line of each row. Every line must hold
-    four numbers or nothing."""
+    """[N, 4] int64 or float64 of whole lines, and the number of the line of each row. Every line
+    must hold four numbers or nothing."""
     raw = np.frombuffer(lines, np.uint8)
     blank = raw <= 32
     starts = ~blank & np.concatenate([[True], blank[:-1]])

@@ -1,11 +1,12 @@
 """Event layers by name, and their comparators: from what a pixel sees to counts, all called alike.
 
-A comparator is a small object with ``comparator(frames, theta_on, theta_off, state, log_input) -> counts,
-state``: frames [T, ...] on the 0-255 scale, or log levels with log_input, give counts [T-1, 2, ...], ON
-first, and with a state of an earlier call [T, 2, ...]. theta_on, theta_off: 0-dim or [...].
-``mismatched`` says whether it takes the thresholds of every pixel, or the nominal ones. ``refines`` says
-whether it may be asked between frames, for the times of events: whether it counts the same events, or more of
-the sensor's, the more often it looks. Without it the events of an interval are spread evenly.
+A comparator is a small object with ``comparator(frames, theta_on, theta_off, state, log_input) ->
+counts, state``: frames [T, ...] on the 0-255 scale, or log levels with log_input, give counts
+[T-1, 2, ...], ON first, and with a state of an earlier call [T, 2, ...]. theta_on, theta_off: 0-dim
+or [...]. ``mismatched`` says whether it takes the thresholds of every pixel, or the nominal ones.
+``refines`` says whether it may be asked between frames, for the times of events: whether it counts
+the same events, or more of the sensor's, the more often it looks. Without it the events of an
+interval are spread evenly.
 """
 
 import difflib
@@ -39,7 +40,8 @@ MOST_STEPS = 4096  # of spiking neurons per frame interval
 
 
 class LastDraw:
-    """Remembers one draw: what was asked for, the generators' states before and behind it, and what came."""
+    """Remembers one draw: what was asked for, the generators' states before and behind it, and what
+    came."""
 
     def __init__(self):
         self._known = None
@@ -53,13 +55,18 @@ class LastDraw:
         Args:
           asked: all that the draw depends on but its generators, to be compared by ==.
           generators: in the order in which they are drawn from, also several times.
-          draw: without arguments; what it returns, a tuple of tensors or None, is not changed afterwards.
+          draw: without arguments; what it returns, a tuple of tensors or None, is not changed
+            afterwards.
         """
         own = list(dict.fromkeys(generators))
         place = {generator: number for number, generator in enumerate(own)}
         asked = asked, [place[generator] for generator in generators]
         before = [generator.get_state() for generator in own]
-        if self._known and self._known[0] == asked and all(map(torch.equal, before, self._known[1])):
+        if (
+            self._known
+            and self._known[0] == asked
+            and all(map(torch.equal, before, self._known[1]))
+        ):
             _, _, behind, drawn = self._known
             for generator, state in zip(own, behind, strict=True):
                 generator.set_state(state)
@@ -100,33 +107,38 @@ class SoftCounts:
 
 @dataclass
 class Dense:
-    """``events.dense``: at most one event per frame and polarity. sharpness: b of the surrogate slope."""
+    """``events.dense``: at most one event per frame and polarity. sharpness: b of the surrogate
+    slope."""
 
     sharpness: float = 5.0
     mismatched = True
     refines = False
 
     def __call__(self, frames, theta_on, theta_off, state, log_input):
-        return dense(frames, theta_on, theta_off, sharpness=self.sharpness, state=state, log_input=log_input)
+        return dense(
+            frames, theta_on, theta_off, sharpness=self.sharpness, state=state, log_input=log_input
+        )
 
 
 @dataclass
 class Memory:
-    """``events.memory``: hard counts against the memorised level. gradient: "exact", "play" or None, as
-    there."""
+    """``events.memory``: hard counts against the memorised level. gradient: "exact", "play" or
+    None, as there."""
 
     gradient: str | None = None
     mismatched = True
     refines = True
 
     def __call__(self, frames, theta_on, theta_off, state, log_input):
-        return memory(frames, theta_on, theta_off, state=state, log_input=log_input, gradient=self.gradient)
+        return memory(
+            frames, theta_on, theta_off, state=state, log_input=log_input, gradient=self.gradient
+        )
 
 
 @dataclass
 class Expected:
-    """``events.expected``: mean counts under threshold mismatch. spread: relative standard deviation of the
-    thresholds, in place of a drawn one; assign to anneal it."""
+    """``events.expected``: mean counts under threshold mismatch. spread: relative standard
+    deviation of the thresholds, in place of a drawn one; assign to anneal it."""
 
     spread: float = 0.15
     mismatched = False
@@ -138,9 +150,10 @@ class Expected:
 
 @dataclass
 class Spikes:
-    """``events.srm`` with step kernels and coupled polarities, fed with steps of the log level: at most one
-    event per frame and polarity, the rest of a step stays for the frames after it; with the gradient of the
-    mean count, as ``events.memory``. steps: of the neurons per frame interval, over which the level runs
+    """``events.srm`` with step kernels and coupled polarities, fed with steps of the log level: at
+    most one event per frame and polarity, the rest of a step stays for the frames after it; with
+    the gradient of the mean count, as ``events.memory``. steps: of the neurons per frame interval,
+    over which the level runs
     linearly: the most events that an interval can give."""
 
     steps: int = 1
@@ -161,7 +174,8 @@ class Spikes:
 
 
 def _between(level, steps):
-    """Levels [T, ...] with steps - 1 more between two, on a straight line: [(T - 1) * steps + 1, ...]."""
+    """Levels [T, ...] with steps - 1 more between two, on a straight line:
+    [(T - 1) * steps + 1, ...]."""
     share = torch.arange(1, steps + 1, dtype=level.dtype, device=level.device) / steps
     share = share.reshape(-1, *[1] * (level.ndim - 1))
     line = level[:-1, None] + share * level.diff(dim=0)[:, None]
@@ -174,8 +188,8 @@ def _with_last(frames, last):
 
 
 def check_comparator(comparator: object, sensor: SensorModel, learnt: Container[str]) -> None:
-    """Refuse what is no comparator, or takes no mismatch that is to be learnt; warn of what the sensor has
-    and no comparator knows."""
+    """Refuse what is no comparator, or takes no mismatch that is to be learnt; warn of what the
+    sensor has and no comparator knows."""
     if not callable(comparator) or not hasattr(comparator, "mismatched"):
         raise DomainError(
             f"the comparator is {comparator!r}; it is called (frames, theta_on, theta_off, state, log_input) "
@@ -205,10 +219,10 @@ def check_comparator(comparator: object, sensor: SensorModel, learnt: Container[
 class LayerState:
     """What a ``ComparatorLayer`` carries over chunks.
 
-    comparator: state of the comparator, and what it is a state of. level, frame: [..., H, W] level behind the
-      low-pass and last frame, None without a low-pass. deviates: [2, ..., H, W] standard normal numbers of
-      the thresholds, None without mismatch. time_s: time of the last frame. generators: of the noise still to
-      come, one per sample.
+    comparator: state of the comparator, and what it is a state of. level, frame: [..., H, W] level
+      behind the low-pass and last frame, None without a low-pass. deviates: [2, ..., H, W] standard
+      normal numbers of the thresholds, None without mismatch. time_s: time of the last frame.
+      generators: of the noise still to come, one per sample.
     shape, dtype: of a frame [..., H, W].
     """
 
@@ -224,11 +238,12 @@ class LayerState:
 
 
 class ComparatorLayer(EventLayer):
-    """Low-pass (where the sensor has a bandwidth), thresholds (with mismatch), a comparator, noise events.
+    """Low-pass (where the sensor has a bandwidth), thresholds (with mismatch), a comparator, noise
+    events.
 
     Of the sensor it uses theta_on, theta_off, theta_sigma, cutoff_hz and shot_rate_hz (Poisson, as
-    ``draw_shot_counts``, without gradient); leak, dead time, hot pixels and photoreceptor noise are those of
-    ``PhysicalLayer``: a sensor that has them is taken without, and a warning names them.
+    ``draw_shot_counts``, without gradient); leak, dead time, hot pixels and photoreceptor noise are
+    those of ``PhysicalLayer``: a sensor that has them is taken without, and a warning names them.
     comparator: one of ``events.layers.comparators``, or your own of the same call.
     """
 
@@ -258,7 +273,9 @@ class ComparatorLayer(EventLayer):
                 f"{type(self.comparator).__name__}; pass what this layer returned."
             )
         elif state.level is None and self.sensor.cutoff_hz > 0:
-            raise DomainError("the layer has a bandwidth, the one that began the state had not; begin anew.")
+            raise DomainError(
+                "the layer has a bandwidth, the one that began the state had not; begin anew."
+            )
         else:
             check_chunk(frames, state.shape, state.dtype)
             times_s = check_later(times_s, state.time_s)
@@ -280,14 +297,16 @@ class ComparatorLayer(EventLayer):
         )
 
     def _noise(self, frames, interval_s, state):
-        """Deviates of the thresholds [2, ..., H, W] and noise events [T-1, 2, ..., H, W], None each where the
-        sensor has none; one sample after the other."""
+        """Deviates of the thresholds [2, ..., H, W] and noise events [T-1, 2, ..., H, W], None each
+        where the sensor has none; one sample after the other."""
         draws_thetas = self.sensor.theta_sigma > 0 and state.deviates is None
         if not draws_thetas and not self.sensor.has_shots:
             return state.deviates, None
         asked = (frames.shape, frames.dtype, frames.device, interval_s.tolist(), draws_thetas)
         deviates, shots = self._last_draw(
-            asked, state.generators, lambda: self._draw(frames, interval_s, state.generators, draws_thetas)
+            asked,
+            state.generators,
+            lambda: self._draw(frames, interval_s, state.generators, draws_thetas),
         )
         return state.deviates if deviates is None else deviates, shots
 
@@ -299,7 +318,9 @@ class ComparatorLayer(EventLayer):
             if draws_thetas:
                 deviates.append(draw_deviates(pixels, generator, dtype=frames.dtype))
             if self.sensor.has_shots:
-                shots.append(draw_shot_counts(self.sensor, pixels, interval_s, generator, dtype=frames.dtype))
+                shots.append(
+                    draw_shot_counts(self.sensor, pixels, interval_s, generator, dtype=frames.dtype)
+                )
         batch = frames.shape[1:]
         return (
             torch.stack(deviates, 1).reshape(2, *batch).to(frames) if deviates else None,
@@ -307,7 +328,8 @@ class ComparatorLayer(EventLayer):
         )
 
     def _seen(self, frames, interval_s, state):
-        """What the comparator gets: the frames, or log levels behind the low-pass with the last of them."""
+        """What the comparator gets: the frames, or log levels behind the low-pass with the last of
+        them."""
         if self.sensor.cutoff_hz == 0:
             return frames, None
         both = frames if state.frame is None else torch.cat((state.frame[None], frames))
@@ -332,15 +354,17 @@ def layer(name: str = "memory", sensor: SensorModel | None = None, **options: An
     """The event layer of that name, a module with learnable thresholds.
 
     Args:
-      name: "sigmoid" (per frame pair, no memory: the baseline), "counts" (the same without cap or ghosts),
-        "dense" (comparator with surrogate, at most one event per frame), "memory" (memorised level,
-        straight-through counts: the default), "expected" (mean counts under threshold mismatch), "srm"
-        (spike response model, at most one event per frame), "physical" (the full sensor).
-      sensor: SensorModel to start from. options: learn, log_input (see ``EventLayer``), and spread of
-        "expected", sharpness of "sigmoid" and "dense", gradient of "memory" ("exact", "play" or None), steps
-        (per frame interval) of "srm".
-    Raises: DomainError for an unknown name, with the nearest one, an unknown option, or a value that cannot
-      be learnt. A warning names what the sensor has and the layer does not know (leak, dead time, ...).
+      name: "sigmoid" (per frame pair, no memory: the baseline), "counts" (the same without cap or
+        ghosts), "dense" (comparator with surrogate, at most one event per frame), "memory"
+        (memorised level, straight-through counts: the default), "expected" (mean counts under
+        threshold mismatch), "srm" (spike response model, at most one event per frame), "physical"
+        (the full sensor).
+      sensor: SensorModel to start from. options: learn, log_input (see ``EventLayer``), and spread
+        of "expected", sharpness of "sigmoid" and "dense", gradient of "memory"
+        ("exact", "play" or None), steps (per frame interval) of "srm".
+    Raises: DomainError for an unknown name, with the nearest one, an unknown option, or a value
+      that cannot be learnt. A warning names what the sensor has and the layer does not know
+      (leak, dead time, ...).
 
     Example:
     >>> import torch

@@ -1,23 +1,24 @@
-"""What dead time lets pass of mean counts: the expectation over where events stand in a pixel's threshold, as
-a smooth function of the levels, the thresholds and the dead time.
+"""What dead time lets pass of mean counts: the expectation over where events stand in a pixel's
+threshold, as a smooth function of the levels, the thresholds and the dead time.
 
-A pixel has an event whenever its mean signed count I (ON less OFF) passes i + u, up or down, with a phase u
-that is as good as random: on a way back those come first that came last. Event i is kept unless one kept
-before lies less than T back, and no two kept ones do:
+A pixel has an event whenever its mean signed count I (ON less OFF) passes i + u, up or down, with a
+phase u that is as good as random: on a way back those come first that came last. Event i is kept
+unless one kept before lies less than T back, and no two kept ones do:
 
     kept_i = 1 - sum over j < i with t_i - t_j < T of kept_j,
 
-a linear recursion, exact for every single phase. Here it runs for PHASES groups of neighbouring phases, each
-WIDTH of a count wide and mixed within; S(t) is what a group has kept until t, and a phase that has its event
-during a step is kept by 1 - (S(its event before) - S(t - T)). The first event after a pause is never lost,
-and dead time reaches over frames, turns and polarities. What the mixing costs is in docs/events.md.
+a linear recursion, exact for every single phase. Here it runs for PHASES groups of neighbouring
+phases, each WIDTH of a count wide and mixed within; S(t) is what a group has kept until t, and a
+phase that has its event during a step is kept by 1 - (S(its event before) - S(t - T)). The first
+event after a pause is never lost, and dead time reaches over frames, turns and polarities. What the
+mixing costs is in docs/events.md.
 
-It is a drjit loop over time per pixel. Intervals are cut into parts. A pixel carries the centre of its play,
-its mean count so far (position), where it heads, and of every group of phases what it had kept when its last
-event began, and what it had kept at the ends of the parts within a dead time (rows). Rows lie in memory
-local to the pixel's thread: ``reach`` before a block of parts, then those of the block. The forward loop
-stores the state at the beginning of every block; the adjoint goes from block to block backward, walks each
-forward once more, and then back.
+It is a drjit loop over time per pixel. Intervals are cut into parts. A pixel carries the centre of
+its play, its mean count so far (position), where it heads, and of every group of phases what it had
+kept when its last event began, and what it had kept at the ends of the parts within a dead time
+(rows). Rows lie in memory local to the pixel's thread: ``reach`` before a block of parts, then
+those of the block. The forward loop stores the state at the beginning of every block; the adjoint
+goes from block to block backward, walks each forward once more, and then back.
 """
 
 import warnings
@@ -49,10 +50,11 @@ FEWEST = 8  # dead times shorter than an interval over this are taken as local
 
 @dataclass(frozen=True)
 class DeadTimeState:
-    """What ``mean_counts`` carries over chunks. position: [...] mean signed count so far, modulo 1. heading:
-    [...] 1 where the last counts were ON, -1 where they were OFF. begun: [PHASES, ...] what a group had kept
-    when its last event began. kept: [N, PHASES, ...] what it had kept at ago_s: [N] seconds
-    before the end, the last one 0. All keep their graph."""
+    """What ``mean_counts`` carries over chunks. position: [...] mean signed count so far, modulo 1.
+    heading:
+    [...] 1 where the last counts were ON, -1 where they were OFF. begun: [PHASES, ...] what a group
+    had kept when its last event began. kept: [N, PHASES, ...] what it had kept at ago_s: [N]
+    seconds before the end, the last one 0. All keep their graph."""
 
     position: Tensor
     heading: Tensor
@@ -72,14 +74,15 @@ def mean_counts(
     """Mean counts behind a dead time, of levels linear between frames.
 
     Args:
-      level: [T + 1, ...] log levels. centre: [...] of the play at the first one. thetas: ON, OFF, 0-dim or
-        [...].
-      interval_s: [T] float64 lengths. refractory_s: 0-dim, > 0. state: DeadTimeState of an earlier chunk.
+      level: [T + 1, ...] log levels. centre: [...] of the play at the first one. thetas: ON, OFF,
+        0-dim or [...].
+      interval_s: [T] float64 lengths. refractory_s: 0-dim, > 0. state: DeadTimeState of an earlier
+        chunk.
     Returns: kept counts [T, 2, ...], ON first; the play's centre [...]; DeadTimeState.
     Gradient: level, centre, thetas, refractory_s, state; exact, of the recursion.
     Raises: DomainError for a dead time that reaches over more than MOST_ROWS intervals.
-    Cost: one pass forward and two backward; beside counts and gradients some 15 numbers per part (a fifth of
-      the dead time, or an interval) and pixel.
+    Cost: one pass forward and two backward; beside counts and gradients some 15 numbers per part (a
+      fifth of the dead time, or an interval) and pixel.
     """
     dead_s = torch.as_tensor(refractory_s, dtype=torch.float64)
     thetas = [torch.as_tensor(theta).to(level) for theta in thetas]
@@ -100,7 +103,11 @@ def mean_counts(
     kept = rows[-_wanted(ago_s, float(dead_s.detach())) :]
     base = kept[-1].detach()
     after = DeadTimeState(
-        position - position.detach().floor(), heading, begun - base, kept - base, ago_s[-len(kept) :]
+        position - position.detach().floor(),
+        heading,
+        begun - base,
+        kept - base,
+        ago_s[-len(kept) :],
     )
     return passed, centre, after
 
@@ -108,7 +115,9 @@ def mean_counts(
 class _Kept(Function):
     @staticmethod
     @exclusive
-    def forward(ctx, level, theta_on, theta_off, dead_s, centre, position, heading, begun, rows, cut):
+    def forward(
+        ctx, level, theta_on, theta_off, dead_s, centre, position, heading, begun, rows, cut
+    ):
         run = _Run(cut, level, theta_on, theta_off)
         passed, after, stored = run.forward(centre, position, heading, begun, rows)
         ctx.mark_non_differentiable(after[2])
@@ -123,19 +132,30 @@ class _Kept(Function):
     def backward(ctx, grad_passed, *grads):
         level, theta_on, theta_off = ctx.saved_tensors
         run = _Run(ctx.cut, level, theta_on, theta_off)
-        of_level, (of_on, of_off, of_dead, *of_state), of_rows = run.backward(ctx.stored, grad_passed, *grads)
+        of_level, (of_on, of_off, of_dead, *of_state), of_rows = run.backward(
+            ctx.stored, grad_passed, *grads
+        )
         of_thetas = of_on.sum_to_size(theta_on.shape), of_off.sum_to_size(theta_off.shape)
         of_dead = of_dead.sum(dtype=torch.float64)
-        return of_level, *of_thetas, of_dead, *of_state[:2], None, torch.stack(of_state[2:]), of_rows, None
+        return (
+            of_level,
+            *of_thetas,
+            of_dead,
+            *of_state[:2],
+            None,
+            torch.stack(of_state[2:]),
+            of_rows,
+            None,
+        )
 
 
 @dataclass(frozen=True)
 class Parts:
-    """Parts of intervals. interval: [N] that each lies in. share: [N] of the interval that has passed at its
-    end.
-    back: [N] >= 1 rows from its start to the row before the look, a dead time before its middle; blend: [N]
-    of the way from that row to the next; slope: [N] of blend, per second of dead time, negative sign left
-    out.
+    """Parts of intervals. interval: [N] that each lies in. share: [N] of the interval that has
+    passed at its end.
+    back: [N] >= 1 rows from its start to the row before the look, a dead time before its middle;
+    blend: [N] of the way from that row to the next; slope: [N] of blend, per second of dead time,
+    negative sign left out.
     reach: rows to keep."""
 
     interval: Tensor
@@ -147,8 +167,8 @@ class Parts:
 
 
 class _Run(Lanes):
-    """One call of a loop over parts, in either direction of time. A state is a list: the play's centre,
-    position, heading, and of every group what it had kept when its last event began."""
+    """One call of a loop over parts, in either direction of time. A state is a list: the play's
+    centre, position, heading, and of every group what it had kept when its last event began."""
 
     def __init__(self, cut, level, theta_on, theta_off):
         super().__init__(level, level[0].numel())
@@ -160,7 +180,9 @@ class _Run(Lanes):
             for theta in (theta_on, theta_off)
         ]
         self.interval, self.back_rows = (UInt32(x.tolist()) for x in (cut.interval, cut.back))
-        self.share, self.blend, self.slope = (Float(x.tolist()) for x in (cut.share, cut.blend, cut.slope))
+        self.share, self.blend, self.slope = (
+            Float(x.tolist()) for x in (cut.share, cut.blend, cut.slope)
+        )
         self.reach = cut.reach
         # as many parts as rows of a state, so that both take the same memory
         self.size = max(BLOCK, cut.reach)
@@ -171,14 +193,20 @@ class _Run(Lanes):
     def local(self, rows, several=PHASES):
         """Zeros in the memory of a thread: [rows] of every pixel, several times."""
         # one block each: numbers that are read at the same row share the work of finding it
-        return [self.dr.alloc_local(self.arr.Float, rows, value=self.arr.Float(0)) for _ in range(several)]
+        return [
+            self.dr.alloc_local(self.arr.Float, rows, value=self.arr.Float(0))
+            for _ in range(several)
+        ]
 
     def add(self, flat, value, row):
         reduce = self.dr.ReduceOp.Add
-        self.dr.scatter_reduce(reduce, flat, value, self.place(row), mode=self.dr.ReduceMode.NoConflicts)
+        self.dr.scatter_reduce(
+            reduce, flat, value, self.place(row), mode=self.dr.ReduceMode.NoConflicts
+        )
 
     def fill(self, rows, source, place=0, at=0):
-        """Rows in the memory of a thread, from ``at`` on, as they stand in a source from row ``place`` on."""
+        """Rows in the memory of a thread, from ``at`` on, as they stand in a source from row
+        ``place`` on."""
 
         def read(row, rows):
             for group, mine in enumerate(rows):
@@ -206,8 +234,8 @@ class _Run(Lanes):
         return first, self.dr.minimum(self.count - first, self.size), block * self.stored
 
     def given(self, rows, part, now, state):
-        """What ``step`` takes: of the pixel, then of every group when its last event began, now, and at the
-        rows around a dead time ago."""
+        """What ``step`` takes: of the pixel, then of every group when its last event began, now,
+        and at the rows around a dead time ago."""
         centre, position, _, *begun = state
         interval = self.of_part(self.interval, part)
         low = self.at(self.values, interval)
@@ -222,8 +250,9 @@ class _Run(Lanes):
         return [level, *self.thetas, self.of_part(self.blend, part), centre, position, *groups]
 
     def step(self, heading, level, theta_on, theta_off, blend, centre, position, *groups):
-        """One part, as drjit differentiates it. Returns where the play heads now; kept counts, centre,
-        position, and of every group what it had kept when its last event began, and what it has kept now."""
+        """One part, as drjit differentiates it. Returns where the play heads now; kept counts,
+        centre, position, and of every group what it had kept when its last event began, and what it
+        has kept now."""
         dr = self.dr
         rise, fall = beyond(dr, level, centre, theta_on, theta_off)
         total = rise / theta_on + fall / theta_off
@@ -242,8 +271,8 @@ class _Run(Lanes):
             end = start + total
             border = dr.floor(dr.detach(start)) + 1
             begins = dr.floor(dr.detach(end)) >= border
-            # masses of the event begun before this part, and of the one that begins in it; further ones are
-            # lost to it
+            # masses of the event begun before this part, and of the one that begins in it; further
+            # ones are lost to it
             early = dr.select(begins, border, _filled(dr, end)) - _filled(dr, start)
             late = dr.select(begins, _at_most_one(dr, _filled(dr, end) - border), 0)
             early = early * _at_most_one(dr, 1 - (begun - free))
@@ -254,15 +283,20 @@ class _Run(Lanes):
         return ahead, passed / PHASES, centre + (rise - fall), position + ahead * total, *after
 
     def walk(self, rows, part, now, state):
-        """One part forward; rows gain one. Returns kept counts and their row, and the state after it."""
-        ahead, passed, centre, position, *groups = self.step(state[2], *self.given(rows, part, now, state))
+        """One part forward; rows gain one. Returns kept counts and their row, and the state after
+        it."""
+        ahead, passed, centre, position, *groups = self.step(
+            state[2], *self.given(rows, part, now, state)
+        )
         for mine, value in zip(rows, groups[1::2], strict=True):
             mine[now + 1] = value
         return passed, self.row(part, ahead), [centre, position, ahead, *groups[::2]]
 
     def row(self, part, ahead):
         """Row of the counts of a part that heads there: ON, then OFF."""
-        return 2 * self.of_part(self.interval, part) + self.dr.select(ahead < 0, self.arr.UInt32(1), 0)
+        return 2 * self.of_part(self.interval, part) + self.dr.select(
+            ahead < 0, self.arr.UInt32(1), 0
+        )
 
     def forward(self, centre, position, heading, begun, rows):
         """Kept counts [T, 2, ...] of levels [T + 1, ...]; the state after them; the stored states.
@@ -309,8 +343,8 @@ class _Run(Lanes):
         return kept, (centre, position, heading, torch.stack(begun), rows), stored
 
     def backward(self, stored, grad_kept, grad_centre, grad_position, _, grad_begun, grad_rows):
-        """Adjoint of ``forward``: gradients of the level; of theta_on, theta_off, dead time and the state
-        but its heading, a list of [...]; of the rows."""
+        """Adjoint of ``forward``: gradients of the level; of theta_on, theta_off, dead time and the
+        state but its heading, a list of [...]; of the rows."""
         dr = self.dr
         seed = self.load(grad_kept)
         target = self.zeros(self.shape[0])
@@ -324,7 +358,11 @@ class _Run(Lanes):
             def walk(index, state, local, path):
                 for mine, value in zip(path, state, strict=True):
                     mine[index] = value
-                return self.walk(local, first + index, index + self.reach - 1, state)[2], local, path
+                return (
+                    self.walk(local, first + index, index + self.reach - 1, state)[2],
+                    local,
+                    path,
+                )
 
             _, local, path = self.loop(0, size, walk, state, local, path)
 
@@ -350,7 +388,9 @@ class _Run(Lanes):
         nothing = [dr.zeros(self.arr.Float, self.width) for _ in range(3)]
         pulls = [*nothing, *self.rows(torch.stack((grad_centre, grad_position, *grad_begun)))]
         path = self.local(self.size, PHASES + 3)
-        pulls, pull, *_ = self.loop_back(0, self.blocks, back_block, pulls, pull, self.local(rows), path)
+        pulls, pull, *_ = self.loop_back(
+            0, self.blocks, back_block, pulls, pull, self.local(rows), path
+        )
         self.keep(pull, before)
         dr.eval(target, before, pulls)
         dr.sync_thread()
@@ -359,8 +399,8 @@ class _Run(Lanes):
         return self.tensor(target, self.shape), [self.tensor(one, pixels) for one in pulls], of_rows
 
     def pull(self, seed, target, pulls, pull, rows, part, now, state):
-        """One part backward. pulls: gradients gathered so far of thresholds and dead time, then those of the
-        state after it; pull: of the rows. Returns those before it."""
+        """One part backward. pulls: gradients gathered so far of thresholds and dead time, then
+        those of the state after it; pull: of the rows. Returns those before it."""
         given = self.given(rows, part, now, state)
         ahead = self.dr.detach(self.step(state[2], *given)[0])
         seeds = [self.at(seed, self.row(part, ahead)), *pulls[3:5]]
@@ -396,8 +436,8 @@ def _at_most_one(dr, share):
 
 
 def _cut(interval_s, refractory_s, ago_s):
-    """Parts of the intervals, at most a fifth of the dead time long, as the kernel wants them; the times
-    [rows] that it knows what was kept at, of the state's rows and of the ends of parts."""
+    """Parts of the intervals, at most a fifth of the dead time long, as the kernel wants them; the
+    times [rows] that it knows what was kept at, of the state's rows and of the ends of parts."""
     ends_s = torch.cat((interval_s.new_zeros(1), interval_s.cumsum(0)))
     interval, share, fine_s = parts(ends_s, refractory_s / STEPS)
     first = len(ago_s) - 1
@@ -423,7 +463,8 @@ def _cut(interval_s, refractory_s, ago_s):
 
 
 def _wanted(ago_s, refractory_s):
-    """How many rows the next chunk looks back at: one more for the interval in which the dead time begins."""
+    """How many rows the next chunk looks back at: one more for the interval in which the dead time
+    begins."""
     return len(ago_s) - max(0, int((ago_s > refractory_s).sum()) - 1)
 
 
@@ -436,8 +477,8 @@ def reaches(interval_s: Tensor, refractory_s: float) -> bool:
 def warn_beyond(
     level: Tensor, thetas: Sequence[Tensor], interval_s: Tensor, refractory_s: Tensor | float
 ) -> None:
-    """Warn where rate x dead time is beyond ``MOST_LOAD``, the mean over events, or beyond ``THRESHOLD_LOAD``
-    where thresholds have gradients."""
+    """Warn where rate x dead time is beyond ``MOST_LOAD``, the mean over events, or beyond
+    ``THRESHOLD_LOAD`` where thresholds have gradients."""
     with torch.no_grad():
         step = level.diff(dim=0)
         moved = (step.clamp(min=0) / thetas[0] + (-step).clamp(min=0) / thetas[1]).sum(0)
@@ -465,8 +506,8 @@ def warn_beyond(
 def local_share(
     step: Tensor, thetas: Sequence[Tensor], interval_s: Tensor, refractory_s: Tensor | float
 ) -> Tensor:
-    """Share of regularly arriving events that a short dead time lets pass, [T-1, ...]: one in ceil(r T),
-    averaged over phases. step: [T-1, ...] of the level."""
+    """Share of regularly arriving events that a short dead time lets pass, [T-1, ...]: one in
+    ceil(r T), averaged over phases. step: [T-1, ...] of the level."""
     theta = torch.where(step > 0, thetas[0], thetas[1])
     rate_hz = step.abs() / theta / interval_s.to(step).reshape(-1, *[1] * (step.ndim - 1))
     return 1 / (rate_hz * refractory_s + 0.5).clamp(min=1)

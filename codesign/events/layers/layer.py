@@ -33,9 +33,11 @@ NEAR = 1e-6  # of the lead, by which a frame may miss its end
 
 
 class PositiveValues(nn.Module):
-    """Positive values by name, each start exp(0.1 v) with a variable v in ``raw`` that is 0 at first.
+    """Positive values by name, each start exp(0.1 v) with a variable v in ``raw`` that is 0 at
+    first.
 
-    start: value > 0 by name. Whatever the unit, a unit step of a variable is about 10 % of its value.
+    start: value > 0 by name. Whatever the unit, a unit step of a variable is about 10 % of its
+      value.
     """
 
     def __init__(self, start: Mapping[str, float]):
@@ -81,7 +83,9 @@ class EventLayer(nn.Module):
         self.sensor = SensorModel() if sensor is None else check_sensor(sensor)
         self.log_input = FrontEnd(log_input).log_input
         if isinstance(learn, str) or not isinstance(learn, Sequence):
-            raise DomainError(f"learn is {learn!r}; a list of names is needed, such as {THRESHOLDS}, or ().")
+            raise DomainError(
+                f"learn is {learn!r}; a list of names is needed, such as {THRESHOLDS}, or ()."
+            )
         for name in learn:
             if name not in self.learnable:
                 raise DomainError(
@@ -95,13 +99,15 @@ class EventLayer(nn.Module):
         self.learnt = PositiveValues({name: getattr(self.sensor, name) for name in learn})
 
     def value(self, name: str) -> Tensor | float:
-        """A field of the sensor as it is now: a 0-dim tensor with a gradient where it is learnt, a number
-        otherwise."""
+        """A field of the sensor as it is now: a 0-dim tensor with a gradient where it is learnt, a
+        number otherwise."""
         return self.learnt[name] if name in self.learnt else getattr(self.sensor, name)
 
     def fitted(self) -> SensorModel:
         """The sensor with all values as they are now, for ``events.simulate``."""
-        return replace(self.sensor, **{name: float(self.learnt[name].detach()) for name in self.learnt})
+        return replace(
+            self.sensor, **{name: float(self.learnt[name].detach()) for name in self.learnt}
+        )
 
     def forward(
         self, frames: Tensor, t_s: Tensor, generator: Generator | Sequence[Generator] | None = None
@@ -109,11 +115,12 @@ class EventLayer(nn.Module):
         """Event counts of the frames.
 
         Args:
-          frames: [..., T, H, W] linear intensity on the 0-255 scale (log levels with ``log_input``); axes
-            before time are a batch. t_s: [T] seconds, strictly increasing, the same for the whole batch.
-          generator: for threshold mismatch and noise where the sensor has them. One for all: the samples of
-            a batch draw one after the other, as if each were given by itself; or a list with one each. None:
-            seed 0 in every sample and call.
+          frames: [..., T, H, W] linear intensity on the 0-255 scale (log levels with
+            ``log_input``); axes before time are a batch. t_s: [T] seconds, strictly increasing, the
+            same for the whole batch.
+          generator: for threshold mismatch and noise where the sensor has them. One for all: the
+            samples of a batch draw one after the other, as if each were given by itself; or a list
+            with one each. None: seed 0 in every sample and call.
         Returns: counts [..., T-1, 2, H, W] >= 0, ON first.
         Gradient: frames and ``parameters()``, as of the function that the layer calls.
         Raises: ShapeError, DomainError for frames, times or generators that do not fit.
@@ -131,10 +138,10 @@ class EventLayer(nn.Module):
 
         Args:
           as for ``forward``.
-          state: what the chunk before returned, which brings its own generators; then T frames give T
-            intervals. None: the first chunk.
-        Returns: counts [..., T-1, 2, H, W] ([..., T, 2, H, W] with a state); state to carry on, with its
-          graph.
+          state: what the chunk before returned, which brings its own generators; then T frames give
+            T intervals. None: the first chunk.
+        Returns: counts [..., T-1, 2, H, W] ([..., T, 2, H, W] with a state); state to carry on,
+          with its graph.
         """
         check_axes(frames)
         if state is not None and generator is not None:
@@ -154,17 +161,18 @@ class EventLayer(nn.Module):
         longest_s: float,
         generator: Generator | Sequence[Generator] | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Event counts in intervals no longer than asked for: when events come, and not only between which
-        frames.
+        """Event counts in intervals no longer than asked for: when events come, and not only
+        between which frames.
 
-        A layer that can (``refines``) is asked on the way of the log level between frames (``events.finer``);
-        another one has the events of an interval spread evenly over it.
+        A layer that can (``refines``) is asked on the way of the log level between frames
+        (``events.finer``); another one has the events of an interval spread evenly over it.
 
         Args:
           as for ``forward``.
           longest_s: length of the longest interval, seconds, > 0.
-        Returns: counts [..., T'-1, 2, H, W], times [T'] float64, those of the frames among them. Frames that
-          are dense enough are taken as they are: then these are the counts of ``forward``.
+        Returns: counts [..., T'-1, 2, H, W], times [T'] float64, those of the frames among them.
+          Frames that are dense enough are taken as they are: then these are the counts of
+          ``forward``.
         Gradient: as ``forward``, also for when events come.
         Raises: as ``forward``; DomainError for a length that is not positive.
         """
@@ -187,13 +195,14 @@ class EventLayer(nn.Module):
         bins: int,
         generator: Generator | Sequence[Generator] | None = None,
     ) -> EventVolume:
-        """Events of the frames in time bins, each near its own time however few the frames are (``finely``).
+        """Events of the frames in time bins, each near its own time however few the frames are
+        (``finely``).
 
         Args:
           as for ``forward``.
           bins: number of bins.
-        Returns: EventVolume of counts [B, 2, bins, H, W], see ``events.from_counts``; several batch axes come
-          as one.
+        Returns: EventVolume of counts [B, 2, bins, H, W], see ``events.from_counts``; several batch
+          axes come as one.
         Gradient: as ``forward``, also for when events come.
         """
         return self._volume(frames, t_s, bins, generator, 0.0)
@@ -204,10 +213,14 @@ class EventLayer(nn.Module):
         check_axes(frames)
         given_s = check_times(t_s, frames.shape[-3])
         start_s = float(given_s[0]) + lead_s
-        longest_s = float(given_s[-1] - start_s) / (bins - 1) / PARTS_PER_BIN if bins > 1 else math.inf
+        longest_s = (
+            float(given_s[-1] - start_s) / (bins - 1) / PARTS_PER_BIN if bins > 1 else math.inf
+        )
         if lead_s:
             off_s = (given_s[:-1] - start_s).abs()
-            if len(given_s) < 2 or float(off_s.min()) > NEAR * max(lead_s, float(given_s.diff().min())):
+            if len(given_s) < 2 or float(off_s.min()) > NEAR * max(
+                lead_s, float(given_s.diff().min())
+            ):
                 raise DomainError(
                     f"settled: no frame stands {lead_s:g} s after the first; give frames at "
                     f"{(given_s - given_s[0]).tolist()} s a lead that ends with one, before the last."
@@ -246,10 +259,11 @@ def _generators(generator, batch):
 
 
 class Settled(nn.Module):
-    """An event layer whose events in the first ``lead_s`` are not read; frames begin as much before the
-    window.
+    """An event layer whose events in the first ``lead_s`` are not read; frames begin as much before
+    the window.
 
-    A few time constants of the sensor's bandwidth are enough, and as much motion as makes an event or two.
+    A few time constants of the sensor's bandwidth are enough, and as much motion as makes an event
+    or two.
 
     Args:
       layer: of ``events.layer``.
@@ -308,7 +322,8 @@ class HardSensor(nn.Module):
     ) -> EventVolume:
         """Events of frames [N, T, H, W] at t_s [T] in time bins, [N, 2, bins, H, W].
 
-        generator: one for all samples, which stand above one another as one tall sensor; None: seed 0.
+        generator: one for all samples, which stand above one another as one tall sensor; None: seed
+          0.
         Raises: ShapeError for other shapes; DomainError as ``simulate``.
         """
         check(frames, "N T H W", "frames", FLOATS)
@@ -318,5 +333,9 @@ class HardSensor(nn.Module):
         start_s, end_s = check_times(t_s, times)[[0, -1]].tolist()
         start_us, end_us = (round(time_s * 1e6) for time_s in (start_s + self.lead_s, end_s))
         volume = from_stream(stream, start_us, end_us, self.bins)
-        counts = volume.counts.reshape(2, self.bins, count, height, width).permute(2, 0, 1, 3, 4).contiguous()
+        counts = (
+            volume.counts.reshape(2, self.bins, count, height, width)
+            .permute(2, 0, 1, 3, 4)
+            .contiguous()
+        )
         return EventVolume(counts, volume.centroid_s, volume.collected_s)

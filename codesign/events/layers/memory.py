@@ -1,4 +1,5 @@
-"""The default event layer: counts against a per-pixel memorised level, with a straight-through gradient."""
+"""The default event layer: counts against a per-pixel memorised level, with a straight-through
+gradient."""
 
 import warnings
 
@@ -29,45 +30,49 @@ def memory(
 ) -> tuple[Tensor, Tensor]:
     """Event counts per pixel and interval against the memorised log level r of each pixel.
 
-    Per interval, with L the new log level and C = theta_on where L > r, else theta_off: n = trunc((L - r) /
-    C), then r += C n.
+    Per interval, with L the new log level and C = theta_on where L > r, else theta_off: n =
+    trunc((L - r) / C), then r += C n.
 
     Args:
-      frames: [T, ...] linear intensity on the 0-255 scale (lin-log is applied here), any pixel shape; log
-        intensity with ``log_input``.
-      theta_on, theta_off: contrast thresholds > 0, natural log units; scalar or broadcasting over one frame
-        (mismatch), learnable or not.
-      state: what an earlier chunk returned, [2, ...], or a memorised level [...]. None: r starts at the first
-        frame, and T frames give T-1 intervals.
-        With a state every frame is new: T frames give T intervals, so chunks [0:k], [k:] with the state equal
+      frames: [T, ...] linear intensity on the 0-255 scale (lin-log is applied here), any pixel
+        shape; log intensity with ``log_input``.
+      theta_on, theta_off: contrast thresholds > 0, natural log units; scalar or broadcasting over
+        one frame (mismatch), learnable or not.
+      state: what an earlier chunk returned, [2, ...], or a memorised level [...]. None: r starts at
+        the first frame, and T frames give T-1 intervals. With a state every frame is new: T frames
+        give T intervals, so chunks [0:k], [k:] with the state equal
           the whole bit for bit.
     Returns:
       counts: [T-1, 2, ...] ([T, 2, ...] with a state), ON first, whole numbers >= 0.
-      state: [2, ...] the memorised level, and the centre of its play (below), to carry on. It keeps its
-        graph: detach it to cut the gradient between chunks.
-    Gradient: frames, thetas, state: of the mean count over all places of a pixel inside its thresholds
-      (straight through the rounding): D = L - r begins evenly from -theta_off/2 to theta_on/2. After a turn
-      of the signal the mean count stays 0 until the way back exceeds the threshold of that side. For equal
-      thresholds this is a play, exactly. For unequal ones:
-        "exact": of the ideal sensor, by pairs of pixels followed from every turn. Slopes beat against the
-          thresholds: a wide step's mean slope is met only over many pixels or places. To the thresholds as
+      state: [2, ...] the memorised level, and the centre of its play (below), to carry on. It keeps
+        its graph: detach it to cut the gradient between chunks.
+    Gradient: frames, thetas, state: of the mean count over all places of a pixel inside its
+      thresholds (straight through the rounding): D = L - r begins evenly from -theta_off/2 to
+      theta_on/2. After a turn of the signal the mean count stays 0 until the way back exceeds the
+      threshold of that side. For equal thresholds this is a play, exactly. For unequal ones:
+        "exact": of the ideal sensor, by pairs of pixels followed from every turn. Slopes beat
+          against the thresholds: a wide step's mean slope is met only over many pixels or places.
+          To the thresholds as
             "play".
-        "play": of width (theta_on + theta_off)/2, the mean over the scatter of real thresholds; smooth.
-        None: "exact" where all pixels share one pair of thresholds that differ by more than a quarter, else
-          "play". docs/events.md has both in figures.
+        "play": of width (theta_on + theta_off)/2, the mean over the scatter of real thresholds;
+        smooth.
+        None: "exact" where all pixels share one pair of thresholds that differ by more than a
+          quarter, else "play". docs/events.md has both in figures.
       Thresholds: that of the play, exact for equal ones that change together, else approximate.
-      Scenes that never reach half a threshold have no gradient: start those with ``soft_counts``. Chunks have
-      the gradient of the whole with "play"; with "exact" each begins evenly around the play's centre. Second
-      derivatives raise.
-    Numerics: the count is the exact floor of the quotient of the two floats. In float32 a level within about
-      1e-7 |L| of a crossing may fall to either side; it is then counted in a later frame, never lost.
-    Raises: ShapeError for too few frames or shapes that do not fit; DomainError for theta <= 0, NaN, infinite
-      or negative input.
-    Warns: RuntimeWarning where a gradient may be asked for and thresholds differ by more than a factor of 4.
-    Cost: one pass over the frames forward, one backward; no memory beside counts and gradients. "exact" takes
-      2.5 times as long backward.
-    Source: Rebecq et al., ESIM, CoRL 2018; v2e (Hu et al., CVPR-W 2021), memorised brightness; Bengio et al.
-      2013, straight-through; the mean count's play and pairs are ours.
+      Scenes that never reach half a threshold have no gradient: start those with ``soft_counts``.
+      Chunks have the gradient of the whole with "play"; with "exact" each begins evenly around the
+      play's centre. Second derivatives raise.
+    Numerics: the count is the exact floor of the quotient of the two floats. In float32 a level
+      within about 1e-7 |L| of a crossing may fall to either side; it is then counted in a later
+      frame, never lost.
+    Raises: ShapeError for too few frames or shapes that do not fit; DomainError for theta <= 0,
+      NaN, infinite or negative input.
+    Warns: RuntimeWarning where a gradient may be asked for and thresholds differ by more than a
+      factor of 4.
+    Cost: one pass over the frames forward, one backward; no memory beside counts and gradients.
+      "exact" takes 2.5 times as long backward.
+    Source: Rebecq et al., ESIM, CoRL 2018; v2e (Hu et al., CVPR-W 2021), memorised brightness;
+      Bengio et al. 2013, straight-through; the mean count's play and pairs are ours.
 
     Example:
     >>> from codesign import events
@@ -99,11 +104,10 @@ def soft_counts(
     Args: as for ``memory``.
     Returns:
       [T-1, 2, ...] ON = max(dL, 0)/theta_on, OFF = max(-dL, 0)/theta_off, with dL the step between
-      consecutive frames; >= 0, 0 for a static scene.
-      Equals the memory layer's counts to within one event per pixel at any time, summed over a monotone
-      stretch.
-    Gradient: frames, thetas; exact, but at dL = 0, where both polarities get half their slope (the central
-      difference).
+      consecutive frames; >= 0, 0 for a static scene. Equals the memory layer's counts to within one
+      event per pixel at any time, summed over a monotone stretch.
+    Gradient: frames, thetas; exact, but at dL = 0, where both polarities get half their slope
+      (the central difference).
     Raises: as ``memory``.
 
     Example:
@@ -122,8 +126,8 @@ def soft_counts(
 
 
 def _gradient(name, theta_on, theta_off, steers):
-    """The gradient that the thresholds [...] ask for where the caller leaves it open. steers: whether one may
-    be asked for at all."""
+    """The gradient that the thresholds [...] ask for where the caller leaves it open. steers:
+    whether one may be asked for at all."""
     if name is not None:
         check_choice(name, "gradient", GRADIENTS)
     if name is not None:
@@ -144,10 +148,12 @@ def _gradient(name, theta_on, theta_off, steers):
 class _MemorisedCounts(Function):
     @staticmethod
     def forward(ctx, frames, theta_on, theta_off, state, front_end, gradient):
-        # the first level comes by the arithmetic of the kernel: a static scene then differs from it by
-        # nothing
+        # the first level comes by the arithmetic of the kernel: a static scene then differs from it
+        # by nothing
         start = (
-            kernel_levels(frames[:1], front_end)[0].expand(2, *frames.shape[1:]) if state is None else state
+            kernel_levels(frames[:1], front_end)[0].expand(2, *frames.shape[1:])
+            if state is None
+            else state
         )
         ctx.front_end = front_end
         ctx.gradient = gradient
@@ -162,7 +168,15 @@ class _MemorisedCounts(Function):
     @once_differentiable
     def backward(ctx, *grads):
         frames, theta_on, theta_off, start = ctx.saved_tensors
-        call = frames[ctx.first :], start, theta_on, theta_off, ctx.front_end, grads[0], grads[1].sum(0)
+        call = (
+            frames[ctx.first :],
+            start,
+            theta_on,
+            theta_off,
+            ctx.front_end,
+            grads[0],
+            grads[1].sum(0),
+        )
         wants_thetas = any(ctx.needs_input_grad[1:3])
         grad_thetas = [None, None]
         if ctx.gradient == "play" or wants_thetas:
@@ -172,11 +186,13 @@ class _MemorisedCounts(Function):
         if ctx.gradient == "exact":
             grad_frames, grad_start = kernel.turns_adjoint(*call, first=ctx.first)
         needed = zip(grad_thetas, (theta_on, theta_off), ctx.needs_input_grad[1:3], strict=True)
-        grad_thetas = [grad.sum_to_size(theta.shape) if needs else None for grad, theta, needs in needed]
+        grad_thetas = [
+            grad.sum_to_size(theta.shape) if needs else None for grad, theta, needs in needed
+        ]
         if ctx.first:
             grad_frames[0] = grad_start * ctx.front_end.slope(frames[0])
             return grad_frames, *grad_thetas, None, None, None
-        # the mean count alone carries the gradient: what reaches the memorised level reaches it through the
-        # place of the pixels that may be meant
+        # the mean count alone carries the gradient: what reaches the memorised level reaches it
+        # through the place of the pixels that may be meant
         grad_state = torch.stack((torch.zeros_like(grad_start), grad_start))
         return grad_frames, *grad_thetas, grad_state, None, None

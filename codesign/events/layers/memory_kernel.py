@@ -1,34 +1,36 @@
-"""The memory layer as one drjit loop over time per pixel, forward and adjoint, front end included; nothing is
-stored between the two.
+"""The memory layer as one drjit loop over time per pixel, forward and adjoint, front end included;
+nothing is stored between the two.
 
-Forward, with L the log level, r the memorised level and C the threshold on the side of L - r: n = floor(|L -
-r|/C), r += C n.
+Forward, with L the log level, r the memorised level and C the threshold on the side of L - r: n =
+floor(|L - r|/C), r += C n.
 
-Backward is the play of width w = (C_on + C_off)/2 and centre m that the mean of n follows over where in its
-threshold a pixel happens to stand (exactly for C_on = C_off, see docs/events.md; ``turns_adjoint`` is exact
-for all). It moves only where L leaves it, by as much as L does: n_on = (L - m - w/2)/C_on, n_off = (m - w/2 -
-L)/C_off, and the edge then stands at L. So an engaged step pulls at its own level, and pushes at the level of
-the step engaged before: the loop forward in time writes both.
+Backward is the play of width w = (C_on + C_off)/2 and centre m that the mean of n follows over
+where in its threshold a pixel happens to stand (exactly for C_on = C_off, see docs/events.md;
+``turns_adjoint`` is exact for all). It moves only where L leaves it, by as much as L does: n_on =
+(L - m - w/2)/C_on, n_off = (m - w/2 - L)/C_off, and the edge then stands at L. So an engaged step
+pulls at its own level, and pushes at the level of the step engaged before: the loop forward in time
+writes both.
 
 The exact gradient of the mean count for unequal thresholds, as one drjit loop over time per pixel.
 
-The mean runs over all places that a pixel may begin at: its memorised level r evenly over a box. A small move
-of one level L_s makes the pixels that then stand on the brink fire at s, or not, and moves nothing else. So
-with f the density on the brink (ON: r = L_s - C_on before, r = L_s after; OFF: r = L_s + C_off before, L_s
-after)
+The mean runs over all places that a pixel may begin at: its memorised level r evenly over a box. A
+small move of one level L_s makes the pixels that then stand on the brink fire at s, or not, and
+moves nothing else. So with f the density on the brink (ON: r = L_s - C_on before, r = L_s after;
+OFF: r = L_s + C_off before, L_s after)
 
-    d mean(loss) / d L_s = f (J(fired) - J(not fired)),  J(r): what a pixel at r adds to the loss from s on,
+    d mean(loss) / d L_s = f (J(fired) - J(not fired)),  J(r): what a pixel at r adds to the loss
+    from s on,
 
-for ON, and the negative for OFF: a **pair** of pixels, ``plus`` and ``minus``, C apart, simulated from s on
-by the rule of the hard sensor. In the inside of a monotone stretch they meet in the very next step; a pair
-born at a turn lives until they meet. For equal thresholds they meet when the way back has reached C, and what
-is left is the play of ``play_adjoint``; unequal ones may never meet.
+for ON, and the negative for OFF: a **pair** of pixels, ``plus`` and ``minus``, C apart, simulated
+from s on by the rule of the hard sensor. In the inside of a monotone stretch they meet in the very
+next step; a pair born at a turn lives until they meet. For equal thresholds they meet when the way
+back has reached C, and what is left is the play of ``play_adjoint``; unequal ones may never meet.
 
-The pairs are also the edges of the density: of all pixels above ``plus`` and ``minus``, weight f lies
-between. Whatever passes the brink in a step changes the density there, f = -sum of weight (n_plus - n_minus)
-in signed counts n, and the box begins as a pair of its own. A pixel keeps ``PAIRS`` pairs beside the
-youngest. Where a turn needs more, the pair with the least weight x distance is spread evenly over the
-threshold in use: mass is kept.
+The pairs are also the edges of the density: of all pixels above ``plus`` and ``minus``, weight f
+lies between. Whatever passes the brink in a step changes the density there, f = -sum of weight
+(n_plus - n_minus) in signed counts n, and the box begins as a pair of its own. A pixel keeps
+``PAIRS`` pairs beside the youngest. Where a turn needs more, the pair with the least weight x
+distance is spread evenly over the threshold in use: mass is kept.
 """
 
 from typing import Any
@@ -61,8 +63,8 @@ class Loop(Lanes):
         self.values = self.load(frames)
 
     def __call__(self, step, carried, target) -> Any:
-        """Carry values through step(index, value, *carried) for every frame; ``target`` is what the steps
-        write to."""
+        """Carry values through step(index, value, *carried) for every frame; ``target`` is what the
+        steps write to."""
         size = frames_per_kernel(self.width)
 
         def body(index, *carried):
@@ -78,8 +80,8 @@ class Loop(Lanes):
 
 @exclusive
 def count(frames, start, theta_on, theta_off, front_end):
-    """Counts [T, 2, ...] of frames [T, ...] from a start [2, ...] (memorised level, centre of the play); the
-    state after them; whether a value may not enter."""
+    """Counts [T, 2, ...] of frames [T, ...] from a start [2, ...] (memorised level, centre of the
+    play); the state after them; whether a value may not enter."""
     loop = Loop(frames, theta_on, theta_off)
     dr = loop.dr
     target = loop.fresh(2 * len(frames))
@@ -107,8 +109,8 @@ def count(frames, start, theta_on, theta_off, front_end):
 
 
 def exact_floor(dr, value, divisor):
-    """floor(value/divisor) of the two floats as they are, for value >= 0: a rounded quotient may reach the
-    next whole number too early."""
+    """floor(value/divisor) of the two floats as they are, for value >= 0: a rounded quotient may
+    reach the next whole number too early."""
     whole = dr.floor(value / divisor)
     rest = dr.fma(-whole, divisor, value)
     return dr.select(rest < 0, whole - 1, dr.select(rest >= divisor, whole + 1, whole))
@@ -118,12 +120,12 @@ def exact_floor(dr, value, divisor):
 def play_adjoint(
     frames, start, theta_on, theta_off, front_end, grad_counts, grad_end, *, first, wants_thetas
 ):
-    """Adjoint of ``count``: gradients of the frames [first + T, ...] (rows before ``first`` are left to the
-    caller), start, theta_on, theta_off [...] (zero unless wanted).
+    """Adjoint of ``count``: gradients of the frames [first + T, ...] (rows before ``first`` are
+    left to the caller), start, theta_on, theta_off [...] (zero unless wanted).
 
     Args:
-      grad_end: [...] of the memorised level and the play's centre together; the start's is theirs together,
-        too.
+      grad_end: [...] of the memorised level and the play's centre together; the start's is theirs
+        together, too.
     """
     loop = Loop(frames, theta_on, theta_off)
     dr = loop.dr
@@ -132,7 +134,19 @@ def play_adjoint(
     offset = loop.opaque(first)
     target = loop.zeros(first + len(frames))  # steps inside the play keep 0
 
-    def step(index, value, centre, pull, slope, engaged, anchor, grad_start, grad_on, grad_off, grad_width):
+    def step(
+        index,
+        value,
+        centre,
+        pull,
+        slope,
+        engaged,
+        anchor,
+        grad_start,
+        grad_on,
+        grad_off,
+        grad_width,
+    ):
         level, now_slope = front_end.traced(dr, value)
         rise, fall = beyond(dr, level, centre, loop.theta_on, loop.theta_off)
         is_on = rise > 0
@@ -147,8 +161,8 @@ def play_adjoint(
         if wants_thetas:
             grad_on = grad_on - seed_on * rise / loop.theta_on
             grad_off = grad_off - seed_off * fall / loop.theta_off
-            # anchor: how the upper edge moves with the width: 0 where it stands at a level, 1 where the lower
-            # one does, 1/2 at the start
+            # anchor: how the upper edge moves with the width: 0 where it stands at a level, 1 where
+            # the lower one does, 1/2 at the start
             grad_width = (
                 grad_width
                 - dr.select(is_on, now_pull * anchor, 0)
@@ -158,12 +172,24 @@ def play_adjoint(
         pull = dr.select(moves, now_pull, pull)
         slope = dr.select(moves, now_slope(), slope)
         engaged = dr.select(moves, index, engaged)
-        return centre + (rise - fall), pull, slope, engaged, anchor, grad_start, grad_on, grad_off, grad_width
+        return (
+            centre + (rise - fall),
+            pull,
+            slope,
+            engaged,
+            anchor,
+            grad_start,
+            grad_on,
+            grad_off,
+            grad_width,
+        )
 
     zero = dr.zeros(arr.Float, loop.width)
     never = dr.full(arr.UInt32, NONE, loop.width)
     begun = (loop.load(start[1]), zero, zero, never, zero + 0.5, *[zero] * 4)
-    _, pull, slope, engaged, anchor, grad_start, grad_on, grad_off, grad_width = loop(step, begun, target)
+    _, pull, slope, engaged, anchor, grad_start, grad_on, grad_off, grad_width = loop(
+        step, begun, target
+    )
     end = loop.load(grad_end)
     known = engaged != NONE
     loop.put(target, (pull + end) * slope, engaged + offset, known)
@@ -180,8 +206,8 @@ def play_adjoint(
 
 @exclusive
 def turns_adjoint(frames, start, theta_on, theta_off, front_end, grad_counts, grad_end, *, first):
-    """Gradients of the frames [first + T, ...] (rows before ``first`` are left to the caller) and of the
-    place of the box that the pixels begin in, [...].
+    """Gradients of the frames [first + T, ...] (rows before ``first`` are left to the caller) and
+    of the place of the box that the pixels begin in, [...].
 
     Args: as for ``play_adjoint``; the box lies from centre - theta_on/2 to centre +
       theta_off/2.
@@ -222,8 +248,8 @@ def turns_adjoint(frames, start, theta_on, theta_off, front_end, grad_counts, gr
 
 
 class _Pairs:
-    """The pairs of one step, the youngest first. Each is six values: plus, minus, weight, gradient, slope of
-    the front end at the frame that it belongs to, and that frame."""
+    """The pairs of one step, the youngest first. Each is six values: plus, minus, weight, gradient,
+    slope of the front end at the frame that it belongs to, and that frame."""
 
     def __init__(self, loop, level, before, slots):
         dr = loop.dr
@@ -256,8 +282,9 @@ class _Pairs:
         self.flux = -self.direction * _sum(passed)
 
     def renew(self, frame, slope):
-        """A new youngest pair where something fired; the one before is kept where its pixels have not met.
-        Returns the frame whose gradient is complete (NONE where there is none), and the gradient."""
+        """A new youngest pair where something fired; the one before is kept where its pixels have
+        not met. Returns the frame whose gradient is complete (NONE where there is none), and the
+        gradient."""
         dr = self.dr
         fired = dr.abs(self.flux) > TIE
         keeps = fired & (self.slots[0][2] != 0)
@@ -276,8 +303,17 @@ class _Pairs:
             here = keeps & (chosen == k)
             slot[:] = [dr.select(here, a, b) for a, b in zip(youngest, slot, strict=True)]
         upper = dr.select(self.rises, self.level, self.level + self.theta)
-        new = [upper, upper - self.theta, flux, self.flux * self.direction * self.seed, slope, frame]
-        grad, slope, frame = (dr.select(keeps, a, b) for a, b in zip(least[3:], youngest[3:], strict=True))
+        new = [
+            upper,
+            upper - self.theta,
+            flux,
+            self.flux * self.direction * self.seed,
+            slope,
+            frame,
+        ]
+        grad, slope, frame = (
+            dr.select(keeps, a, b) for a, b in zip(least[3:], youngest[3:], strict=True)
+        )
         self.slots[0] = [dr.select(fired, a, b) for a, b in zip(new, youngest, strict=True)]
         return dr.select(fired, frame, NONE), grad * slope
 

@@ -1,5 +1,5 @@
-"""The full sensor made differentiable: hard events forward, and backward the slopes of a smooth account of
-the same physics."""
+"""The full sensor made differentiable: hard events forward, and backward the slopes of a smooth
+account of the same physics."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,9 +26,10 @@ from codesign.events.sensor.state import SensorState
 
 @dataclass(frozen=True)
 class PhysicalState:
-    """What ``sensor_counts`` carries over chunks. sensor: SensorState of the hard sensor; reference, level:
-    [...] of the smooth account (their graph is kept); frame: [...] last frame; time_s: time of the last
-    frame;
+    """What ``sensor_counts`` carries over chunks. sensor: SensorState of the hard sensor;
+    reference, level:
+    [...] of the smooth account (their graph is kept); frame: [...] last frame; time_s: time of the
+    last frame;
     dead: state of the dead time's account, None where no gradient was asked."""
 
     sensor: SensorState
@@ -49,34 +50,37 @@ def sensor_counts(
     log_input: bool = False,
     **design: Tensor | float,
 ) -> tuple[Tensor, PhysicalState]:
-    """Event counts of the physical sensor with gradients to frames and to the sensor's own parameters.
+    """Event counts of the physical sensor with gradients to frames and to the sensor's own
+    parameters.
 
-    Forward: exactly the counts of ``simulate``, noise and all. Backward: the low-pass is linear and exact;
-      thresholds are C = theta + sigma e with the drawn e held fixed; leakage adds a known ramp; counts follow
-      ``memory`` (slope 1/C through the memorised level); dead time passes what it would pass on average over
-      where events stand in the threshold, over frames, turns and polarities (``layers.dead_time``; one
-      shorter than an eighth of an interval thins n events of rate r to n / max(1, r T + 1/2)). Noise events
-      have no gradient, and block none in it.
+    Forward: exactly the counts of ``simulate``, noise and all. Backward: the low-pass is linear and
+      exact; thresholds are C = theta + sigma e with the drawn e held fixed; leakage adds a known
+      ramp; counts follow ``memory`` (slope 1/C through the memorised level); dead time passes what
+      it would pass on average over where events stand in the threshold, over frames, turns and
+      polarities (``layers.dead_time``; one shorter than an eighth of an interval thins n events of
+      rate r to n / max(1, r T + 1/2)). Noise events have no gradient, and block none in it.
 
     Args:
-      frames: [T, ...] intensity on the 0-255 scale, or its natural logarithm with ``log_input``. t_s: [T]
-        seconds. sensor: SensorModel, timing "interpolated".
-      generator: for thresholds and noise; None: seed 0. state: PhysicalState of an earlier chunk (then T
-        frames give T intervals).
+      frames: [T, ...] intensity on the 0-255 scale, or its natural logarithm with ``log_input``.
+        t_s: [T] seconds. sensor: SensorModel, timing "interpolated".
+      generator: for thresholds and noise; None: seed 0. state: PhysicalState of an earlier chunk
+        (then T frames give T intervals).
       design: tensors that replace fields of the sensor and receive gradients: theta_on, theta_off,
         theta_sigma, cutoff_hz, refractory_s (0-dim).
     Returns: counts [T-1, 2, ...] whole numbers, ON first; PhysicalState.
-    Gradient: frames and design, as above; docs/events.md has each against differences of the hard counts.
-      With a dead time, over a step, cosine (scale) by rate x dead time of the average event, 240 frames per
-      second:
-        0.7: contrast 1.00 (0.99), focus 0.98 (0.92), shift by a pixel 0.93 (0.92), thresholds 1.00 (1.02),
-        dead time 1.00 (0.89) 2.9: contrast 1.00 (0.99), focus 0.98 (0.98), shift 0.90 (0.92), thresholds 0.96
-        (0.93), dead time 1.00 (0.98) 8.8: contrast 0.98 (0.89), focus 0.86 (0.99), shift 0.45 (0.84) Warns:
-        UserWarning where rate x dead time exceeds 5, or 2 with gradients to thresholds: one threshold alone
-        had cosine 0.11 to 0.96 at 2.6 to 2.9, by signal (the play of the mean width does not follow fast
-        turns).
-    Raises: DomainError for other names in ``design`` (they have no gradient) or values outside the sensor's
-      domain, or a dead time that its gradient cannot follow over thousands of intervals; and as ``simulate``.
+    Gradient: frames and design, as above; docs/events.md has each against differences of the hard
+      counts. With a dead time, over a step, cosine (scale) by rate x dead time of the average
+      event, 240 frames per second:
+        0.7: contrast 1.00 (0.99), focus 0.98 (0.92), shift by a pixel 0.93 (0.92), thresholds 1.00
+        (1.02), dead time 1.00 (0.89) 2.9: contrast 1.00 (0.99), focus 0.98 (0.98), shift 0.90
+        (0.92), thresholds 0.96 (0.93), dead time 1.00 (0.98) 8.8: contrast 0.98 (0.89), focus 0.86
+        (0.99), shift 0.45 (0.84) Warns:
+        UserWarning where rate x dead time exceeds 5, or 2 with gradients to thresholds: one
+        threshold alone had cosine 0.11 to 0.96 at 2.6 to 2.9, by signal (the play of the mean width
+        does not follow fast turns).
+    Raises: DomainError for other names in ``design`` (they have no gradient) or values outside the
+      sensor's domain, or a dead time that its gradient cannot follow over thousands of intervals;
+      and as ``simulate``.
     """
     check_state(state, PhysicalState)
     front_end = FrontEnd(log_input)
@@ -114,11 +118,13 @@ def sensor_counts(
 
 
 def _mean_counts(seen, thetas, interval_s, refractory_s, state):
-    """Counts with the slopes of their mean over places inside the threshold and behind the dead time, [T-1,
-    2, ...]; the states of ``memory`` and of the dead time after them."""
+    """Counts with the slopes of their mean over places inside the threshold and behind the dead
+    time, [T-1, 2, ...]; the states of ``memory`` and of the dead time after them."""
     start = seen[0] if state is None else state.reference
     slopes = [seen, start, *thetas, refractory_s]
-    asked = torch.is_grad_enabled() and any(isinstance(x, Tensor) and x.requires_grad for x in slopes)
+    asked = torch.is_grad_enabled() and any(
+        isinstance(x, Tensor) and x.requires_grad for x in slopes
+    )
     # without gradients the values are the hard sensor's: nobody asks for what the mean passes
     if refractory_s is None or not asked:
         return *memory(seen[1:], *thetas, state=start, log_input=True), None
@@ -129,13 +135,15 @@ def _mean_counts(seen, thetas, interval_s, refractory_s, state):
         share = dead_time.local_share(seen.diff(dim=0), thetas, interval_s, refractory_s)
         return smooth * share[:, None], reference, None
     centre, before = (start, None) if state is None else (start[1], state.dead)
-    passed, centre, dead = dead_time.mean_counts(seen, centre, thetas, interval_s, refractory_s, before)
+    passed, centre, dead = dead_time.mean_counts(
+        seen, centre, thetas, interval_s, refractory_s, before
+    )
     return passed, torch.stack((centre, centre)), dead
 
 
 class PhysicalLayer(EventLayer):
-    """``events.sensor_counts``: exactly the events of ``events.simulate``, noise and all, with gradients to
-    the sensor. A batch is one sample after the other."""
+    """``events.sensor_counts``: exactly the events of ``events.simulate``, noise and all, with
+    gradients to the sensor. A batch is one sample after the other."""
 
     learnable = DESIGN
     refines = True

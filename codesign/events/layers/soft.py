@@ -1,6 +1,6 @@
-"""The layers beside ``memory``: the sigmoid per frame pair (the named baseline), a comparator that looks once
-per frame, with a surrogate slope, and mean counts under threshold mismatch: smooth, without ghosts, hard
-counts as the spread falls.
+"""The layers beside ``memory``: the sigmoid per frame pair (the named baseline), a comparator that
+looks once per frame, with a surrogate slope, and mean counts under threshold mismatch: smooth,
+without ghosts, hard counts as the spread falls.
 """
 
 import math
@@ -15,8 +15,8 @@ from codesign.events.intensity import log_levels
 
 # a pixel without change fires sigmoid(-5) = 0.67 % of an event per polarity and frame
 GHOST_LOGIT = -5.0
-# beyond a spread of so many events the sum over events equals its integral less a half, to exp(-2 pi^2 1.2^2)
-# = 5e-13
+# beyond a spread of so many events the sum over events equals its integral less a half, to exp(-2
+# pi^2 1.2^2) = 5e-13
 SERIES_END = 1.2
 LEAST_SPREAD = 0.01
 MOST_SPREAD = 1.0
@@ -29,18 +29,19 @@ def soft(
     sharpness: float | None = None,
     log_input: bool = False,
 ) -> Tensor:
-    """Soft events of consecutive frames, without memory and capped at one per pixel, polarity and frame.
+    """Soft events of consecutive frames, without memory and capped at one per pixel, polarity and
+    frame.
 
     Args:
-      frames: [T, ...] linear intensity on the 0-255 scale (lin-log is applied here), any pixel shape; log
-        intensity with ``log_input``.
+      frames: [T, ...] linear intensity on the 0-255 scale (lin-log is applied here), any pixel
+        shape; log intensity with ``log_input``.
       theta: contrast threshold > 0, natural log units, scalar or broadcasting over one frame.
       sharpness: k > 0 in 1/log units; None: k = 5/theta.
-    Returns: [T-1, 2, ...] ON = sigmoid(k (dL - theta)), OFF = sigmoid(k (-dL - theta)), between 0 and 1,
-      never 0.
+    Returns: [T-1, 2, ...] ON = sigmoid(k (dL - theta)), OFF = sigmoid(k (-dL - theta)), between 0
+      and 1, never 0.
     Gradient: frames and theta, exact.
-    Raises: ShapeError for fewer than two frames; DomainError for theta or sharpness <= 0, NaN, infinite or
-      negative input.
+    Raises: ShapeError for fewer than two frames; DomainError for theta or sharpness <= 0, NaN,
+      infinite or negative input.
 
     Example:
     >>> from codesign import events
@@ -53,7 +54,9 @@ def soft(
     theta = check_per_pixel(theta, "theta", level)
     k = -GHOST_LOGIT / theta if sharpness is None else check_positive(sharpness, "sharpness")
     step = level.diff(dim=0)
-    return torch.stack((torch.sigmoid(k * (step - theta)), torch.sigmoid(k * (-step - theta))), dim=1)
+    return torch.stack(
+        (torch.sigmoid(k * (step - theta)), torch.sigmoid(k * (-step - theta))), dim=1
+    )
 
 
 def dense(
@@ -65,17 +68,19 @@ def dense(
     state: Tensor | None = None,
     log_input: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Events of a comparator that looks once per frame; a pixel that fires memorises the level it sees.
+    """Events of a comparator that looks once per frame; a pixel that fires memorises the level it
+    sees.
 
-    With u = (L - r)/theta_on - 1 an ON event is the step H(u), likewise OFF; then r := L where one fired. In
-    the manner of SENPI: the physics of the pixel forward, a surrogate only for the step.
+    With u = (L - r)/theta_on - 1 an ON event is the step H(u), likewise OFF; then r := L where one
+    fired. In the manner of SENPI: the physics of the pixel forward, a surrogate only for the step.
 
     Args:
-      frames: [T, ...] linear intensity on the 0-255 scale, or log levels with ``log_input``. theta_on,
-        theta_off: thresholds > 0, scalar or broadcasting over one frame. sharpness: b of the surrogate slope
-        b/(1 + b |u|)^2, > 0. state: [...] memorised level of an earlier chunk.
+      frames: [T, ...] linear intensity on the 0-255 scale, or log levels with ``log_input``.
+        theta_on, theta_off: thresholds > 0, scalar or broadcasting over one frame. sharpness: b of
+        the surrogate slope b/(1 + b |u|)^2, > 0. state: [...] memorised level of an earlier chunk.
     Returns: counts [T-1, 2, ...] of 0 and 1 ([T, 2, ...] with a state), ON first; state [...].
-    Gradient: frames, thetas, state; surrogate slope at the step, exact elsewhere, through the memory.
+    Gradient: frames, thetas, state; surrogate slope at the step, exact elsewhere, through the
+      memory.
     Raises: ShapeError, DomainError as ``memory``.
     Source: comparator surrogate: Zenke and Ganguli 2018 (fast sigmoid).
     """
@@ -90,8 +95,8 @@ def dense(
 
 
 def _memorised(frames, theta_on, theta_off, state, log_input, step):
-    """Counts and the memorised level after them; step(way from the memorised level, theta_on, theta_off)
-    gives both counts and what the memorised level moves by."""
+    """Counts and the memorised level after them; step(way from the memorised level, theta_on,
+    theta_off) gives both counts and what the memorised level moves by."""
     level = log_levels(frames, log_input, minimum=2 if state is None else 1)
     theta_on = check_per_pixel(theta_on, "theta_on", level)
     theta_off = check_per_pixel(theta_off, "theta_off", level)
@@ -126,18 +131,20 @@ def expected(
     state: Tensor | None = None,
     log_input: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Mean counts of pixels whose thresholds scatter log-normally, with the mean memorised level carried on.
+    """Mean counts of pixels whose thresholds scatter log-normally, with the mean memorised level
+    carried on.
 
     With D = L - r, median threshold C and relative spread s: n = sum_k P(k theta <= |D|) = sum_k
-    Phi(ln(|D|/(k C))/s), and r moves by the mean of theta times its count, sum_k C e^(s^2/2) Phi(ln(|D|/(k
-    C))/s - s). A level at rest gives exactly nothing; s -> 0 gives the hard count.
+    Phi(ln(|D|/(k C))/s), and r moves by the mean of theta times its count, sum_k C e^(s^2/2)
+    Phi(ln(|D|/(k C))/s - s). A level at rest gives exactly nothing; s -> 0 gives the hard count.
 
     Args:
-      frames: [T, ...] linear intensity on the 0-255 scale, or log levels with ``log_input``. theta_on,
-        theta_off: median thresholds > 0, scalar or broadcasting over one frame. spread: s, relative standard
-        deviation (sigma/theta), 0.01 to 1. state: [...] as for ``memory``.
+      frames: [T, ...] linear intensity on the 0-255 scale, or log levels with ``log_input``.
+        theta_on, theta_off: median thresholds > 0, scalar or broadcasting over one frame. spread:
+        s, relative standard deviation (sigma/theta), 0.01 to 1. state: [...] as for ``memory``.
     Returns: counts [T-1, 2, ...] >= 0 ([T, 2, ...] with a state), ON first; state [...].
-    Gradient: frames, thetas, spread, state: exact, smooth for D other than 0, where all derivatives vanish.
+    Gradient: frames, thetas, spread, state: exact, smooth for D other than 0, where all derivatives
+      vanish.
     Raises: ShapeError, DomainError as ``memory``, and for a spread outside its range.
     """
     check_number(spread, "spread", LEAST_SPREAD, MOST_SPREAD, remedy="0.15 is typical")
@@ -162,7 +169,9 @@ def _mean_count(distance, theta, spread):
     moved = torch.zeros_like(many)
     close = many.detach()[~far.detach()]
     # six deviations: what is left out is below 1e-9
-    last = math.ceil(float(close.max()) * math.exp(6 * float(spread.detach()))) if close.numel() else 0
+    last = (
+        math.ceil(float(close.max()) * math.exp(6 * float(spread.detach()))) if close.numel() else 0
+    )
     for k in range(1, last + 1):
         place = (near - math.log(k)) / spread
         count = count + torch.special.ndtr(place)

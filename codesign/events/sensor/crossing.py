@@ -1,16 +1,17 @@
-"""The interpolated sensor as one drjit loop over time per pixel: low-pass, noise, leak, threshold crossings,
-noise events, dead time.
+"""The interpolated sensor as one drjit loop over time per pixel: low-pass, noise, leak, threshold
+crossings, noise events, dead time.
 
-Between frames the signal s (the low-passed log level plus noise) and the leak are linear in time, so D = s -
-M, with M the memorised level, crosses a threshold at a time known in closed form, and all crossings of an
-interval lie on one side. Noise events are a Poisson process in continuous time: a pixel carries the hazard
-that must still pass until its next one, so nothing depends on the frame rate or on chunks, and nothing is
-drawn in vain.
+Between frames the signal s (the low-passed log level plus noise) and the leak are linear in time,
+so D = s - M, with M the memorised level, crosses a threshold at a time known in closed form, and
+all crossings of an interval lie on one side. Noise events are a Poisson process in continuous time:
+a pixel carries the hazard that must still pass until its next one, so nothing depends on the frame
+rate or on chunks, and nothing is drawn in vain.
 
-A sink is where events go, sortable 64-bit keys or dense counts per frame interval, of a ``Lanes``. It gives
-``tally`` (what it carries through the events of one interval of a pixel), ``take`` (one event), ``close``
-(the end of the interval) and ``arrays`` (what to evaluate). Random numbers are hashes of a key per pixel and
-a counter, without a state, so that chunks and threads change nothing.
+A sink is where events go, sortable 64-bit keys or dense counts per frame interval, of a ``Lanes``.
+It gives ``tally`` (what it carries through the events of one interval of a pixel), ``take``
+(one event), ``close`` (the end of the interval) and ``arrays`` (what to evaluate). Random numbers
+are hashes of a key per pixel and a counter, without a state, so that chunks and threads change
+nothing.
 """
 
 import math
@@ -23,7 +24,8 @@ from codesign.backend import load
 from codesign.events.intensity import light_share
 from codesign.events.low_pass import coefficients, passed
 
-# of a pixel in one interval: beyond it a unit is wrong, and single precision would soon stop counting
+# of a pixel in one interval: beyond it a unit is wrong, and single precision would soon stop
+# counting
 MOST_EVENTS = 1e6
 # what changes from frame to frame
 CARRIED = (
@@ -40,8 +42,8 @@ CARRIED = (
 
 
 def hashed(bits):
-    """32 well-mixed bits of 32 bits; one to one. Source: C. Wellons, "Prospecting for Hash Functions"
-    (triple32, bias 0.02 of ideal)."""
+    """32 well-mixed bits of 32 bits; one to one. Source: C. Wellons, "Prospecting for Hash
+    Functions" (triple32, bias 0.02 of ideal)."""
     bits = (bits ^ (bits >> 17)) * 0xED5AD4BB
     bits = (bits ^ (bits >> 11)) * 0xAC4C1B51
     bits = (bits ^ (bits >> 15)) * 0x31848BAB
@@ -66,22 +68,24 @@ def normal_pair(dr, arr, bits):
 
 
 class EventKeys:
-    """Events as integers that sort by (t, y, x, p): microseconds since an origin, row, column, polarity, from
-    high to low bits."""
+    """Events as integers that sort by (t, y, x, p): microseconds since an origin, row, column,
+    polarity, from high to low bits."""
 
     def __init__(self, lanes, start_s, end_s, layout, capacity):
-        """Args: start_s, end_s: lists, ends of every interval, seconds. layout: KeyLayout. capacity: room for
-        so many events; ``found`` tells how many there were."""
+        """Args: start_s, end_s: lists, ends of every interval, seconds. layout: KeyLayout.
+        capacity: room for so many events; ``found`` tells how many there were."""
         dr, Float = lanes.dr, lanes.arr.Float
         start_s, end_s = np.array(start_s), np.array(end_s)
-        start_us, end_us = (np.array([round(time_s * 1e6) for time_s in times]) for times in (start_s, end_s))
+        start_us, end_us = (
+            np.array([round(time_s * 1e6) for time_s in times]) for times in (start_s, end_s)
+        )
         length_us = (end_s - start_s) * 1e6
         # single precision resolves a microsecond of intervals up to a second to better than a tenth
         self._Time = Float if length_us.max() <= 1e6 else dr.float64_array_t(Float)
         self._Key = dr.uint64_array_t(Float)
         self._lanes = lanes
-        # of every interval: its length, the fraction of a microsecond that it starts with, whole ones to its
-        # end
+        # of every interval: its length, the fraction of a microsecond that it starts with, whole
+        # ones to its end
         spans = length_us, start_s * 1e6 - start_us, (end_us - start_us).astype(np.float64)
         self._spans = [self._Time(span) for span in spans]
         first = (start_us - layout.origin_us).astype(np.uint64)
@@ -100,7 +104,9 @@ class EventKeys:
         dr, UInt32 = self._lanes.dr, self._lanes.arr.UInt32
         length, fraction, span = (dr.gather(self._Time, table, index) for table in self._spans)
         # after the start, so that rounding moves no event to the interval before
-        since_us = dr.clip(dr.round(self._Time(when) * length + fraction), dr.minimum(span, 1), span)
+        since_us = dr.clip(
+            dr.round(self._Time(when) * length + fraction), dr.minimum(span, 1), span
+        )
         start = dr.gather(self._Key, self._start, index)
         key = (start + (self._Key(since_us) << self._bits)) | self._pixel
         slot = dr.scatter_inc(self._count, UInt32(0), active=kept)
@@ -171,7 +177,9 @@ class DenseCounts:
 
     def take(self, index, when, on, kept, tally):
         one, select = self._lanes.arr.Float(1), self._lanes.dr.select
-        return [total + select(kept & way, one, 0) for total, way in zip(tally, (on, ~on), strict=True)]
+        return [
+            total + select(kept & way, one, 0) for total, way in zip(tally, (on, ~on), strict=True)
+        ]
 
     def close(self, index, tally):
         for k, total in enumerate(tally):
@@ -197,9 +205,9 @@ def run(lanes, frames, front_end, dt_s, interval_key, sensor, state, sink):
       sensor: SensorModel.
       state: SensorState (read only).
       sink: ``EventKeys`` or ``DenseCounts`` of the lanes; takes every event.
-    Returns: dict of the carried tensors after the chunk; what was wrong: 0 nothing, 1 a value that is not
-      finite or negative, 2 a pixel with more than ``MOST_EVENTS`` events in an interval (then everything else
-      is void).
+    Returns: dict of the carried tensors after the chunk; what was wrong: 0 nothing, 1 a value that
+      is not finite or negative, 2 a pixel with more than ``MOST_EVENTS`` events in an interval
+      (then everything else is void).
     """
     dr, arr = lanes.dr, lanes.arr
     names = [name for name in CARRIED if getattr(state, name) is not None]
@@ -211,7 +219,9 @@ def run(lanes, frames, front_end, dt_s, interval_key, sensor, state, sink):
         value = lanes.at(values, index)
         fits = front_end.accepts(dr, value)
         # an infinite level would fire without end
-        after, too_many = step(index, dr.select(fits, value, 1), dict(zip(names, carried, strict=True)))
+        after, too_many = step(
+            index, dr.select(fits, value, 1), dict(zip(names, carried, strict=True))
+        )
         return bad | ~fits, busy | too_many, *(after[name] for name in names)
 
     with dr.suspend_grad():
@@ -223,7 +233,9 @@ def run(lanes, frames, front_end, dt_s, interval_key, sensor, state, sink):
     after = {}
     for name, value in zip(names, carried, strict=True):
         like = getattr(state, name)
-        after[name] = lanes.tensor(arr.Int32(value) if like.dtype == torch.int32 else value, like.shape)
+        after[name] = lanes.tensor(
+            arr.Int32(value) if like.dtype == torch.int32 else value, like.shape
+        )
     return after, int(wrong[0])
 
 
@@ -244,8 +256,8 @@ def exact_sum(first, second):
 
 
 class _Step:
-    """One frame of one pixel, as drjit operations. Built once per chunk; every number that changes between
-    chunks is opaque or in memory."""
+    """One frame of one pixel, as drjit operations. Built once per chunk; every number that changes
+    between chunks is opaque or in memory."""
 
     def __init__(self, lanes, front_end, dt_s, interval_key, sensor, state, sink):
         self.lanes = lanes
@@ -292,7 +304,9 @@ class _Step:
         if "input_level" in now:
             now["input_level"] = level
         gauss = (
-            normal_pair(dr, self.arr, self.key ^ dr.gather(self.arr.UInt32, self.interval_key, index))
+            normal_pair(
+                dr, self.arr, self.key ^ dr.gather(self.arr.UInt32, self.interval_key, index)
+            )
             if sensor.leak_jitters or sensor.photoreceptor_noise
             else (0.0, 0.0)
         )
@@ -300,7 +314,9 @@ class _Step:
         if sensor.photoreceptor_noise:
             keep = dr.exp(-self.omega * dt_s)
             before = before + now["noise"]
-            now["noise"] = keep * now["noise"] + dr.sqrt(1 - keep * keep) * self.noise_level * gauss[0]
+            now["noise"] = (
+                keep * now["noise"] + dr.sqrt(1 - keep * keep) * self.noise_level * gauss[0]
+            )
             signal = signal + now["noise"]
         base = now["reference"]
         rest = now["reference_rest"]
@@ -308,16 +324,18 @@ class _Step:
         # per frame it may be less than the last digit of the memorised level
         if self.leak_hz is not None:
             rise = self.leak_hz * dt_s
-            leak = (rise * (1 - self.jitter * gauss[1]) if sensor.leak_jitters else rise) * self.thetas[0]
+            leak = (
+                rise * (1 - self.jitter * gauss[1]) if sensor.leak_jitters else rise
+            ) * self.thetas[0]
             base, now["reference_rest"] = exact_sum(base, rest - leak)
         return now, self._fire(index, dt_s, light, start, signal, base, now)
 
     def _fire(self, index, dt_s, light, start, signal, base, now):
-        """All events of the interval in order of time; moves the reference, the dead time and the hazard on.
-        Returns where there were too many.
+        """All events of the interval in order of time; moves the reference, the dead time and the
+        hazard on. Returns where there were too many.
 
-        Whether the level fires is decided by the rounded reference, as in v2e and ``memory``; when, by the
-        reference with what its rounding took, which adds up over the events of a ramp.
+        Whether the level fires is decided by the rounded reference, as in v2e and ``memory``; when,
+        by the reference with what its rounding took, which adds up over the events of a ramp.
         """
         dr = self.dr
         arr = self.arr
@@ -375,7 +393,9 @@ class _Step:
                 end = dr.select(is_shot, slope * (1 - when), end)
                 base = dr.select(is_shot, signal - end, base)
                 rising = dr.select(is_shot, slope > 0, rising)
-                hazard = dr.select(is_shot, hazard + exponential(dr, arr, hashed(bits + 0x9E3779B9)), hazard)
+                hazard = dr.select(
+                    is_shot, hazard + exponential(dr, arr, hashed(bits + 0x9E3779B9)), hazard
+                )
                 drawn = drawn + dr.select(is_shot, arr.UInt32(1), 0)
             return nth, start, base, end, rising, last_s, tally, hazard, drawn
 
@@ -395,7 +415,9 @@ class _Step:
         )
         self.sink.close(index, tally)
         now["reference"], lost = exact_sum(base, nth * dr.select(rising, theta_on, -theta_off))
-        now["reference_rest"] = lost + (dr.select(drawn == now["shots"], rest, 0) if shots else rest)
+        now["reference_rest"] = lost + (
+            dr.select(drawn == now["shots"], rest, 0) if shots else rest
+        )
         if dead:
             now["last_event_s"] = dr.maximum(last_s - dt_s, -1e6)
         if shots:

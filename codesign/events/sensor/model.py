@@ -1,5 +1,5 @@
-"""The event sensor: its parameters, and the random parts that the hard simulator and the differentiable
-layers share."""
+"""The event sensor: its parameters, and the random parts that the hard simulator and the
+differentiable layers share."""
 
 import math
 import operator
@@ -23,28 +23,30 @@ DESIGN = ("theta_on", "theta_off", "theta_sigma", "cutoff_hz", "refractory_s")
 
 @dataclass(frozen=True)
 class SensorModel:
-    """Parameters of an event sensor. The defaults are ideal: equal thresholds, no noise, no limit of speed.
+    """Parameters of an event sensor. The defaults are ideal: equal thresholds, no noise, no limit
+    of speed.
 
     theta_on, theta_off: nominal contrast thresholds, natural log units, > 0.
     theta_sigma: standard deviation of the thresholds over pixels, natural log units, >= 0.
-    cutoff_hz: bandwidth of the photoreceptor at full light, a one-pole low-pass of the log level; it shrinks
-      with intensity as (I + 20)/275. 0: none.
-    leak_rate_hz: ON events per pixel and second from leakage, on average. leak_jitter: standard deviation of
-      the leak from frame to frame, relative.
-    rate_cov_decades: spread of the leak rate over pixels, standard deviation of its base-10 logarithm.
-    shot_rate_hz: noise events per pixel and second in the dark, both polarities together; a quarter at full
-      light (1 - 0.75 (I + 20)/275). It scales inversely with the pixel's threshold, and a noise event sets
-      the memorised level to the level seen.
+    cutoff_hz: bandwidth of the photoreceptor at full light, a one-pole low-pass of the log level;
+      it shrinks with intensity as (I + 20)/275. 0: none.
+    leak_rate_hz: ON events per pixel and second from leakage, on average. leak_jitter: standard
+      deviation of the leak from frame to frame, relative.
+    rate_cov_decades: spread of the leak rate over pixels, standard deviation of its base-10
+      logarithm.
+    shot_rate_hz: noise events per pixel and second in the dark, both polarities together; a quarter
+      at full light (1 - 0.75 (I + 20)/275). It scales inversely with the pixel's threshold, and a
+      noise event sets the memorised level to the level seen.
     refractory_s: dead time of a pixel after an event, seconds.
-    photoreceptor_noise: noise of the log level before the comparator instead of separate noise events, of the
-      strength that v2e's fit assigns to shot_rate_hz; the rate that comes out depends on bandwidth and frame
-      rate (measured in docs/events.md).
-      Needs cutoff_hz and shot_rate_hz above 0.
-    hot_pixel_share: share of pixels that fire by themselves. hot_pixel_rate_hz: their rate (ON, as a leak),
-      events per second.
-    timing: "interpolated": each event at the time its pixel crosses the threshold, log level linear in time
-      between frames; events inside the dead time are lost (ESIM). "v2e": the frame-wide time slots of v2e,
-      where events inside the dead time are deferred.
+    photoreceptor_noise: noise of the log level before the comparator instead of separate noise
+      events, of the strength that v2e's fit assigns to shot_rate_hz; the rate that comes out
+      depends on bandwidth and frame rate (measured in docs/events.md). Needs cutoff_hz and
+      shot_rate_hz above 0.
+    hot_pixel_share: share of pixels that fire by themselves. hot_pixel_rate_hz: their rate
+      (ON, as a leak), events per second.
+    timing: "interpolated": each event at the time its pixel crosses the threshold, log level linear
+      in time between frames; events inside the dead time are lost (ESIM). "v2e": the frame-wide
+      time slots of v2e, where events inside the dead time are deferred.
     Source: v2e (Hu, Liu, Delbruck, CVPR-W 2021); Rebecq et al., ESIM, CoRL 2018.
 
     Example:
@@ -120,12 +122,13 @@ class SensorModel:
         return self.shot_rate_hz > 0 and not self.photoreceptor_noise
 
     def noise_level(self) -> float:
-        """Standard deviation of the photoreceptor noise at the comparator, natural log units; 0 without
-        ``photoreceptor_noise``.
+        """Standard deviation of the photoreceptor noise at the comparator, natural log units; 0
+        without ``photoreceptor_noise``.
 
-        Source: v2e's fit of the threshold-to-noise ratio that gives a wanted noise rate R at bandwidth f:
-          with x = log10(R / 2 f), the smaller of the two thresholds over 10^y, y = -0.0026 x^3 - 0.036 x^2 -
-          0.1949 x + 0.321. The mean of the smaller one is exact here (v2e draws 300).
+        Source: v2e's fit of the threshold-to-noise ratio that gives a wanted noise rate R at
+          bandwidth f: with x = log10(R / 2 f), the smaller of the two thresholds over 10^y, y =
+          -0.0026 x^3 - 0.036 x^2 - 0.1949 x + 0.321. The mean of the smaller one is exact here
+          (v2e draws 300).
         """
         if not self.photoreceptor_noise:
             return 0.0
@@ -140,7 +143,8 @@ class SensorModel:
 
 
 def threshold_to_noise(rate_hz: float, cutoff_hz: float) -> float:
-    """Threshold over noise deviation at which a pixel of that bandwidth makes so many noise events per second.
+    """Threshold over noise deviation at which a pixel of that bandwidth makes so many noise events
+    per second.
 
     Source: v2e's fit (see ``SensorModel.noise_level``).
     """
@@ -176,7 +180,10 @@ def check_sensor(sensor: object) -> SensorModel:
     """Return ``sensor`` when it is a SensorModel; DomainError otherwise."""
     names = ", ".join(map(repr, PRESETS))
     check_kind(
-        sensor, SensorModel, "the sensor", f"give an events.SensorModel, or one of events.PRESETS ({names})"
+        sensor,
+        SensorModel,
+        "the sensor",
+        f"give an events.SensorModel, or one of events.PRESETS ({names})",
     )
     return sensor
 
@@ -186,8 +193,8 @@ def with_design(sensor: SensorModel, design: Mapping[str, Tensor | float]) -> Se
 
     Args:
       design: numbers or 0-dim tensors by name, of DESIGN.
-    Raises: DomainError for another name, a value that is no number or outside the sensor's domain, and one of
-      0 that requires a gradient: what is switched off has none.
+    Raises: DomainError for another name, a value that is no number or outside the sensor's domain,
+      and one of 0 that requires a gradient: what is switched off has none.
     """
     values = {}
     for name, value in design.items():
@@ -223,10 +230,10 @@ def draw_thresholds(
     """Contrast thresholds of every pixel.
 
     Args:
-      sensor: SensorModel. pixels: shape of one frame. generator: draws happen on its device; untouched when
-        theta_sigma is 0.
-    Returns: theta_on, theta_off: ``pixels`` each, natural log units: N(theta, sigma), values below 0.01 set
-      to 0.01; first all ON, then all OFF.
+      sensor: SensorModel. pixels: shape of one frame. generator: draws happen on its device;
+        untouched when theta_sigma is 0.
+    Returns: theta_on, theta_off: ``pixels`` each, natural log units: N(theta, sigma), values below
+      0.01 set to 0.01; first all ON, then all OFF.
     Source: v2e (Hu et al., CVPR-W 2021), threshold mismatch.
     """
     check_generator(generator)
@@ -238,11 +245,13 @@ def draw_thresholds(
 
 
 def thresholds(sensor, pixels, deviates, *, dtype, device):
-    """Thresholds ON and OFF of every pixel, [*pixels] each, of the standard normal numbers drawn for them;
-    these are not looked at without a mismatch."""
+    """Thresholds ON and OFF of every pixel, [*pixels] each, of the standard normal numbers drawn
+    for them; these are not looked at without a mismatch."""
     nominal = sensor.theta_on, sensor.theta_off
     if sensor.theta_sigma == 0:
-        return tuple(torch.tensor(theta, dtype=dtype, device=device).expand(pixels) for theta in nominal)
+        return tuple(
+            torch.tensor(theta, dtype=dtype, device=device).expand(pixels) for theta in nominal
+        )
     return tuple(
         mismatched(theta, sensor.theta_sigma, deviate).to(device, dtype)
         for theta, deviate in zip(nominal, deviates, strict=True)
@@ -252,22 +261,26 @@ def thresholds(sensor, pixels, deviates, *, dtype, device):
 def draw_deviates(
     pixels: Sequence[int], generator: Generator, *, dtype: torch.dtype = torch.float32
 ) -> Tensor:
-    """Standard normal numbers behind the thresholds of every pixel, [2, *pixels] on the generator's device:
+    """Standard normal numbers behind the thresholds of every pixel, [2, *pixels] on the generator's
+    device:
     first all ON, then all OFF."""
     place: dict[str, Any] = {"generator": generator, "dtype": dtype, "device": generator.device}
     return torch.stack([torch.randn(_shape(pixels), **place) for _ in range(2)])
 
 
 def mismatched(theta: Tensor | float, sigma: Tensor | float, deviate: Tensor) -> Tensor:
-    """Thresholds of every pixel: theta + sigma deviate, at least 0.01. Gradient: theta and sigma, none where
-    the minimum holds."""
+    """Thresholds of every pixel: theta + sigma deviate, at least 0.01. Gradient: theta and sigma,
+    none where the minimum holds."""
     return (theta + sigma * deviate).clamp(min=THETA_MINIMUM)
 
 
 def of_pixels(theta: Any, sigma: Any, deviate: Tensor | None, like: Tensor) -> Tensor:
-    """``mismatched`` in the type of another tensor; the nominal threshold where no number was drawn.
+    """``mismatched`` in the type of another tensor; the nominal threshold where no number was
+    drawn.
     Gradient: theta and sigma."""
-    theta, sigma = (torch.as_tensor(x, dtype=like.dtype, device=like.device) for x in (theta, sigma))
+    theta, sigma = (
+        torch.as_tensor(x, dtype=like.dtype, device=like.device) for x in (theta, sigma)
+    )
     return theta if deviate is None else mismatched(theta, sigma, deviate.to(like))
 
 
@@ -278,8 +291,9 @@ def draw_leaks(
     *,
     dtype: torch.dtype = torch.float32,
 ) -> tuple[Tensor | None, Tensor | None]:
-    """What makes the leaks of pixels differ, drawn only where the sensor has it: standard normal numbers of
-    the spread, then even ones in 0 to 1, by which pixels are hot. [*pixels] each, or None."""
+    """What makes the leaks of pixels differ, drawn only where the sensor has it: standard normal
+    numbers of the spread, then even ones in 0 to 1, by which pixels are hot. [*pixels] each, or
+    None."""
     pixels = tuple(pixels)
     place: dict[str, Any] = {"generator": generator, "device": generator.device}
     return (
@@ -289,24 +303,30 @@ def draw_leaks(
 
 
 def leak_rates(sensor, pixels, spread, heat, *, dtype, device):
-    """Leak of every pixel in ON thresholds per second, [*pixels]: log-normal around leak_rate_hz, plus
-    the rate of hot pixels, of the numbers from ``draw_leaks``.
+    """Leak of every pixel in ON thresholds per second, [*pixels]: log-normal around leak_rate_hz,
+    plus the rate of hot pixels, of the numbers from ``draw_leaks``.
 
-    Source: v2e, noise_rate_cov_decades (a median of leak_rate_hz; the mean is higher by exp((ln 10 c)^2 /
-      2)).
+    Source: v2e, noise_rate_cov_decades (a median of leak_rate_hz; the mean is higher by
+      exp((ln 10 c)^2 / 2)).
     """
     rate_hz = torch.full(pixels, sensor.leak_rate_hz, dtype=dtype)
     if sensor.leaks_unevenly:
         rate_hz = rate_hz * torch.pow(10.0, sensor.rate_cov_decades * spread.cpu())
     if sensor.has_hot_pixels:
-        rate_hz = rate_hz + sensor.hot_pixel_rate_hz * (heat.cpu() < sensor.hot_pixel_share).to(dtype)
+        rate_hz = rate_hz + sensor.hot_pixel_rate_hz * (heat.cpu() < sensor.hot_pixel_share).to(
+            dtype
+        )
     return rate_hz.to(device, dtype)
 
 
 def draw_keys(shape, generator):
     """Random int32 of a shape."""
     whole = torch.iinfo(torch.int32)
-    place: dict[str, Any] = {"generator": generator, "dtype": torch.int64, "device": generator.device}
+    place: dict[str, Any] = {
+        "generator": generator,
+        "dtype": torch.int64,
+        "device": generator.device,
+    }
     return torch.randint(whole.min, whole.max, shape, **place).to(torch.int32)
 
 
@@ -318,17 +338,17 @@ def draw_shot_counts(
     *,
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """Noise events per pixel and interval: Poisson, shot_rate_hz/2 per polarity. Add them to the counts of
-    any event layer.
+    """Noise events per pixel and interval: Poisson, shot_rate_hz/2 per polarity. Add them to the
+    counts of any event layer.
 
-    The rate is shot_rate_hz at every intensity, and the memorised level stays: one fixed draw serves a whole
-    optimisation.
+    The rate is shot_rate_hz at every intensity, and the memorised level stays: one fixed draw
+    serves a whole optimisation.
 
     Args:
-      sensor: SensorModel. pixels: shape of one frame. interval_s: [T-1] lengths of the intervals, seconds, >
-        0.
-      generator: draws happen on its device, one interval after the other, so chunks draw what the whole
-        draws; untouched when the rate is 0.
+      sensor: SensorModel. pixels: shape of one frame. interval_s: [T-1] lengths of the intervals,
+        seconds, > 0.
+      generator: draws happen on its device, one interval after the other, so chunks draw what the
+        whole draws; untouched when the rate is 0.
     Returns: [T-1, 2, *pixels] whole numbers >= 0, ON first.
     """
     check_generator(generator)

@@ -9,7 +9,14 @@ from torch import Generator, Tensor
 from codesign import backend
 from codesign.checks import FLOATS, check
 from codesign.errors import DomainError
-from codesign.events.entry import Times, check_chunk, check_frames, check_later, check_per_pixel, check_times
+from codesign.events.entry import (
+    Times,
+    check_chunk,
+    check_frames,
+    check_later,
+    check_per_pixel,
+    check_times,
+)
 from codesign.events.intensity import FrontEnd, kernel_levels, log_levels
 from codesign.events.kernels import Lanes
 from codesign.events.sensor import crossing, v2e
@@ -34,35 +41,38 @@ def simulate(
     *,
     log_input: bool = False,
 ) -> EventStream:
-    """Events of a sensor that sees the frames one after the other; log level runs linearly between them.
+    """Events of a sensor that sees the frames one after the other; log level runs linearly between
+    them.
 
-    Per interval a pixel fires each time its level crosses its memorised level by one more threshold, as many
-    times as it does so. Low-pass, mismatch, leak, noise, dead time and hot pixels come with the fields of the
-    sensor. Without them the counts are those of ``memory``.
+    Per interval a pixel fires each time its level crosses its memorised level by one more
+    threshold, as many times as it does so. Low-pass, mismatch, leak, noise, dead time and hot
+    pixels come with the fields of the sensor. Without them the counts are those of ``memory``.
 
     Args:
-      frames: [T, H, W] linear intensity on the 0-255 scale (lin-log is applied here; brighter values are
-        taken as they are), finite, >= 0.
-      t_s: [T] frame times, seconds, strictly increasing; microseconds stay exact at epoch times (float64).
+      frames: [T, H, W] linear intensity on the 0-255 scale (lin-log is applied here; brighter
+        values are taken as they are), finite, >= 0.
+      t_s: [T] frame times, seconds, strictly increasing; microseconds stay exact at epoch times
+        (float64).
       sensor: SensorModel.
-      generator: torch.Generator for all that is random. None: the one in ``state``, which starts at seed 0.
-      state: SensorState carried over chunks, changed in place; empty for the first. Later chunks start with
-        the frame after the last one seen, and may hold a single frame. Any chunking gives the events of the
-        whole. A later chunk may have another sensor (biases that change in a recording): its pixels keep the
-        numbers drawn for them, and those that stand beyond their new thresholds fire at once. What the first
-        sensor had not, and needs draws or a memory, is refused.
-      log_input: frames are natural-log levels, such as ln(I + eps) of linear frames of high dynamic range
-        (ESIM: eps 1e-3 with frames 0 to 1; of the 0-255 scale where the sensor's speed or noise depends on
-        intensity).
-    Returns: EventStream sorted by (t, y, x, p), int64 microseconds. The first frame gives no event. float32
-      frames time events to the microsecond where the log level moves by 1 per second or more; slower ones to
-      about 6e-8 |level| over its speed (float64 frames to the microsecond).
+      generator: torch.Generator for all that is random. None: the one in ``state``, which starts at
+        seed 0.
+      state: SensorState carried over chunks, changed in place; empty for the first. Later chunks
+        start with the frame after the last one seen, and may hold a single frame. Any chunking
+        gives the events of the whole. A later chunk may have another sensor (biases that change in
+        a recording): its pixels keep the numbers drawn for them, and those that stand beyond their
+        new thresholds fire at once. What the first sensor had not, and needs draws or a memory, is
+        refused.
+      log_input: frames are natural-log levels, such as ln(I + eps) of linear frames of high dynamic
+        range (ESIM: eps 1e-3 with frames 0 to 1; of the 0-255 scale where the sensor's speed or
+        noise depends on intensity).
+    Returns: EventStream sorted by (t, y, x, p), int64 microseconds. The first frame gives no event.
+      float32 frames time events to the microsecond where the log level moves by 1 per second or
+      more; slower ones to about 6e-8 |level| over its speed (float64 frames to the microsecond).
     Gradient: none (see ``sensor_counts`` for one).
-    Raises: ShapeError for too few frames or a size that changed; DomainError for NaN, infinite or negative
-      frames, or times that do not increase.
-      The state is then as before.
-    Source: Rebecq et al., ESIM, CoRL 2018 (linear interpolation of log intensity); v2e (Hu, Liu, Delbruck,
-      CVPR-W 2021), docs/events.md.
+    Raises: ShapeError for too few frames or a size that changed; DomainError for NaN, infinite or
+      negative frames, or times that do not increase. The state is then as before.
+    Source: Rebecq et al., ESIM, CoRL 2018 (linear interpolation of log intensity); v2e (Hu, Liu,
+      Delbruck, CVPR-W 2021), docs/events.md.
 
     Example:
     >>> from codesign import events
@@ -75,7 +85,9 @@ def simulate(
     check(frames, "T H W", "frames", FLOATS)
     front_end = FrontEnd(log_input)
     state = SensorState() if state is None else state
-    moved, frames, times_s, generator, at_once = _open(frames, t_s, sensor, generator, state, front_end)
+    moved, frames, times_s, generator, at_once = _open(
+        frames, t_s, sensor, generator, state, front_end
+    )
     start_us = round(moved.time_s * 1e6)
     height_px, width_px = frames.shape[1:]
     if sensor.timing == "v2e":
@@ -88,7 +100,9 @@ def simulate(
         density = EVENTS_PER_PIXEL
         for first in range(0, len(frames), size):
             chunk = frames[first : first + size], times_s[first : first + size]
-            keys.append(_interpolated_keys(*chunk, sensor, generator, moved, front_end, layout, density))
+            keys.append(
+                _interpolated_keys(*chunk, sensor, generator, moved, front_end, layout, density)
+            )
             density = 1.25 * len(keys[-1]) / chunk[0].numel()
         t_us, x, y, p = layout.columns(keys[0] if len(keys) == 1 else np.concatenate(keys))
         stream = EventStream(t_us, x, y, p, height_px, width_px)
@@ -122,7 +136,9 @@ def dense_counts(
         )
     front_end = FrontEnd(log_input)
     state = SensorState() if state is None else state
-    moved, frames, times_s, generator, at_once = _open(frames, t_s, sensor, generator, state, front_end)
+    moved, frames, times_s, generator, at_once = _open(
+        frames, t_s, sensor, generator, state, front_end
+    )
     lanes = Lanes(frames, frames[0].numel())
     sink = DenseCounts(lanes, len(frames))
     keys = _random_keys(len(frames), sensor, moved, generator)
@@ -135,9 +151,9 @@ def dense_counts(
 
 
 def _open(frames, t_s, sensor, generator, state, front_end):
-    """Check what can be checked without reading every frame, and begin a copy of an empty state with the
-    first. Returns the copy, the frames and times still to be seen, the generator, and what a changed sensor
-    fires at once (``change``)."""
+    """Check what can be checked without reading every frame, and begin a copy of an empty state
+    with the first. Returns the copy, the frames and times still to be seen, the generator, and what
+    a changed sensor fires at once (``change``)."""
     check_state(state, sensor)
     state = replace(state)
     fresh = state.level is None
@@ -185,8 +201,8 @@ def _v2e_events(frames, times_s, sensor, generator, state, front_end):
 
 @exclusive
 def _interpolated_keys(frames, times_s, sensor, generator, state, front_end, layout, density):
-    """Sorted keys of the events of one chunk; a chunk busier than the room made for it is run again with the
-    room it needs."""
+    """Sorted keys of the events of one chunk; a chunk busier than the room made for it is run again
+    with the room it needs."""
     lanes = Lanes(frames, frames[0].numel())
     random_keys = _random_keys(len(frames), sensor, state, generator)
     starts_s = [state.time_s, *times_s[:-1]]
@@ -212,7 +228,9 @@ def _random_keys(count, sensor, state, generator):
 def _advance(lanes, frames, times_s, keys, sensor, state, front_end, sink):
     """Run the kernel and move the state on; on bad frames raise before anything has changed."""
     dt_s = torch.tensor([state.time_s, *times_s], dtype=torch.float64).diff()
-    carried, wrong = crossing.run(lanes, frames, front_end, dt_s.to(frames), keys, sensor, state, sink)
+    carried, wrong = crossing.run(
+        lanes, frames, front_end, dt_s.to(frames), keys, sensor, state, sink
+    )
     if wrong == 1:
         check_frames(frames, 1, non_negative=not front_end.log_input)
     if wrong:
@@ -243,22 +261,22 @@ def naive(
     *,
     log_input: bool = False,
 ) -> EventStream:
-    """At most one event per pixel and frame: ON when dL >= theta, OFF when dL <= -theta between consecutive
-    frames.
+    """At most one event per pixel and frame: ON when dL >= theta, OFF when dL <= -theta between
+    consecutive frames.
 
-    What stays below the threshold is forgotten, what exceeds it several times counts once: slow motion goes
-    unseen and fast edges lose events.
+    What stays below the threshold is forgotten, what exceeds it several times counts once: slow
+    motion goes unseen and fast edges lose events.
 
     Args:
-      frames: [T, H, W] linear intensity on the 0-255 scale (lin-log is applied here); log intensity with
-        ``log_input``.
-      t_s: [T] frame times, seconds, strictly increasing. An event gets the time of the later frame, to the
-        nearest microsecond.
+      frames: [T, H, W] linear intensity on the 0-255 scale (lin-log is applied here); log intensity
+        with ``log_input``.
+      t_s: [T] frame times, seconds, strictly increasing. An event gets the time of the later frame,
+        to the nearest microsecond.
       theta: contrast threshold > 0, natural log units, scalar or broadcasting over one frame.
     Returns: EventStream sorted by (t, y, x, p).
     Gradient: none.
-    Raises: ShapeError for fewer than two frames or other shapes; DomainError for theta <= 0, NaN, negative
-      input or times that do not increase.
+    Raises: ShapeError for fewer than two frames or other shapes; DomainError for theta <= 0, NaN,
+      negative input or times that do not increase.
     """
     level = log_levels(frames, log_input, minimum=2)
     check(level, "T H W", "frames")

@@ -8,23 +8,29 @@ from torch import Tensor
 
 from codesign.checks import check_kind
 from codesign.errors import DomainError
-from codesign.events.sensor.model import draw_deviates, draw_keys, draw_leaks, leak_rates, thresholds
+from codesign.events.sensor.model import (
+    draw_deviates,
+    draw_keys,
+    draw_leaks,
+    leak_rates,
+    thresholds,
+)
 
 
 @dataclass
 class SensorState:
     """Memory of a sensor. Make an empty one; ``simulate`` fills it and moves it on.
 
-    reference: [H, W] memorised log level. level: [H, W] log level behind the low-pass. theta_on, theta_off:
-      [H, W] thresholds as they are now.
-    start_s, time_s: times of the first and the last frame. generator: used when none is passed; starts at
-      seed 0. Only where the sensor needs them: reference_rest: [H, W] what rounding took from the memorised
-      level (not for timing "v2e"); input_level, input: [H, W] last log level before the low-pass, last
-      intensity; noise: [H, W] photoreceptor noise; leak_hz: [H, W] as it is now; deviate_on, deviate_off,
-      leak_spread, leak_heat: [H, W] numbers drawn for thresholds and leaks; last_event_s: [H, W] time of the
-      last event (since the first frame for timing "v2e", since the last frame otherwise, so <= 0); hazard:
-      [H, W] noise still to pass until the next noise event; key, shots: [H, W] int32 random key and noise
-      events so far.
+    reference: [H, W] memorised log level. level: [H, W] log level behind the low-pass. theta_on,
+      theta_off: [H, W] thresholds as they are now.
+    start_s, time_s: times of the first and the last frame. generator: used when none is passed;
+      starts at seed 0. Only where the sensor needs them: reference_rest: [H, W] what rounding took
+      from the memorised level (not for timing "v2e"); input_level, input: [H, W] last log level
+      before the low-pass, last intensity; noise: [H, W] photoreceptor noise; leak_hz: [H, W] as it
+      is now; deviate_on, deviate_off, leak_spread, leak_heat: [H, W] numbers drawn for thresholds
+      and leaks; last_event_s: [H, W] time of the last event (since the first frame for timing
+      "v2e", since the last frame otherwise, so <= 0); hazard: [H, W] noise still to pass until the
+      next noise event; key, shots: [H, W] int32 random key and noise events so far.
     """
 
     # Any: filled by the first frame, and used as tensors and numbers from then on
@@ -71,7 +77,9 @@ def check_state(state, sensor):
         "a leak that jitters": ("key", sensor.leak_jitters and sensor.timing == "interpolated"),
         "photoreceptor noise": ("noise", sensor.photoreceptor_noise),
     }
-    lacks = [what for what, (name, asked) in needs.items() if asked and getattr(state, name) is None]
+    lacks = [
+        what for what, (name, asked) in needs.items() if asked and getattr(state, name) is None
+    ]
     if sensor.timing == "v2e" and state.reference_rest is not None:
         lacks.append("timing='v2e'")
     if lacks:
@@ -84,9 +92,8 @@ def check_state(state, sensor):
 def begin(state, sensor, frame, level, time_s, generator):
     """Fill an empty state at the first frame, which gives no event.
 
-    Draws, in this order and only what the sensor has: thresholds, leak rates, hot pixels, first noise
-    hazards, keys.
-    Args:
+    Draws, in this order and only what the sensor has: thresholds, leak rates, hot pixels, first
+    noise hazards, keys. Args:
       frame: [H, W] intensity.
       level: [H, W] its log level.
     """
@@ -113,19 +120,21 @@ def begin(state, sensor, frame, level, time_s, generator):
         state.noise = torch.zeros(pixels, **place)
     draws = sensor.has_shots or sensor.photoreceptor_noise or sensor.leak_jitters
     if sensor.timing == "interpolated" and draws:
-        uniform = torch.rand(tuple(pixels), generator=generator, dtype=torch.float64, device=generator.device)
+        uniform = torch.rand(
+            tuple(pixels), generator=generator, dtype=torch.float64, device=generator.device
+        )
         state.hazard = (-torch.log1p(-uniform)).to(level)
         state.key = draw_keys(tuple(pixels), generator).to(level.device)
         state.shots = torch.zeros(pixels, dtype=torch.int32, device=level.device)
 
 
 def change(state, sensor):
-    """Give the pixels of a state the values of a sensor, which may be another than before: its thresholds and
-    leaks by the numbers drawn at first, and no noise where it has none.
+    """Give the pixels of a state the values of a sensor, which may be another than before: its
+    thresholds and leaks by the numbers drawn at first, and no noise where it has none.
 
-    Returns: [2, H, W] events, ON first, of pixels that stand beyond their thresholds now (at the time of the
-      last frame; the memorised level moves by them), None where nothing of that kind has changed, or with the
-      timing of v2e, which looks at the ends of intervals alone.
+    Returns: [2, H, W] events, ON first, of pixels that stand beyond their thresholds now (at the
+      time of the last frame; the memorised level moves by them), None where nothing of that kind
+      has changed, or with the timing of v2e, which looks at the ends of intervals alone.
     """
     before = state.theta_on, state.theta_off
     quiets = state.noise is not None and not sensor.photoreceptor_noise and bool(state.noise.any())

@@ -1,10 +1,10 @@
-"""The sensor as v2e times it: every pixel's i-th event of a frame gets the i-th of the frame's equal time
-slots.
+"""The sensor as v2e times it: every pixel's i-th event of a frame gets the i-th of the frame's
+equal time slots.
 
-Kept beside the interpolated sensor so that results with v2e can be repeated event by event; precisions and
-the order of operations are v2e's.
-Source: Hu, Liu, Delbruck, "v2e: From Video Frames to Realistic DVS Events", CVPR-W 2021, and the published
-  program.
+Kept beside the interpolated sensor so that results with v2e can be repeated event by event;
+precisions and the order of operations are v2e's.
+Source: Hu, Liu, Delbruck, "v2e: From Video Frames to Realistic DVS Events", CVPR-W 2021, and the
+  published program.
 """
 
 import math
@@ -14,14 +14,14 @@ import torch
 from codesign.errors import DomainError
 from codesign.events.intensity import light_share
 
-# up to here single-precision seconds resolve a microsecond, and v2e's rounding is repeated; later slots are
-# computed in double
+# up to here single-precision seconds resolve a microsecond, and v2e's rounding is repeated; later
+# slots are computed in double
 EXACT_SINGLE_S = 8.0
 
 
 def levels(frames, front_end):
-    """Log levels as v2e has them: lin-log is computed in double precision, rounded to 8 decimals and kept in
-    single."""
+    """Log levels as v2e has them: lin-log is computed in double precision, rounded to 8 decimals
+    and kept in single."""
     if front_end.log_input:
         return frames
     return ((front_end.level(frames.double()) * 1e8).round() / 1e8).float()
@@ -55,11 +55,15 @@ def interval(frame, level, time_s, sensor, generator, state):
     if sensor.refractory_s > dt_s / slots:
         on, off, found = _with_dead_time(on, off, times, sensor.refractory_s, state)
     else:
-        found = [(*_each(fired), torch.full((int(fired.sum()),), p)) for fired, p in ((on, 1), (off, -1))]
+        found = [
+            (*_each(fired), torch.full((int(fired.sum()),), p)) for fired, p in ((on, 1), (off, -1))
+        ]
         if state.last_event_s is not None:
             last = torch.maximum(on, off)
             state.last_event_s = torch.where(
-                last > 0, times.to(state.last_event_s.dtype)[(last - 1).clamp(min=0)], state.last_event_s
+                last > 0,
+                times.to(state.last_event_s.dtype)[(last - 1).clamp(min=0)],
+                state.last_event_s,
             )
     # a single-precision product at all times
     moved = on * state.theta_on.float(), off * state.theta_off.float()
@@ -98,9 +102,9 @@ def _photoreceptor(level, light, dt_s, sensor, generator, state):
 def _slots(before_s, now_s, dt_s, count):
     """[count] times of the frame's slots since the first frame, seconds.
 
-    In single precision they are torch.linspace as v2e's processor made it, from the nearer end and rounded
-    once (a fused multiply-add); without AVX2 torch rounds twice, and a dead time that ends at a slot ends
-    later.
+    In single precision they are torch.linspace as v2e's processor made it, from the nearer end and
+    rounded once (a fused multiply-add); without AVX2 torch rounds twice, and a dead time that ends
+    at a slot ends later.
     """
     if now_s >= EXACT_SINGLE_S:
         return torch.linspace(before_s + dt_s / count, now_s, count, dtype=torch.float64)
@@ -113,8 +117,8 @@ def _slots(before_s, now_s, dt_s, count):
 
 
 def _with_dead_time(on, off, times, refractory_s, state):
-    """Keep the events that come later than the dead time behind the last one kept; the others are not
-    counted, so the next frames see them again."""
+    """Keep the events that come later than the dead time behind the last one kept; the others are
+    not counted, so the next frames see them again."""
     kept_on = torch.zeros_like(on)
     kept_off = torch.zeros_like(off)
     found = []
@@ -132,10 +136,12 @@ def _with_dead_time(on, off, times, refractory_s, state):
 
 
 def _shots(light, dt_s, slots, sensor, generator, state):
-    """Noise events: at most one per pixel and frame, in the last slot; they set the memorised level to the
-    level seen."""
+    """Noise events: at most one per pixel and frame, in the last slot; they set the memorised level
+    to the level seen."""
     chance = sensor.shot_rate_hz / 2 * dt_s * (1 - 0.75 * light)
-    draw = torch.rand(light.shape, generator=generator, dtype=torch.float64, device=generator.device)
+    draw = torch.rand(
+        light.shape, generator=generator, dtype=torch.float64, device=generator.device
+    )
     draw = draw.to(light.device)
     on = draw > 1 - chance * (sensor.theta_on / state.theta_on)
     off = draw < chance * (sensor.theta_off / state.theta_off)
@@ -145,16 +151,16 @@ def _shots(light, dt_s, slots, sensor, generator, state):
 
 
 def _randn(like, generator):
-    return torch.randn(like.shape, generator=generator, dtype=like.dtype, device=generator.device).to(
-        like.device
-    )
+    return torch.randn(
+        like.shape, generator=generator, dtype=like.dtype, device=generator.device
+    ).to(like.device)
 
 
 def _each(counts):
     """Row, column and running number (from 0) of every single event in a map of counts."""
     y, x = counts.nonzero(as_tuple=True)
     many = counts[y, x]
-    nth = torch.arange(int(many.sum()), device=counts.device) - (many.cumsum(0) - many).repeat_interleave(
-        many
-    )
+    nth = torch.arange(int(many.sum()), device=counts.device) - (
+        many.cumsum(0) - many
+    ).repeat_interleave(many)
     return y.repeat_interleave(many), x.repeat_interleave(many), nth

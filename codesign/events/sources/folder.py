@@ -22,7 +22,8 @@ MOST_RATIO = 1040  # at most 1032 to 1
 
 
 def open_folder(folder):
-    """Open a folder: every PNG, JPEG, TIFF or BMP in it is a frame; other files and folders are left alone.
+    """Open a folder: every PNG, JPEG, TIFF or BMP in it is a frame; other files and folders are
+    left alone.
 
     Raises: FileFormatError for fewer than two pictures, and for a first one that cannot be read.
     """
@@ -57,7 +58,14 @@ def open_folder(folder):
         )
 
     return FrameSource(
-        folder, len(paths), height, width, 255.0 if first.dtype == np.uint8 else 65535.0, None, "", read
+        folder,
+        len(paths),
+        height,
+        width,
+        255.0 if first.dtype == np.uint8 else 65535.0,
+        None,
+        "",
+        read,
     )
 
 
@@ -70,11 +78,11 @@ def natural(path):
 
 
 def read_picture(path):
-    """One picture as stored: [H, W] or [H, W, 3], uint8 or uint16. Palettes become colours, black and white
-    becomes 0 and 255.
+    """One picture as stored: [H, W] or [H, W, 3], uint8 or uint16. Palettes become colours, black
+    and white becomes 0 and 255.
 
-    Raises: FileFormatError when it cannot be read, holds several pages, is partly transparent, or is of
-      another depth.
+    Raises: FileFormatError when it cannot be read, holds several pages, is partly transparent, or
+      is of another depth.
     """
     content = read_bytes(path, MOST_BYTES)
     with reading(path, "is it a picture, and whole?"):
@@ -84,14 +92,20 @@ def read_picture(path):
             picture = _tiff(path, file)
         else:
             head = file.read(26)
-            if head[:4] == b"\x89PNG" and head[24:25] == b"\x10" and head[25:] in (b"\x02", b"\x06"):
+            if (
+                head[:4] == b"\x89PNG"
+                and head[24:25] == b"\x10"
+                and head[25:] in (b"\x02", b"\x06")
+            ):
                 raise FileFormatError(
                     f"{path} is a PNG in colour with 16 bits, which the reader would cut to 8; convert it to "
                     "TIFF, or to gray."
                 )
             file.seek(0)
             with PIL.Image.open(file) as opened:
-                check_room(path, (opened.height, opened.width, 4), 1, 4 * MOST_RATIO * path.stat().st_size)
+                check_room(
+                    path, (opened.height, opened.width, 4), 1, 4 * MOST_RATIO * path.stat().st_size
+                )
             file.seek(0)
             picture = np.asarray(iio.imread(file, plugin="pillow", extension=path.suffix.lower()))
     if picture.dtype == bool:

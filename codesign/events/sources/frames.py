@@ -18,13 +18,13 @@ class FrameSource:
     """Frames that can be read in order, from any of them on.
 
     path: where they come from. count: number of frames. height_px, width_px: their size.
-    white: digital value of full scale: 255, 65535, that of the camera for .mraw, or 255 for floating-point
-      stacks, which are taken to be on the 0-255 scale.
-    t_s: [count] float64 times since the first frame, seconds, as the container or the file has them; None
-      where it has none.
+    white: digital value of full scale: 255, 65535, that of the camera for .mraw, or 255 for
+      floating-point stacks, which are taken to be on the 0-255 scale.
+    t_s: [count] float64 times since the first frame, seconds, as the container or the file has
+      them; None where it has none.
     clock: where t_s comes from, for people.
-    read: function from the index of a frame to an iterator over it and all later ones: [H, W] or [H, W, 3]
-      (red, green, blue), as stored.
+    read: function from the index of a frame to an iterator over it and all later ones: [H, W] or
+      [H, W, 3] (red, green, blue), as stored.
     complaint: what the decoder found wrong with the file, empty when nothing.
     """
 
@@ -40,8 +40,8 @@ class FrameSource:
 
 
 def same_size(frames, path, shape, count):
-    """Pass frames on while they have one shape. Raises: FileFormatError naming the first that differs, or the
-    number of frames that are missing."""
+    """Pass frames on while they have one shape. Raises: FileFormatError naming the first that
+    differs, or the number of frames that are missing."""
     index = -1
     for index, frame in frames:
         if frame.shape != shape:

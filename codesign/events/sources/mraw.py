@@ -1,7 +1,8 @@
-"""Frames of a Photron high-speed camera: raw values in .mraw, their description beside it in .cihx or .cih.
+"""Frames of a Photron high-speed camera: raw values in .mraw, their description beside it in .cihx
+or .cih.
 
-Source: the published reader pyMRAW (github.com/ladisk/pyMRAW) for the names of the fields and the packing of
-  12 bits: two values in three bytes, the first in byte 0 and the upper half of byte 1.
+Source: the published reader pyMRAW (github.com/ladisk/pyMRAW) for the names of the fields and the
+  packing of 12 bits: two values in three bytes, the first in byte 0 and the upper half of byte 1.
 """
 
 import re
@@ -35,12 +36,13 @@ TEXT = {
 
 
 def open_mraw(path):
-    """Open a monochrome recording of 8, 12 (packed) or 16 bits; its times follow from the record rate.
+    """Open a monochrome recording of 8, 12 (packed) or 16 bits; its times follow from the record
+    rate.
 
-    Full scale is that of the effective bits where they are the lower ones of what is stored, else that of the
-    bits stored.
-    Raises: FileFormatError when the description is missing or incomplete, or the file is not as long as it
-      says.
+    Full scale is that of the effective bits where they are the lower ones of what is stored, else
+    that of the bits stored.
+    Raises: FileFormatError when the description is missing or incomplete, or the file is not as
+      long as it says.
     """
     facts = _facts(path)
     count, height, width, bits = (
@@ -70,7 +72,9 @@ def open_mraw(path):
         frames = (
             (
                 index,
-                _values(np.fromfile(path, np.uint8, size, offset=index * size), bits).reshape(height, width),
+                _values(np.fromfile(path, np.uint8, size, offset=index * size), bits).reshape(
+                    height, width
+                ),
             )
             for index in range(start, count)
         )
@@ -104,9 +108,12 @@ def _facts(path):
     ):
         beside = path.with_suffix(suffix)
         if beside.is_file():
-            # patterns and no parser: the XML stands behind other bytes, and nothing in it is ever expanded
+            # patterns and no parser: the XML stands behind other bytes, and nothing in it is ever
+            # expanded
             text = read_bytes(beside, MOST_BYTES).decode("latin-1")
-            found = {name: re.search(pattern.format(re.escape(key)), text) for name, key in names.items()}
+            found = {
+                name: re.search(pattern.format(re.escape(key)), text) for name, key in names.items()
+            }
             return {name: match[1] for name, match in found.items() if match}
     raise FileFormatError(
         f"{path} has no description beside it ({path.stem}.cihx or {path.stem}.cih), which says its size "

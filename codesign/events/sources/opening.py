@@ -1,5 +1,5 @@
-"""Frames to make events of: a video, a folder of pictures, a stack of arrays, or a raw recording, opened
-alike."""
+"""Frames to make events of: a video, a folder of pictures, a stack of arrays, or a raw recording,
+opened alike."""
 
 from pathlib import Path
 
@@ -11,17 +11,17 @@ VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wm
 
 
 def open_frames(path: str | Path) -> FrameSource:
-    """Open a video file, a folder of pictures, a .npy or .npz stack, or a .mraw recording; frames are read
-    when they are asked for.
+    """Open a video file, a folder of pictures, a .npy or .npz stack, or a .mraw recording; frames
+    are read when they are asked for.
 
     Args:
-      path: .mp4, .avi, .mov, .mkv, .webm, .gif …; a folder of PNG, JPEG, TIFF or BMP of 8 or 16 bits, taken
-        in natural order (2 before 10); .npy [T, H, W] or [T, H, W, 3]; .npz with one such array (called
-        ``frames`` if there are several) and, if wanted, its times as ``t_s`` or ``t_us``; .mraw with its
-        .cihx or .cih beside it.
+      path: .mp4, .avi, .mov, .mkv, .webm, .gif …; a folder of PNG, JPEG, TIFF or BMP of 8 or 16
+        bits, taken in natural order (2 before 10); .npy [T, H, W] or [T, H, W, 3]; .npz with one
+        such array (called ``frames`` if there are several) and, if wanted, its times as ``t_s`` or
+        ``t_us``; .mraw with its .cihx or .cih beside it.
     Returns: FrameSource.
-    Raises: FileFormatError when there is nothing at the path, or nothing that can be read as at least two
-      frames of one size.
+    Raises: FileFormatError when there is nothing at the path, or nothing that can be read as at
+      least two frames of one size.
     """
     # readers are imported when they are asked for, with the decoders that they need
     from codesign.events.sources import folder, mraw, stack, video

@@ -11,10 +11,11 @@ TIMES = {"t_s": 1.0, "t_us": 1e6}  # name -> in a second
 
 
 def open_stack(path):
-    """Open a stack [T, H, W] or [T, H, W, 3] of uint8, uint16, float32 or float64 in a .npy or .npz file.
+    """Open a stack [T, H, W] or [T, H, W, 3] of uint8, uint16, float32 or float64 in a .npy or .npz
+    file.
 
-    Raises: FileFormatError when the file is damaged, or holds no such array, several without one called
-      ``frames``, or times of another length.
+    Raises: FileFormatError when the file is damaged, or holds no such array, several without one
+      called ``frames``, or times of another length.
     """
     if path.suffix.lower() == ".npy":
         stack = read_npy(path, mapped=True)
@@ -40,19 +41,28 @@ def open_stack(path):
 
     def read(start):
         frames = (
-            (np.array(frame) for frame in stack[start:]) if stack is not None else _unpack(path, name, start)
+            (np.array(frame) for frame in stack[start:])
+            if stack is not None
+            else _unpack(path, name, start)
         )
         yield from same_size(enumerate(frames, start), path, tuple(shape[1:]), shape[0])
 
     white = 65535.0 if kind.itemsize == 2 else 255.0
     return FrameSource(
-        path, shape[0], shape[1], shape[2], white, None if t_s is None else torch.from_numpy(t_s), clock, read
+        path,
+        shape[0],
+        shape[1],
+        shape[2],
+        white,
+        None if t_s is None else torch.from_numpy(t_s),
+        clock,
+        read,
     )
 
 
 def _look(path):
-    """Name, shape and type of the frames in an archive, and times when it has them; only headers and times
-    are read."""
+    """Name, shape and type of the frames in an archive, and times when it has them; only headers
+    and times are read."""
     with open_npz(path) as archive:
         heads = {name: archive.header(name) for name in archive.names}
         stacks = [name for name, head in heads.items() if len(head.shape) in (3, 4)]
@@ -72,7 +82,9 @@ def _look(path):
         key = next((key for key in TIMES if key in archive), None)
         if key is not None:
             if heads[key].dtype.kind not in "fiu":
-                raise FileFormatError(f"{path}: the times {key} are {heads[key].dtype}; numbers are needed.")
+                raise FileFormatError(
+                    f"{path}: the times {key} are {heads[key].dtype}; numbers are needed."
+                )
             t_s = archive.read(key).astype(np.float64) / TIMES[key]
             if not np.isfinite(t_s).all():
                 raise FileFormatError(

@@ -1,5 +1,5 @@
-"""Frames of a video file, decoded by FFmpeg one after the other, with the times that the container gives
-them."""
+"""Frames of a video file, decoded by FFmpeg one after the other, with the times that the container
+gives them."""
 
 import re
 import subprocess
@@ -20,12 +20,12 @@ PICTURES = "-fps_mode passthrough -noautoscale -c:v ppm -f image2pipe -"
 
 
 def open_video(path):
-    """Open a video: it is decoded once to count its frames and read their times; the pictures themselves are
-    decoded again when they are asked for.
+    """Open a video: it is decoded once to count its frames and read their times; the pictures
+    themselves are decoded again when they are asked for.
 
-    Times are exact multiples of the container's time base, also where the frame rate varies. Frames are those
-    that FFmpeg decodes, in colour of 8 bits, or of 16 for videos of more than 8; none is repeated or left out
-    to reach an even rate.
+    Times are exact multiples of the container's time base, also where the frame rate varies. Frames
+    are those that FFmpeg decodes, in colour of 8 bits, or of 16 for videos of more than 8; none is
+    repeated or left out to reach an even rate.
     Raises: FileFormatError when FFmpeg finds no video in the file, or fewer than two frames.
     """
     t_s, complaint = _times(path)
@@ -46,15 +46,23 @@ def open_video(path):
         yield from same_size(enumerate(_decode(path, start), start), path, first.shape, len(t_s))
 
     return FrameSource(
-        path, len(t_s), height, width, white, torch.from_numpy(t_s) if even else None, clock, read, complaint
+        path,
+        len(t_s),
+        height,
+        width,
+        white,
+        torch.from_numpy(t_s) if even else None,
+        clock,
+        read,
+        complaint,
     )
 
 
 def _times(path):
     """[T] seconds of every frame since the first, and what the decoder complained about.
 
-    Packets alone would be quicker to list, but a video that was cut without coding it again holds packets
-    that are not shown.
+    Packets alone would be quicker to list, but a video that was cut without coding it again holds
+    packets that are not shown.
     """
     command = [*_ffmpeg(path), *TIMES.split()]
     done = subprocess.run(
@@ -62,7 +70,11 @@ def _times(path):
     )
     base = re.search(rb"#tb 0: (\d+)/(\d+)", done.stdout)
     ticks = np.array(
-        [int(line.split(b",")[2]) for line in done.stdout.splitlines() if not line.startswith(b"#")],
+        [
+            int(line.split(b",")[2])
+            for line in done.stdout.splitlines()
+            if not line.startswith(b"#")
+        ],
         dtype=np.int64,
     )
     if done.returncode or base is None or not len(ticks):
@@ -75,16 +87,21 @@ def _times(path):
 
 
 def _decode(path, start):
-    """Frames from number ``start`` on; each comes with its own header, so that its size and depth are known
-    and not assumed."""
-    # autoscale off: a video that changes its size is not brought to one in silence; passthrough: no frame is
-    # repeated or dropped
+    """Frames from number ``start`` on; each comes with its own header, so that its size and depth
+    are known and not assumed."""
+    # autoscale off: a video that changes its size is not brought to one in silence; passthrough: no
+    # frame is repeated or dropped
     chosen = ["-vf", rf"select=gte(n\,{start})"] if start else []
     command = [*_ffmpeg(path), *chosen, *PICTURES.split()]
     with tempfile.TemporaryFile() as notes:
-        # a group of its own: Ctrl-C then ends the run between two steps, not the decoder in the middle of one
+        # a group of its own: Ctrl-C then ends the run between two steps, not the decoder in the
+        # middle of one
         with subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=notes, stdin=subprocess.DEVNULL, start_new_session=True
+            command,
+            stdout=subprocess.PIPE,
+            stderr=notes,
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,
         ) as process:
             try:
                 assert process.stdout is not None
@@ -109,12 +126,16 @@ def _picture(pipe):
     data = pipe.read(width * height * 3 * kind.itemsize)
     if len(data) < width * height * 3 * kind.itemsize:
         return None
-    return np.frombuffer(data, kind).reshape(height, width, 3).astype(kind.newbyteorder("="), copy=False)
+    return (
+        np.frombuffer(data, kind)
+        .reshape(height, width, 3)
+        .astype(kind.newbyteorder("="), copy=False)
+    )
 
 
 def _ffmpeg(path):
-    # "file:" keeps a name with a colon from being taken for a protocol, and the list keeps playlists inside
-    # the machine
+    # "file:" keeps a name with a colon from being taken for a protocol, and the list keeps
+    # playlists inside the machine
     quiet = "-v error -nostdin -protocol_whitelist file,pipe -i"
     return [imageio_ffmpeg.get_ffmpeg_exe(), *quiet.split(), f"file:{path}", "-map", "0:v:0"]
 

@@ -1,5 +1,5 @@
-"""Distances between event counts over time, differentiable: van Rossum's, and a chi-square of pooled
-counts."""
+"""Distances between event counts over time, differentiable: van Rossum's, and a chi-square of
+pooled counts."""
 
 import torch.nn.functional as F
 from torch import Tensor
@@ -10,27 +10,27 @@ from codesign.events.spiking.srm import alpha_response
 
 
 def van_rossum(found: Tensor, target: Tensor, *, tau_s: Tensor | float, dt: float = 1.0) -> Tensor:
-    """Van Rossum distance 1/2 int (eps * (s - s^))^2 dt with eps(t) = t/tau exp(1 - t/tau), summed over
-    pixels and polarities.
+    """Van Rossum distance 1/2 int (eps * (s - s^))^2 dt with eps(t) = t/tau exp(1 - t/tau), summed
+    over pixels and polarities.
 
     Args:
       found, target: [T, 2, ...] counts or spikes per step of length ``dt``, ON first.
       tau_s: time constant, in the unit of dt.
-    Returns: 0-dim loss, in the unit of dt; a lone wrong event costs 1/2 sum_k (k h)^2 exp(2 - 2 k h) dt,
-      about e^2 tau/8.
+    Returns: 0-dim loss, in the unit of dt; a lone wrong event costs 1/2 sum_k (k h)^2
+      exp(2 - 2 k h) dt, about e^2 tau/8.
     Gradient: found, target.
-    Raises: ShapeError when the two differ in shape; DomainError for NaN, infinity or time constants that are
-      not positive.
-    Source: van Rossum, Neural Computation 2001; alpha kernel as in Shrestha and Orchard, SLAYER, NeurIPS
-      2018.
+    Raises: ShapeError when the two differ in shape; DomainError for NaN, infinity or time constants
+      that are not positive.
+    Source: van Rossum, Neural Computation 2001; alpha kernel as in Shrestha and Orchard, SLAYER,
+      NeurIPS 2018.
     """
     response, _ = alpha_response(_difference(found, target), tau_s=tau_s, dt=dt)
     return response.square().sum() * (dt / 2)
 
 
 def count_loss(found: Tensor, target: Tensor, *, side_px: int = 8, steps: int = 10) -> Tensor:
-    """Half the chi-square of counts pooled over blocks of space and time: 1/2 sum (n - n^)^2 / (n^ + 1), per
-    polarity.
+    """Half the chi-square of counts pooled over blocks of space and time: 1/2 sum (n - n^)^2 /
+    (n^ + 1), per polarity.
 
     Args:
       found, target: [T, 2, ..., H, W] counts, ON first.
@@ -65,5 +65,7 @@ def _difference(found, target):
             "steps, polarities and pixels."
         )
     if found.ndim < 2 or found.shape[1] != 2:
-        raise DomainError(f"counts have shape {list(found.shape)}; [T, 2, ...] is needed, ON first.")
+        raise DomainError(
+            f"counts have shape {list(found.shape)}; [T, 2, ...] is needed, ON first."
+        )
     return found - target

@@ -1,5 +1,5 @@
-"""Spike-ESIM: an event generator that starts as the ideal memorised-reference sensor and learns what a real
-one does differently."""
+"""Spike-ESIM: an event generator that starts as the ideal memorised-reference sensor and learns
+what a real one does differently."""
 
 import io
 import json
@@ -50,8 +50,8 @@ SLOW_S = 0.05  # time constant of the slow level that the residual branch compar
 class SpikeEsimState:
     """What Spike-ESIM carries over chunks; it keeps its graph.
 
-    level, filtered, slow: [B, 1, H, W] level behind the tone curve, behind the bandwidth, and a slow mean of
-      it. frame: [...] last frame, time_s its time.
+    level, filtered, slow: [B, 1, H, W] level behind the tone curve, behind the bandwidth, and a
+      slow mean of it. frame: [...] last frame, time_s its time.
     comparator: state of the comparator.
     """
 
@@ -64,16 +64,18 @@ class SpikeEsimState:
 
 
 class SpikeEsim(nn.Module):
-    """Frames to events: log level, prefilter, tone curve, bandwidth, residual branch, and a comparator with a
-    memorised level per pixel.
+    """Frames to events: log level, prefilter, tone curve, bandwidth, residual branch, and a
+    comparator with a memorised level per pixel.
 
-    Untrained it is the ideal sensor of the given thresholds, exactly: every learnt part starts as the
-    identity or at zero effect.
+    Untrained it is the ideal sensor of the given thresholds, exactly: every learnt part starts as
+    the identity or at zero effect.
 
-    theta_on, theta_off: contrast thresholds > 0, natural log units. refractory_s: dead time, 0 for none;
-      learnt when above 0. cutoff_hz: corner frequency at full light that the bandwidth starts to learn from.
-      comparator: "memory" (any number of events per interval) or "srm" (coupled spike response layer, at most
-      one per step and polarity). width, depth: of the residual branch. seed: of its weights.
+    theta_on, theta_off: contrast thresholds > 0, natural log units. refractory_s: dead time, 0 for
+      none; learnt when above 0. cutoff_hz: corner frequency at full light that the bandwidth starts
+      to learn from.
+      comparator: "memory" (any number of events per interval) or "srm" (coupled spike response
+      layer, at most one per step and polarity). width, depth: of the residual branch. seed: of its
+      weights.
     """
 
     def __init__(
@@ -106,7 +108,9 @@ class SpikeEsim(nn.Module):
             )
         # of the thresholds, so that 0 is the given one exactly
         self.log_gain = nn.Parameter(torch.zeros(2, dtype=torch.float64))
-        self.log_dead = nn.Parameter(torch.zeros((), dtype=torch.float64)) if refractory_s > 0 else None
+        self.log_dead = (
+            nn.Parameter(torch.zeros((), dtype=torch.float64)) if refractory_s > 0 else None
+        )
         self.prefilter = Prefilter()
         self.tone = ToneCurve()
         self.bandwidth = Bandwidth(cutoff_hz)
@@ -116,13 +120,17 @@ class SpikeEsim(nn.Module):
     def thetas(self) -> Tensor:
         """Thresholds ON and OFF as they are now: [2] float64, natural log units."""
         return (
-            torch.tensor((self.settings["theta_on"], self.settings["theta_off"]), dtype=torch.float64)
+            torch.tensor(
+                (self.settings["theta_on"], self.settings["theta_off"]), dtype=torch.float64
+            )
             * self.log_gain.exp()
         )
 
     def refractory_s(self) -> Tensor | None:
         """Dead time as it is now, 0-dim tensor, or None when there is none."""
-        return None if self.log_dead is None else self.settings["refractory_s"] * self.log_dead.exp()
+        return (
+            None if self.log_dead is None else self.settings["refractory_s"] * self.log_dead.exp()
+        )
 
     def forward(
         self,
@@ -135,24 +143,30 @@ class SpikeEsim(nn.Module):
         """Events of the frames, without noise.
 
         Args:
-          frames: [T, H, W] or [T, B, H, W] linear intensity on the 0-255 scale, finite, >= 0. t_s: [T]
-            seconds.
-          state: SpikeEsimState of the chunk before; then T frames give T intervals. None: T frames give T-1.
-          theta_scale: factor on both thresholds for this call, a number or [2] tensor (ON, OFF): sensitivity
-            at test time.
-        Returns: counts [T-1, 2, ...] whole numbers, ON first; state to carry on. Chunks equal the whole bit
-          for bit on one machine with one number of threads: every step sees the same calls on the same
-          shapes. Batches equal their sequences but for levels within rounding of a threshold.
+          frames: [T, H, W] or [T, B, H, W] linear intensity on the 0-255 scale, finite, >= 0. t_s:
+            [T] seconds.
+          state: SpikeEsimState of the chunk before; then T frames give T intervals. None: T frames
+            give T-1.
+          theta_scale: factor on both thresholds for this call, a number or [2] tensor (ON, OFF):
+            sensitivity at test time.
+        Returns: counts [T-1, 2, ...] whole numbers, ON first; state to carry on. Chunks equal the
+          whole bit for bit on one machine with one number of threads: every step sees the same
+          calls on the same shapes. Batches equal their sequences but for levels within rounding of
+          a threshold.
         Gradient: every parameter but the noise rates, and frames; through the comparator.
-        Raises: ShapeError, DomainError for frames, times or scales that cannot be (NaN and infinity among
-          them).
+        Raises: ShapeError, DomainError for frames, times or scales that cannot be (NaN and infinity
+          among them).
         """
         frames, times_s = _checked(frames, t_s, state)
         try:
             scale = torch.as_tensor(theta_scale, dtype=torch.float64)
         except (TypeError, ValueError, RuntimeError, OverflowError):
             scale = torch.zeros(())
-        if scale.is_meta or scale.shape not in ((), (2,)) or not bool((scale.isfinite() & (scale > 0)).all()):
+        if (
+            scale.is_meta
+            or scale.shape not in ((), (2,))
+            or not bool((scale.isfinite() & (scale > 0)).all())
+        ):
             raise DomainError(
                 f"theta_scale is {shown(theta_scale)}; a finite factor > 0, or one each for ON and "
                 "OFF, is needed."
@@ -183,7 +197,8 @@ class SpikeEsim(nn.Module):
         t_s: Times,
         state: SpikeEsimState | None = None,
     ) -> Tensor:
-        """Mean number of noise events per interval, [T-1, 2, ...] ([T, 2, ...] with a state), ON first.
+        """Mean number of noise events per interval, [T-1, 2, ...] ([T, 2, ...] with a state), ON
+        first.
         Gradient: the noise rates, frames."""
         frames, times_s = _checked(frames, t_s, state)
         if state is not None:
@@ -201,8 +216,8 @@ class SpikeEsim(nn.Module):
         *,
         theta_scale: Tensor | float = 1.0,
     ) -> tuple[Tensor, SpikeEsimState]:
-        """Hard events with noise: ``forward`` plus a Poisson draw of ``expected_noise``. Returns counts and
-        state."""
+        """Hard events with noise: ``forward`` plus a Poisson draw of ``expected_noise``. Returns
+        counts and state."""
         check_generator(generator)
         noise = torch.poisson(self.expected_noise(frames, t_s, state), generator=generator)
         counts, after = self(frames, t_s, state, theta_scale=theta_scale)
@@ -210,15 +225,17 @@ class SpikeEsim(nn.Module):
 
     def save(self, path: str | Path) -> None:
         """Write settings and parameters as an .npz file."""
-        parameters = {name: value.detach().cpu().numpy() for name, value in self.state_dict().items()}
+        parameters = {
+            name: value.detach().cpu().numpy() for name, value in self.state_dict().items()
+        }
         buffer = io.BytesIO()
         np.savez(buffer, **{SETTINGS: np.array(json.dumps(self.settings))}, **parameters)
         write_atomic(check_path(path), buffer.getvalue())
 
     @classmethod
     def load(cls, path: str | Path) -> "SpikeEsim":
-        """A generator that ``save`` wrote. Raises: FileFormatError when the file is missing, damaged or of
-        another kind."""
+        """A generator that ``save`` wrote. Raises: FileFormatError when the file is missing,
+        damaged or of another kind."""
         path = check_path(path)
         stored = read_npz(path, REMEDY)
         with reading(f"'{path}'", REMEDY):
@@ -242,7 +259,9 @@ class SpikeEsim(nn.Module):
         intensity = frames.reshape(len(frames), -1, *frames.shape[-2:])
         # one by one: logarithms of vectors round by their place
         log_level = torch.stack([lin_log(picture[None])[0] for picture in intensity])
-        levels = stepwise(lambda pictures: self.tone(self.prefilter(pictures)), log_level[:, :, None])
+        levels = stepwise(
+            lambda pictures: self.tone(self.prefilter(pictures)), log_level[:, :, None]
+        )
         if state is None:
             filtered = slow = before = levels[0]
             light = intensity[0]
@@ -251,9 +270,13 @@ class SpikeEsim(nn.Module):
             filtered, slow, before = state.filtered, state.slow, state.level
             light = state.frame.reshape(intensity.shape[1:])
             follow = []
-        seen = zip(levels[len(follow) :], intensity[len(follow) :], times_s.diff().tolist(), strict=True)
+        seen = zip(
+            levels[len(follow) :], intensity[len(follow) :], times_s.diff().tolist(), strict=True
+        )
         for now, picture, step_s in seen:
-            filtered = self.bandwidth.advance(filtered, before, now, (light + picture)[:, None] / 2, step_s)
+            filtered = self.bandwidth.advance(
+                filtered, before, now, (light + picture)[:, None] / 2, step_s
+            )
             slow = now + (slow - now) * math.exp(-step_s / SLOW_S)
             follow.append((filtered, slow))
             before = now
@@ -266,7 +289,8 @@ class SpikeEsim(nn.Module):
 
 
 def _checked(frames, t_s, state):
-    """Frames as given and the times of all frames seen by this call, that of the state's last frame first."""
+    """Frames as given and the times of all frames seen by this call, that of the state's last frame
+    first."""
     check_frames(frames, 2 if state is None else 1)
     if frames.ndim not in (3, 4) or min(frames.shape[-2:]) < 2:
         raise ShapeError(

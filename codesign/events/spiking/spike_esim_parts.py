@@ -1,5 +1,5 @@
-"""The learnt parts of Spike-ESIM: noise prefilter, tone curve, bandwidth, a residual branch, noise. Each is
-without effect before it is trained: the identity, or zero."""
+"""The learnt parts of Spike-ESIM: noise prefilter, tone curve, bandwidth, a residual branch, noise.
+Each is without effect before it is trained: the identity, or zero."""
 
 import math
 from collections.abc import Callable
@@ -18,8 +18,8 @@ BRIGHTEST = math.log(256.0)
 
 
 class Prefilter(nn.Module):
-    """Spatial 3x3 filter of the log level with unit gain for an even picture; ``weight`` is what it adds to
-    the identity, less its mean."""
+    """Spatial 3x3 filter of the log level with unit gain for an even picture; ``weight`` is what it
+    adds to the identity, less its mean."""
 
     def __init__(self):
         super().__init__()
@@ -34,8 +34,8 @@ class Prefilter(nn.Module):
 
 
 class ToneCurve(nn.Module):
-    """Monotone change of the level: slope exp(w_k) in each of six stretches of log level, so gain per
-    intensity. Stands also for a dark offset."""
+    """Monotone change of the level: slope exp(w_k) in each of six stretches of log level, so gain
+    per intensity. Stands also for a dark offset."""
 
     def __init__(self):
         super().__init__()
@@ -66,7 +66,8 @@ class Bandwidth(nn.Module):
     def advance(
         self, filtered: Tensor, before: Tensor, now: Tensor, intensity: Tensor, interval_s: float
     ) -> Tensor:
-        """The filter after an interval over which the level runs linearly from ``before`` to ``now``;
+        """The filter after an interval over which the level runs linearly from ``before`` to
+        ``now``;
         intensity: mean over the interval."""
         light = light_share(intensity)
         pace = (2 * math.pi * interval_s) * torch.exp(self.log_cutoff + self.power * light.log())
@@ -79,10 +80,10 @@ class Bandwidth(nn.Module):
 class ResidualBranch(nn.Module):
     """3x3 convolutions with skip connections, from three pictures to a correction of the level.
 
-    width: channels in between. depth: residual blocks. Its last convolution starts at zero, so the branch
-      starts without effect but with a gradient.
-    seed: of the other weights. An even, unchanging picture gets an even, unchanging correction, hence no
-      events.
+    width: channels in between. depth: residual blocks. Its last convolution starts at zero, so the
+      branch starts without effect but with a gradient.
+    seed: of the other weights. An even, unchanging picture gets an even, unchanging correction,
+      hence no events.
     """
 
     INPUTS = 3
@@ -93,7 +94,8 @@ class ResidualBranch(nn.Module):
 
         def drawn(outputs, inputs):
             return nn.Parameter(
-                torch.randn(outputs, inputs, 3, 3, generator=generator) * math.sqrt(2 / (9 * inputs))
+                torch.randn(outputs, inputs, 3, 3, generator=generator)
+                * math.sqrt(2 / (9 * inputs))
             )
 
         self.first = drawn(width, self.INPUTS)
@@ -113,14 +115,14 @@ def _convolved(pictures, weight):
 
 
 def _activated(pictures):
-    """(x + sqrt(x^2 + 1) - 1)/2: smooth, so that a small change of light makes a small change of level; of
-    operations that round alike everywhere."""
+    """(x + sqrt(x^2 + 1) - 1)/2: smooth, so that a small change of light makes a small change of
+    level; of operations that round alike everywhere."""
     return (pictures + (pictures * pictures + 1).sqrt() - 1) / 2
 
 
 class NoiseRate(nn.Module):
-    """rate = a exp(-b light) events per pixel and second, light = (I + 20)/275, one a per polarity; a starts
-    at 0.
+    """rate = a exp(-b light) events per pixel and second, light = (I + 20)/275, one a per polarity;
+    a starts at 0.
 
     amplitude_hz below 0 counts as 0 but keeps its gradient, so that it finds its way back.
     """
@@ -138,16 +140,19 @@ class NoiseRate(nn.Module):
 
 
 def stepwise(function: Callable[[Tensor], Tensor], pictures: Tensor) -> Tensor:
-    """Apply a function of pictures to every step of a sequence, so that chunks of time round as the whole
-    does.
+    """Apply a function of pictures to every step of a sequence, so that chunks of time round as the
+    whole does.
 
-    The matrix products behind a convolution may round by the number of pictures they get and by where these
-    begin in memory (MKL documents equal bits for equal shapes at equally aligned addresses). Every step
-    therefore gets a call of its own, on memory of its own, which torch aligns to 64 bytes.
+    The matrix products behind a convolution may round by the number of pictures they get and by
+    where these begin in memory (MKL documents equal bits for equal shapes at equally aligned
+    addresses). Every step therefore gets a call of its own, on memory of its own, which torch
+    aligns to 64 bytes.
 
     Args:
       function: [B, C, H, W] to [B, C', H, W].
       pictures: [T, B, C, H, W].
     Returns: [T, B, C', H, W]. Gradient: pictures and what the function holds.
     """
-    return torch.stack([function(step.clone(memory_format=torch.contiguous_format)) for step in pictures])
+    return torch.stack(
+        [function(step.clone(memory_format=torch.contiguous_format)) for step in pictures]
+    )

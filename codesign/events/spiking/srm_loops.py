@@ -1,16 +1,17 @@
-"""The spike response model over time as one node of torch's graph: a symbolic drjit loop forward and one
-backward, one lane per pixel (or pair of coupled polarities), in float64 whatever the drive.
+"""The spike response model over time as one node of torch's graph: a symbolic drjit loop forward
+and one backward, one lane per pixel (or pair of coupled polarities), in float64 whatever the drive.
 
-Its kernels are linear recursions with one decay a, one amplitude m and at most two states; no sum is cut:
+Its kernels are linear recursions with one decay a, one amplitude m and at most two states; no sum
+is cut:
 
     pair     q <- a (q + p), p <- a p, y = m q, p <- p + z    y_t = m sum_{k>=1} k a^k z_{t-k}
     early    y = m p, p <- a p + z                            y_t = m sum_{k>=1} a^{k-1} z_{t-k}
     sum      p <- p + z, y = p                                y_t = sum_{k>=0} z_{t-k}
     none     y = z
 
-The adjoint is written by hand, since it needs no state of the layer, only its potential: letting drjit
-differentiate one step after the other (``events.kernels.recursion``) keeps or computes again the states of
-every step: 1.8 times as long, forward and backward, 2 x 128 x 128 pixels, T = 200.
+The adjoint is written by hand, since it needs no state of the layer, only its potential: letting
+drjit differentiate one step after the other (``events.kernels.recursion``) keeps or computes again
+the states of every step: 1.8 times as long, forward and backward, 2 x 128 x 128 pixels, T = 200.
 """
 
 import math
@@ -30,17 +31,18 @@ from codesign.exclusive import exclusive
 STATES = {"pair": 2, "early": 1, "sum": 1, "none": 0}
 RESPONSES = {"none": "none", "alpha": "pair", "step": "sum"}
 RESETS = {"slayer": "pair", "thesis": "early", "exp": "early", "step": "early"}
-# "bounded" keeps rho * sum|nu| at most this: the adjoint then shrinks by 10 % per pass through the reset
+# "bounded" keeps rho * sum|nu| at most this: the adjoint then shrinks by 10 % per pass through the
+# reset
 BOUND = 0.9
-# floats ahead of the potential: where potentials and their gradient share their place in a memory page,
-# backward takes 1.4 times as long
+# floats ahead of the potential: where potentials and their gradient share their place in a memory
+# page, backward takes 1.4 times as long
 STAGGER = 768
 
 
 @dataclass(frozen=True)
 class Coefficients:
-    """Decay a and amplitude m per pixel, and their derivatives with respect to h = dt/tau; tensors of one
-    shape."""
+    """Decay a and amplitude m per pixel, and their derivatives with respect to h = dt/tau; tensors
+    of one shape."""
 
     a: Tensor
     m: Tensor
@@ -55,8 +57,9 @@ def response_coefficients(h: Tensor) -> Coefficients:
 
 
 def reset_coefficients(kernel: str, h: Tensor, amplitude: Tensor) -> Coefficients:
-    """Reset kernel of the given name, for k >= 1, with amplitude = -reset_scale * theta: slayer: amplitude k
-    h exp(1 - k h); thesis: amplitude exp(1 - k h); exp: amplitude exp(-(k - 1) h); step: amplitude."""
+    """Reset kernel of the given name, for k >= 1, with amplitude = -reset_scale * theta: slayer:
+    amplitude k h exp(1 - k h); thesis: amplitude exp(1 - k h); exp: amplitude exp(-(k - 1) h);
+    step: amplitude."""
     a = (-h).exp()
     zero = 0 * h
     if kernel == "slayer":
@@ -70,8 +73,8 @@ def reset_coefficients(kernel: str, h: Tensor, amplitude: Tensor) -> Coefficient
 
 
 def advance(kind, states, a, m, z=None):
-    """One step of the recursion up to its output y; returns y and the states, into whose first one the input
-    z is still to be added (``sum`` and ``none`` take z in at once)."""
+    """One step of the recursion up to its output y; returns y and the states, into whose first one
+    the input z is still to be added (``sum`` and ``none`` take z in at once)."""
     if kind == "pair":
         p, q = states
         q = a * (q + p)
@@ -84,7 +87,8 @@ def advance(kind, states, a, m, z=None):
 
 
 def retreat(kind, adjoint, a, m, y):
-    """Adjoint of the states before a step, from the adjoint after it and the adjoint y of its output."""
+    """Adjoint of the states before a step, from the adjoint after it and the adjoint y of its
+    output."""
     if kind == "pair":
         p = adjoint[0]
         q = adjoint[1] + m * y
@@ -95,8 +99,8 @@ def retreat(kind, adjoint, a, m, y):
 
 
 def retreat_tangent(kind, tangent, adjoint, a, m, da, dm, y):
-    """Derivative of ``retreat`` where a and m move by da and dm, y being held; da None stands for zero
-    (``adjoint`` is then not needed)."""
+    """Derivative of ``retreat`` where a and m move by da and dm, y being held; da None stands for
+    zero (``adjoint`` is then not needed)."""
     moved = retreat(kind, tangent, a, dm, y)
     if da is None:
         return moved
@@ -108,8 +112,10 @@ def retreat_tangent(kind, tangent, adjoint, a, m, da, dm, y):
 
 @dataclass(frozen=True)
 class Setup:
-    """Everything about a call that is not a tensor. response: kind of recursion. kernel: name of the reset.
-    channels: 2 where ON and OFF reset one another, else 1. shape: of the drive as the caller gave it."""
+    """Everything about a call that is not a tensor. response: kind of recursion. kernel: name of
+    the reset.
+    channels: 2 where ON and OFF reset one another, else 1. shape: of the drive as the caller gave
+      it."""
 
     response: str
     kernel: str
@@ -129,8 +135,8 @@ class Setup:
         return reset_coefficients(self.kernel, h_reset, -self.reset_scale * theta)
 
     def reset_sum(self, theta: Tensor, h_reset: Tensor, steps: int) -> Tensor:
-        """Sum of |nu| over all lags, of every pixel, doubled where a spike also lifts the other polarity; a
-        kernel that does not decay is summed over ``steps`` lags."""
+        """Sum of |nu| over all lags, of every pixel, doubled where a spike also lifts the other
+        polarity; a kernel that does not decay is summed over ``steps`` lags."""
         k = self.reset_of(theta, h_reset)
         if self.reset == "pair":
             return self.channels * k.m.abs() * k.a / (1 - k.a) ** 2
@@ -139,12 +145,13 @@ class Setup:
 
 
 class Srm(Function):
-    """Spikes, potential and final states of the layer: ``Srm.apply(setup, drive, theta, h_response, h_reset,
-    response, reset)``.
+    """Spikes, potential and final states of the layer: ``Srm.apply(setup, drive, theta, h_response,
+    h_reset, response, reset)``.
 
-    drive: [T, channels, lanes] float32 or float64, as are spikes and potential. theta, h_response, h_reset:
-    [channels, lanes] float64; h_response None without an alpha response. response, reset: [number of states,
-    channels, lanes] float64.
+    drive: [T, channels, lanes] float32 or float64, as are spikes and potential. theta, h_response,
+      h_reset:
+    [channels, lanes] float64; h_response None without an alpha response. response, reset: [number
+    of states, channels, lanes] float64.
     """
 
     @staticmethod
@@ -159,7 +166,9 @@ class Srm(Function):
         dr.sync_thread()
         if bool(dr.any(bad)):
             check_finite(
-                drive.view(setup.shape), "drive", "remove or repair them, for example by torch.where"
+                drive.view(setup.shape),
+                "drive",
+                "remove or repair them, for example by torch.where",
             )
             raise NonFiniteError(
                 "the potential of events.srm overflows; scale the drive down (events.drive_scale proposes a "
@@ -182,8 +191,8 @@ class Srm(Function):
 
 @exclusive
 def _backward(setup, saved, grads, need):
-    """Gradients of drive, theta, h_response, h_reset, response and reset; the initial states add their share
-    to those of the parameters."""
+    """Gradients of drive, theta, h_response, h_reset, response and reset; the initial states add
+    their share to those of the parameters."""
     drive, theta, h_response, h_reset, response, reset, spikes, potential = saved
     loops = _Loops(setup, drive, theta, h_response, h_reset)
     dr = loops.dr
@@ -200,7 +209,9 @@ def _backward(setup, saved, grads, need):
     dr.sync_thread()
 
     def rows(name):
-        columns = [torch.stack([x.torch() for x in part[name]]) for part in carried if part.get(name)]
+        columns = [
+            torch.stack([x.torch() for x in part[name]]) for part in carried if part.get(name)
+        ]
         return torch.stack(columns, 1) if columns else theta.new_zeros(0, *theta.shape)
 
     def parameter(name, initial):
@@ -217,8 +228,8 @@ def _backward(setup, saved, grads, need):
 
 
 class _Loops(Lanes):
-    """The drjit side of one call: per-pixel numbers of every channel, and the loops. Numbers are evaluated
-    or opaque, so that no call compiles anew."""
+    """The drjit side of one call: per-pixel numbers of every channel, and the loops. Numbers are
+    evaluated or opaque, so that no call compiles anew."""
 
     def __init__(self, setup, drive, theta, h_response, h_reset):
         self.steps, self.channels, lanes = drive.shape
@@ -242,8 +253,8 @@ class _Loops(Lanes):
         return self.Double(self.at(flat, step * self.channels + channel))
 
     def numbers(self, **more):
-        """Per channel, thresholds, decays and amplitudes [lanes] by name; ``more``: columns [channels,
-        lanes] besides."""
+        """Per channel, thresholds, decays and amplitudes [lanes] by name; ``more``: columns
+        [channels, lanes] besides."""
         columns = {"theta": self.theta, "reset_a": self.reset.a, "reset_m": self.reset.m, **more}
         if self.response:
             columns |= {"response_a": self.response.a, "response_m": self.response.m}
@@ -254,7 +265,8 @@ class _Loops(Lanes):
         ]
 
     def split(self, response, reset):
-        """Per channel, the states of response and reset [states, channels, lanes] as drjit arrays [lanes]."""
+        """Per channel, the states of response and reset [states, channels, lanes] as drjit arrays
+        [lanes]."""
         return [
             [[load(self.Double, row[k]) for row in rows] for rows in (response, reset)]
             for k in range(self.channels)
@@ -274,7 +286,8 @@ class _Loops(Lanes):
 
         Args:
           states: per channel, of response and reset.
-        Returns: the states after the last step, and per lane whether something became NaN or infinite.
+        Returns: the states after the last step, and per lane whether something became NaN or
+          infinite.
         """
         dr, setup = self.dr, self.setup
         Single, Double = self.arr.Float, self.Double
@@ -313,9 +326,9 @@ class _Loops(Lanes):
         return states, bad
 
     def after(self, need, grad_response, grad_reset):
-        """Per channel, what the loop backward carries, after the last step, by name: adjoints of the states
-        of response and reset; where wanted, derivatives of those by h or theta (tangents), and gradients
-        gathered so far (sums)."""
+        """Per channel, what the loop backward carries, after the last step, by name: adjoints of
+        the states of response and reset; where wanted, derivatives of those by h or theta
+        (tangents), and gradients gathered so far (sums)."""
         setup = self.setup
         _, theta, response, reset, _, reset_state = need
         through = setup.through_reset != "off" or reset or reset_state
@@ -361,7 +374,8 @@ class _Loops(Lanes):
         surrogate = self.surrogate(Single)
 
         def through_threshold(t, k, n, part):
-            """Gradient of the potential of one channel, and its share that came through the spike."""
+            """Gradient of the potential of one channel, and its share that came through the
+            spike."""
             x = Single(self.read(flat["potential"], t, k) - n["theta"])
             # no better known than the stored potential
             rho = Double(setup.surrogate.density(surrogate[0], x, *surrogate[1:]))
@@ -384,10 +398,14 @@ class _Loops(Lanes):
                 tangent, total = part["response_tangent"], part["response_sum"][0]
                 after["response_sum"] = [total + self.read(self.drive, t, k) * tangent[0]]
                 by_h = n["response_a_h"], n["response_m_h"]
-                after["response_tangent"] = retreat_tangent(kind, tangent, adjoint, *coefficients, *by_h, y)
+                after["response_tangent"] = retreat_tangent(
+                    kind, tangent, adjoint, *coefficients, *by_h, y
+                )
             if flat["grad_drive"] is not None:
                 # what a response takes in at once reaches its output in the same step
-                of_drive = y if kind == "none" else after["response"][0] if kind == "sum" else adjoint[0]
+                of_drive = (
+                    y if kind == "none" else after["response"][0] if kind == "sum" else adjoint[0]
+                )
                 self.put(flat["grad_drive"], Single(of_drive), t * self.channels + k)
             return after
 

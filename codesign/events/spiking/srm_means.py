@@ -1,22 +1,23 @@
-"""The gradients of mean spikes: of the spike response layer with resets that fade, and of the one that
-memorises a level.
+"""The gradients of mean spikes: of the spike response layer with resets that fade, and of the one
+that memorises a level.
 
-**Mean**, of resets that fade: that of the mean response of many noisy neurons, by the age of their last
-spike. All neurons of a pixel see one response v; a share P_k of them spiked last k steps ago, and carries
-the mean states of its resets. Where u = v + reset comes near theta a neuron spikes at the rate PACE / tau_r
-ln(1 + exp(x)), x = (u - theta) / (WIDTH theta): of each age the share F = 1 - exp(-dt rate) spikes in a step
-and goes to age 0; the others grow older, into a last age that holds all that are older still. The mean
-spikes, sum_k P_k F_k, are a smooth function of the response, and their gradient is exact. The equations are
-those of a population of neurons with escape noise: Gerstner and Kistler, Spiking Neuron Models, 2002, section
-6.2, with the resets of earlier spikes as a mean per age. For dt = tau_r / PACE the share is a logistic
-function of x.
+**Mean**, of resets that fade: that of the mean response of many noisy neurons, by the age of their
+last spike. All neurons of a pixel see one response v; a share P_k of them spiked last k steps ago,
+and carries the mean states of its resets. Where u = v + reset comes near theta a neuron spikes at
+the rate PACE / tau_r ln(1 + exp(x)), x = (u - theta) / (WIDTH theta): of each age the share F = 1 -
+exp(-dt rate) spikes in a step and goes to age 0; the others grow older, into a last age that holds
+all that are older still. The mean spikes, sum_k P_k F_k, are a smooth function of the response, and
+their gradient is exact. The equations are those of a population of neurons with escape noise:
+Gerstner and Kistler, Spiking Neuron Models, 2002, section 6.2, with the resets of earlier spikes as
+a mean per age. For dt = tau_r / PACE the share is a logistic function of x.
 
-**Play**, of coupled polarities with step kernels: that of the mean count of ``events.memory``, for a level
-that runs no faster than one threshold per step. Such a layer fires at most once a step and polarity; what is
-left of a larger step fires in the steps after it. With the memorised level r spread evenly over one
-threshold C below the edge E of the last engaged step, all pixels fire once where the level exceeds E + C,
-and r then fills the C below E + C: as if the level itself had stopped there. For C_on = C_off the mean is
-exact; otherwise E is the edge of a play of their mean width.
+**Play**, of coupled polarities with step kernels: that of the mean count of ``events.memory``, for
+a level that runs no faster than one threshold per step. Such a layer fires at most once a step and
+polarity; what is left of a larger step fires in the steps after it. With the memorised level r
+spread evenly over one threshold C below the edge E of the last engaged step, all pixels fire once
+where the level exceeds E + C, and r then fills the C below E + C: as if the level itself had
+stopped there. For C_on = C_off the mean is exact; otherwise E is the edge of a play of their mean
+width.
 """
 
 import math
@@ -31,7 +32,8 @@ from codesign.events.kernels import beyond, recursion
 from codesign.events.layers.memory import memory
 from codesign.events.spiking.srm_loops import RESETS, STATES, advance, reset_coefficients
 
-# of the noise, in thresholds; a narrower one is nearer to hard spikes, and its gradient more erratic
+# of the noise, in thresholds; a narrower one is nearer to hard spikes, and its gradient more
+# erratic
 WIDTH = 0.087
 PACE = 1.2  # spikes per tau_r and x, far above the threshold
 MEAN_AGE = 3.0  # of the last spike before the first step, in time constants of the reset
@@ -42,9 +44,9 @@ MOST_AGES = 64
 
 
 def check_mean(kernel, coupled, others, state):
-    """Raises: DomainError where the neurons of a pixel have no mean response of this kind, an argument of
-    surrogates is given (others: name -> (value, default)), or a state comes from a layer with another
-    gradient."""
+    """Raises: DomainError where the neurons of a pixel have no mean response of this kind, an
+    argument of surrogates is given (others: name -> (value, default)), or a state comes from a
+    layer with another gradient."""
     if kernel == "step":
         raise DomainError(
             "gradient 'mean' goes with a reset that fades ('slayer', 'thesis' or 'exp'), got kernel 'step'; "
@@ -82,8 +84,8 @@ def mean_spikes(
       response: [T, ...] of the drive, before any reset.
       theta, h_reset: threshold and dt / tau_r, positive, broadcasting over [...].
       before: [1 + states, ages, ...] of the chunk before, or None.
-    Returns: [T, ...] in 0 to 1; shares and states of the ages to carry on, with their graph. Gradient:
-      response, theta, h_reset, before.
+    Returns: [T, ...] in 0 to 1; shares and states of the ages to carry on, with their graph.
+      Gradient: response, theta, h_reset, before.
     """
     pixels = response.shape[1:]
     kind = RESETS[kernel]
@@ -102,13 +104,15 @@ def mean_spikes(
     pace = PACE * h_reset.detach()
     numbers = torch.stack((theta, reset.a, reset.m, pace))
     flat = response.reshape(len(response), -1)
-    mean, after = recursion(partial(_step, kind, count), flat, numbers, before.reshape(-1, flat.shape[1]))
+    mean, after = recursion(
+        partial(_step, kind, count), flat, numbers, before.reshape(-1, flat.shape[1])
+    )
     return mean.reshape(response.shape), after.reshape(wanted)
 
 
 def rested(ages: int, states: int, h: Tensor) -> Tensor:
-    """[1 + states, ages, ...] shares and reset states of neurons that spiked last at a random time, MEAN_AGE
-    time constants ago on average. h: [...] dt/tau of the reset."""
+    """[1 + states, ages, ...] shares and reset states of neurons that spiked last at a random time,
+    MEAN_AGE time constants ago on average. h: [...] dt/tau of the reset."""
     # in time constants
     age = torch.arange(ages, dtype=h.dtype, device=h.device).reshape(-1, *[1] * h.ndim) * h
     older = (-age / MEAN_AGE).exp()
@@ -155,7 +159,9 @@ def _step(kind, ages, dr, response, numbers, flat):
 def _mixed(shares, carried):
     """Mean states of some ages."""
     total = sum(shares) + TINY * len(shares)
-    weighted = [[(share + TINY) * x for x in states] for share, states in zip(shares, carried, strict=True)]
+    weighted = [
+        [(share + TINY) * x for x in states] for share, states in zip(shares, carried, strict=True)
+    ]
     return [sum(column) / total for column in zip(*weighted, strict=True)]
 
 
@@ -164,8 +170,8 @@ def with_play(spikes, level, theta_on, theta_off, state):
 
     Args:
       spikes: [T-1, 2, ...] of a level [T, ...], or [T, 2, ...] with a state of the chunk before.
-    Returns: the same spikes; state to carry on, with its graph: that of ``events.memory``, and the centre [...]
-      of the play that holds the level back. Gradient: level, thetas, state.
+    Returns: the same spikes; state to carry on, with its graph: that of ``events.memory``, and the
+      centre [...] of the play that holds the level back. Gradient: level, thetas, state.
     """
     now = level if state is not None else level[1:]
     before, centre = (level[0], level[0]) if state is None else state
@@ -180,8 +186,8 @@ def held_back(
     theta_on: Tensor,
     theta_off: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """The level [T, ...], held back to one threshold beyond a play, and the centre [...] of the play after
-    it."""
+    """The level [T, ...], held back to one threshold beyond a play, and the centre [...] of the
+    play after it."""
     pixels = level.shape[1:]
     numbers = torch.stack([theta.expand(pixels).reshape(-1) for theta in (theta_on, theta_off)])
     slow, after = recursion(_follow, level.reshape(len(level), -1), numbers, centre.reshape(1, -1))
@@ -189,7 +195,8 @@ def held_back(
 
 
 def _follow(dr, level, thetas, centres):
-    """One step: a play as wide as the mean threshold is pushed by the level, by no more than a threshold."""
+    """One step: a play as wide as the mean threshold is pushed by the level, by no more than a
+    threshold."""
     on, off = thetas
     (centre,) = centres
     half = (on + off) * 0.25

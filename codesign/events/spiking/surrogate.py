@@ -1,8 +1,9 @@
-"""Surrogate derivatives of the spike, with the antiderivative that makes an exact smooth twin of the layer.
+"""Surrogate derivatives of the spike, with the antiderivative that makes an exact smooth twin of
+the layer.
 
-A surrogate is the density rho(x) that stands in for the derivative of the step at x = u - theta. Its integral
-from -infinity replaces the step in the smooth twin, whose gradient is therefore exact. All three have their
-largest value 1/alpha at the threshold and the width 1/beta.
+A surrogate is the density rho(x) that stands in for the derivative of the step at x = u - theta.
+Its integral from -infinity replaces the step in the smooth twin, whose gradient is therefore exact.
+All three have their largest value 1/alpha at the threshold and the width 1/beta.
 """
 
 import math
@@ -34,8 +35,8 @@ TORCH = Operations(torch.exp2, torch.abs, lambda x, floor: x.clamp_min(floor), t
 
 @dataclass(frozen=True)
 class Surrogate:
-    """Height 1/alpha at the threshold (alpha in spikes^-1 times potential units), width 1/beta in potential
-    units.
+    """Height 1/alpha at the threshold (alpha in spikes^-1 times potential units), width 1/beta in
+    potential units.
 
     Raises: DomainError when alpha or beta is not a positive finite number.
     """
@@ -50,8 +51,8 @@ class Surrogate:
 
     @classmethod
     def unit(cls, width: float) -> Self:
-        """The surrogate of the given width in potential units whose integral is 1, like that of the step's
-        true derivative."""
+        """The surrogate of the given width in potential units whose integral is 1, like that of the
+        step's true derivative."""
         width = check_positive(width, f"{cls.__name__}.unit: width")
         return cls(cls.mass * width, 1 / width)
 
@@ -70,8 +71,8 @@ class Surrogate:
         return self.density(TORCH, _real(x), *astuple(self))
 
     def torch_integral(self, x: Tensor) -> Tensor:
-        """Integral of rho up to a torch tensor x of real numbers, differentiable. Raises: DomainError for
-        anything else."""
+        """Integral of rho up to a torch tensor x of real numbers, differentiable. Raises:
+        DomainError for anything else."""
         return self.integral(TORCH, _real(x), *astuple(self))
 
 

@@ -1,5 +1,5 @@
-"""The spiking network of the thesis: brightness steps, one 3x3 convolution per polarity, a spike response
-threshold."""
+"""The spiking network of the thesis: brightness steps, one 3x3 convolution per polarity, a spike
+response threshold."""
 
 from dataclasses import dataclass
 
@@ -18,26 +18,26 @@ MOST_CHANNELS = 1024
 
 @dataclass(frozen=True)
 class BranchState:
-    """What the network carries over chunks. frame: [C, H, W] last frame; neurons: SrmState of the spike
-    response layer."""
+    """What the network carries over chunks. frame: [C, H, W] last frame; neurons: SrmState of the
+    spike response layer."""
 
     frame: Tensor
     neurons: SrmState
 
 
 class TwoBranchSpikes(nn.Module):
-    """ON and OFF spikes of +dI and -dI, each through its own convolution and threshold: 9 weights per channel
-    and branch, no bias, no shared weight.
+    """ON and OFF spikes of +dI and -dI, each through its own convolution and threshold: 9 weights
+    per channel and branch, no bias, no shared weight.
 
-    It has no memory of brightness: a change that is too slow to reach the threshold within the reset's time
-    never gives an event.
+    It has no memory of brightness: a change that is too slow to reach the threshold within the
+    reset's time never gives an event.
 
-    channels: 3 for RGB, 1 for monochrome frames. theta: threshold > 0. tau_r: time constant of the reset, in
-      the unit of dt. dt: length of a step.
+    channels: 3 for RGB, 1 for monochrome frames. theta: threshold > 0. tau_r: time constant of the
+      reset, in the unit of dt. dt: length of a step.
     kernel, surrogate, through_reset: as for ``events.srm``; the thesis's own reset is
       "thesis".
-    seed: of the weights, uniform in 0 to 1 over their number, so that ON starts as brighter and OFF as
-      darker.
+    seed: of the weights, uniform in 0 to 1 over their number, so that ON starts as brighter and OFF
+      as darker.
     """
 
     def __init__(
@@ -59,7 +59,9 @@ class TwoBranchSpikes(nn.Module):
                 check_positive(value, name)
         channels = check_whole(channels, "channels", 1, MOST_CHANNELS)
         seed = check_seed(seed, "seed")
-        draw = torch.rand(2, channels, 3, 3, generator=torch.Generator().manual_seed(seed)) / (9 * channels)
+        draw = torch.rand(2, channels, 3, 3, generator=torch.Generator().manual_seed(seed)) / (
+            9 * channels
+        )
         self.weight_on = nn.Parameter(draw[0])
         self.weight_off = nn.Parameter(draw[1])
         self.theta = theta
@@ -82,11 +84,12 @@ class TwoBranchSpikes(nn.Module):
 
         Args:
           frames: [T, C, H, W], or [T, H, W] with one channel; linear intensity in any unit, finite.
-          state: BranchState of the chunk before; then T frames give T steps. None: at rest, T frames give T-1
-            steps.
+          state: BranchState of the chunk before; then T frames give T steps. None: at rest, T
+            frames give T-1 steps.
           theta: threshold for this call; None: the one of the network.
-        Returns: spikes and potential [T-1, 2, H, W] ([T, 2, H, W] with a state), ON first; BranchState to
-          carry on. Chunks equal the whole bit for bit on one machine with one number of threads.
+        Returns: spikes and potential [T-1, 2, H, W] ([T, 2, H, W] with a state), ON first;
+          BranchState to carry on. Chunks equal the whole bit for bit on one machine with one number
+          of threads.
         Gradient: weights and frames, by the surrogate.
         Raises: ShapeError for other shapes or too few frames; DomainError for NaN or infinity.
         """
@@ -104,10 +107,11 @@ class TwoBranchSpikes(nn.Module):
 
     @torch.no_grad()
     def wake(self, frames: Tensor, share: float = 0.05) -> None:
-        """Scale the weights of either branch so that ``share`` of its potentials reaches the threshold on
-        these frames: training never starts dead.
+        """Scale the weights of either branch so that ``share`` of its potentials reaches the
+        threshold on these frames: training never starts dead.
 
-        Raises: DomainError when the frames are too silent for any scale (see ``events.drive_scale``).
+        Raises: DomainError when the frames are too silent for any scale (see
+          ``events.drive_scale``).
         """
         drive, _ = self._drive(frames, None)
         for branch, weight in enumerate((self.weight_on, self.weight_off)):
@@ -129,6 +133,8 @@ class TwoBranchSpikes(nn.Module):
         weights = (self.weight_on, -self.weight_off)
 
         def convolved(pictures):
-            return torch.cat([torch.conv2d(pictures, w[None].to(pictures), padding=1) for w in weights], 1)
+            return torch.cat(
+                [torch.conv2d(pictures, w[None].to(pictures), padding=1) for w in weights], 1
+            )
 
         return stepwise(convolved, steps[:, None])[:, 0], frames[-1]

@@ -1,6 +1,6 @@
-"""Optical flow between two frames, both ways, from coarse to fine: total variation of the flow against the
-absolute brightness difference at every scale, and block matches at a coarse one, which find what a coarse
-picture no longer shows.
+"""Optical flow between two frames, both ways, from coarse to fine: total variation of the flow
+against the absolute brightness difference at every scale, and block matches at a coarse one, which
+find what a coarse picture no longer shows.
 """
 
 import math
@@ -26,11 +26,12 @@ STILLNESS = 5e-4  # log units per pixel: of equals the smaller displacement is t
 BETTER = 0.7
 MARGIN = 0.02
 AGREEMENT_PX = 1.5  # and where both directions agree
-# on the 0-255 scale: flow is found on ln(I + 12), so that dark edges count about as the sensor sees them
+# on the 0-255 scale: flow is found on ln(I + 12), so that dark edges count about as the sensor sees
+# them
 DARK_OFFSET = 12.0
 SMALLEST_PX = 12  # shorter side of the coarsest scale
-# matches are sought at the first scale whose shorter side is at most this: there they reach a ninth of it or
-# more
+# matches are sought at the first scale whose shorter side is at most this: there they reach a ninth
+# of it or more
 MATCHED_PX = 80
 PREFILTER_PX = 1.04  # standard deviation of the blur before every halving
 WARPS = 4
@@ -53,8 +54,8 @@ def sampled(pictures, displacement_px, mode="bicubic"):
     Args:
       pictures: [B, C, H, W].
       displacement_px: [B, 2, H, W], +x right, +y down.
-      mode: "bicubic" (Keys' kernel with -0.75: sharp, and off by at most 0.048 px on a slope), "bilinear" or
-        "nearest".
+      mode: "bicubic" (Keys' kernel with -0.75: sharp, and off by at most 0.048 px on a slope),
+        "bilinear" or "nearest".
     Gradient: pictures (linear in them), and the displacement.
     """
     height, width = pictures.shape[-2:]
@@ -70,16 +71,18 @@ def sampled(pictures, displacement_px, mode="bicubic"):
 
 
 def inside(displacement_px):
-    """[B, 1, H, W] 1 where a pixel plus its displacement lies in the picture, to its edge half a pixel from
-    the outermost centres, else 0."""
+    """[B, 1, H, W] 1 where a pixel plus its displacement lies in the picture, to its edge half a
+    pixel from the outermost centres, else 0."""
     at = places(displacement_px) + displacement_px
-    size = torch.tensor([at.shape[-1], at.shape[-2]], dtype=at.dtype, device=at.device)[:, None, None]
+    size = torch.tensor([at.shape[-1], at.shape[-2]], dtype=at.dtype, device=at.device)[
+        :, None, None
+    ]
     return ((at >= -0.5) & (at <= size - 0.5)).all(1, keepdim=True).to(at.dtype)
 
 
 def splatted(values, displacement_px):
-    """Sum of what lands on every pixel when each value moves by its displacement and is shared among the four
-    pixels around its place.
+    """Sum of what lands on every pixel when each value moves by its displacement and is shared
+    among the four pixels around its place.
 
     Args:
       values: [H, W, C].
@@ -110,12 +113,12 @@ def refined(first, second, flow, warps, iterations):
 
     Args:
       first, second: [B, 1, H, W] log levels. flow: [B, 2, H, W] guess, pixels, +x right, +y down.
-      warps: how often the brightness difference is made linear about the current flow. iterations: of the
-        solver in between.
+      warps: how often the brightness difference is made linear about the current flow. iterations:
+        of the solver in between.
     Returns: [B, 2, H, W]. Where the flow leaves the picture it follows its neighbours.
-    Source: Zach, Pock and Bischof, A duality based approach for realtime TV-L1 optical flow, DAGM 2007;
-      gradients averaged over both pictures and a median_of_nine filter between warps as in Wedel et al., An
-      improved algorithm for TV-L1 optical flow, 2009.
+    Source: Zach, Pock and Bischof, A duality based approach for realtime TV-L1 optical flow, DAGM
+      2007; gradients averaged over both pictures and a median_of_nine filter between warps as in
+      Wedel et al., An improved algorithm for TV-L1 optical flow, 2009.
     """
     dual_x = torch.zeros_like(flow)
     dual_y = torch.zeros_like(flow)
@@ -152,8 +155,8 @@ def _iterate(flow, dual_x, dual_y, data, buffers):
     """One step of the data term, one of the smoothness, in place.
 
     Args:
-      data: of the brightness difference constant + gradient . flow, these two, the step along it, and its
-        bounds.
+      data: of the brightness difference constant + gradient . flow, these two, the step along it,
+        and its bounds.
       buffers: five tensors to work in; the last column and row of the last two stay 0.
     """
     constant, gradient, step, most, least = data
@@ -168,7 +171,9 @@ def _iterate(flow, dual_x, dual_y, data, buffers):
     flow.addcmul_(residual, step, value=-1).add_(divergence, alpha=COUPLING)
     torch.sub(flow[..., 1:], flow[..., :-1], out=across[..., :-1])
     torch.sub(flow[..., 1:, :], flow[..., :-1, :], out=down[..., :-1, :])
-    torch.mul(across, across, out=size).addcmul_(down, down).sqrt_().mul_(DUAL_STEP / COUPLING).add_(1)
+    torch.mul(across, across, out=size).addcmul_(down, down).sqrt_().mul_(
+        DUAL_STEP / COUPLING
+    ).add_(1)
     dual_x.add_(across, alpha=DUAL_STEP / COUPLING).div_(size)
     dual_y.add_(down, alpha=DUAL_STEP / COUPLING).div_(size)
 
@@ -187,11 +192,14 @@ def with_matches(levels, flow):
       levels: [2, 1, H, W] log levels of both frames.
       flow: [2, 2, H, W] from the first to the second, and back, pixels of this scale.
     Returns: [2, 2, H, W].
-    Source: the idea of Xu, Jia and Matsushita, Motion detail preserving optical flow estimation, 2012.
+    Source: the idea of Xu, Jia and Matsushita, Motion detail preserving optical flow estimation,
+      2012.
     """
     found = _best(levels)
     better = _misfit(levels, found) < BETTER * _misfit(levels, flow) - MARGIN
-    agree = (found + sampled(found.flip(0), found, "bilinear")).norm(dim=1, keepdim=True) <= AGREEMENT_PX
+    agree = (found + sampled(found.flip(0), found, "bilinear")).norm(
+        dim=1, keepdim=True
+    ) <= AGREEMENT_PX
     return torch.where(better & agree, found, flow)
 
 
@@ -201,9 +209,13 @@ def _best(levels):
     least = torch.full_like(levels, math.inf)
     chosen = torch.zeros_like(levels)
     steps = range(-RADIUS_PX, RADIUS_PX + 1)
-    moves = torch.tensor([(x, y) for y in steps for x in steps], dtype=levels.dtype, device=levels.device)
+    moves = torch.tensor(
+        [(x, y) for y in steps for x in steps], dtype=levels.dtype, device=levels.device
+    )
     for index, (x, y) in enumerate((x, y) for y in steps for x in steps):
-        shifted = other[..., RADIUS_PX + y : RADIUS_PX + y + height, RADIUS_PX + x : RADIUS_PX + x + width]
+        shifted = other[
+            ..., RADIUS_PX + y : RADIUS_PX + y + height, RADIUS_PX + x : RADIUS_PX + x + width
+        ]
         cost = _mean((levels - shifted).abs_().clamp_(max=MOST)).add_(STILLNESS * math.hypot(x, y))
         better = cost < least
         least = torch.where(better, cost, least)
@@ -225,8 +237,8 @@ def flow_both_ways(first, second):
 
     Args:
       first, second: [H, W] linear intensity on the 0-255 scale.
-    Returns: [2, 2, H, W]: from the first to the second, and from the second to the first; pixels, +x right,
-      +y down. Exactly 0 for equal frames.
+    Returns: [2, 2, H, W]: from the first to the second, and from the second to the first; pixels,
+      +x right, +y down. Exactly 0 for equal frames.
     Gradient: none.
     """
     if torch.equal(first, second):
@@ -244,9 +256,14 @@ def flow_both_ways(first, second):
         size = levels.shape[-2:]
         if flow.shape[-2:] != size:
             growth = torch.tensor(
-                [size[1] / flow.shape[3], size[0] / flow.shape[2]], dtype=flow.dtype, device=flow.device
+                [size[1] / flow.shape[3], size[0] / flow.shape[2]],
+                dtype=flow.dtype,
+                device=flow.device,
             )
-            flow = interpolate(flow, size, mode="bilinear", align_corners=False) * growth[:, None, None]
+            flow = (
+                interpolate(flow, size, mode="bilinear", align_corners=False)
+                * growth[:, None, None]
+            )
         if number == matched:
             flow = with_matches(levels, flow)
         flow = refined(levels, levels.flip(0), flow, WARPS, ITERATIONS)
@@ -254,8 +271,8 @@ def flow_both_ways(first, second):
 
 
 def flow_levels(first, second):
-    """[2, H, W] log levels of two frames [H, W] in which motion is looked for; light that changed everywhere
-    alike (their median) is taken out."""
+    """[2, H, W] log levels of two frames [H, W] in which motion is looked for; light that changed
+    everywhere alike (their median) is taken out."""
     levels = (torch.stack((first, second)).detach() + DARK_OFFSET).log()
     levels[1] -= (levels[1] - levels[0]).median()
     return levels

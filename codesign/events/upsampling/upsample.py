@@ -1,5 +1,6 @@
-"""Video to a higher frame rate, so that events see motion and not jumps: frames between frames, each scene
-point on its straight way from one to the other, hidden ones taken from the frame that shows them.
+"""Video to a higher frame rate, so that events see motion and not jumps: frames between frames,
+each scene point on its straight way from one to the other, hidden ones taken from the frame that
+shows them.
 """
 
 import math
@@ -15,7 +16,14 @@ from codesign.checks import FLOATS, check, check_number, check_positive, check_w
 from codesign.errors import DomainError, ShapeError
 from codesign.events.entry import Times, check_times
 from codesign.events.intensity import lin_log
-from codesign.events.upsampling.flow import blurred, flow_both_ways, flow_levels, inside, sampled, splatted
+from codesign.events.upsampling.flow import (
+    blurred,
+    flow_both_ways,
+    flow_levels,
+    inside,
+    sampled,
+    splatted,
+)
 
 DOUBTED = 0.5  # visibility below which the flow of a pixel is replaced
 SAMPLES = 4  # on each side: a neighbourhood is looked at in 9 x 9 places
@@ -41,12 +49,12 @@ def repaired(levels, flows, seen):
     """Flow with the values of doubted pixels replaced.
 
     Args:
-      levels: [2, H, W] log levels of both frames. flows: [2, 2, H, W] both ways. seen: [2, H, W] visibility
-        of either frame in the other.
-    Returns: [2, 2, H, W]: in doubted pixels the median of the flow over seen pixels around, weighted by
-      visibility, likeness and nearness.
-    Source: weighted median of Sun, Roth and Black, Secrets of optical flow estimation and their principles,
-      CVPR 2010, section 5.
+      levels: [2, H, W] log levels of both frames. flows: [2, 2, H, W] both ways. seen: [2, H, W]
+        visibility of either frame in the other.
+    Returns: [2, 2, H, W]: in doubted pixels the median of the flow over seen pixels around,
+      weighted by visibility, likeness and nearness.
+    Source: weighted median of Sun, Roth and Black, Secrets of optical flow estimation and their
+      principles, CVPR 2010, section 5.
     """
     height, width = levels.shape[-2:]
     spread_px = float((flows.amax((2, 3)) - flows.amin((2, 3))).max())
@@ -68,7 +76,9 @@ def repaired(levels, flows, seen):
             found = vote.sum(1) > 0
             for component in range(2):
                 flow[component, y, x] = torch.where(
-                    found, _weighted_median(old[component].flatten()[at], vote), old[component, y, x]
+                    found,
+                    _weighted_median(old[component].flatten()[at], vote),
+                    old[component, y, x],
                 )
     return flows
 
@@ -97,14 +107,14 @@ def between(first, second, flows, seen, share):
     """The frame at a share of the interval between two frames.
 
     Args:
-      first, second: [H, W] linear intensity. flows: [2, 2, H, W] from ``flow_both_ways``. seen: [2, H, W]
-        from ``visibility``. share: 0..1.
-    Returns: [H, W]. What the bicubic kernel makes darker or brighter than all nine pixels around is set to
-      the darkest or brightest of them: next to a sharp edge its overshoot would be many thresholds of a dark
-      pixel.
+      first, second: [H, W] linear intensity. flows: [2, 2, H, W] from ``flow_both_ways``. seen:
+        [2, H, W] from ``visibility``. share: 0..1.
+    Returns: [H, W]. What the bicubic kernel makes darker or brighter than all nine pixels around is
+      set to the darkest or brightest of them: next to a sharp edge its overshoot would be many
+      thresholds of a dark pixel.
     Gradient: first and second (piecewise linear in them), for fixed flows.
-    Source: flow carried forward to the time asked for, Baker et al., A database and evaluation methodology
-      for optical flow, 2011, section 3.3.
+    Source: flow carried forward to the time asked for, Baker et al., A database and evaluation
+      methodology for optical flow, 2011, section 3.3.
     """
     motion, weight = _motion_at(flows, seen, share)
     pictures = torch.stack((first, second))[:, None]
@@ -120,11 +130,13 @@ def between(first, second, flows, seen, share):
 
 @torch.no_grad()
 def _motion_at(flows, seen, share):
-    """Motion per interval [2, H, W] of what is seen at a time in between, and how much either frame knows of
-    it, [2, H, W]."""
+    """Motion per interval [2, H, W] of what is seen at a time in between, and how much either frame
+    knows of it, [2, H, W]."""
     carried = []
     for flow, weight, part in ((flows[0], seen[0], share), (-flows[1], seen[1], share - 1)):
-        carried.append(splatted(torch.cat((flow * weight, weight[None])).permute(1, 2, 0), part * flow))
+        carried.append(
+            splatted(torch.cat((flow * weight, weight[None])).permute(1, 2, 0), part * flow)
+        )
     total = carried[0] + carried[1]
     motion = total[..., :2].permute(2, 0, 1)
     mass = total[..., 2]
@@ -141,7 +153,9 @@ def _motion_at(flows, seen, share):
         empty = empty & (spread[2] <= LEAST)
         width = 2 * width
     weight = torch.stack([each[..., 2] for each in carried]).clamp(max=1)
-    return motion, torch.where(weight.sum(0) < LEAST, torch.ones_like(weight), weight.clamp(min=LEAST**2))
+    return motion, torch.where(
+        weight.sum(0) < LEAST, torch.ones_like(weight), weight.clamp(min=LEAST**2)
+    )
 
 
 def largest(values):
@@ -151,8 +165,8 @@ def largest(values):
 
 
 def steps_for(amount, bound, what, max_steps, start_s, end_s):
-    """Least number of equal steps that keep ``amount`` within ``bound`` each. Raises: DomainError when that
-    takes more than ``max_steps``."""
+    """Least number of equal steps that keep ``amount`` within ``bound`` each. Raises: DomainError
+    when that takes more than ``max_steps``."""
     count = max(1.0, amount / bound * (1 - 1e-6))
     if count > max_steps:
         raise DomainError(
@@ -171,27 +185,30 @@ def upsample(
     max_log_change: float | None = None,
     max_steps: int = MAX_STEPS,
 ) -> tuple[Tensor, Tensor]:
-    """Put frames between the frames of a video until nothing moves further than a bound from one to the next.
+    """Put frames between the frames of a video until nothing moves further than a bound from one to
+    the next.
 
-    Frames are taken as instantaneous: blur of an exposure is moved along and not undone. Motion is straight
-    and even between two frames, and light changes evenly along it. Each interval gets as many steps as its
-    own motion asks for.
+    Frames are taken as instantaneous: blur of an exposure is moved along and not undone. Motion is
+    straight and even between two frames, and light changes evenly along it. Each interval gets as
+    many steps as its own motion asks for.
 
     Args:
       frames: [T, H, W] linear intensity on the 0-255 scale, finite, >= 0.
       t_s: [T] frame times, seconds, strictly increasing.
-      max_displacement_px: how far 99.9 % of the pixels move at most per step, by the flow found, > 0.
-      max_log_change: how far the lin-log level of 99.9 % of the pixels moves at most per step, natural log
-        units, > 0; None: not asked.
+      max_displacement_px: how far 99.9 % of the pixels move at most per step, by the flow found, >
+        0.
+      max_log_change: how far the lin-log level of 99.9 % of the pixels moves at most per step,
+        natural log units, > 0; None: not asked.
       max_steps: most steps per interval that may be needed.
-    Returns: frames [T', H, W] and times [T'] float64, the given ones among them exactly. Where two frames are
-      equal, nothing is put between.
-    Gradient: frames, for the flow, visibility and number of steps found, which are held fixed; none to times.
-    Raises: ShapeError for fewer than two frames or other shapes; DomainError for NaN, infinite or negative
-      frames, times that do not increase, bounds that are not positive, or an interval that needs more than
-      max_steps.
-    Source: Gehrig et al., Video to Events, CVPR 2020 (upsampling before event generation); Rebecq et al.,
-      ESIM, CoRL 2018 (both bounds).
+    Returns: frames [T', H, W] and times [T'] float64, the given ones among them exactly. Where two
+      frames are equal, nothing is put between.
+    Gradient: frames, for the flow, visibility and number of steps found, which are held fixed; none
+      to times.
+    Raises: ShapeError for fewer than two frames or other shapes; DomainError for NaN, infinite or
+      negative frames, times that do not increase, bounds that are not positive, or an interval that
+      needs more than max_steps.
+    Source: Gehrig et al., Video to Events, CVPR 2020 (upsampling before event generation); Rebecq
+      et al., ESIM, CoRL 2018 (both bounds).
     """
     check(frames, "T>=2 H W", "frames", FLOATS)
     pieces = list(
@@ -219,8 +236,9 @@ def upsample_stream(
     Args:
       frames: anything that yields frames [H, W].
       t_s: anything that yields as many times. The rest as for ``upsample``.
-    Returns: iterator over (frames [n, H, W], times [n] float64): first the first frame alone, then for each
-      later frame those that lead to it, and itself. Joined they are what ``upsample`` gives, bit for bit.
+    Returns: iterator over (frames [n, H, W], times [n] float64): first the first frame alone, then
+      for each later frame those that lead to it, and itself. Joined they are what ``upsample``
+      gives, bit for bit.
     Raises: as ``upsample``; bounds at once, frames and times when they come.
     """
     max_displacement_px = check_positive(max_displacement_px, "max_displacement_px")
@@ -237,14 +255,18 @@ def _pieces(frames, t_s, max_displacement_px, max_log_change, max_steps):
     sizes = {}
     for index, (frame, time_s) in enumerate(zip_longest(frames, t_s)):
         if frame is None or time_s is None:
-            raise ShapeError(f"there is no {'frame' if frame is None else 'time'} {index}; give one of each.")
+            raise ShapeError(
+                f"there is no {'frame' if frame is None else 'time'} {index}; give one of each."
+            )
         dtypes = FLOATS if before is None else (before.dtype,)
         check(frame, "H W", f"frame {index}", dtypes, sizes=sizes, least=0.0, finite=True)
         time_s = check_number(time_s, f"the time of frame {index}", above=before_s)
         if before is None:
             yield frame[None], torch.tensor([time_s], dtype=torch.float64)
         else:
-            made = _interval(before, frame, before_s, time_s, max_displacement_px, max_log_change, max_steps)
+            made = _interval(
+                before, frame, before_s, time_s, max_displacement_px, max_log_change, max_steps
+            )
             times_s = before_s + (time_s - before_s) * _shares(len(made))
             times_s[-1] = time_s
             yield made, times_s
@@ -262,7 +284,9 @@ def _interval(first, second, start_s, end_s, max_displacement_px, max_log_change
     count = steps_for(moved_px, max_displacement_px, "the place of things, in pixels,", *interval)
     while True:
         shares = _shares(count).tolist()[:-1]
-        made = torch.stack([*(between(first, second, flows, seen, share) for share in shares), second])
+        made = torch.stack(
+            [*(between(first, second, flows, seen, share) for share in shares), second]
+        )
         if max_log_change is None:
             return made
         levels = lin_log(torch.cat((first[None], made)).detach())
@@ -270,7 +294,9 @@ def _interval(first, second, start_s, end_s, max_displacement_px, max_log_change
         if change <= max_log_change:
             return made
         # at least one step more each time, for the change of a step need not shrink with its length
-        count = max(count + 1, steps_for(change * count, max_log_change, "the log level", *interval))
+        count = max(
+            count + 1, steps_for(change * count, max_log_change, "the log level", *interval)
+        )
 
 
 def _shares(count):

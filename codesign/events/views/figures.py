@@ -1,5 +1,5 @@
-"""Figures of events: their rate over time, one line per polarity, and a space-time plot, with time along one
-axis and the sensor across it.
+"""Figures of events: their rate over time, one line per polarity, and a space-time plot, with time
+along one axis and the sensor across it.
 """
 
 from typing import Any
@@ -25,9 +25,10 @@ def rate_figure(middle_s, rate_hz):
     """Figure of event rates.
 
     Args:
-      middle_s: [K] middle of each interval, seconds. rate_hz: [K, 2] events per second, ON first (both as
-        ``rates`` gives them).
-    Returns: matplotlib Figure; time in milliseconds below ten seconds of recording, else in seconds.
+      middle_s: [K] middle of each interval, seconds. rate_hz: [K, 2] events per second, ON first
+        (both as ``rates`` gives them).
+    Returns: matplotlib Figure; time in milliseconds below ten seconds of recording, else in
+      seconds.
     Raises: ShapeError when the two do not fit.
     """
     if middle_s.ndim != 1 or rate_hz.shape != (len(middle_s), 2) or not len(middle_s):
@@ -65,21 +66,27 @@ def rate_figure(middle_s, rate_hz):
     axis.grid(alpha=0.3)
     axis.spines[["top", "right"]].set_visible(False)
     axis.legend(
-        frameon=False, fontsize=9, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2
+        frameon=False,
+        fontsize=9,
+        ncols=2,
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
+        borderaxespad=0.2,
     )
     return figure
 
 
 def space_time_figure(stream, *, points=20_000, total=None):
-    """3-D figure of a stream: time to the right, columns into depth, rows downwards; rows and columns have
-    the same scale.
+    """3-D figure of a stream: time to the right, columns into depth, rows downwards; rows and
+    columns have the same scale.
 
     Args:
       stream: EventStream with at least one event.
       points: at most so many events are shown, drawn evenly from all of them.
       total: number of events that the stream is itself a sample of; None: it holds all.
     Returns: matplotlib Figure; milliseconds since the first event.
-    Raises: ShapeError for a stream without events; DomainError for points that are not a whole number >= 1.
+    Raises: ShapeError for a stream without events; DomainError for points that are not a whole
+      number >= 1.
     """
     if not len(stream):
         raise ShapeError("the stream holds no event; a figure needs at least one.")
@@ -122,7 +129,9 @@ def space_time_figure(stream, *, points=20_000, total=None):
     ):
         one.labelpad = pad
         one.set_major_locator(
-            MaxNLocator(max(1, round(4 * length)), steps=(1, 2, 2.5, 5, 10), integer=one is not axis.xaxis)
+            MaxNLocator(
+                max(1, round(4 * length)), steps=(1, 2, 2.5, 5, 10), integer=one is not axis.xaxis
+            )
         )
         one.set_pane_color((0.97, 0.97, 0.97, 1.0))
     total = len(stream) if total is None else total
@@ -137,8 +146,8 @@ def space_time_figure(stream, *, points=20_000, total=None):
 
 
 def sample(count, most, generator):
-    """[min(count, most)] different indices below ``count`` in increasing order, every subset equally likely;
-    in the memory of the indices alone."""
+    """[min(count, most)] different indices below ``count`` in increasing order, every subset
+    equally likely; in the memory of the indices alone."""
     if count <= most:
         return torch.arange(count)
     if count < 4 * most:

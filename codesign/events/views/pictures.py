@@ -1,4 +1,5 @@
-"""Events as pictures: red and blue, gray, rates over time, and videos of them, written one by one."""
+"""Events as pictures: red and blue, gray, rates over time, and videos of them, written one by
+one."""
 
 from collections.abc import Iterable
 from contextlib import closing
@@ -20,14 +21,15 @@ from codesign.types import EventStream
 
 iio = optional("imageio.v3", "video", "writing .gif")
 imageio_ffmpeg = optional("imageio_ffmpeg", "video", "writing .mp4")
-# small frames are enlarged until their shorter side reaches this, so that single pixels can be seen,
+# small frames are enlarged until their shorter side reaches this, so that single pixels can be
+# seen,
 LEAST_SIDE_PX = 256
 LARGEST_SIDE_PX = 1280  # unless the longer one would exceed this
 
 
 def picture(counts: Tensor, full_scale: float | None = None) -> Tensor:
-    """Event frames as colour pictures: white where nothing happened, red for ON, blue for OFF, purple for
-    both.
+    """Event frames as colour pictures: white where nothing happened, red for ON, blue for OFF,
+    purple for both.
 
     Args:
       counts: [..., 2, H, W] counts >= 0, ON first.
@@ -42,7 +44,8 @@ def picture(counts: Tensor, full_scale: float | None = None) -> Tensor:
 
 
 def gray_picture(counts: Tensor, full_scale: float | None = None) -> Tensor:
-    """Event frames as gray pictures: middle gray where ON and OFF balance, white for ON, black for OFF.
+    """Event frames as gray pictures: middle gray where ON and OFF balance, white for ON, black for
+    OFF.
 
     Args: as for ``picture``.
     Returns: [..., H, W] uint8, 128 for no event.
@@ -76,21 +79,23 @@ def _scaled(counts, full_scale):
 
 
 def write_video(path: str | Path, pictures: Iterable[Any], fps: float) -> None:
-    """Write pictures as a video; small ones are enlarged by whole factors, odd sizes get one more row or
-    column of their edge.
+    """Write pictures as a video; small ones are enlarged by whole factors, odd sizes get one more
+    row or column of their edge.
 
     Args:
       path: file ending in .mp4 (H.264) or .gif.
-      pictures: [N, H, W, 3] or [N, H, W] uint8, N >= 1; or anything that yields such pictures one after the
-        other (an MP4 then needs the memory of one).
+      pictures: [N, H, W, 3] or [N, H, W] uint8, N >= 1; or anything that yields such pictures one
+        after the other (an MP4 then needs the memory of one).
       fps: pictures per second, > 0 (a GIF keeps hundredths of a second: at most 50).
-    Raises: FileFormatError for another extension or a folder that is not writable; ShapeError, DomainError
-      for anything but such pictures.
+    Raises: FileFormatError for another extension or a folder that is not writable; ShapeError,
+      DomainError for anything but such pictures.
     """
     path = Path(path)
     check_number(fps, "fps", above=0.0, most=1000.0)
     if path.suffix.lower() not in (".mp4", ".gif"):
-        raise FileFormatError(f"{path} ends in {path.suffix or 'nothing'!r}; videos end in .mp4 or .gif.")
+        raise FileFormatError(
+            f"{path} ends in {path.suffix or 'nothing'!r}; videos end in .mp4 or .gif."
+        )
     ready = _prepared(pictures)
     first = next(ready, None)
     if first is None:
@@ -113,7 +118,9 @@ def write_video(path: str | Path, pictures: Iterable[Any], fps: float) -> None:
                 for each in ready:
                     file.send(np.ascontiguousarray(each))
         else:
-            iio.imwrite(temporary, np.stack([first, *ready]), plugin="pillow", duration=1000 / fps, loop=0)
+            iio.imwrite(
+                temporary, np.stack([first, *ready]), plugin="pillow", duration=1000 / fps, loop=0
+            )
 
 
 def decay_video(
@@ -131,7 +138,8 @@ def decay_video(
       path: file ending in .mp4 or .gif.
       events: EventStream, or counts [T-1, 2, H, W] per interval.
       t_s: [T] seconds; one picture per interval.
-      tau_s: fading time, seconds. fps: pictures per second of the video. full_scale: as for ``picture``.
+      tau_s: fading time, seconds. fps: pictures per second of the video. full_scale: as for
+        ``picture``.
     """
     counts = to_counts(events, t_s) if isinstance(events, EventStream) else events.detach()
     write_video(path, picture(decay(counts, t_s, tau_s), full_scale), fps)

@@ -1,5 +1,6 @@
-"""What fades, per pixel and polarity. Time surfaces: how long ago the last event was, as exp(-(t_ref -
-t_last) / tau); 0 where none was yet. Traces, which grow by one with every event and fade between them."""
+"""What fades, per pixel and polarity. Time surfaces: how long ago the last event was, as
+exp(-(t_ref - t_last) / tau); 0 where none was yet. Traces, which grow by one with every event and
+fade between them."""
 
 import math
 from collections.abc import Sequence
@@ -28,11 +29,11 @@ def surface_from_stream(
 
     Args:
       stream: EventStream.
-      at_us: [K] reference times, whole microseconds, strictly increasing. Events at a reference time belong
-        to it, later ones do not.
+      at_us: [K] reference times, whole microseconds, strictly increasing. Events at a reference
+        time belong to it, later ones do not.
       tau_s: time in which the surface fades to 1/e, seconds, > 0.
-    Returns: [K, 2, H, W] in 0 to 1, ON first; the difference of times is taken in whole microseconds, so
-      epoch times lose nothing.
+    Returns: [K, 2, H, W] in 0 to 1, ON first; the difference of times is taken in whole
+      microseconds, so epoch times lose nothing.
     Gradient: none (timestamps are integers).
     Raises: DomainError for reference times that are not whole or do not increase, and for tau.
     Source: Lagorce et al., HOTS, PAMI 2017, eq. 2 and 3.
@@ -58,13 +59,13 @@ def surface_from_stream(
 def surface_from_counts(counts: Tensor, t_s: Times, tau_s: float) -> Tensor:
     """Time surface after every frame interval, from hard or soft counts.
 
-    The events of an interval of length d sit at its middle. With m = min(count, 1): S <- (1 - m) S exp(-d /
-    tau) + m exp(-d / (2 tau)). Whole counts give the surface of such events exactly; a count between 0 and 1
-    is the share of an event, and mixes the two.
+    The events of an interval of length d sit at its middle. With m = min(count, 1): S <- (1 - m) S
+    exp(-d / tau) + m exp(-d / (2 tau)). Whole counts give the surface of such events exactly; a
+    count between 0 and 1 is the share of an event, and mixes the two.
 
     Args:
-      counts: [T-1, 2, ..., H, W] counts >= 0, ON first. t_s: [T] seconds, strictly increasing. tau_s:
-        seconds, > 0.
+      counts: [T-1, 2, ..., H, W] counts >= 0, ON first. t_s: [T] seconds, strictly increasing.
+        tau_s: seconds, > 0.
     Returns: [T-1, 2, ..., H, W]; entry k belongs to t_s[k + 1].
     Gradient: counts up to and including 1; none above, where one more event moves no last time.
     Raises: ShapeError, DomainError as ``from_counts``; DomainError for negative counts and for tau.
@@ -110,20 +111,20 @@ def decay_from_stream(
     start: tuple[Tensor, int] | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """Exponentially fading sum of single events at given times: sum over t <= t_ref of exp(-(t_ref - t) /
-    tau).
+    """Exponentially fading sum of single events at given times: sum over t <= t_ref of
+    exp(-(t_ref - t) / tau).
 
     Args:
       stream: EventStream.
-      at_us: [K] reference times, whole microseconds, strictly increasing. Events at a reference time belong
-        to it.
+      at_us: [K] reference times, whole microseconds, strictly increasing. Events at a reference
+        time belong to it.
       tau_s: seconds, > 0.
-      start: (trace [2, H, W], its time in whole microseconds) of an earlier chunk, whose events are then not
-        in the stream; None: nothing before.
+      start: (trace [2, H, W], its time in whole microseconds) of an earlier chunk, whose events are
+        then not in the stream; None: nothing before.
     Returns: [K, 2, H, W], summed in float64, ON first.
     Gradient: none (timestamps are integers).
-    Raises: DomainError for reference times that are not whole or do not increase, and for tau; ShapeError for
-      a trace of another size.
+    Raises: DomainError for reference times that are not whole or do not increase, and for tau;
+      ShapeError for a trace of another size.
     """
     tau_s = check_tau(tau_s)
     check_stream(stream)
@@ -134,7 +135,9 @@ def decay_from_stream(
     before_us = None
     if start is not None:
         if not isinstance(start, tuple) or len(start) != 2 or not isinstance(start[0], Tensor):
-            raise DomainError(f"start is {shown(start)}; a trace and its time in microseconds are needed.")
+            raise DomainError(
+                f"start is {shown(start)}; a trace and its time in microseconds are needed."
+            )
         earlier, before_us = start[0], check_whole(start[1], "the time of the trace", None)
         check(earlier, (2, height, width), "the trace to go on with", FLOATS)
         trace += earlier.to(trace).flatten()
@@ -153,11 +156,11 @@ def decay_from_stream(
 
 
 def segments(stream, at_us):
-    """For every reference time: the time, and (cell, t_us) of the events after the one before, up to and
-    including it.
+    """For every reference time: the time, and (cell, t_us) of the events after the one before, up
+    to and including it.
 
-    A cell is the place of (polarity, row, column) in a flattened [2, H, W]. Raises: DomainError for times
-    that are not whole or do not increase.
+    A cell is the place of (polarity, row, column) in a flattened [2, H, W]. Raises: DomainError for
+    times that are not whole or do not increase.
     """
     try:
         times_us = torch.as_tensor(at_us)

@@ -1,11 +1,12 @@
 """Event volumes: counts on a grid of time bins, shared linearly between the two nearest bins.
 
-With n bins the nodes are n equally spaced times from the start to the end of the interval. An event between
-two nodes is shared in proportion to its nearness, so nothing is lost. The end bins collect from one side
+With n bins the nodes are n equally spaced times from the start to the end of the interval. An event
+between two nodes is shared in proportion to its nearness, so nothing is lost. The end bins collect
+from one side
 only: half as much as the others, centred a third of a node spacing inside.
 
-Spike tensors [2, W, H, T] hold one binary spike per polarity, column, row and time step, ON first, as spiking
-networks take them.
+Spike tensors [2, W, H, T] hold one binary spike per polarity, column, row and time step, ON first,
+as spiking networks take them.
 """
 
 import torch
@@ -29,17 +30,19 @@ def from_counts(counts: Tensor, t_s: Times, bins: int) -> EventVolume:
     """Sort the counts of consecutive frame intervals into time bins.
 
     Args:
-      counts: [T-1, 2, ..., H, W] events per interval, ON first, axes between polarity and H as batch ([T-1,
-        2, H, W]: batch of one).
-      t_s: [T] frame times, seconds, strictly increasing. The events of an interval sit at its middle.
+      counts: [T-1, 2, ..., H, W] events per interval, ON first, axes between polarity and H as
+        batch ([T-1, 2, H, W]: batch of one).
+      t_s: [T] frame times, seconds, strictly increasing. The events of an interval sit at its
+        middle.
       bins: number of bins, >= 1.
     Returns: EventVolume of counts [B, 2, bins, H, W]; the total is conserved.
-      centroid_s: [bins] float64, seconds from t_s[0]: mean time of what a bin collects when events come at an
-        even rate. It does not depend on the counts, so a rate that changes linearly with time is read off at
-        the centroid exactly.
+      centroid_s: [bins] float64, seconds from t_s[0]: mean time of what a bin collects when events
+        come at an even rate. It does not depend on the counts, so a rate that changes linearly with
+        time is read off at the centroid exactly.
     Gradient: counts.
-    Raises: ShapeError when axes or the number of times do not fit; DomainError for times that do not
-      increase, counts that are not finite, bins < 1, and for fewer intervals than fill every bin.
+    Raises: ShapeError when axes or the number of times do not fit; DomainError for times that do
+      not increase, counts that are not finite, bins < 1, and for fewer intervals than fill every
+      bin.
 
     Example:
     >>> from codesign import events
@@ -76,12 +79,12 @@ def from_stream(
 
     Args:
       stream: EventStream.
-      t0_us, t1_us: the interval, integer microseconds, both ends included; tile time with [a, b], [b + 1, c].
-        Events outside are not asked for.
+      t0_us, t1_us: the interval, integer microseconds, both ends included; tile time with [a, b],
+        [b + 1, c]. Events outside are not asked for.
       bins: number of bins, >= 1.
-    Returns: EventVolume of counts [1, 2, bins, H, W] whose total is the number of events in the interval, and
-      centroid_s [bins] float64, seconds from t0: (t1 - t0)/(3 (bins - 1)) inside at the ends, the nodes
-      between (even event rate).
+    Returns: EventVolume of counts [1, 2, bins, H, W] whose total is the number of events in the
+      interval, and centroid_s [bins] float64, seconds from t0: (t1 - t0)/(3 (bins - 1)) inside at
+      the ends, the nodes between (even event rate).
     Gradient: none (timestamps are integers).
     Raises: DomainError for t1 <= t0 or bins < 1.
 
@@ -112,7 +115,9 @@ def from_stream(
     share = (scaled - node * duration_us).to(torch.float64) / duration_us
     cell = (((p < 0).long() * bins + node) * height + y) * width + x
     # one spare node: an event at the end gives it 0
-    counts = torch.zeros(2 * bins * height * width + height * width, dtype=torch.float64, device=cell.device)
+    counts = torch.zeros(
+        2 * bins * height * width + height * width, dtype=torch.float64, device=cell.device
+    )
     counts.index_add_(0, cell, 1 - share)
     if bins > 1:
         counts.index_add_(0, cell + height * width, share)
@@ -124,7 +129,9 @@ def from_stream(
     if bins > 1:
         collected_s[[0, -1]] /= 2
     return EventVolume(
-        counts.reshape(1, 2, bins, height, width).to(dtype), node_s * (duration_us * 1e-6), collected_s
+        counts.reshape(1, 2, bins, height, width).to(dtype),
+        node_s * (duration_us * 1e-6),
+        collected_s,
     )
 
 
@@ -135,16 +142,16 @@ def spikes_from_stream(
 
     Args:
       stream: EventStream.
-      t0_us: start of step 0, whole microseconds. step_us: length of a step, whole microseconds, > 0. steps:
-        number of steps T, >= 1.
-    Returns: [2, W, H, T]: 1 where at least one event lies in [t0 + k step, t0 + (k + 1) step), else 0. Events
-      of one pixel, polarity and step become one spike (the number of events less the sum of the tensor says
-      how many went into others); those outside the T steps are not asked for. Neurons of ``events.srm``:
-      ``spikes.flatten(0, 2).T`` is [T, N].
+      t0_us: start of step 0, whole microseconds. step_us: length of a step, whole microseconds, >
+        0. steps: number of steps T, >= 1.
+    Returns: [2, W, H, T]: 1 where at least one event lies in [t0 + k step, t0 + (k + 1) step), else
+      0. Events of one pixel, polarity and step become one spike (the number of events less the sum
+      of the tensor says how many went into others); those outside the T steps are not asked for.
+      Neurons of ``events.srm``: ``spikes.flatten(0, 2).T`` is [T, N].
     Gradient: none (timestamps are integers).
     Raises: DomainError for times or numbers that are not whole, or not positive.
-    Source: layout of Gehrig et al., Event-Based Angular Velocity Regression with Spiking Networks, ICRA 2020,
-      and of SLAYER (Shrestha, Orchard 2018).
+    Source: layout of Gehrig et al., Event-Based Angular Velocity Regression with Spiking Networks,
+      ICRA 2020, and of SLAYER (Shrestha, Orchard 2018).
     """
     t0_us = check_whole(t0_us, "t0_us", None)
     step_us = check_whole(step_us, "step_us")

@@ -10,19 +10,19 @@ from codesign.types import EventVolume
 
 
 class FlowNetEvents(Baseline):
-    """Four strided layers, two residual blocks, four decoding layers that each add to the flow and hand it
-    on, with skip connections.
+    """Four strided layers, two residual blocks, four decoding layers that each add to the flow and
+    hand it on, with skip connections.
 
     Args:
       bins: bins of the volumes, >= 2.
-      width: channels of the first layer (8 times as many in the last); every layer takes the nearest
-        multiple of 4.
+      width: channels of the first layer (8 times as many in the last); every layer takes the
+        nearest multiple of 4.
       hidden: channels inside the residual blocks, a multiple of 4; None for 8 times ``width``.
       seed: of the first weights.
     Gradient: counts and weights; smooth, so any order.
     Raises: ShapeError, DomainError.
-    Source: Zhu et al., EV-FlowNet, RSS 2018, fig. 4, with group normalisation (Wu and He, ECCV 2018) and
-      SiLU.
+    Source: Zhu et al., EV-FlowNet, RSS 2018, fig. 4, with group normalisation
+      (Wu and He, ECCV 2018) and SiLU.
 
     >>> from codesign.flow.export import evenly_timed
     >>> FlowNetEvents(bins=4, width=4.0)(evenly_timed(torch.ones(1, 2, 4, 32, 48))).flow_px.shape

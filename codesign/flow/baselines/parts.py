@@ -1,5 +1,5 @@
-"""What the networks that event flow is compared with share: from volume to fields of flow, layers, how
-many weights they have, where these start, and the widths that fill a budget."""
+"""What the networks that event flow is compared with share: from volume to fields of flow, layers,
+how many weights they have, where these start, and the widths that fill a budget."""
 
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence
@@ -11,14 +11,23 @@ from torch.nn.functional import interpolate
 
 from codesign.checks import check_seed, check_whole
 from codesign.errors import DomainError
-from codesign.flow.entry import WIDEST, check_bins, check_sizes, normalise, pad_to, takes_volume, to_field
+from codesign.flow.entry import (
+    WIDEST,
+    check_bins,
+    check_sizes,
+    normalise,
+    pad_to,
+    takes_volume,
+    to_field,
+)
 from codesign.types import EventVolume, FlowField
 
 MOST_WEIGHTS = 10**9
 
 
 class Baseline(nn.Module):
-    """A network on the counts of a volume, normalised and padded with emptiness to multiples of STRIDE.
+    """A network on the counts of a volume, normalised and padded with emptiness to multiples of
+    STRIDE.
 
     Called with an EventVolume [B, 2, bins, H, W] of any H, W: FlowField, px per interval at full
     resolution. Its confidence only says whether the sample had events. Computed in the type of the
@@ -44,8 +53,8 @@ class Baseline(nn.Module):
 
     @classmethod
     def with_weights(cls, weights: int, bins: int = 8, seed: int = 0, **rest: Any) -> Self:
-        """The network with the fewest weights that are not below the budget (at most 4 % above it from 0.3 M
-        on)."""
+        """The network with the fewest weights that are not below the budget (at most 4 % above it
+        from 0.3 M on)."""
         width, hidden = fill_budget(lambda **sizes: cls(bins=bins, **sizes), weights, cls.INSIDE)
         return cls(bins=bins, width=width, hidden=hidden, seed=seed, **rest)
 
@@ -55,16 +64,16 @@ class Baseline(nn.Module):
 
     @takes_volume
     def predictions(self, volume: EventVolume) -> list[FlowField]:
-        """Flow of every level or iteration at full resolution, in pixels there, coarse or early first;
-        the last is what a call returns."""
+        """Flow of every level or iteration at full resolution, in pixels there, coarse or early
+        first; the last is what a call returns."""
         return self._finished(volume, self._found(volume))
 
     def _found(self, volume):
         return self.levels(pad_to(normalise(volume.counts).flatten(1, 2), self.STRIDE), volume)
 
     def levels(self, counts: Tensor, volume: EventVolume) -> list[Tensor]:
-        """Flows [B, 2, h, w] of the padded image, each in pixels of its own grid, from coarse or early
-        ones to the last.
+        """Flows [B, 2, h, w] of the padded image, each in pixels of its own grid, from coarse or
+        early ones to the last.
 
         Args:
           counts: [B, 2 bins, H', W'] normalised and padded, ON first.
@@ -84,19 +93,23 @@ def rescale_flow(flow_px: Tensor, size: Sequence[int]) -> Tensor:
     Args:
       flow_px: [B, 2, H, W] in pixels of its own grid.
       size: (height, width) of the new grid, >= 1.
-    Returns: [B, 2, height, width] in pixels of the new grid: resampled bilinearly between pixel centres
-      (constant beyond the outermost), x times width / W, y times height / H.
+    Returns: [B, 2, height, width] in pixels of the new grid: resampled bilinearly between pixel
+      centres (constant beyond the outermost), x times width / W, y times height / H.
     Gradient: flow_px.
     """
     height, width = size
     if (height, width) == tuple(flow_px.shape[2:]):
         return flow_px
     factor = flow_px.new_tensor([width / flow_px.shape[3], height / flow_px.shape[2]])
-    return interpolate(flow_px, (height, width), mode="bilinear", align_corners=False) * factor[:, None, None]
+    return (
+        interpolate(flow_px, (height, width), mode="bilinear", align_corners=False)
+        * factor[:, None, None]
+    )
 
 
 def channels(width: float, factor: float = 1.0) -> int:
-    """Channels of a layer ``factor`` times as wide as the first: the nearest multiple of 4, at least 4."""
+    """Channels of a layer ``factor`` times as wide as the first: the nearest multiple of 4, at
+    least 4."""
     return max(4, 4 * round(width * factor / 4))
 
 
@@ -106,10 +119,11 @@ def count_weights(module: nn.Module) -> int:
 
 
 def start(module: nn.Module, seed: int, variance: float, heads: Iterable[nn.Module] = ()) -> None:
-    """Draw convolutions from a normal distribution of variance ``variance`` / inputs of a weight (a hundredth
-    of that in ``heads``), biases 0.
+    """Draw convolutions from a normal distribution of variance ``variance`` / inputs of a weight (a
+    hundredth of that in ``heads``), biases 0.
 
-    The generator's seed is the only source. Modules on the meta device, built to be counted, are left alone.
+    The generator's seed is the only source. Modules on the meta device, built to be counted, are
+    left alone.
     """
     generator = torch.Generator().manual_seed(check_seed(seed, "seed"))
     for part in module.modules():
@@ -121,7 +135,8 @@ def start(module: nn.Module, seed: int, variance: float, heads: Iterable[nn.Modu
             small = 0.1 if any(part is head for head in heads) else 1.0
             with torch.no_grad():
                 part.weight.copy_(
-                    torch.randn(part.weight.shape, generator=generator) * (small * (variance / inputs) ** 0.5)
+                    torch.randn(part.weight.shape, generator=generator)
+                    * (small * (variance / inputs) ** 0.5)
                 )
                 if part.bias is not None:
                     part.bias.zero_()
@@ -132,7 +147,8 @@ def fill_budget(
     weights: int,
     inside: float = 8.0,
 ) -> tuple[float, int]:
-    """Arguments (width, hidden) of the network with the fewest weights that is not below the budget.
+    """Arguments (width, hidden) of the network with the fewest weights that is not below the
+    budget.
 
     Args:
       build: function of width and hidden (channels inside the residual blocks, None for the usual

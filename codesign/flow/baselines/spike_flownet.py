@@ -18,12 +18,14 @@ LEAK = 0.1  # slope of the decoder's rectifiers for negative input
 
 
 class SpikeFlowNet(Baseline):
-    """Four strided layers of integrate-and-fire neurons, sums of what flowed into them, two residual blocks,
-    a decoder with four flow scales that each add to the coarser one.
+    """Four strided layers of integrate-and-fire neurons, sums of what flowed into them, two
+    residual blocks, a decoder with four flow scales that each add to the coarser one.
 
     Args:
-      bins: bins of the volumes, even; half of them are the time steps of the encoder (10 as published).
-      width: channels of the first layer, 64 as published; every layer takes the nearest multiple of 4.
+      bins: bins of the volumes, even; half of them are the time steps of the encoder
+        (10 as published).
+      width: channels of the first layer, 64 as published; every layer takes the nearest multiple of
+        4.
       hidden: channels inside the residual blocks; None for 8 times ``width``.
       threshold: potential at which a neuron fires, in normalised counts.
       surrogate_width: of the fast sigmoid that stands for the derivative of the step, in potential.
@@ -70,7 +72,9 @@ class SpikeFlowNet(Baseline):
         self.decoder = nn.ModuleList(
             nn.ConvTranspose2d(a, b, 4, 2, 1, bias=False) for a, b in zip(levels, up, strict=False)
         )
-        self.necks = nn.ModuleList(nn.ConvTranspose2d(a, self.neck, 4, 2, 1, bias=False) for a in levels)
+        self.necks = nn.ModuleList(
+            nn.ConvTranspose2d(a, self.neck, 4, 2, 1, bias=False) for a in levels
+        )
         self.heads = nn.ModuleList(nn.Conv2d(self.neck, 2, 1, bias=False) for _ in levels)
         start(self, seed, 3.0, self.heads)
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
@@ -83,18 +87,23 @@ class SpikeFlowNet(Baseline):
         return self.decode(sums)
 
     def encode(self, halves: Tensor) -> list[Tensor]:
-        """Sums over the steps of what flowed into each layer's neurons: [B, width, H/2, W/2] to [B, 8 width,
-        H/16, W/16].
+        """Sums over the steps of what flowed into each layer's neurons: [B, width, H/2, W/2] to
+        [B, 8 width, H/16, W/16].
 
         Args:
-          halves: [B, 4, H, W, steps], ON and OFF of the former half of the window, then of the latter;
-            H and W multiples of 16.
+          halves: [B, 4, H, W, steps], ON and OFF of the former half of the window, then of the
+            latter; H and W multiples of 16.
         """
         steps = halves.shape[4]
         halves = halves.to(next(self.parameters()).dtype)
-        x = halves.permute(4, 0, 1, 2, 3).flatten(0, 1).contiguous(memory_format=torch.channels_last)
+        x = (
+            halves.permute(4, 0, 1, 2, 3)
+            .flatten(0, 1)
+            .contiguous(memory_format=torch.channels_last)
+        )
         sums = []
-        # every layer runs over all steps at once: nothing flows back, so this is the same as step by step
+        # every layer runs over all steps at once: nothing flows back, so this is the same as step
+        # by step
         for layer in self.encoder:
             current = layer(x).permute(0, 2, 3, 1)
             # rows in the order of memory, which sums 15 times faster
@@ -110,15 +119,15 @@ class SpikeFlowNet(Baseline):
         return sums
 
     def decode(self, sums: list[Tensor]) -> list[Tensor]:
-        """Flow at 1/8, 1/4, 1/2 and all of the resolution, each in pixels of its own grid, from what
-        ``encode`` returns."""
+        """Flow at 1/8, 1/4, 1/2 and all of the resolution, each in pixels of its own grid, from
+        what ``encode`` returns."""
         x = sums[-1]
         flows = []
         for first, second in self.residual:  # pyright: ignore[reportGeneralTypeIssues]
             x = x + leaky_relu(second(leaky_relu(first(x), LEAK)), LEAK)
         for level in range(4):
-            # neck and head are linear, one after the other: their product is one transposed convolution to 2
-            # channels
+            # neck and head are linear, one after the other: their product is one transposed
+            # convolution to 2 channels
             head = torch.einsum(
                 "on,inhw->iohw",
                 self.heads[level].weight[:, :, 0, 0],  # pyright: ignore[reportIndexIssue, reportArgumentType]
@@ -127,7 +136,9 @@ class SpikeFlowNet(Baseline):
             change = conv_transpose2d(x, head, stride=2, padding=1)
             flows.append(rescale_flow(flows[-1], change.shape[2:]) + change if flows else change)
             if level < 3:
-                x = torch.cat([sums[2 - level], leaky_relu(self.decoder[level](x), LEAK), flows[-1]], 1)
+                x = torch.cat(
+                    [sums[2 - level], leaky_relu(self.decoder[level](x), LEAK), flows[-1]], 1
+                )
         return flows
 
 
@@ -136,9 +147,9 @@ def to_halves(counts: Tensor) -> Tensor:
 
     Args:
       counts: [B, 2, 2 k, H, W] events per bin, ON first.
-    Returns: [B, 4, H, W, k] view: ON and OFF of the former half, ON and OFF of the latter; nothing is lost or
-      added. The bins keep their shared borders, so an event that crosses one, also the middle of the window,
-      changes the input continuously.
+    Returns: [B, 4, H, W, k] view: ON and OFF of the former half, ON and OFF of the latter; nothing
+      is lost or added. The bins keep their shared borders, so an event that crosses one, also the
+      middle of the window, changes the input continuously.
     Gradient: counts.
     Source: Lee et al., Spike-FlowNet, ECCV 2020, sec. 3.1.
     """
@@ -152,8 +163,8 @@ class _Fire(torch.autograd.Function):
     def forward(ctx, current, threshold, surrogate):
         ctx.threshold = threshold
         ctx.surrogate = surrogate
-        # the potential is made again: it would weigh as much, and the current ties a second derivative
-        # to its refusal
+        # the potential is made again: it would weigh as much, and the current ties a second
+        # derivative to its refusal
         ctx.save_for_backward(current)
         return _run(current, threshold, torch.empty_like(current[:1]))
 
@@ -172,8 +183,8 @@ class _Fire(torch.autograd.Function):
 
 
 def _run(current, threshold, potential):
-    """Spikes [T, ...]; potentials before the reset are left in ``potential``, as far as it is long. Into
-    buffers made once: fresh ones cost more than the arithmetic."""
+    """Spikes [T, ...]; potentials before the reset are left in ``potential``, as far as it is long.
+    Into buffers made once: fresh ones cost more than the arithmetic."""
     spikes = torch.empty_like(current)
     rest = torch.zeros_like(current[0])
     for t in range(len(current)):
@@ -184,18 +195,18 @@ def _run(current, threshold, potential):
 
 
 def integrate_and_fire(current: Tensor, threshold: float, surrogate: Surrogate) -> Tensor:
-    """Spikes of neurons without leak that fall back to 0 when they fire: u_t = u_{t-1} (1 - s_{t-1}) + I_t,
-    s_t = [u_t >= threshold].
+    """Spikes of neurons without leak that fall back to 0 when they fire: u_t = u_{t-1}
+    (1 - s_{t-1}) + I_t, s_t = [u_t >= threshold].
 
     Args:
       current: [T, ...] input of every step, in units of the potential.
       threshold: > 0.
       surrogate: Surrogate, its density at u - threshold stands for the derivative of the step.
     Returns: [T, ...] spikes, 0 or 1.
-    Gradient: current; lambda_t = g_t rho(u_t - threshold) + (1 - s_t) lambda_{t+1}, the reset taken as it
-      happened. First derivatives only.
+    Gradient: current; lambda_t = g_t rho(u_t - threshold) + (1 - s_t) lambda_{t+1}, the reset taken
+      as it happened. First derivatives only.
     Raises: GradientError for a second derivative.
-    Source: Lee et al., Spike-FlowNet, ECCV 2020, eqs. 1 to 3, which lets rho be 1 / threshold above it and 0
-      below.
+    Source: Lee et al., Spike-FlowNet, ECCV 2020, eqs. 1 to 3, which lets rho be 1 / threshold above
+      it and 0 below.
     """
     return _Fire.apply(current, threshold, surrogate)

@@ -1,8 +1,9 @@
 """A symmetric kernel along both axes, mirrored at the border: in drjit, and as operations of torch.
 
-A lane goes down a column: it takes the horizontal sum of each row and keeps the last ones for the vertical
-sum, so nothing is stored between the two. An even continuation makes the blur A self-adjoint for a product in
-which the outermost samples count half: A^T = E A E^-1, E = 1/2 at the ends of an axis, 1 within.
+A lane goes down a column: it takes the horizontal sum of each row and keeps the last ones for the
+vertical sum, so nothing is stored between the two. An even continuation makes the blur A
+self-adjoint for a product in which the outermost samples count half: A^T = E A E^-1, E = 1/2 at the
+ends of an axis, 1 within.
 """
 
 from collections.abc import Sequence
@@ -36,7 +37,8 @@ def blurred(images: Tensor, grid: Grid, taps: Sequence[float]) -> Tensor:
 
 
 def _along_rows(images, taps):
-    """A symmetric kernel along the last axis, mirrored about the outermost samples as often as need be."""
+    """A symmetric kernel along the last axis, mirrored about the outermost samples as often as need
+    be."""
     size = images.shape[-1]
     place = torch.arange(size)
     found = taps[0] * images
@@ -118,7 +120,8 @@ def _weighed(dr, values, taps):
 
 
 class _Mirrored:
-    """Samples of an axis, continued by their mirror image at either end as often as ``radius`` needs."""
+    """Samples of an axis, continued by their mirror image at either end as often as ``radius``
+    needs."""
 
     def __init__(self, lanes, count, radius):
         self.lanes = lanes

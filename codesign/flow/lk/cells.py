@@ -1,11 +1,12 @@
-"""The local part of a flow field: values on cells of 8 px that a polynomial leaves, as smooth as the
-data ask.
+"""The local part of a flow field: values on cells of 8 px that a polynomial leaves, as smooth as
+the data ask.
 
-What the data say of a cell is weighed as the whole image is in level: by what scattered events alone
-would add to the slopes, and by the noise that a fit leaves, both over the 3 x 3 cells around. The
-field is a tree of steps (quadtree) whose variance grows sixfold from a scale to the next coarser one.
-How large it is, is not known: several sizes are tried, and their fields averaged with the weights that
-the evidence gives them (empirical Bayes). So the local part vanishes where one polynomial explains the image.
+What the data say of a cell is weighed as the whole image is in level: by what scattered events
+alone would add to the slopes, and by the noise that a fit leaves, both over the 3 x 3 cells around.
+The field is a tree of steps (quadtree) whose variance grows sixfold from a scale to the next
+coarser one. How large it is, is not known: several sizes are tried, and their fields averaged with
+the weights that the evidence gives them (empirical Bayes). So the local part vanishes where one
+polynomial explains the image.
 """
 
 import math
@@ -21,7 +22,8 @@ CELL = 8  # px
 SIZES = (0.005, 0.025, 0.1, 0.33)  # standard deviations of the cells' own steps, over the prior's
 RARER = 2.0  # logarithm of how much rarer each size is than the one before
 GROWTH = 6.0  # of the variance, from a scale to the next coarser one
-# events whose slopes are as the whole image's are, and whose noise, added to those of the cells around
+# events whose slopes are as the whole image's are, and whose noise, added to those of the cells
+# around
 FEW_EVENTS = 30.0
 FEW_OF_NOISE = 10.0
 CLAIM = 0.7  # of the calibration of the whole image: sums over cells share fewer events
@@ -49,7 +51,9 @@ class Cells:
         self.covariance = self.value.new_zeros(batch, 3, rows, columns)
         self.prior = (-RARER * torch.arange(len(SIZES), device=device).double()).softmax(0)
         variances = (self.value.new_tensor(SIZES) * prior_px) ** 2
-        self.widest = float(self.prior @ variances) * sum(GROWTH**scale for scale in range(self.scales))
+        self.widest = float(self.prior @ variances) * sum(
+            GROWTH**scale for scale in range(self.scales)
+        )
 
     def on(self, level: Level) -> Tensor:
         """Flow [B, 2, h, w] on the samples of a level."""
@@ -64,11 +68,15 @@ class Cells:
           products: [B, 8, h, w] of a level's samples.
           change: [B, 2, h, w] what the polynomial moved since they were taken.
         """
-        precision, pull = self._evidence(level, self._summed(products, CELL // level.stride, change))
+        precision, pull = self._evidence(
+            level, self._summed(products, CELL // level.stride, change)
+        )
         pull = pull + _apply(precision, self.value)
         growth = GROWTH ** torch.arange(self.scales).to(pull)
         variances = (pull.new_tensor(SIZES) * self.prior_px) ** 2
-        means, covariances, evidence = quadtree.posterior(precision, pull, growth[:, None] * variances)
+        means, covariances, evidence = quadtree.posterior(
+            precision, pull, growth[:, None] * variances
+        )
         weights = (evidence + self.prior.log()[:, None]).softmax(0)
         whole = weights[:, :, None, None, None]
         mean = (whole * means).sum(0)
@@ -81,7 +89,8 @@ class Cells:
 
     def _summed(self, products, step, change):
         """[B, 8, rows, columns] products summed over cells of step x step samples, as they are once
-        the flow has changed by the cell's mean of ``change``: V_t grows by the slopes times the change."""
+        the flow has changed by the cell's mean of ``change``: V_t grows by the slopes times the
+        change."""
         rows, columns = (
             step * cells - samples
             for cells, samples in zip(self.value.shape[2:], products.shape[2:], strict=True)
@@ -108,7 +117,9 @@ class Cells:
         few = FEW_EVENTS / level.stride**2
         texture = near + few * whole[:, :3] / (whole[:, 3:] + few)
         scattered_too = scattered + few * level.texture_noise
-        ridge = RIDGE * (xx + yy + 2 * events * level.texture_noise).mean((1, 2), keepdim=True) + TINY
+        ridge = (
+            RIDGE * (xx + yy + 2 * events * level.texture_noise).mean((1, 2), keepdim=True) + TINY
+        )
         square = _commuting(texture, texture)
         doubt = (DOUBT * scattered_too).square() + ridge.square()
         trust = _commuting(square, _inverse(_plus(square, doubt)))
@@ -132,7 +143,9 @@ class Cells:
         everywhere = ((left + least).sum((1, 2), keepdim=True) + few) / (
             expected.sum((1, 2), keepdim=True) + few
         )
-        return level.slope_noise[:, None, None] * (left + least + everywhere * few) / (expected + few)
+        return (
+            level.slope_noise[:, None, None] * (left + least + everywhere * few) / (expected + few)
+        )
 
 
 def _plus(matrix, number):

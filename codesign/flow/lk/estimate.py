@@ -1,12 +1,13 @@
 """Closed-form event flow: coarse-to-fine Bayesian least squares on event volumes.
 
-The signed event rate of a moving texture moves with it, so the volume obeys V_t + u V_x + v V_y = 0 (Lucas
-and Kanade, 1981, with event rate in place of intensity); time is the way that the scene has gone (path). The
-volume is warped back along the current flow; per pixel, the regression of the bins over the way gives
-V_t and their mean gives V_x, V_y; all pixels together pull at the parameters of a polynomial field
-(level), those of cells at what it leaves (cells). Gaussian priors on the field (polynomials, quadtree)
-hold against the pull, which is weighed by the noise that scattered events put into it, so that few
-events mean small steps, and the spread of what is left is returned with the flow.
+The signed event rate of a moving texture moves with it, so the volume obeys V_t + u V_x + v V_y = 0
+(Lucas and Kanade, 1981, with event rate in place of intensity); time is the way that the scene has
+gone (path). The volume is warped back along the current flow; per pixel, the regression of the bins
+over the way gives V_t and their mean gives V_x, V_y; all pixels together pull at the parameters of
+a polynomial field (level), those of cells at what it leaves (cells). Gaussian priors on the field
+(polynomials, quadtree) hold against the pull, which is weighed by the noise that scattered events
+put into it, so that few events mean small steps, and the spread of what is left is returned with
+the flow.
 """
 
 from collections.abc import Sequence
@@ -25,7 +26,12 @@ from codesign.flow.lk.start import at_start
 from codesign.types import EventVolume, FlowField
 
 # field -> the polynomial in it
-MODELS = {"constant": "constant", "affine": "affine", "quadratic": "quadratic", "local": "quadratic"}
+MODELS = {
+    "constant": "constant",
+    "affine": "affine",
+    "quadratic": "quadratic",
+    "local": "quadratic",
+}
 CLOCKS = ("time", "events")
 TURNED = 0.1  # share of the variance of the whole way that remains where it leads back to its start
 LEAST_BLUR_PX, MOST_BLUR_PX = 0.2, 1000  # below, a Gaussian is one sample
@@ -48,29 +54,31 @@ def estimate_lk(
     Args:
       volume: EventVolume, counts [B, 2, bins >= 2, H >= 2, W >= 2]. Hot pixels are weighed down
         (level.weighed_down).
-      model: "constant", "affine" or "quadratic" field over the image, or "local": a quadratic one and
-        values on cells of 8 px, as smooth as the data ask, for layers and depth.
-      prior_px: standard deviation expected of each component of the flow at the image centre, px per
-        interval; weak evidence leaves the flow near zero.
+      model: "constant", "affine" or "quadratic" field over the image, or "local": a quadratic one
+        and values on cells of 8 px, as smooth as the data ask, for layers and depth.
+      prior_px: standard deviation expected of each component of the flow at the image centre, px
+        per interval; weak evidence leaves the flow near zero.
       levels_px: Gaussian blur of the volume, coarse to fine.
       steps: Gauss-Newton steps at each.
-      noise_floor: least noise assumed, relative to that of a Poisson volume with these counts; matters
-        for counts without quantisation or noise.
+      noise_floor: least noise assumed, relative to that of a Poisson volume with these counts;
+        matters for counts without quantisation or noise.
       clock: "time": motion is even over the interval. "events": it goes as the events come, and may
-        turn back (``path``); for sensors that saw the scene before the window began, in steady light.
+        turn back (``path``); for sensors that saw the scene before the window began, in steady
+        light.
       start_px: flow [B, 2] or [B, 2, H, W] on the pixels of the start, px per interval, expected of
-        these windows (in a video, that of the window before): its least-squares fit by the polynomial
-        is one more field to descend from, with the prior about it at the first of several levels. The
-        descents from zero stay, and are averaged with it by the contrast of the events along each.
-    Returns: FlowField on the pixels of the start of the interval: flow_px [B, 2, H, W] px per interval;
-      covariance_px2 [B, 3, H, W] of its error by the posterior; confidence [B, H, W] in 0..1, 1 -
-      trace(covariance) / trace(prior covariance), both of the flow along the whole way (``path``);
-      valid is False for samples without events, whose flow and confidence are 0 and whose covariance
-      is the prior's.
+        these windows (in a video, that of the window before): its least-squares fit by the
+        polynomial is one more field to descend from, with the prior about it at the first of
+        several levels. The descents from zero stay, and are averaged with it by the contrast of the
+        events along each.
+    Returns: FlowField on the pixels of the start of the interval: flow_px [B, 2, H, W] px per
+      interval; covariance_px2 [B, 3, H, W] of its error by the posterior; confidence [B, H, W] in
+      0..1, 1 - trace(covariance) / trace(prior covariance), both of the flow along the whole way
+      (``path``); valid is False for samples without events, whose flow and confidence are 0 and
+      whose covariance is the prior's.
     Gradient: counts, of flow, covariance and confidence; none to start_px.
     Raises: ShapeError, DomainError.
-    Cost: linear in pixels and bins; a level of blur s works on a grid of spacing 2^floor(log2 s) px.
-      start_px adds a descent on the first two levels.
+    Cost: linear in pixels and bins; a level of blur s works on a grid of spacing 2^floor(log2 s)
+      px. start_px adds a descent on the first two levels.
 
     >>> import torch
     >>> from codesign.flow.export import evenly_timed
@@ -95,7 +103,9 @@ def estimate_lk(
         check_number(blur_px, "a blur of levels_px", LEAST_BLUR_PX, MOST_BLUR_PX)
     found = along_path(volume, clock)
     return field(
-        volume, found[0], *descended(volume, found, model, prior_px, levels_px, steps, noise_floor, start_px)
+        volume,
+        found[0],
+        *descended(volume, found, model, prior_px, levels_px, steps, noise_floor, start_px),
     )
 
 
@@ -150,7 +160,9 @@ def field(
     net, share = _net(way, volume.counts)
     interval_s = float(volume.collected_s.sum())
     covariance = share * covariance
-    return FlowField(net * flow, _seen(volume.counts), interval_s, confidence, covariance, way.net.detach())
+    return FlowField(
+        net * flow, _seen(volume.counts), interval_s, confidence, covariance, way.net.detach()
+    )
 
 
 def _net(way, counts):
@@ -186,17 +198,21 @@ def check_start(start_px: Tensor, counts: Tensor) -> Tensor:
             f"start_px is {list(start_px.shape)}; [{batch}, 2] or [{batch}, 2, {height}, {width}] is needed."
         )
     else:
-        start_px = check_finite(start_px, "start_px")[:, :, None, None].expand(-1, -1, height, width)
+        start_px = check_finite(start_px, "start_px")[:, :, None, None].expand(
+            -1, -1, height, width
+        )
     if (longest := float(start_px.detach().abs().max())) > LONGEST_PX:
-        raise DomainError(f"start_px reaches {longest:g} px; at most {LONGEST_PX:g} px are possible.")
+        raise DomainError(
+            f"start_px reaches {longest:g} px; at most {LONGEST_PX:g} px are possible."
+        )
     return start_px.to(counts)
 
 
 class Descent:
     """A field, and how surely it is known: a polynomial, and values on cells.
 
-    Where not ``local``, the cells are no part of the flow. They are found once, at the end: what one
-    polynomial does not explain is error of the field.
+    Where not ``local``, the cells are no part of the flow. They are found once, at the end: what
+    one polynomial does not explain is error of the field.
     """
 
     def __init__(self, shape: Polynomials, prior_px: float, local: bool, like: Tensor) -> None:
@@ -237,13 +253,17 @@ class Descent:
         """Moves to the best field, by steps no longer than the linearisation reaches.
 
         Args:
-          bend: whether cells of a local field move too; they do from the second step on, or the only
-            one, since what the polynomial has not yet reached looks like a local part.
+          bend: whether cells of a local field move too; they do from the second step on, or the
+            only one, since what the polynomial has not yet reached looks like a local part.
           last: whether nothing follows.
-          expected: whether the prior is about the field of ``begin``, which a blur that sees nothing
-            then leaves as it is.
+          expected: whether the prior is about the field of ``begin``, which a blur that sees
+            nothing then leaves as it is.
         """
-        centre = self.expected if expected and self.expected is not None else torch.zeros_like(self.found)
+        centre = (
+            self.expected
+            if expected and self.expected is not None
+            else torch.zeros_like(self.found)
+        )
         for step in range(steps):
             products = level.products(self.flow(level))
             evidence, pull = level.evidence(products)
@@ -258,8 +278,8 @@ class Descent:
                 self.cells.step(level, products, by_polynomial)
 
     def join(self, other: "Descent", level: Level) -> None:
-        """The mean of this field and another, by how much contrast the events along each have; where
-        this one began somewhere, also by the prior, which it has had few steps to meet."""
+        """The mean of this field and another, by how much contrast the events along each have;
+        where this one began somewhere, also by the prior, which it has had few steps to meet."""
         more = level.contrast_along(self.flow(level)) - level.contrast_along(other.flow(level))
         if self.expected is not None:
             more = more + other.found.square().sum(1) - self.found.square().sum(1)
@@ -270,8 +290,8 @@ class Descent:
             self.cells.value = other.cells.value + share * (self.cells.value - other.cells.value)
 
     def at_start(self, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Flow [B, 2, H, W], its covariance [B, 3, H, W] and confidence [B, H, W] on the pixels of the
-        start, which lies at ``start`` [B] on the way."""
+        """Flow [B, 2, H, W], its covariance [B, 3, H, W] and confidence [B, H, W] on the pixels of
+        the start, which lies at ``start`` [B] on the way."""
         unit = self.shape.unit
         spread = unit @ torch.linalg.inv(self.precision) @ unit.T
         return at_start(self.shape, self.parameters(), spread, self.cells, self.local, start)

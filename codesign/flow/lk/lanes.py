@@ -41,7 +41,8 @@ def plain_wanted() -> bool:
 
 @dataclass(frozen=True)
 class Grid:
-    """Samples of an image of height x width pixels: the centres of its squares of stride x stride pixels."""
+    """Samples of an image of height x width pixels: the centres of its squares of stride x stride
+    pixels."""
 
     height: int
     width: int
@@ -66,7 +67,9 @@ class Form(NamedTuple):
     @classmethod
     def of(cls, tensor: Tensor, grid: Grid) -> "Form":
         """Of a tensor [B, ...] on the samples of ``grid``."""
-        return cls(tensor.device.type, tensor.dtype, len(tensor), grid.height, grid.width, grid.stride)
+        return cls(
+            tensor.device.type, tensor.dtype, len(tensor), grid.height, grid.width, grid.stride
+        )
 
     def load(self, *tensors: Tensor) -> list[Any]:
         """As flat drjit arrays, without a copy where they are dense."""
@@ -82,14 +85,14 @@ class Form(NamedTuple):
 
 
 def recorded(kernel: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of hashable settings and then drjit arrays or lists of them, which is traced once for each
-    of the settings and replayed after that: small images cost mostly tracing. Widths of arrays must follow
-    from the settings.
+    """A function of hashable settings and then drjit arrays or lists of them, which is traced once
+    for each of the settings and replayed after that: small images cost mostly tracing. Widths of
+    arrays must follow from the settings.
 
     While drjit looks at what a recording is given, or at what its closure holds, it holds its own
-    lock. Where that runs anything in Python, as for a dataclass, another thread may get Python's lock
-    and wait for drjit's for ever (one that gives tensors back to torch does). So settings, which have
-    methods in Python, are not given but bound as defaults.
+    lock. Where that runs anything in Python, as for a dataclass, another thread may get Python's
+    lock and wait for drjit's for ever (one that gives tensors back to torch does). So settings,
+    which have methods in Python, are not given but bound as defaults.
     """
 
     @lru_cache(RECORDINGS)
@@ -130,9 +133,9 @@ def in_graph(
 
     Args:
       forward: forward(*settings, *given) gives the outputs and what else the adjoint needs.
-      adjoint: adjoint(*settings, *given, *that, grads, wanted) gives a gradient, or None, of each of
-        the given; ``grads`` are None where an output has no gradient, ``wanted`` says which of the
-        given want one.
+      adjoint: adjoint(*settings, *given, *that, grads, wanted) gives a gradient, or None, of each
+        of the given; ``grads`` are None where an output has no gradient, ``wanted`` says which of
+        the given want one.
     """
     return _Kernel.apply(forward, adjoint, settings, *given)
 
@@ -167,7 +170,8 @@ def first_only(found: Sequence[Tensor | None], *sources: Tensor) -> Sequence[Ten
 
 
 class Lanes:
-    """Lanes of drjit for the samples of images, and numbers that need no new kernel when they change."""
+    """Lanes of drjit for the samples of images, and numbers that need no new kernel when they
+    change."""
 
     def __init__(self, form: Form) -> None:
         import drjit as dr
@@ -196,8 +200,8 @@ class Lanes:
         return self.dr.gather(self.arr.Float, flat, index)
 
     def split(self, index: Any, size: int) -> tuple[Any, Any]:
-        """Quotient and remainder by a size. Processors divide no vectors of whole numbers; the half keeps the
-        rounded quotient off the next whole number."""
+        """Quotient and remainder by a size. Processors divide no vectors of whole numbers; the half
+        keeps the rounded quotient off the next whole number."""
         inverse = self.dr.opaque(self.double, 1 / size)
         quotient = self.arr.UInt32((self.double(index) + 0.5) * inverse)
         return quotient, index - quotient * self.count(size)

@@ -1,15 +1,17 @@
-"""One scale of the closed form: the blurred volume on its own grid, and what it says about the parameters of
-a field.
+"""One scale of the closed form: the blurred volume on its own grid, and what it says about the
+parameters of a field.
 
-Noise. Events scattered at random, rho per pixel and window, put into a volume blurred by a Gaussian of sigma
-- temporal slopes of variance rho / (sum w t^2) / (4 pi sigma^2), w the share of the window in a bin and t its
-  time, and
-- slopes of the mean of variance kappa rho, about rho / (8 pi sigma^4), which look like texture and are none.
-  The first sets how much the pull of the data can be trusted; how far real events are from Poisson is read
-  off the residual. The second is an error in the regressors (Fuller, Measurement Error Models, 1987): with N
-  = sum g g^T the normal matrix of the slopes seen and Z what scattered events alone would add to it, a
-  direction of the parameters in which Z makes up the share z counts by (1 - z)^4 / ((1 - z)^4 + (3 z)^4):
-  nearly 1 for texture, 1/82 where all is noise.
+Noise. Events scattered at random, rho per pixel and window, put into a volume blurred by a Gaussian
+of sigma
+- temporal slopes of variance rho / (sum w t^2) / (4 pi sigma^2), w the share of the window in a bin
+  and t its time, and
+- slopes of the mean of variance kappa rho, about rho / (8 pi sigma^4), which look like texture and
+  are none. The first sets how much the pull of the data can be trusted; how far real events are
+  from Poisson is read off the residual. The second is an error in the regressors (Fuller,
+  Measurement Error Models, 1987): with N = sum g g^T the normal matrix of the slopes seen and Z
+  what scattered events alone would add to it, a direction of the parameters in which Z makes up the
+  share z counts by (1 - z)^4 / ((1 - z)^4 + (3 z)^4): nearly 1 for texture, 1/82 where all is
+  noise.
 """
 
 import math
@@ -32,8 +34,8 @@ DOUBLINGS = 2
 # worth of Poisson noise the measured noise starts from: some events alone fit any field
 FEW_EVENTS = 10.0
 OVERLAP = 4 * math.pi  # blurred white noise is alike over 4 pi sigma^2 pixels
-# for what makes errors larger than that: bins share events, thresholds quantise, fields warp imperfectly
-# (docs/flow_closed_form.md)
+# for what makes errors larger than that: bins share events, thresholds quantise, fields warp
+# imperfectly (docs/flow_closed_form.md)
 CALIBRATION = 1.7
 # of the mean diagonal: above the rounding of sums in float32
 RIDGE = 1e-5
@@ -46,22 +48,22 @@ TINY = 2.0**-100  # keeps empty samples solvable, far below a millionth of an ev
 
 
 def stride(sigma_px: float, shortest_px: int = 2**30) -> int:
-    """Spacing of a level's grid, px: the largest power of two up to sigma, at least 1, at most 8, of which
-    two fit into the shorter side."""
+    """Spacing of a level's grid, px: the largest power of two up to sigma, at least 1, at most 8,
+    of which two fit into the shorter side."""
     return 2 ** math.floor(math.log2(max(min(sigma_px, shortest_px / 2, 8.0), 1.0)))
 
 
 def weighed_down(counts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Counts by what their pixels count: hot pixels are weighed down.
 
-    A pixel counts by k = 1 / (1 + e^2), e = max(0, n - 4 q - m) / (q + m): n events of the pixel, q the
-    mean of the 24 pixels around it, m = 5 events. Moving texture puts events on several pixels; a hot
-    pixel has them alone.
+    A pixel counts by k = 1 / (1 + e^2), e = max(0, n - 4 q - m) / (q + m): n events of the pixel, q
+    the mean of the 24 pixels around it, m = 5 events. Moving texture puts events on several pixels;
+    a hot pixel has them alone.
 
     Args:
       counts: [B, 2, n, H, W].
-    Returns: ON less OFF [B, n, H, W], events of both signs and all bins [B, H, W], both weighed, and
-      the weights [B, H, W].
+    Returns: ON less OFF [B, n, H, W], events of both signs and all bins [B, H, W], both weighed,
+      and the weights [B, H, W].
     Gradient: counts.
     """
     events = counts.sum((1, 2))
@@ -81,11 +83,11 @@ def _boxes(images):
 
 
 def along_path(volume: EventVolume, clock: str) -> tuple[Path, Tensor, Tensor]:
-    """The way of the samples, weight and time of the bins [2, n], events of both signs per pixel [B, H, W];
-    hot pixels weighed down.
+    """The way of the samples, weight and time of the bins [2, n], events of both signs per pixel
+    [B, H, W]; hot pixels weighed down.
 
-    clock: "time", "events", or "turn": events, with one turn of any speed. Weights are the shares of
-      the interval; time is 0 at mid-interval, in intervals.
+    clock: "time", "events", or "turn": events, with one turn of any speed. Weights are the shares
+      of the interval; time is 0 at mid-interval, in intervals.
     """
     counts = volume.counts
     span = volume.collected_s.sum()
@@ -101,8 +103,8 @@ def along_path(volume: EventVolume, clock: str) -> tuple[Path, Tensor, Tensor]:
 
 
 class Level:
-    """The volume blurred by a Gaussian of sigma_px, sampled at the centres of squares of ``stride`` x
-    ``stride`` pixels."""
+    """The volume blurred by a Gaussian of sigma_px, sampled at the centres of squares of ``stride``
+    x ``stride`` pixels."""
 
     def __init__(
         self,
@@ -124,7 +126,8 @@ class Level:
         weight, time = bins
         self.place = time - weight @ time
         spread = weight @ self.place.square()
-        # of the events: their sum over the bins is the rate, their mean place its slope over the way
+        # of the events: their sum over the bins is the rate, their mean place its slope over the
+        # way
         self.contrast = torch.stack([torch.ones_like(weight), self.place / spread])
         self.gain = (spread / way.spread).to(density)
         self.slope_noise = 1 / (way.spread * OVERLAP * sigma_px**2)
@@ -136,8 +139,8 @@ class Level:
         return cell_sums(mean, slope, seen, self.density, self.grid)
 
     def contrast_along(self, flow: Tensor) -> Tensor:
-        """Mean square [B] of the rate over the level's samples, in units of what scattered events give
-        it, times how many independent samples there are."""
+        """Mean square [B] of the rate over the level's samples, in units of what scattered events
+        give it, times how many independent samples there are."""
         mean, _, seen = self._moving(flow)
         square = (seen * mean.square()).sum((1, 2)) / (seen.sum((1, 2)) + TINY)
         noise = (self.density.mean((1, 2)) + TINY) / (OVERLAP * self.sigma**2)
@@ -151,8 +154,8 @@ class Level:
         return mean, self.gain[:, None, None] * slope, seen
 
     def evidence(self, products: Tensor) -> tuple[Tensor, Tensor]:
-        """Precision [B, 2K, 2K] that the data add where their products were taken, and their pull [B, 2K] on
-        the parameters: precision times the distance to the best fit."""
+        """Precision [B, 2K, 2K] that the data add where their products were taken, and their pull
+        [B, 2K] on the parameters: precision times the distance to the best fit."""
         side = 2 * self.shape.terms
         slopes, scattered, right, energy, events = (
             self.moments.sums(products).double() @ self.shape.equations
@@ -168,8 +171,8 @@ class Level:
         return kept / scale[:, None, None], weighed / scale[:, None]
 
     def _noise(self, explained, events, energy):
-        """Variance [B] of the temporal slopes: what the fit leaves of their energy, on a floor, per sample of
-        the grid."""
+        """Variance [B] of the temporal slopes: what the fit leaves of their energy, on a floor, per
+        sample of the grid."""
         # positive and smooth
         left = torch.sqrt((energy - explained).square() + (1e-6 * energy).square() + TINY)
         few = FEW_EVENTS / self.stride**2 * self.slope_noise
@@ -178,17 +181,20 @@ class Level:
 
 
 def _trusted(normal, scattered, right):
-    """What of the normal equations N p = r is texture (see above), and how much of the slopes' energy it
-    explains.
+    """What of the normal equations N p = r is texture (see above), and how much of the slopes'
+    energy it explains.
 
-    Args: N, Z [B, 2K, 2K], r [B, 2K], float64, in units in which all parameters are expected to be alike. A
-      ridge, relative to N + Z, counts as noise: directions in which nothing was seen are not trusted.
-    Returns: with N + Z = L L^T, S = L^-1 Z L^-T, whose eigenvalues z are the shares of noise, and t(z) the
-      trust: L t(S) (1 - S) L^T (symmetric, no eigenvalue below 0), L t(S) L^-1 r, and what a step
-      x = (N + Z)^-1 r takes off the energy, 2 r x - x N x.
+    Args: N, Z [B, 2K, 2K], r [B, 2K], float64, in units in which all parameters are expected to be
+      alike. A ridge, relative to N + Z, counts as noise: directions in which nothing was seen are
+      not trusted.
+    Returns: with N + Z = L L^T, S = L^-1 Z L^-T, whose eigenvalues z are the shares of noise, and
+      t(z) the trust: L t(S) (1 - S) L^T (symmetric, no eigenvalue below 0), L t(S) L^-1 r, and what
+      a step x = (N + Z)^-1 r takes off the energy, 2 r x - x N x.
     """
     unit = torch.eye(normal.shape[-1], dtype=normal.dtype, device=normal.device)
-    ridge = (RIDGE * (normal + scattered).diagonal(dim1=1, dim2=2).mean(1) + TINY)[:, None, None] * unit
+    ridge = (RIDGE * (normal + scattered).diagonal(dim1=1, dim2=2).mean(1) + TINY)[
+        :, None, None
+    ] * unit
     root = torch.linalg.cholesky(normal + scattered + ridge)
     inverse = torch.linalg.solve_triangular(root, unit, upper=False)
     noise = inverse @ (scattered + ridge) @ inverse.mT
@@ -206,18 +212,20 @@ def _trusted(normal, scattered, right):
 
 
 def gaussian(sigma_px: float, step: int) -> Tensor:
-    """Taps [2 radius + 1], float64, on samples ``step`` px apart, that after averaging over squares of
-    ``step`` px make a Gaussian of standard deviation sigma."""
+    """Taps [2 radius + 1], float64, on samples ``step`` px apart, that after averaging over squares
+    of ``step`` px make a Gaussian of standard deviation sigma."""
     # in samples: the averages have variance (step^2 - 1) / 12 px^2
     spread = math.sqrt(sigma_px**2 - (step**2 - 1) / 12) / step
     radius = int((3.0 if step == 1 else 2.5) * spread + 0.5)
-    taps = torch.exp(-torch.arange(-radius, radius + 1, dtype=torch.float64).square() / (2 * spread**2))
+    taps = torch.exp(
+        -torch.arange(-radius, radius + 1, dtype=torch.float64).square() / (2 * spread**2)
+    )
     return taps / taps.sum()
 
 
 def blurred_to(images: Tensor, sigma_px: float, grid: Grid) -> Tensor:
-    """Images [B, n, H, W] on the samples of ``grid``: averaged over squares, then through a Gaussian,
-    together of standard deviation sigma; mirrored at the border."""
+    """Images [B, n, H, W] on the samples of ``grid``: averaged over squares, then through a
+    Gaussian, together of standard deviation sigma; mirrored at the border."""
     taps = gaussian(sigma_px, grid.stride)
     return blurred(images, grid, taps[len(taps) // 2 :].tolist())
 
@@ -232,8 +240,8 @@ def _whole_kernel(sigma_px, step):
 
 
 def _slope_of_noise(kernel, step):
-    """Mean square of a central difference, per px^2, in white noise of variance 1 per pixel behind this
-    separable kernel."""
+    """Mean square of a central difference, per px^2, in white noise of variance 1 per pixel behind
+    this separable kernel."""
     wide = pad(kernel, (2 * step, 2 * step))
     difference = (wide[2 * step :] - wide[: -2 * step]) / (2 * step)
     return float(difference.square().sum() * kernel.square().sum())

@@ -5,9 +5,9 @@ events is its share of the path. Where the motion turns back, what was ON become
 place: the signed counts of nearby bins are alike while the direction holds, and opposite across a
 turn. Turns are looked for only where events become rare, since speed passes through zero there.
 
-Events are a false clock where a bin has few of them for another reason: a sensor that begins with the
-window has all its pixels in the middle of their thresholds, light that changes makes events of its
-own. Then time is the clock.
+Events are a false clock where a bin has few of them for another reason: a sensor that begins with
+the window has all its pixels in the middle of their thresholds, light that changes makes events of
+its own. Then time is the clock.
 """
 
 from dataclasses import dataclass
@@ -32,11 +32,11 @@ class Path:
     """The way of each sample, its whole length 1.
 
     counts: [B, n, H, W] ON less OFF, in bins evenly spaced on the path as the volume's are in time,
-      events on the way back with their sign turned. net: [B] displacement over the way, 1 for motion
-      that never turns. start: [B] place of the beginning; 0 is the mean place of the events. spread:
-      [B] mean square place of the events.
-    place: [B, n] of the volume's bins on the way. direction: [B, n] of the motion in them, 1 forwards,
-      -1 on the way back.
+      events on the way back with their sign turned. net: [B] displacement over the way, 1 for
+      motion that never turns. start: [B] place of the beginning; 0 is the mean place of the events.
+      spread: [B] mean square place of the events.
+    place: [B, n] of the volume's bins on the way. direction: [B, n] of the motion in them, 1
+      forwards, -1 on the way back.
     """
 
     counts: Tensor
@@ -59,12 +59,15 @@ def path(
     Args:
       signed: [B, n, H, W] ON less OFF per bin.
       events: [B, n] of both signs.
-      weight, time: [n] share of the interval that each bin collects, and its mean time, in intervals.
+      weight, time: [n] share of the interval that each bin collects, and its mean time, in
+        intervals.
     Gradient: signed, events.
     """
     weight = weight.double()
     time = time.double()
-    speed = (events.double() + FEW_EVENTS * weight) / (events.double().sum(1, keepdim=True) + FEW_EVENTS)
+    speed = (events.double() + FEW_EVENTS * weight) / (
+        events.double().sum(1, keepdim=True) + FEW_EVENTS
+    )
     speed = speed / weight
     uneven = (weight * (speed - 1).square()).sum(1, keepdim=True)
     speed = 1 + (speed - 1) * uneven / (uneven + UNEVEN)
@@ -95,8 +98,8 @@ def _along(signed, speed, direction, weight, time):
 
 
 def _shared(place, nodes):
-    """[B, n, m] shares of bins at ``place`` [B, n] in the two nearest of the nodes [m], which keep their mean
-    place; beyond the last nodes they are continued."""
+    """[B, n, m] shares of bins at ``place`` [B, n] in the two nearest of the nodes [m], which keep
+    their mean place; beyond the last nodes they are continued."""
     upper = torch.searchsorted(nodes, place.detach()).clamp(1, len(nodes) - 1)
     share = (place - nodes[upper - 1]) / (nodes[upper] - nodes[upper - 1])
     found = place.new_zeros(*place.shape, len(nodes))
@@ -104,8 +107,8 @@ def _shared(place, nodes):
 
 
 def _mirror(signed, weight):
-    """[B, n] in -1..1: one turn, or none. Bins as far before it as after it have seen the same places,
-    with the opposite sign, whatever the texture, the speed and the direction."""
+    """[B, n] in -1..1: one turn, or none. Bins as far before it as after it have seen the same
+    places, with the opposite sign, whatever the texture, the speed and the direction."""
     bins = len(weight)
     side = min(POOL, *signed.shape[2:])
     images = avg_pool2d(signed.detach(), side).flatten(2).double()
@@ -126,7 +129,8 @@ def _mirror(signed, weight):
 
 
 def _directions(signed, speed, weight):
-    """[B, n] in -1..1: the mean of the ways with at most two turns, by how well the signed counts agree."""
+    """[B, n] in -1..1: the mean of the ways with at most two turns, by how well the signed counts
+    agree."""
     bins = len(weight)
     side = min(POOL, *signed.shape[2:])
     images = avg_pool2d(signed, side).flatten(2).double()

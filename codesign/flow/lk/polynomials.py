@@ -1,8 +1,9 @@
-"""Polynomial flow fields: their basis, the prior on their parameters, the step from mid-interval to the
-start, the spread of the flow; values and sums on the samples of a grid.
+"""Polynomial flow fields: their basis, the prior on their parameters, the step from mid-interval to
+the start, the spread of the flow; values and sums on the samples of a grid.
 
-A field is u = sum p_k b_k(x, y), v = sum q_k b_k(x, y) with b = 1, x, y, x^2, xy, y^2 on coordinates that
-reach from -1 to 1 along the longer side. Parameters are [B, 2K]: p_1..p_K, q_1..q_K.
+A field is u = sum p_k b_k(x, y), v = sum q_k b_k(x, y) with b = 1, x, y, x^2, xy, y^2 on
+coordinates that reach from -1 to 1 along the longer side. Parameters are [B, 2K]: p_1..p_K,
+q_1..q_K.
 """
 
 from functools import cached_property
@@ -15,8 +16,8 @@ from codesign.flow.lk.lanes import Grid
 
 TERMS = {"constant": 1, "affine": 3, "quadratic": 6}
 POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # of x and y in the basis
-# expected flow at the border from these terms, over that of the constant: cameras mostly shift, turn and
-# approach
+# expected flow at the border from these terms, over that of the constant: cameras mostly shift,
+# turn and approach
 AFFINE = 0.35
 SHEAR = 0.25
 QUADRATIC = 0.15
@@ -43,7 +44,9 @@ class Polynomials:
         self.width = width
         self.half = max(height, width) / 2
         # [2K, 2K]: parameters = unit @ numbers that are independent and of variance 1
-        self.unit = torch.linalg.cholesky(torch.linalg.inv(self.prior_precision(prior_px))).to(device)
+        self.unit = torch.linalg.cholesky(torch.linalg.inv(self.prior_precision(prior_px))).to(
+            device
+        )
 
     def scaled(self, x_px: Tensor, y_px: Tensor) -> tuple[Tensor, Tensor]:
         """Pixel coordinates to coordinates of the polynomials."""
@@ -54,8 +57,8 @@ class Polynomials:
         return torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v][: self.terms], dim)
 
     def prior_precision(self, prior_px: float) -> Tensor:
-        """Inverse covariance [2K, 2K] of the parameters, per px^2: constant, divergence, rotation, two
-        shears, quadratic terms, all independent."""
+        """Inverse covariance [2K, 2K] of the parameters, per px^2: constant, divergence, rotation,
+        two shears, quadratic terms, all independent."""
         k = self.terms
         unit = torch.eye(2 * k, dtype=torch.float64)
         precision = torch.zeros(2 * k, 2 * k, dtype=torch.float64)
@@ -79,8 +82,8 @@ class Polynomials:
 
     @cached_property
     def equations(self) -> Tensor:
-        """Sums over an image to normal equations, which are linear in them: [8 s^2, 8 K^2 + 2 K + 2],
-        float64.
+        """Sums over an image to normal equations, which are linear in them:
+        [8 s^2, 8 K^2 + 2 K + 2], float64.
 
         Rows: the sums of ``slopes.cell_sums`` times y^i x^j, i, j < s = 2 degree + 1. Columns: in
         units of the prior the matrix of the slopes and that of events as slopes along x and y, [2K,
@@ -125,7 +128,9 @@ class Polynomials:
         normal = design.mT @ design
         ridge = RIDGE * normal.diagonal(dim1=1, dim2=2).mean(1)[:, None, None]
         right = design.mT @ flow.flatten(1)[:, :, None]
-        return torch.linalg.solve(normal + ridge * torch.eye(2 * self.terms).to(normal), right)[..., 0]
+        return torch.linalg.solve(normal + ridge * torch.eye(2 * self.terms).to(normal), right)[
+            ..., 0
+        ]
 
     @cached_property
     def of_squares(self) -> tuple[tuple[int, int], ...]:
@@ -134,7 +139,8 @@ class Polynomials:
         return tuple((x, degree - x) for degree in range(most + 1) for x in range(degree, -1, -1))
 
     def squares(self, covariance: Tensor) -> Tensor:
-        """``covariance`` as coefficients [3, B, M] of polynomials in the powers of ``of_squares``."""
+        """``covariance`` as coefficients [3, B, M] of polynomials in the powers of
+        ``of_squares``."""
         k = self.terms
         sums = (self.powers[:, None] + self.powers).flatten(0, 1)
         powers = torch.tensor(self.of_squares, device=sums.device)
@@ -145,13 +151,15 @@ class Polynomials:
 
 class Moments:
     """Powers of x and y at the samples of ``grid``, up to twice the degree of ``shape``: values of
-    fields, and sums of images times powers. Powers are separable, so each costs two small matrix products."""
+    fields, and sums of images times powers. Powers are separable, so each costs two small matrix
+    products."""
 
     def __init__(self, shape: Polynomials, grid: Grid, like: Tensor) -> None:
         """Args: like: tells precision and device."""
         self.side = shape.degree + 1
         rows, columns = (
-            torch.arange(count).to(like) * grid.stride + (grid.stride - 1) / 2 for count in grid.shape
+            torch.arange(count).to(like) * grid.stride + (grid.stride - 1) / 2
+            for count in grid.shape
         )
         u, v = shape.scaled(columns, rows)
         exponents = torch.arange(2 * shape.degree + 1, device=like.device)

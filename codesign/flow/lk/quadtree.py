@@ -1,14 +1,14 @@
 """Fields on cells, smooth over many scales: the exact posterior on a quadtree (Luettgen, Karl and
 Willsky, 1994).
 
-A cell's value is its parent's plus a Gaussian step; the parents of the coarsest scale begin at zero.
-What the data say of the cells goes up the tree, each scale adding its doubt; means and covariances
-come down. All is linear in the number of cells. Trees see neighbours on two sides of a coarse border
-as strangers, so several, shifted against each other, are averaged.
+A cell's value is its parent's plus a Gaussian step; the parents of the coarsest scale begin at
+zero. What the data say of the cells goes up the tree, each scale adding its doubt; means and
+covariances come down. All is linear in the number of cells. Trees see neighbours on two sides of a
+coarse border as strangers, so several, shifted against each other, are averaged.
 
-In drjit a pass is one kernel for each scale, a lane for each cell. At the cells themselves the trees
-of one size of steps have the same data, so what goes up from there is found once for all of them. The
-adjoint of a cell is left to drjit; how cells hang together is written down here.
+In drjit a pass is one kernel for each scale, a lane for each cell. At the cells themselves the
+trees of one size of steps have the same data, so what goes up from there is found once for all of
+them. The adjoint of a cell is left to drjit; how cells hang together is written down here.
 """
 
 from itertools import pairwise
@@ -38,8 +38,9 @@ def posterior(precision: Tensor, pull: Tensor, steps: Tensor) -> tuple[Tensor, T
         float64.
       pull: [B, 2, h, w] precision times the value they say.
       steps: [scales, S] variances of the steps to each scale, cells first.
-    Returns: mean [S, B, 2, h, w], covariance [S, B, 3, h, w], and the logarithm [S, B] of the evidence
-      for these variances, relative to a field that is zero; covariance includes what the trees differ by.
+    Returns: mean [S, B, 2, h, w], covariance [S, B, 3, h, w], and the logarithm [S, B] of the
+      evidence for these variances, relative to a field that is zero; covariance includes what the
+      trees differ by.
     Gradient: precision, pull; exact, the first one.
     """
     data = torch.cat([precision, pull], 1)
@@ -52,8 +53,8 @@ def posterior(precision: Tensor, pull: Tensor, steps: Tensor) -> tuple[Tensor, T
 
 
 class Trees(NamedTuple):
-    """How many sizes of steps are tried, how many scales there are, and the cells (down, right) that
-    each tree is shifted by."""
+    """How many sizes of steps are tried, how many scales there are, and the cells (down, right)
+    that each tree is shifted by."""
 
     sizes: int
     scales: int
@@ -122,7 +123,9 @@ def _forward(trees, data, steps):
 def _adjoint(trees, data, steps, *rest):
     *kept, grads, _ = rest
     shapes = (trees.sizes, *data.shape), (trees.sizes, len(data))
-    grads = [data.new_zeros(shape) if by is None else by for by, shape in zip(grads, shapes, strict=True)]
+    grads = [
+        data.new_zeros(shape) if by is None else by for by, shape in zip(grads, shapes, strict=True)
+    ]
     form = Form.of(data, Grid(*data.shape[2:]))
     found = _gradients(form, trees, *form.load(data, steps, *grads, *kept))
     return tensors(shapes[0], found)[0].sum(0), None
@@ -191,8 +194,8 @@ def _gradients(form, trees, data, variances, by_values, by_evidence, *kept):
 
 
 class _Cells(Lanes):
-    """The cells of one scale: of all trees, or at scale 0, where their data are the same, of all sizes
-    and images."""
+    """The cells of one scale: of all trees, or at scale 0, where their data are the same, of all
+    sizes and images."""
 
     def __init__(self, form, trees, variances, scale):
         super().__init__(form)
@@ -220,12 +223,16 @@ class _Cells(Lanes):
 
     def loaded(self, array):
         """Of [sets, 5, cells]."""
-        return [self.take(array, (self.set * DATA + part) * self.plane + self.place) for part in range(DATA)]
+        return [
+            self.take(array, (self.set * DATA + part) * self.plane + self.place)
+            for part in range(DATA)
+        ]
 
     def data(self, array):
         """Of [B, 5, cells]."""
         return [
-            self.take(array, (self.image * DATA + part) * self.plane + self.place) for part in range(DATA)
+            self.take(array, (self.image * DATA + part) * self.plane + self.place)
+            for part in range(DATA)
         ]
 
     def of_evidence(self, array):
@@ -266,7 +273,9 @@ class _Cells(Lanes):
             y = y + self.shifts[tree][0]
             x = x + self.shifts[tree][1]
         place = (y >> 1) * above.wide + (x >> 1)
-        return [self.take(array, (chosen * DATA + part) * above.plane + place) for part in range(DATA)]
+        return [
+            self.take(array, (chosen * DATA + part) * above.plane + place) for part in range(DATA)
+        ]
 
     def shift(self, axis):
         """Of each lane's tree."""
@@ -302,8 +311,8 @@ def _above(log, variance, xx, xy, yy, px, py):
 
 
 def _below(variance, xx, xy, yy, px, py, x, y, uu, uv, vv):
-    """Mean and covariance of cells, from what is summed up there and the mean and covariance of their
-    parents."""
+    """Mean and covariance of cells, from what is summed up there and the mean and covariance of
+    their parents."""
     (a, b, d), _ = _gain(variance, xx, xy, yy)
     mean = _times((a, b, d), x + variance * px, y + variance * py)
     first = _times((a, b, d), uu, uv)

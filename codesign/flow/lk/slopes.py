@@ -19,10 +19,12 @@ def cell_sums(
     Args:
       mean, slope, seen: [B, h, w] as from ``warp.moving``, on the samples of ``grid``.
       density: [B, h, w].
-      cell: side of the squares in samples, >= 1; those at the lower and right border hold what is left.
-    Returns: [B, 8, ceil(h / cell), ceil(w / cell)], sums over samples of seen times x x, x y, y y, x
-      s, y s, s s, 1, density, where x and y are the slopes of the mean per px (central differences,
-      one-sided at the border; 0 where there is one sample) and s is the slope over time.
+      cell: side of the squares in samples, >= 1; those at the lower and right border hold what is
+        left.
+    Returns: [B, 8, ceil(h / cell), ceil(w / cell)], sums over samples of seen times x x, x y, y y,
+      x s, y s, s s, 1, density, where x and y are the slopes of the mean per px (central
+      differences, one-sided at the border; 0 where there is one sample) and s is the slope over
+      time.
     Gradient: mean, slope, seen, density; exact, the first one.
     Raises: GradientError for a second derivative.
     """
@@ -43,7 +45,8 @@ def _plain(mean, slope, seen, density, grid, cell):
 
 
 def _differences(image):
-    """Central differences along the last axis, one-sided at both ends; 0 where there is one sample."""
+    """Central differences along the last axis, one-sided at both ends; 0 where there is one
+    sample."""
     if image.shape[-1] == 1:
         return torch.zeros_like(image)
     step = image.diff(dim=-1)
@@ -56,13 +59,17 @@ def _forward(grid, cell, mean, slope, seen, density):
     rows, columns = grid.shape
     found = _sums_of_columns(form, cell, *form.load(mean, slope, seen, density))
     (sums,) = tensors((len(mean), PRODUCTS, -(-rows // cell), columns), found)
-    return [sums if cell == 1 else pad(sums, (0, -columns % cell)).unflatten(3, (-1, cell)).sum(4)], ()
+    return [
+        sums if cell == 1 else pad(sums, (0, -columns % cell)).unflatten(3, (-1, cell)).sum(4)
+    ], ()
 
 
 @exclusive
 def _adjoint(grid, cell, mean, slope, seen, density, grads, wanted):
     form = Form.of(mean, grid)
-    return tensors(mean.shape, *_gradients(form, cell, *form.load(mean, slope, seen, density, *grads)))
+    return tensors(
+        mean.shape, *_gradients(form, cell, *form.load(mean, slope, seen, density, *grads))
+    )
 
 
 @recorded
@@ -121,11 +128,18 @@ def _gradients(form, cell, mean, slope, seen, density, grad):
     start = number * image.area
     plane = image.count(image.cell_rows * across)
     of_cell = (
-        number * PRODUCTS * plane + image.split(y, cell)[0] * image.count(across) + image.split(x, cell)[0]
+        number * PRODUCTS * plane
+        + image.split(y, cell)[0] * image.count(across)
+        + image.split(x, cell)[0]
     )
     seeds = [image.take(grad, of_cell + k * plane) for k in range(PRODUCTS)]
-    given = [*image.slopes(start, y, x), *(image.take(values, at) for values in (slope, seen, density))]
-    grad_x, grad_y, *others = pull_back(lambda *given: [a * b for a, b in _products(*given)], given, seeds)
+    given = [
+        *image.slopes(start, y, x),
+        *(image.take(values, at) for values in (slope, seen, density)),
+    ]
+    grad_x, grad_y, *others = pull_back(
+        lambda *given: [a * b for a, b in _products(*given)], given, seeds
+    )
     grad_x *= image.factor(x, image.edge)
     grad_y *= image.factor(y, image.bottom)
     dr.eval(grad_x, grad_y, *others)
@@ -150,8 +164,8 @@ class _Slopes(Lanes):
         self.per_one = self.number(1 / form.stride)
 
     def slopes(self, start, y, x):
-        """Central differences of the mean, one-sided at the border; ``start``: index of the image's first
-        sample."""
+        """Central differences of the mean, one-sided at the border; ``start``: index of the image's
+        first sample."""
         return (
             self.difference(start + y * self.across, x, self.edge, 1),
             self.difference(start + x, y, self.bottom, self.across),
@@ -161,7 +175,9 @@ class _Slopes(Lanes):
         dr = self.dr
         before = dr.select(at > 0, at - 1, at)
         after = dr.minimum(at + 1, last)
-        change = self.take(self.mean, start + after * step) - self.take(self.mean, start + before * step)
+        change = self.take(self.mean, start + after * step) - self.take(
+            self.mean, start + before * step
+        )
         return change * self.factor(at, last)
 
     def factor(self, at, last):
@@ -169,9 +185,9 @@ class _Slopes(Lanes):
 
 
 def _back(image, grad, start, at, last, step):
-    """Adjoint of ``difference`` without its factor: a sample is the upper end of the difference at the
-    one before, or at itself at the end, and the lower end of that at the next, or at itself at the
-    beginning."""
+    """Adjoint of ``difference`` without its factor: a sample is the upper end of the difference at
+    the one before, or at itself at the end, and the lower end of that at the next, or at itself at
+    the beginning."""
     dr = image.dr
     inner = at > 0
     before = image.take(grad, start + dr.select(inner, at - 1, 0) * step)

@@ -1,9 +1,9 @@
-"""From the field at the mean place of the events to flow, covariance and confidence on the pixels of
-the start: in drjit, and as operations of torch.
+"""From the field at the mean place of the events to flow, covariance and confidence on the pixels
+of the start: in drjit, and as operations of torch.
 
-A lane goes down a part of a column with the coefficients of its image at hand; in the adjoint it sums
-up their gradients. The adjoint of a pixel, all rounds of its fixed point included, is left to drjit
-but for the cells, whose four values around a place are added to at once (as in ``warp``).
+A lane goes down a part of a column with the coefficients of its image at hand; in the adjoint it
+sums up their gradients. The adjoint of a pixel, all rounds of its fixed point included, is left to
+drjit but for the cells, whose four values around a place are added to at once (as in ``warp``).
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,8 @@ ROWS = 64
 
 @dataclass(frozen=True)
 class Setting:
-    """powers: of x and y in the basis of the flow, and in that of its variances. rows, columns: of the cells.
+    """powers: of x and y in the basis of the flow, and in that of its variances. rows, columns: of
+    the cells.
     cell_px: their side. rounds: of the fixed point. joined: whether cells are part of the field."""
 
     powers: tuple[tuple[int, int], ...]
@@ -68,7 +69,8 @@ def at_start(
       joined: whether they are part of the flow; else their mean is error.
       start: [B] place of the start on the way.
     Returns: flow [B, 2, H, W] px per way, by ``Polynomials.at_start``; covariance [B, 3, H, W] of
-      polynomial and cells; confidence [B, H, W] in [0, 1], 1 - trace(covariance) / trace(prior covariance).
+      polynomial and cells; confidence [B, H, W] in [0, 1], 1 - trace(covariance) /
+      trace(prior covariance).
     Gradient: parameters, spread, cells, start; exact, the first one.
     """
     prior = (shape.unit @ shape.unit.T).to(parameters)[None]
@@ -79,7 +81,9 @@ def at_start(
     of_flow = torch.cat([-start.to(parameters)[:, None], parameters], 1)
     of_rest = torch.cat([xx, xy, yy, widest.expand_as(xx)], 1)
     powers = tuple(tuple(pair) for pair in shape.powers.tolist())
-    setting = Setting(powers, shape.of_squares, *cells.value.shape[2:], CELL, FIXED_POINT_STEPS, joined)
+    setting = Setting(
+        powers, shape.of_squares, *cells.value.shape[2:], CELL, FIXED_POINT_STEPS, joined
+    )
     of_cells = cells.value.to(parameters), cells.covariance.to(parameters)
     grid = Grid(shape.height, shape.width)
     if plain_wanted():
@@ -95,13 +99,18 @@ def at_start(
 def _forward(grid, setting, of_flow, of_rest, value, covariance):
     form = Form.of(of_flow, grid)
     given = torch.cat([of_flow, of_rest], 1), torch.cat([value, covariance], 1)
-    (found,) = tensors((form.images, OUT, *grid.shape), _outcomes(form, setting, *form.load(*given)))
+    (found,) = tensors(
+        (form.images, OUT, *grid.shape), _outcomes(form, setting, *form.load(*given))
+    )
     return [found[:, :2].clone(), found[:, 2:].clone()], given
 
 
 @exclusive
-def _adjoint(grid, setting, of_flow, of_rest, value, covariance, coefficients, cells, grads, wanted):
-    """Most who follow a gradient follow that of the flow alone: what it does not depend on has none."""
+def _adjoint(
+    grid, setting, of_flow, of_rest, value, covariance, coefficients, cells, grads, wanted
+):
+    """Most who follow a gradient follow that of the flow alone: what it does not depend on has
+    none."""
     by_flow, by_rest = grads
     by_flow = torch.zeros_like(by_rest[:, :2]) if by_flow is None else by_flow
     form = Form.of(of_flow, grid)
@@ -157,7 +166,11 @@ def _gradients(form, setting, coefficients, cells, by_flow, by_rest=None):
 
         def outcome(*given):
             row = pixels.arr.Float(y)
-            return pixels.flow(given, row, read)[0] if by_rest is None else pixels.outcome(given, row, read)
+            return (
+                pixels.flow(given, row, read)[0]
+                if by_rest is None
+                else pixels.outcome(given, row, read)
+            )
 
         found = pull_back(outcome, given, seeds, read.values)
         of_cells = found[numbers:]
@@ -184,12 +197,12 @@ class _Read(NamedTuple):
 
 
 class _Outcome:
-    """What is found at pixels, by the numbers ``x``, ``middle``, ``per_half`` and ``setting`` and the
-    operations ``fma``, ``share`` (cut off at 0 and 1) and ``of_cells`` of its kinds."""
+    """What is found at pixels, by the numbers ``x``, ``middle``, ``per_half`` and ``setting`` and
+    the operations ``fma``, ``share`` (cut off at 0 and 1) and ``of_cells`` of its kinds."""
 
     def flow(self, given, y, read):
-        """Flow on a pixel of the start, and where that is at the mean place. ``read`` takes what cells
-        gave."""
+        """Flow on a pixel of the start, and where that is at the mean place. ``read`` takes what
+        cells gave."""
         back, *given = given
         terms = len(self.setting.powers)
         field = given[:terms], given[terms : 2 * terms]
@@ -199,7 +212,9 @@ class _Outcome:
             place = self.x + back * flow[0], y + back * flow[1]
             flow = self.polynomials(field, self.setting.powers, place)
             if joined:
-                flow = [a + b for a, b in zip(flow, self.of_cells(place, (0, 1), read), strict=True)]
+                flow = [
+                    a + b for a, b in zip(flow, self.of_cells(place, (0, 1), read), strict=True)
+                ]
         return flow, place
 
     def outcome(self, given, y, read):
@@ -222,13 +237,17 @@ class _Outcome:
 
     def polynomials(self, rows, powers, place):
         """Values of several polynomials with the same powers."""
-        u, v = ((at - middle) * self.per_half for at, middle in zip(place, self.middle, strict=True))
+        u, v = (
+            (at - middle) * self.per_half for at, middle in zip(place, self.middle, strict=True)
+        )
         of_u = _powers(u, max(x for x, _ in powers))
         of_v = _powers(v, max(y for _, y in powers))
         found = [row[0] for row in rows]  # of power 0
         for number, (x, y) in list(enumerate(powers))[1:]:
             value = of_v[y] if not x else of_u[x] if not y else of_u[x] * of_v[y]
-            found = [self.fma(row[number], value, total) for row, total in zip(rows, found, strict=True)]
+            found = [
+                self.fma(row[number], value, total) for row, total in zip(rows, found, strict=True)
+            ]
         return found
 
 

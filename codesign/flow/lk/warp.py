@@ -1,9 +1,10 @@
-"""Bins read along a flow, their mean and their slope over time: in drjit, and as operations of torch.
+"""Bins read along a flow, their mean and their slope over time: in drjit, and as operations of
+torch.
 
-The adjoint of a bin is left to drjit, but for what is read: it belongs to four neighbours. A lane adds
-to all of them at once, to the four values of the slot of its upper left neighbour; a second pass
-collects what belongs to a sample. That is a third of the time of four additions, which processors do
-one by one.
+The adjoint of a bin is left to drjit, but for what is read: it belongs to four neighbours. A lane
+adds to all of them at once, to the four values of the slot of its upper left neighbour; a second
+pass collects what belongs to a sample. That is a third of the time of four additions, which
+processors do one by one.
 """
 
 import torch
@@ -33,16 +34,16 @@ def moving(
       fade_px: the windows below fall smoothly from 1 to 0 over this distance to the border, px.
     Returns:
       mean, slope: [B, h, w]. Bins are read bilinearly; beyond the outermost samples, as there.
-      seen: [B, h, w] in [0, 1], product of the windows along x and y where the first and the last bin
-        are read.
-    Gradient: rate, flow_px; exact, the first one. The flow has none through bins that it reads beyond
-      the outermost samples.
+      seen: [B, h, w] in [0, 1], product of the windows along x and y where the first and the last
+        bin are read.
+    Gradient: rate, flow_px; exact, the first one. The flow has none through bins that it reads
+      beyond the outermost samples.
     Raises: GradientError for a second derivative.
-    Cost: one pass forward, two backward; nothing of n bins is stored forward. Backward four values per
-      sample and bin, or ``MOST_VALUES`` where that is less, in each thread. One kernel for each number
-      of bins, whatever the sizes; it is traced once for each size.
-    Source: Lucas and Kanade, 1981; Jaderberg et al., Spatial Transformer Networks, NeurIPS 2015, for
-      the reading.
+    Cost: one pass forward, two backward; nothing of n bins is stored forward. Backward four values
+      per sample and bin, or ``MOST_VALUES`` where that is less, in each thread. One kernel for each
+      number of bins, whatever the sizes; it is traced once for each size.
+    Source: Lucas and Kanade, 1981; Jaderberg et al., Spatial Transformer Networks, NeurIPS 2015,
+      for the reading.
     """
     if plain_wanted():
         return _plain(rate, flow_px, time, contrast, grid, fade_px)
@@ -79,7 +80,9 @@ def _adjoint(grid, fade_px, weights, rate, flow_px, grads, wanted):
     together = min(max(MOST_VALUES // of_bin, 1), BINS)
     grads = [torch.zeros_like(flow_px[:, 0]) if grad is None else grad for grad in grads]
     arrays = form.load(rate, flow_px, *grads)
-    grad_rate, grad_flow = _gradients(form, fade_px, wanted[0], together, *arrays, form.scalars(weights))
+    grad_rate, grad_flow = _gradients(
+        form, fade_px, wanted[0], together, *arrays, form.scalars(weights)
+    )
     (grad_flow,) = tensors(flow_px.shape, grad_flow)
     return (tensors(rate.shape, grad_rate)[0] if wanted[0] else None), grad_flow
 
@@ -102,17 +105,22 @@ def _read(form, fade_px, rate, flow, weights):
 
 
 @recorded
-def _gradients(form, fade_px, wants_rate, together, rate, flow, by_mean, by_slope, by_seen, weights):
+def _gradients(
+    form, fade_px, wants_rate, together, rate, flow, by_mean, by_slope, by_seen, weights
+):
     warp = _Warp(form, fade_px, rate, flow, weights)
     dr = warp.dr
     by_mean, by_slope, by_seen = (warp.take(by, warp.lane) for by in (by_mean, by_slope, by_seen))
     grad_rate = warp.empty(warp.bins * warp.width) if wants_rate else None
     grad_flow = pull_back(lambda *flow: [warp.seen(*flow)], warp.flow, [by_seen])
-    # processors need no locks where each thread has a copy; with several, this kernel is one for each size
+    # processors need no locks where each thread has a copy; with several, this kernel is one for
+    # each size
     mode = dr.ReduceMode.Expand if form.device == "cpu" else dr.ReduceMode.Auto
     for start in range(0, warp.bins, together):
         bins = min(together, warp.bins - start)
-        added = dr.zeros(warp.arr.Float, 4 * warp.images * bins * warp.slots) if wants_rate else None
+        added = (
+            dr.zeros(warp.arr.Float, 4 * warp.images * bins * warp.slots) if wants_rate else None
+        )
         image = warp.image * warp.count(bins)
         for j, (k, (time, in_mean, in_slope)) in enumerate(warp.group(start, bins)):
             u, v, *four = warp.pulled(k, time, dr.fma(in_mean, by_mean, in_slope * by_slope))
@@ -150,22 +158,32 @@ class _Warp(Lanes):
         self.per_stride = self.number(1 / form.stride)
         self.per_fade = self.number(1 / fade_px)
         self.axes = [self.axis(x, self.columns, form.width), self.axis(y, self.rows, form.height)]
-        # of a bin: a row and a column more than samples, so that each sample has upper left neighbours
+        # of a bin: a row and a column more than samples, so that each sample has upper left
+        # neighbours
         self.slots = (self.rows + 1) * (self.columns + 1)
 
     def axis(self, place, count, size):
-        """Along one axis: place, the last sample, the last that is the lower one of two, the middle in px."""
+        """Along one axis: place, the last sample, the last that is the lower one of two, the middle
+        in px."""
         last_lower = self.count(max(count, 2) - 2)
-        return self.arr.Float(place), self.number(count - 1), last_lower, self.number((size - 1) / 2)
+        return (
+            self.arr.Float(place),
+            self.number(count - 1),
+            last_lower,
+            self.number((size - 1) / 2),
+        )
 
     def group(self, start, count):
-        """Bins from ``start`` with their weights; their number is opaque, so that other groups are alike."""
+        """Bins from ``start`` with their weights; their number is opaque, so that other groups are
+        alike."""
         first = self.count(start)
-        return [(first + j, weights) for j, weights in enumerate(self.weights[start : start + count])]
+        return [
+            (first + j, weights) for j, weights in enumerate(self.weights[start : start + count])
+        ]
 
     def value(self, k, time, u, v, read=None):
-        """Bin k where the flow (u, v) leads; ``read`` takes the four values around it, which then have
-        gradients."""
+        """Bin k where the flow (u, v) leads; ``read`` takes the four values around it, which then
+        have gradients."""
         dr = self.dr
         (x, a), (y, b) = (self.along(*pair, time) for pair in zip(self.axes, (u, v), strict=True))
         at = (self.image * self.n + k) * self.area + y * self.across + x

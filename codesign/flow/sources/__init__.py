@@ -1,5 +1,5 @@
-"""Where flow is learned from and judged on: recordings with true flow by path, and folders of data sets as
-sources of windows."""
+"""Where flow is learned from and judged on: recordings with true flow by path, and folders of data
+sets as sources of windows."""
 
 from codesign.doors import explain
 from codesign.flow.sources.dsec import DsecWindows

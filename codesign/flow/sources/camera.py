@@ -1,5 +1,5 @@
-"""The camera of a recording: a pinhole with radial and tangential distortion, as in calib.txt (fx fy
-cx cy k1 k2 p1 p2 k3), and how it turned: from its gyroscope (imu.txt) or from recorded poses
+"""The camera of a recording: a pinhole with radial and tangential distortion, as in calib.txt (fx
+fy cx cy k1 k2 p1 p2 k3), and how it turned: from its gyroscope (imu.txt) or from recorded poses
 (groundtruth.txt)."""
 
 import math
@@ -31,7 +31,8 @@ LARGEST = 1e15  # of a time, rate or place: products of two stay finite
 
 @dataclass(frozen=True)
 class Calibration:
-    """focal_px: (fx, fy). centre_px: (cx, cy). distortion: (k1, k2, p1, p2, k3), dimensionless. Source:
+    """focal_px: (fx, fy). centre_px: (cx, cy). distortion: (k1, k2, p1, p2, k3), dimensionless.
+    Source:
     Brown, Photogrammetric Engineering 1966."""
 
     focal_px: tuple[float, float]
@@ -54,14 +55,17 @@ class Calibration:
         )
 
     def project(self, directions: np.ndarray) -> np.ndarray:
-        """Pixels [..., 2] of directions [..., 3] in camera axes (x right, y down, z forward); NaN behind the
-        camera."""
+        """Pixels [..., 2] of directions [..., 3] in camera axes (x right, y down, z forward); NaN
+        behind the camera."""
         z = np.where(directions[..., 2:] > 0, directions[..., 2:], np.nan)
         return self.distorted(directions[..., :2] / z) * self.focal_px + self.centre_px
 
     def directions(self, height_px: int, width_px: int) -> np.ndarray:
-        """Direction with z = 1 of every pixel, [H, W, 3]; NaN where the distortion has no inverse."""
-        x, y = np.meshgrid(np.arange(width_px, dtype=np.float64), np.arange(height_px, dtype=np.float64))
+        """Direction with z = 1 of every pixel, [H, W, 3]; NaN where the distortion has no
+        inverse."""
+        x, y = np.meshgrid(
+            np.arange(width_px, dtype=np.float64), np.arange(height_px, dtype=np.float64)
+        )
         wanted = (np.stack([x, y], -1) - self.centre_px) / self.focal_px
         slopes = wanted.copy()
         with np.errstate(over="ignore", invalid="ignore"):  # what runs away is marked below
@@ -77,13 +81,15 @@ class Calibration:
         """Flow of a camera that turns before a scene so far that its translation does not matter.
 
         Args:
-          R_later_earlier: [3, 3], takes directions in the camera's axes at the start to those at the
-            end.
+          R_later_earlier: [3, 3], takes directions in the camera's axes at the start to those at
+            the end.
         Returns: flow_px [2, H, W] float64, 0 where not valid; valid [H, W].
         """
         rays = self.directions(height_px, width_px)
         x, y = np.meshgrid(np.arange(width_px), np.arange(height_px))
-        flow = (self.project(rays @ np.asarray(R_later_earlier).T) - np.stack([x, y], -1)).transpose(2, 0, 1)
+        flow = (
+            self.project(rays @ np.asarray(R_later_earlier).T) - np.stack([x, y], -1)
+        ).transpose(2, 0, 1)
         valid = np.asarray(np.isfinite(flow).all(0))
         return np.where(valid, flow, 0.0), valid
 
@@ -93,8 +99,8 @@ class Calibration:
         Args:
           flow_px: [2, H, W] on the pixels of a pinhole with these focal lengths and this centre.
           valid: [H, W].
-        Returns: flow_px [2, H, W] on the pixels as the lens makes them, 0 where not valid; valid [H,
-          W], where the four undistorted pixels around are.
+        Returns: flow_px [2, H, W] on the pixels as the lens makes them, 0 where not valid; valid
+          [H, W], where the four undistorted pixels around are.
         """
         height, width = valid.shape
         slopes = self.directions(height, width)[..., :2]
@@ -102,9 +108,12 @@ class Calibration:
         # -1: beside the picture
         at = np.where(np.isfinite(place), place, -1.0)[..., ::-1].transpose(2, 0, 1)
         known = map_coordinates(valid.astype(float), at, order=1, cval=0.0) > 1 - 1e-9
-        read = np.stack([map_coordinates(part, at, order=1) for part in np.where(valid, flow_px, 0.0)], -1)
+        read = np.stack(
+            [map_coordinates(part, at, order=1) for part in np.where(valid, flow_px, 0.0)], -1
+        )
         landed = (
-            self.distorted((place + read - self.centre_px) / self.focal_px) * self.focal_px + self.centre_px
+            self.distorted((place + read - self.centre_px) / self.focal_px) * self.focal_px
+            + self.centre_px
         )
         y, x = np.mgrid[:height, :width]
         raw = (landed - np.stack([x, y], -1)).transpose(2, 0, 1)
@@ -121,17 +130,23 @@ def read_calibration(path: str | Path) -> Calibration:
     with reading(path, "'fx fy cx cy k1 k2 p1 p2 k3' in pixels is needed"):
         words = read_text(path, MOST_BYTES).replace(",", " ").split()
         values = [float(word) for word in words if not word.endswith(":")]
-    if len(values) not in (4, 8, 9) or not all(map(math.isfinite, values)) or not min(values[:2]) > 0:
+    if (
+        len(values) not in (4, 8, 9)
+        or not all(map(math.isfinite, values))
+        or not min(values[:2]) > 0
+    ):
         raise FileFormatError(
             f"{path} holds {len(values)} numbers; fx fy cx cy k1 k2 p1 p2 k3 are needed (distortion or k3 "
             "may be left out), fx and fy above 0."
         )
-    return Calibration((values[0], values[1]), (values[2], values[3]), tuple((values[4:] + [0.0] * 5)[:5]))
+    return Calibration(
+        (values[0], values[1]), (values[2], values[3]), tuple((values[4:] + [0.0] * 5)[:5])
+    )
 
 
 def signed_axes(text: str) -> np.ndarray:
-    """[3, 3] matrix of axes such as "xyz" or "-y+xz": row k says which of the sensor's axes is the camera's
-    k-th.
+    """[3, 3] matrix of axes such as "xyz" or "-y+xz": row k says which of the sensor's axes is the
+    camera's k-th.
 
     Raises: DomainError unless each of x, y, z appears once.
     """
@@ -151,7 +166,10 @@ def signed_axes(text: str) -> np.ndarray:
             "'x-y-z'."
         )
     return np.array(
-        [[value * (name == axis) for axis in "xyz"] for name, value in zip(names, signs, strict=True)]
+        [
+            [value * (name == axis) for axis in "xyz"]
+            for name, value in zip(names, signs, strict=True)
+        ]
     )
 
 
@@ -168,19 +186,21 @@ class Attitude:
     def turn(self, t0_s: float, t1_s: float) -> np.ndarray:
         """R_later_earlier [3, 3]: takes directions in the camera's axes at t0 to those at t1.
 
-        Raises: FileFormatError when the window is not covered by samples, or lies across a gap of more than
-          0.1 s.
+        Raises: FileFormatError when the window is not covered by samples, or lies across a gap of
+          more than 0.1 s.
         """
         reason = self.missing(t0_s, t1_s)
         if reason:
             raise FileFormatError(f"{reason}; choose windows inside.")
         first, last = self._around(t0_s, t1_s)
-        turns = Slerp(self.t_s[first : last + 1], self.turns[first : last + 1])(np.array([t0_s, t1_s]))
+        turns = Slerp(self.t_s[first : last + 1], self.turns[first : last + 1])(
+            np.array([t0_s, t1_s])
+        )
         return (turns[1].inv() * turns[0]).as_matrix()
 
     def missing(self, t0_s: float, t1_s: float) -> str:
-        """Why a window cannot be told of, in words: it is not covered by samples, or lies across a gap
-        of more than 0.1 s; empty where it can."""
+        """Why a window cannot be told of, in words: it is not covered by samples, or lies across a
+        gap of more than 0.1 s; empty where it can."""
         window = f"the window {t0_s:.6f} to {t1_s:.6f} s"
         if not (self.t_s[0] <= t0_s and t1_s <= self.t_s[-1]):
             return f"{self.name} covers {self.t_s[0]:.6f} to {self.t_s[-1]:.6f} s, not {window}"
@@ -195,17 +215,19 @@ class Attitude:
         return np.searchsorted(self.t_s, t0_s, "right") - 1, np.searchsorted(self.t_s, t1_s, "left")
 
     def moved_m(self, t0_s: float, t1_s: float) -> float | None:
-        """Distance between the camera's places at both times, metres; None where nobody recorded it. Linear
-        between samples."""
+        """Distance between the camera's places at both times, metres; None where nobody recorded
+        it. Linear between samples."""
         if self.position_m is None:
             return None
-        places = np.array([np.interp([t0_s, t1_s], self.t_s, column) for column in self.position_m.T])
+        places = np.array(
+            [np.interp([t0_s, t1_s], self.t_s, column) for column in self.position_m.T]
+        )
         return float(np.linalg.norm(places[:, 1] - places[:, 0]))
 
 
 def read_gyroscope(path: str | Path, axes: str = "xyz") -> Attitude:
-    """Attitude of ``t ax ay az gx gy gz`` (seconds, m/s^2, rad/s): rates integrated from sample to sample,
-    each interval at the mean of its ends. The gyroscope's offset is not removed.
+    """Attitude of ``t ax ay az gx gy gz`` (seconds, m/s^2, rad/s): rates integrated from sample to
+    sample, each interval at the mean of its ends. The gyroscope's offset is not removed.
 
     axes: the camera's from the gyroscope's, as ``signed_axes`` takes them.
     """
@@ -232,10 +254,13 @@ def read_poses(path: str | Path) -> Attitude:
 
 
 def _table(path, columns, names):
-    """[N >= 2, columns] finite numbers with rising times in the first column; repeated times are left out
-    after the first."""
+    """[N >= 2, columns] finite numbers with rising times in the first column; repeated times are
+    left out after the first."""
     path = check_path(path)
-    with open_regular(path, MOST_TABLE_BYTES) as file, reading(path, f"lines of '{names}' are needed"):
+    with (
+        open_regular(path, MOST_TABLE_BYTES) as file,
+        reading(path, f"lines of '{names}' are needed"),
+    ):
         delimiter = "," if b"," in file.read(400) else None
         file.seek(0)
         with warnings.catch_warnings():

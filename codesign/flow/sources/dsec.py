@@ -1,10 +1,10 @@
 """Windows of DSEC as published: events/left/events.h5 with rectify_map.h5, flow/forward/*.png with
 forward_timestamps.txt, per sequence.
 
-The true flow lies on the rectified picture of the left event camera, so events are rectified before they are
-counted. Each flow file is one window (100 ms).
-Source: Gehrig et al., "DSEC: A Stereo Event Camera Dataset for Driving Scenarios", RA-L 2021; its published
-  description of the data format.
+The true flow lies on the rectified picture of the left event camera, so events are rectified before
+they are counted. Each flow file is one window (100 ms).
+Source: Gehrig et al., "DSEC: A Stereo Event Camera Dataset for Driving Scenarios", RA-L 2021; its
+  published description of the data format.
 """
 
 from itertools import product
@@ -30,14 +30,14 @@ class DsecWindows(Windows):
     """Windows of all sequences under a folder that have flow.
 
     Args:
-      folder: one sequence, a folder of sequences, or one that holds train_events and train_optical_flow
-        side by side.
+      folder: one sequence, a folder of sequences, or one that holds train_events and
+        train_optical_flow side by side.
       bins: of the volumes.
       crop_px: (height, width) of a piece at a random place, or None.
       seed: of that place.
       size_px: of the camera.
-    Raises: FileFormatError, before anything is read in earnest, for files that are missing, cut, or do not
-      fit together.
+    Raises: FileFormatError, before anything is read in earnest, for files that are missing, cut, or
+      do not fit together.
     """
 
     def __init__(
@@ -60,8 +60,8 @@ class DsecWindows(Windows):
 
 
 class Sequence(Recording):
-    """One sequence. files: its flow files. spans_us: [(from, to)] of each, on the clock of the events with
-    t_offset added."""
+    """One sequence. files: its flow files. spans_us: [(from, to)] of each, on the clock of the
+    events with t_offset added."""
 
     def __init__(self, events: Path, flow: Path, size_px: tuple[int, int]) -> None:
         self.path = events / "events.h5"
@@ -164,16 +164,23 @@ def splatted(
       t_us: [N] int64 within t0_us to t1_us.
       x_px, y_px: [N] float.
       on: [N] bool.
-    Events, and shares of them, that fall outside the picture are left out; everything else is conserved.
+    Events, and shares of them, that fall outside the picture are left out; everything else is
+    conserved.
     """
     axes = []
-    for place in ((t_us - t0_us).double() / (t1_us - t0_us) * (bins - 1), y_px.double(), x_px.double()):
+    for place in (
+        (t_us - t0_us).double() / (t1_us - t0_us) * (bins - 1),
+        y_px.double(),
+        x_px.double(),
+    ):
         low = place.floor()
         axes.append(((low.long(), 1 - (place - low)), (low.long() + 1, place - low)))
     counts = torch.zeros(2 * bins * height_px * width_px, dtype=torch.float64)
     for (bin_, of_time), (row, of_y), (column, of_x) in product(*axes):
         share = of_x * of_y * of_time
-        inside = (column >= 0) & (column < width_px) & (row >= 0) & (row < height_px) & (bin_ < bins)
+        inside = (
+            (column >= 0) & (column < width_px) & (row >= 0) & (row < height_px) & (bin_ < bins)
+        )
         inside &= share > 0
         cell = (((~on).long() * bins + bin_) * height_px + row) * width_px + column
         counts.index_add_(0, cell[inside], share[inside])

@@ -1,5 +1,5 @@
-"""What lies in the folder of a recording: event files, flow files, and the text files beside them. Zip
-archives are unpacked for as long as they are needed."""
+"""What lies in the folder of a recording: event files, flow files, and the text files beside them.
+Zip archives are unpacked for as long as they are needed."""
 
 import re
 import tempfile
@@ -13,8 +13,8 @@ from codesign.errors import FileFormatError
 from codesign.events.files import READERS
 from codesign.reading import open_regular, reading
 
-# of several event files of one name the first of these kinds is read: text as the Event-Camera Dataset
-# has it, what cameras write, then arrays that somebody made of either
+# of several event files of one name the first of these kinds is read: text as the Event-Camera
+# Dataset has it, what cameras write, then arrays that somebody made of either
 KINDS = (".txt", ".csv", ".h5", ".hdf5", ".aedat4", ".raw", ".dat")
 EVENT_SUFFIXES = set(READERS)
 FLOW_SUFFIXES = {".flo", ".png", ".npy", ".npz", ".mat", ".txt", ".csv"}
@@ -38,7 +38,8 @@ MOST_BYTES = 40_000_000_000
 def opened(path: str | Path) -> Iterator[Path]:
     """Yield ``path`` itself, or the folder that a zip archive holds, which is removed afterwards.
 
-    Raises: FileFormatError when there is nothing, or the archive is damaged or out of all proportion.
+    Raises: FileFormatError when there is nothing, or the archive is damaged or out of all
+      proportion.
     """
     path = check_path(path, "the path of the recording")
     if not path.exists():
@@ -74,12 +75,14 @@ def opened(path: str | Path) -> Iterator[Path]:
 
 def natural(path: str | Path) -> list[int | str]:
     """Sort key: names with numbers in order of the numbers."""
-    return [int(word) if word.isdecimal() else word for word in re.split(r"(\d+)", str(path).lower())]
+    return [
+        int(word) if word.isdecimal() else word for word in re.split(r"(\d+)", str(path).lower())
+    ]
 
 
 def event_files(path: Path) -> list[Path]:
-    """[event file] of a recording: the file itself; events.* of a folder; otherwise one per packet, from the
-    folder or its subfolders, in natural order; of several of one name the first of KINDS.
+    """[event file] of a recording: the file itself; events.* of a folder; otherwise one per packet,
+    from the folder or its subfolders, in natural order; of several of one name the first of KINDS.
 
     Raises: FileFormatError when there is none.
     """
@@ -89,14 +92,19 @@ def event_files(path: Path) -> list[Path]:
     for folders in (
         [path],
         sorted(
-            (entry for entry in path.iterdir() if entry.is_dir() and not FLOW_WORDS.search(entry.name)),
+            (
+                entry
+                for entry in path.iterdir()
+                if entry.is_dir() and not FLOW_WORDS.search(entry.name)
+            ),
             key=natural,
         ),
     ):
         files = []
         for folder in folders:
             found = sorted(
-                (entry for entry in folder.iterdir() if entry.is_file() and _holds_events(entry)), key=natural
+                (entry for entry in folder.iterdir() if entry.is_file() and _holds_events(entry)),
+                key=natural,
             )
             named = [entry for entry in found if entry.stem.lower() == "events"]
             files += _one_of_each_name(named or found)
@@ -110,8 +118,12 @@ def event_files(path: Path) -> list[Path]:
 
 def passed_over(file: Path) -> list[Path]:
     """Other event files of the same name beside one, which event_files passes over."""
-    same = (entry for entry in file.parent.iterdir() if entry != file and _stem(entry) == _stem(file))
-    return sorted((entry for entry in same if entry.is_file() and _holds_events(entry)), key=natural)
+    same = (
+        entry for entry in file.parent.iterdir() if entry != file and _stem(entry) == _stem(file)
+    )
+    return sorted(
+        (entry for entry in same if entry.is_file() and _holds_events(entry)), key=natural
+    )
 
 
 def _stem(entry):
@@ -129,8 +141,8 @@ def _rank(entry):
 
 
 def flow_files(folder: Path) -> list[Path]:
-    """[flow file] of a folder that holds nothing else of these kinds, in natural order; flow/forward inside
-    where there is one."""
+    """[flow file] of a folder that holds nothing else of these kinds, in natural order;
+    flow/forward inside where there is one."""
     folder = Path(folder)
     for inside in (folder / "flow" / "forward", folder / "forward", folder / "flow", folder):
         if inside.is_dir():
@@ -140,7 +152,11 @@ def flow_files(folder: Path) -> list[Path]:
                 files
                 if inside != folder and not named
                 else named
-                or [entry for entry in files if entry.suffix.lower() in (".png", ".npy", ".npz", ".mat")]
+                or [
+                    entry
+                    for entry in files
+                    if entry.suffix.lower() in (".png", ".npy", ".npz", ".mat")
+                ]
             )
             if chosen:
                 return sorted(_one_kind(chosen), key=natural)
@@ -148,31 +164,43 @@ def flow_files(folder: Path) -> list[Path]:
 
 
 def truth_beside(events: Path, alone: bool) -> Path | None:
-    """The flow file that lies beside a packet's event file: its name with flow or truth in it, or the same
-    number; None when there is none.
+    """The flow file that lies beside a packet's event file: its name with flow or truth in it, or
+    the same number; None when there is none.
 
     Args:
       events: path of the event file.
       alone: it is the only one of its folder.
     """
     beside = sorted(events.parent.iterdir(), key=natural)
-    named = [entry for entry in beside if entry != events and _may_hold_flow(entry) and _is_named_flow(entry)]
+    named = [
+        entry
+        for entry in beside
+        if entry != events and _may_hold_flow(entry) and _is_named_flow(entry)
+    ]
     if not alone:
         numbers = re.findall(r"\d+", events.stem)
         named = [
             entry
             for entry in named
-            if (numbers and [int(n) for n in re.findall(r"\d+", entry.stem)] == [int(n) for n in numbers])
+            if (
+                numbers
+                and [int(n) for n in re.findall(r"\d+", entry.stem)] == [int(n) for n in numbers]
+            )
             or entry.stem.startswith(events.stem)
         ]
     return _one_kind(named)[0] if named else None
 
 
 def truth_folder(events: Path) -> Path | None:
-    """The folder of flow files beside an event file or beside its folder; None when there is none."""
+    """The folder of flow files beside an event file or beside its folder; None when there is
+    none."""
     for place in (events.parent, events.parent.parent):
         for entry in sorted(
-            (entry for entry in place.iterdir() if entry.is_dir() and FLOW_WORDS.search(entry.name)),
+            (
+                entry
+                for entry in place.iterdir()
+                if entry.is_dir() and FLOW_WORDS.search(entry.name)
+            ),
             key=natural,
         ):
             if any(map(_may_hold_flow, entry.rglob("*"))):
@@ -181,9 +209,15 @@ def truth_folder(events: Path) -> Path | None:
 
 
 def side_file(events: Path, name: str) -> Path | None:
-    """A file such as imu.txt in the folder of an event file, or in the one above; None when there is none."""
+    """A file such as imu.txt in the folder of an event file, or in the one above; None when there
+    is none."""
     return next(
-        (folder / name for folder in (events.parent, events.parent.parent) if (folder / name).is_file()), None
+        (
+            folder / name
+            for folder in (events.parent, events.parent.parent)
+            if (folder / name).is_file()
+        ),
+        None,
     )
 
 
@@ -207,5 +241,7 @@ def _holds_events(entry):
 def _one_kind(files):
     """The exact kind where the same flow lies there twice (.flo before .png)."""
     kinds = {entry.suffix.lower() for entry in files}
-    kind = next(kind for kind in (".flo", ".npz", ".npy", ".mat", ".png", ".txt", ".csv") if kind in kinds)
+    kind = next(
+        kind for kind in (".flo", ".npz", ".npy", ".mat", ".png", ".txt", ".csv") if kind in kinds
+    )
     return [entry for entry in files if entry.suffix.lower() == kind]

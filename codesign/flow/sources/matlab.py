@@ -1,5 +1,5 @@
-"""Arrays of numbers of a MATLAB file (.mat, versions 5 to 7); text, cells, structures and the rest are
-passed over.
+"""Arrays of numbers of a MATLAB file (.mat, versions 5 to 7); text, cells, structures and the rest
+are passed over.
 
 Source: MathWorks, "MAT-File Format" (level 5).
 """
@@ -17,9 +17,31 @@ from codesign.reading import check_room, read_bytes, reading
 
 MOST_BYTES = 2**32
 HEADER_BYTES = 128
-STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+STORED = {
+    1: "i1",
+    2: "u1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    9: "f8",
+    12: "i8",
+    13: "u8",
+}
 MATRIX, PACKED = 14, 15
-NUMBERS = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
+NUMBERS = {
+    6: "f8",
+    7: "f4",
+    8: "i1",
+    9: "u1",
+    10: "i2",
+    11: "u2",
+    12: "i4",
+    13: "u4",
+    14: "i8",
+    15: "u8",
+}
 COMPLEX = 0x800
 
 
@@ -41,7 +63,9 @@ def _matrices(path, data, order):
             unpacker = zlib.decompressobj()
             plain = unpacker.decompress(body, limit)
             if not unpacker.eof:
-                raise FileFormatError(f"{path} is cut, or unpacks to more than {limit} bytes; it is damaged.")
+                raise FileFormatError(
+                    f"{path} is cut, or unpacks to more than {limit} bytes; it is damaged."
+                )
             kind, body = next(_elements(plain, order, 8))
         if kind == MATRIX:
             yield body

@@ -1,12 +1,13 @@
-"""Windows of MVSEC as published: NAME_data.hdf5 (davis/left/events, image_raw_ts) with NAME_gt_flow_dist.npz
-(x_flow_dist, y_flow_dist, timestamps).
+"""Windows of MVSEC as published: NAME_data.hdf5 (davis/left/events, image_raw_ts) with
+NAME_gt_flow_dist.npz (x_flow_dist, y_flow_dist, timestamps).
 
-A flow of the file leads from its own time to the next one's, on the raw (distorted) pixels of the left
-camera; (0, 0) means that nothing was measured. The usual tests take windows between grey frames: dt = 1 from
-one to the next, dt = 4 to the fourth. There the flow is followed from its time on, whole intervals and linear
-parts of them (``warp.chained``), and is not valid where it leads out of what was measured.
-Sources: Zhu et al., "The Multivehicle Stereo Event Camera Dataset", RA-L 2018; Zhu et al., EV-FlowNet, RSS
-  2018 (dt = 1, 4).
+A flow of the file leads from its own time to the next one's, on the raw (distorted) pixels of the
+left camera; (0, 0) means that nothing was measured. The usual tests take windows between grey
+frames: dt = 1 from one to the next, dt = 4 to the fourth. There the flow is followed from its time
+on, whole intervals and linear parts of them (``warp.chained``), and is not valid where it leads out
+of what was measured.
+Sources: Zhu et al., "The Multivehicle Stereo Event Camera Dataset", RA-L 2018; Zhu et al.,
+  EV-FlowNet, RSS 2018 (dt = 1, 4).
 """
 
 import math
@@ -42,9 +43,9 @@ class MvsecWindows(Windows):
       seed: of that place.
       span_s: (from, to) part of the sequences in seconds after their first true flow, or None;
         published tests leave out the start and the landing.
-    Raises: FileFormatError, before anything is read in earnest, for files that are missing, cut, or do not
-      fit together. Windows that last longer or shorter than the median by 5 percent are not used:
-      ``left_out`` counts them.
+    Raises: FileFormatError, before anything is read in earnest, for files that are missing, cut, or
+      do not fit together. Windows that last longer or shorter than the median by 5 percent are not
+      used: ``left_out`` counts them.
     """
 
     def __init__(
@@ -83,7 +84,8 @@ class MvsecWindows(Windows):
 
 
 class Sequence(Recording):
-    """One sequence. flow_s: [N] times of the true flows. frame_s: [M] times of the grey frames. size_px:
+    """One sequence. flow_s: [N] times of the true flows. frame_s: [M] times of the grey frames.
+    size_px:
     (height, width)."""
 
     def __init__(self, data: Path, truth: Path) -> None:
@@ -91,7 +93,9 @@ class Sequence(Recording):
         with open_npz(truth) as file:
             heads = [file.header(name) for name in (*COMPONENTS, "timestamps")]
             if any(head.dtype.kind not in "fiu" for head in heads):
-                raise FileFormatError(f"{truth} holds {heads[0].dtype}; flows and times are numbers.")
+                raise FileFormatError(
+                    f"{truth} holds {heads[0].dtype}; flows and times are numbers."
+                )
             self.flow_s = file.read("timestamps").astype(np.float64)
         shape = heads[0].shape
         if (
@@ -117,7 +121,9 @@ class Sequence(Recording):
         first_us, last_us = self.ends_us()
         self.ends_s = first_us * 1e-6, last_us * 1e-6
         if not all(map(math.isfinite, self.ends_s)):
-            raise FileFormatError(f"{data}: its events run from {self.ends_s[0]} to {self.ends_s[1]} s.")
+            raise FileFormatError(
+                f"{data}: its events run from {self.ends_s[0]} to {self.ends_s[1]} s."
+            )
 
     def windows(self, frames: int, span_s: tuple[float, float] | None) -> list[tuple[float, float]]:
         """[(from, to)] seconds."""

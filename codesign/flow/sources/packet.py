@@ -1,4 +1,5 @@
-"""A packet of a recording, how a recording is to be read and cut into them, and where it has gaps."""
+"""A packet of a recording, how a recording is to be read and cut into them, and where it has
+gaps."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,8 +20,8 @@ GAP = "windows_across_gaps"
 OUTSIDE = "true_flows_outside"  # the recording, or before the start asked for
 SKIPPABLE = (BACKWARDS, OFF_SENSOR, EMPTY, GAP)  # what PacketOptions.skip may name
 MOST_S = 1e9  # of a recording
-# the flow of a translation, for a scene 1 m away, that makes the flow of rotation alone no truth: px,
-# and a share of it
+# the flow of a translation, for a scene 1 m away, that makes the flow of rotation alone no truth:
+# px, and a share of it
 TRANSLATION_PX = 0.1
 TRANSLATION_SHARE = 0.25
 
@@ -30,7 +31,8 @@ WHOLE_S = 0.1  # a recording up to this long is one packet unless windows are as
 # otherwise
 WINDOW_S = 0.02
 PACKETS = 10
-# a gap: no event of the whole sensor for so long, and for so many times the mean time between events
+# a gap: no event of the whole sensor for so long, and for so many times the mean time between
+# events
 GAP_US = 10_000
 GAP_EVENTS = 100
 
@@ -42,7 +44,8 @@ class Packet:
     stream: the events of the window. t0_us, t1_us: its ends, both included. truth: flow over the
       window [1, 2, H, W], or None. name, notes: for people.
     rotation_only: the truth is the flow of the camera's rotation alone. neglected_px: length of the
-      flow that it leaves out, for a scene 1 m away; None where nobody recorded how the camera moved.
+      flow that it leaves out, for a scene 1 m away; None where nobody recorded how the camera
+      moved.
     undistorted_px: by how much the truth would be off in the mean if it belonged to undistorted
       pixels; 0 where the camera has no distortion, or none is known.
     across_gap: at least half of the window lies where the recording has no event at all.
@@ -64,8 +67,8 @@ class Packet:
 
     @property
     def translates(self) -> bool:
-        """The camera moved so far that the flow of its rotation alone is no truth for scenes nearer than some
-        metres."""
+        """The camera moved so far that the flow of its rotation alone is no truth for scenes nearer
+        than some metres."""
         if self.truth is None or not self.rotation_only or self.neglected_px is None:
             return False
         flow = self.truth.flow_px.square().sum(1).sqrt()[self.truth.valid]
@@ -77,16 +80,17 @@ class Packet:
 class PacketOptions:
     """How a recording is read and cut.
 
-    window_s, start_s, count: length of the windows, start of the first (seconds after the first event), and
-      how many; events: cut by this number instead.
-    size_px: (height, width) of the sensor. columns, time_unit: of text, see events.read. truth_unit:
-      "px" per interval or "px/s".
+    window_s, start_s, count: length of the windows, start of the first (seconds after the first
+      event), and how many; events: cut by this number instead.
+    size_px: (height, width) of the sensor. columns, time_unit: of text, see events.read.
+      truth_unit: "px" per interval or "px/s".
     truth_interval_s: what a flow without times of its own covers. gyro_axes: camera axes from the
       gyroscope's. calibration: file, instead of calib.txt beside.
-    truth_pixels: "raw" where flow files belong to the sensor's pixels, "undistorted" where to those of
-      a pinhole with the same focal lengths and centre, from which they are then carried to the sensor's.
-    skip: faults that are left out and counted instead of refused (events) or kept (windows): names of
-      SKIPPABLE.
+    truth_pixels: "raw" where flow files belong to the sensor's pixels, "undistorted" where to those
+      of a pinhole with the same focal lengths and centre, from which they are then carried to the
+      sensor's.
+    skip: faults that are left out and counted instead of refused (events) or kept (windows): names
+      of SKIPPABLE.
     """
 
     window_s: float | None = None
@@ -107,7 +111,9 @@ class PacketOptions:
 def check_options(options: PacketOptions, truth_path: object) -> None:
     """Raise DomainError, ShapeError or FileFormatError unless options and path mean something."""
     given = {
-        n: v for n, v in vars(check_kind(options, PacketOptions, "the options")).items() if v is not None
+        n: v
+        for n, v in vars(check_kind(options, PacketOptions, "the options")).items()
+        if v is not None
     }
     for name in {"window_s", "truth_interval_s"} & given.keys():
         check_number(given[name], name, above=0.0, most=MOST_S)
@@ -125,7 +131,9 @@ def check_options(options: PacketOptions, truth_path: object) -> None:
     check_choice(options.truth_unit, "truth_unit", ("px", "px/s"))
     check_choice(options.truth_pixels, "truth_pixels", ("raw", "undistorted"))
     if not isinstance(options.skip, tuple) or not set(options.skip) <= set(SKIPPABLE):
-        raise DomainError(f"skip is {shown(options.skip)}; a tuple of {', '.join(SKIPPABLE)} is possible.")
+        raise DomainError(
+            f"skip is {shown(options.skip)}; a tuple of {', '.join(SKIPPABLE)} is possible."
+        )
     if options.window_s is not None and options.events is not None:
         raise DomainError("windows are cut by time or by number of events; give one of both.")
 
@@ -135,8 +143,8 @@ def windows(
 ) -> tuple[list[Window], dict[str, int]]:
     """Windows whose times no truth tells, and how many were left out by which fault.
 
-    The whole of a short recording; otherwise some, one after the other where a start or flows are given
-    (``in_turn``), else spread evenly.
+    The whole of a short recording; otherwise some, one after the other where a start or flows are
+    given (``in_turn``), else spread evenly.
     """
     asked = options.window_s is not None or options.events is not None or options.count is not None
     if not asked and options.start_s is None and whole[1] - whole[0] <= WHOLE_S * 1e6:
@@ -159,7 +167,9 @@ def windows(
                 f"the recording lasts {(whole[1] - whole[0]) * 1e-6:.6f} s; no window of {length_us * 1e-6:g} s "
                 "fits behind the start."
             )
-        possible = [(start_us + k * length_us, start_us + (k + 1) * length_us) for k in range(number)]
+        possible = [
+            (start_us + k * length_us, start_us + (k + 1) * length_us) for k in range(number)
+        ]
     kept, left_out = without(possible, held, options.skip)
     count = options.count or PACKETS
     return (kept[:count] if in_turn else spread(kept, count)), left_out
@@ -178,7 +188,9 @@ def without(
             few = few[~bad]
             possible = [window for window, one in zip(possible, bad, strict=True) if not one]
     if not possible:
-        raise DomainError(f"no window is left: {', '.join(f'{n} {name}' for name, n in left_out.items())}.")
+        raise DomainError(
+            f"no window is left: {', '.join(f'{n} {name}' for name, n in left_out.items())}."
+        )
     return possible, left_out
 
 
@@ -199,8 +211,8 @@ def across(possible: list[Window], empty_us: np.ndarray) -> np.ndarray:
 
 
 def covers(whole: Window, span: Window) -> bool:
-    """Whether a window lies within the times of events; a tenth of it may lie beside, where nothing may have
-    happened."""
+    """Whether a window lies within the times of events; a tenth of it may lie beside, where nothing
+    may have happened."""
     slack = (span[1] - span[0]) / 10
     return whole[0] - slack <= span[0] and span[1] <= whole[1] + slack
 

@@ -27,7 +27,8 @@ NO_TRUTH = "no true flow in some windows: "
 
 @dataclass(frozen=True)
 class Truth:
-    """flows: the fields of files, in order; or motion: how the camera turned, and places: where it was (None:
+    """flows: the fields of files, in order; or motion: how the camera turned, and places: where it
+    was (None:
     not recorded). calibration: of the camera, or None."""
 
     flows: list[TrueFlow] | None
@@ -38,7 +39,11 @@ class Truth:
 
 def is_motion(path: str | Path) -> bool:
     """Whether a file tells of the camera's motion, not of flow."""
-    return Path(path).name.lower().endswith(("imu.txt", "groundtruth.txt", "imu.csv", "groundtruth.csv"))
+    return (
+        Path(path)
+        .name.lower()
+        .endswith(("imu.txt", "groundtruth.txt", "imu.csv", "groundtruth.csv"))
+    )
 
 
 def read_source(
@@ -57,7 +62,9 @@ def read_source(
             raise FileFormatError(
                 f"the flow in {path} is of undistorted pixels, and no calib.txt lies beside it; name the file."
             )
-        return Truth(flows, calibration=None if calibration is None else read_calibration(calibration))
+        return Truth(
+            flows, calibration=None if calibration is None else read_calibration(calibration)
+        )
     if calibration is None:
         raise FileFormatError(
             f"flow from {path} needs the camera: no calib.txt lies beside it; name the file."
@@ -67,12 +74,15 @@ def read_source(
         return Truth(None, poses, poses, read_calibration(calibration))
     recorded = folders.side_file(Path(path), "groundtruth.txt")
     places = None if recorded is None else read_poses(recorded)
-    return Truth(None, read_gyroscope(path, options.gyro_axes), places, read_calibration(calibration))
+    return Truth(
+        None, read_gyroscope(path, options.gyro_axes), places, read_calibration(calibration)
+    )
 
 
 @dataclass(frozen=True)
 class Opened:
-    """An event file that becomes packets. events: of it all. truth: None without any. whole: (from, to) us.
+    """An event file that becomes packets. events: of it all. truth: None without any. whole:
+    (from, to) us.
     notes: of every packet."""
 
     file: Path
@@ -151,7 +161,9 @@ class Opened:
                     f"the camera has distortion: if the true flow is of undistorted pixels, it is {off_px:.2f} px off in "
                     "the mean (truth_pixels says which)"
                 )
-        return replace(found, truth=_field(flow, valid, seconds), notes=tuple(notes), undistorted_px=off_px)
+        return replace(
+            found, truth=_field(flow, valid, seconds), notes=tuple(notes), undistorted_px=off_px
+        )
 
 
 def _with_rotation(found, source):
@@ -162,7 +174,9 @@ def _with_rotation(found, source):
     size_px = found.stream.height_px, found.stream.width_px
     flow, valid = source.calibration.rotation_flow(source.motion.turn(*ends_s), *size_px)
     moved = (
-        None if source.places is None or source.places.missing(*ends_s) else source.places.moved_m(*ends_s)
+        None
+        if source.places is None or source.places.missing(*ends_s)
+        else source.places.moved_m(*ends_s)
     )
     focal_px = sum(source.calibration.focal_px) / 2
     left_out = (

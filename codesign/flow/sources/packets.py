@@ -42,13 +42,14 @@ def read_packets(
     """Read a recording and its true flow.
 
     Args:
-      path: folder with events.txt (Event-Camera Dataset), folder or subfolders of numbered packets, one
-        event file of any kind, or a zip archive.
+      path: folder with events.txt (Event-Camera Dataset), folder or subfolders of numbered packets,
+        one event file of any kind, or a zip archive.
       truth_path: flow file or folder (see read_truth), imu.txt or groundtruth.txt. None: what lies
-        beside the events, flow files before the gyroscope before poses. The last two need calib.txt and
-        give the flow of rotation alone.
-    Returns: [Packet], at least one. A flow over another time than its packet's is scaled linearly, and a note
-      says so. A window that the recorded motion does not cover is a packet without truth, and a note says so.
+        beside the events, flow files before the gyroscope before poses. The last two need calib.txt
+        and give the flow of rotation alone.
+    Returns: [Packet], at least one. A flow over another time than its packet's is scaled linearly,
+      and a note says so. A window that the recorded motion does not cover is a packet without
+      truth, and a note says so.
     Raises: FileFormatError, DomainError.
     """
     options = PacketOptions() if options is None else options
@@ -67,7 +68,9 @@ def read_packets(
                 truth_path = folders.truth_folder(files[0])
             if truth_path is not None:
                 given = _numbered(truth_path, chosen, len(files))
-            found = [_as_packet(file, own, options) for file, own in zip(chosen, given, strict=True)]
+            found = [
+                _as_packet(file, own, options) for file, own in zip(chosen, given, strict=True)
+            ]
             return _with_truth_somewhere(found)
         if truth_path is None and Path(path).is_dir():
             truth_path = folders.truth_beside(files[0], True) or folders.truth_folder(files[0])
@@ -92,9 +95,9 @@ def read_recording(path: str | Path, options: PacketOptions | None = None) -> Ev
 
 
 def read_events(path: Path, options: PacketOptions, truth_path: Path | None = None) -> EventColumns:
-    """EventColumns of one event file of any kind that events.read takes, in order of time; events up to
-    1 ms late are put in order. The sensor is the one asked for, or that of the flow or of the frames
-    beside, or the smallest of SENSORS_PX that holds the events."""
+    """EventColumns of one event file of any kind that events.read takes, in order of time; events
+    up to 1 ms late are put in order. The sensor is the one asked for, or that of the flow or of the
+    frames beside, or the smallest of SENSORS_PX that holds the events."""
     told, told_by = None, "the file"
     if truth_path is not None:
         told, told_by = truth.size_of(truth_path), f"the flow in {truth_path}"
@@ -103,7 +106,16 @@ def read_events(path: Path, options: PacketOptions, truth_path: Path | None = No
     height, width = options.size_px or (None, None)
     found = read_columns(
         path,
-        Asked(height, width, told, told_by, SENSORS_PX, options.columns, options.time_unit, options.skip),
+        Asked(
+            height,
+            width,
+            told,
+            told_by,
+            SENSORS_PX,
+            options.columns,
+            options.time_unit,
+            options.skip,
+        ),
     )
     if not len(found):
         raise FileFormatError(f"{path} holds no event that is on the sensor and in order of time.")
@@ -116,7 +128,8 @@ def _alone(file):
 
 
 def _numbered(truth_path, chosen, total):
-    """The truth of each packet: the same number of a folder's files, or of the flows of one file."""
+    """The truth of each packet: the same number of a folder's files, or of the flows of one
+    file."""
     truth_path = Path(truth_path)
     if truth_path.is_dir():
         files = folders.flow_files(truth_path)
@@ -133,7 +146,9 @@ def _opened(file, truth_path, options):
     sized = truth_path is not None and not is_motion(truth_path)
     held = read_events(file, options, truth_path if sized else None)
     if len(held) < 2 or held.t_us[-1] <= held.t_us[0]:
-        raise FileFormatError(f"{file} holds {len(held)} event(s) at one time; a packet lasts some time.")
+        raise FileFormatError(
+            f"{file} holds {len(held)} event(s) at one time; a packet lasts some time."
+        )
     others = ", ".join(path.name for path in folders.passed_over(file))
     notes = (f"events from {file.name}; {others} beside it not read",) if others else ()
     source = read_source(file, truth_path, held, options)
@@ -186,8 +201,8 @@ def _cut(file, truth_path, options):
 
 
 def _cut_by_flows(one, flows, start_us):
-    """Windows of one event file with a flow for each: those of the flows' own times, or one after the
-    other."""
+    """Windows of one event file with a flow for each: those of the flows' own times, or one after
+    the other."""
     options = one.options
     whole = one.whole
     left_out = {}
@@ -216,7 +231,9 @@ def _cut_by_flows(one, flows, start_us):
     else:
         edges = np.rint(np.linspace(whole[0], whole[1], len(flows) + 1)).astype(np.int64).tolist()
         if options.truth_interval_s is not None:
-            edges = [whole[0] + round(k * options.truth_interval_s * 1e6) for k in range(len(flows) + 1)]
+            edges = [
+                whole[0] + round(k * options.truth_interval_s * 1e6) for k in range(len(flows) + 1)
+            ]
         pairs = list(enumerate(pairwise(edges)))[: options.count]
         over = edges[:2]
     kept, more = without([window for _, window in pairs], one.events, options.skip)
@@ -232,7 +249,9 @@ def _with_truth_somewhere(packets: Sequence[Packet]) -> list[Packet]:
     """The packets, unless a truth was given that tells of none of them."""
     missing = [note for one in packets for note in one.notes if note.startswith(NO_TRUTH)]
     if len(missing) == len(packets):
-        raise FileFormatError(f"{missing[0].removeprefix(NO_TRUTH)}, nor any other; are both on one clock?")
+        raise FileFormatError(
+            f"{missing[0].removeprefix(NO_TRUTH)}, nor any other; are both on one clock?"
+        )
     return list(packets)
 
 
@@ -240,7 +259,10 @@ def _size_of_images(folder):
     """(height, width) of the first frame in images/, or None."""
     place = folder / "images"
     first = (
-        min((entry for entry in place.iterdir() if entry.suffix.lower() in (".png", ".jpg")), default=None)
+        min(
+            (entry for entry in place.iterdir() if entry.suffix.lower() in (".png", ".jpg")),
+            default=None,
+        )
         if place.is_dir()
         else None
     )

@@ -1,5 +1,5 @@
-"""Training data, whichever of the layouts it has, and windows of any recording that ``read_packets``
-reads."""
+"""Training data, whichever of the layouts it has, and windows of any recording that
+``read_packets`` reads."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,8 +20,8 @@ ALL = 2**31  # more windows than any recording has
 
 
 class RecordingWindows(Windows):
-    """Windows of a recording: events in text, arrays or an event file, packets with flow files, or a
-    zip of either.
+    """Windows of a recording: events in text, arrays or an event file, packets with flow files, or
+    a zip of either.
 
     Args:
       path: as for read_packets.
@@ -30,7 +30,8 @@ class RecordingWindows(Windows):
       seed: of that place.
       options: PacketOptions; windows of 20 ms, all of them, where it does not say.
     Where nothing is known of the flow, ``truth.valid`` is False. All events are kept in memory.
-    Raises: FileFormatError, DomainError as read_packets; DomainError for windows of different lengths.
+    Raises: FileFormatError, DomainError as read_packets; DomainError for windows of different
+      lengths.
     """
 
     def __init__(
@@ -44,9 +45,13 @@ class RecordingWindows(Windows):
         options = options or PacketOptions(window_s=WINDOW_S)
         self.packets = read_packets(path, None, replace(options, count=options.count or ALL))
         if options.events is None:
-            check_lengths([1e-6 * (packet.t1_us - packet.t0_us) for packet in self.packets], str(path))
+            check_lengths(
+                [1e-6 * (packet.t1_us - packet.t0_us) for packet in self.packets], str(path)
+            )
         windows = [(k, (packet.t0_us, packet.t1_us)) for k, packet in enumerate(self.packets)]
-        super().__init__([_Recorded(packet) for packet in self.packets], windows, bins, crop_px, seed)
+        super().__init__(
+            [_Recorded(packet) for packet in self.packets], windows, bins, crop_px, seed
+        )
 
 
 class _Recorded(Recording):
@@ -74,18 +79,20 @@ def open_windows(
     seed: int = 0,
     window_s: float = WINDOW_S,
 ) -> DatasetWindows | DsecWindows | MvsecWindows | RecordingWindows:
-    """The source of windows that a folder or file is: one of our data sets, DSEC, MVSEC, or a recording.
+    """The source of windows that a folder or file is: one of our data sets, DSEC, MVSEC, or a
+    recording.
 
     Args:
       bins: of the volumes.
-      window_frames: frame intervals per window (our data sets), or grey frames (MVSEC); DSEC has its
-        own windows.
+      window_frames: frame intervals per window (our data sets), or grey frames (MVSEC); DSEC has
+        its own windows.
       crop_px: (height, width) of a piece at a random place, or None.
       seed: of that place.
       window_s: length of the windows of a recording, seconds.
     Returns: DatasetWindows, DsecWindows, MvsecWindows or RecordingWindows: ``len(source)`` and
       ``source.batch(indices)``.
-    Raises: FileFormatError when nothing of these is there, or something in it is missing or damaged.
+    Raises: FileFormatError when nothing of these is there, or something in it is missing or
+      damaged.
     """
     folder = check_path(folder, "the data set or recording")
     if (folder / "manifest.json").is_file() or (folder / "frames.h5").is_file():

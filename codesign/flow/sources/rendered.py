@@ -1,5 +1,5 @@
-"""Windows of the data sets that studies.make_dataset writes (docs/datasets.md): events, true flow over one
-frame interval or several, and the frames."""
+"""Windows of the data sets that studies.make_dataset writes (docs/datasets.md): events, true flow
+over one frame interval or several, and the frames."""
 
 import shlex
 from itertools import pairwise
@@ -37,12 +37,13 @@ class DatasetWindows(Windows):
       window_frames: frame intervals per window.
       crop_px: (height, width) of a piece at a random place, or None.
       seed: of that place.
-    Raises: FileFormatError, before anything is read in earnest, for files that are missing, cut, or do not
-      fit together; DomainError for sequences too short.
+    Raises: FileFormatError, before anything is read in earnest, for files that are missing, cut, or
+      do not fit together; DomainError for sequences too short.
 
-    Flow over one interval is the stored one. Over several, points of the static world are carried there by
-    depth and poses through the camera's rays (exact to the fit of the camera, CameraFit.error_px); points of
-    moving objects, whose poses are not stored, along the flows in between (``warp.chained``).
+    Flow over one interval is the stored one. Over several, points of the static world are carried
+    there by depth and poses through the camera's rays (exact to the fit of the camera,
+    CameraFit.error_px); points of moving objects, whose poses are not stored, along the flows in
+    between (``warp.chained``).
     """
 
     def __init__(
@@ -123,7 +124,8 @@ class Sequence(Recording):
         )
 
     def flow(self, first: int, last: int) -> tuple[Tensor, Tensor]:
-        """(flow_px [2, H, W] float32, valid [H, W]) on the pixels of frame ``first``, to frame ``last``."""
+        """(flow_px [2, H, W] float32, valid [H, W]) on the pixels of frame ``first``, to frame
+        ``last``."""
         if last == first + 1:
             flow, seen = (torch.from_numpy(self.rows[name][first]) for name in ("flow", "valid"))
         else:
@@ -148,8 +150,8 @@ class Sequence(Recording):
         return values
 
     def carried(self, first: int, last: int) -> tuple[Tensor, Tensor]:
-        """Flow of points at rest, by their depth, both poses and the camera's rays: [2, H, W] float64, valid
-        [H, W]."""
+        """Flow of points at rest, by their depth, both poses and the camera's rays: [2, H, W]
+        float64, valid [H, W]."""
         if self.fit is None:
             self.fit = CameraFit(
                 self.rays["direction"], self.rays["origin_m"], str(self.folder / "camera.h5")
@@ -174,10 +176,9 @@ class Sequence(Recording):
 class CameraFit:
     """Where points land in the picture of a recorded camera, from the chief rays of its pixels.
 
-    Pixels are fitted as a polynomial of the rays' slopes, and the rays' origins as one of the pixels, so
-    that points between pixels, and a little beside the picture, can be projected without the lens. The
-    worst error of the fit is known, and what is worse than asked is refused.
-    Args:
+    Pixels are fitted as a polynomial of the rays' slopes, and the rays' origins as one of the
+    pixels, so that points between pixels, and a little beside the picture, can be projected without
+    the lens. The worst error of the fit is known, and what is worse than asked is refused. Args:
       direction, origin_m: [H, W, 3] of the chief rays in camera axes (x right, y down, z forward).
     name: for messages.
 
@@ -214,7 +215,8 @@ class CameraFit:
         self.size = np.array([width - 1, height - 1], np.float64)
         pixels = np.stack([x, y], -1).reshape(-1, 2)
         rows, columns = (
-            np.unique(np.linspace(0, n - 1, min(n, MOST_SIDE)).round().astype(int)) for n in (height, width)
+            np.unique(np.linspace(0, n - 1, min(n, MOST_SIDE)).round().astype(int))
+            for n in (height, width)
         )
         some = (
             rows[:, None] * width + columns
@@ -247,8 +249,8 @@ class CameraFit:
 
 
 def _fitted(unit, values, degree):
-    """Coefficients [n, n, K] of Chebyshev products of total degree up to n - 1, for values [N, K] at places
-    [N, 2] in [-1, 1]."""
+    """Coefficients [n, n, K] of Chebyshev products of total degree up to n - 1, for values [N, K]
+    at places [N, 2] in [-1, 1]."""
     numbers = np.arange(degree + 1)
     kept = np.add.outer(numbers, numbers).ravel() <= degree
     design = chebyshev.chebvander2d(*unit.T, [degree, degree])[:, kept]
@@ -295,7 +297,11 @@ def _places(folder):
     return [
         (
             folder / name,
-            {file[len(name) + 1 :]: size for file, size in files.items() if file.startswith(f"{name}/")},
+            {
+                file[len(name) + 1 :]: size
+                for file, size in files.items()
+                if file.startswith(f"{name}/")
+            },
         )
         for name in sequences
     ]

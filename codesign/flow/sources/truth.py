@@ -1,5 +1,5 @@
-"""Ground-truth flow of a recording by path: flow files of several kinds, tables of text, and folders of them
-with their times."""
+"""Ground-truth flow of a recording by path: flow files of several kinds, tables of text, and
+folders of them with their times."""
 
 import io
 import re
@@ -57,9 +57,9 @@ MOST_COLUMNS = 1_000_000  # characters of its first line
 class TrueFlow:
     """One flow as its file has it.
 
-    flow: [2, H, W], right and down, in the file's unit. valid: [H, W] bool. span_s: (from, to) seconds on the
-      recording's clock; None where the file has no times, or one time only. name: the file, and which of its
-      flows.
+    flow: [2, H, W], right and down, in the file's unit. valid: [H, W] bool. span_s: (from, to)
+      seconds on the recording's clock; None where the file has no times, or one time only. name:
+      the file, and which of its flows.
     """
 
     flow: np.ndarray
@@ -72,13 +72,13 @@ def read_truth(path: str | Path, size_px: tuple[int, int]) -> list[TrueFlow]:
     """Read the flow fields of a file or folder, in order.
 
     Args:
-      path: .flo, .png (16 bits as in DSEC), .npy, .npz or .mat (up to version 7) ([2, H, W] or [H, W,
-        2], or several along a first axis; .npz also as a pair of components and with valid and
-        timestamps, the layout of MVSEC among them), .txt or .csv (see docs/flow_recordings.md); or a
-        folder of such files, with their times in timestamps.txt or forward_timestamps.txt.
+      path: .flo, .png (16 bits as in DSEC), .npy, .npz or .mat (up to version 7) ([2, H, W] or
+        [H, W, 2], or several along a first axis; .npz also as a pair of components and with valid
+        and timestamps, the layout of MVSEC among them), .txt or .csv (see docs/flow_recordings.md);
+        or a folder of such files, with their times in timestamps.txt or forward_timestamps.txt.
       size_px: (height, width) of the recording, which tables of text need; every flow must have it.
-    Returns: [TrueFlow]. Flows that are not finite are not valid; in MVSEC's layout neither are those of
-      exactly (0, 0).
+    Returns: [TrueFlow]. Flows that are not finite are not valid; in MVSEC's layout neither are
+      those of exactly (0, 0).
     Raises: FileFormatError for anything else.
     """
     path = check_path(path, "the path of the true flow")
@@ -88,7 +88,9 @@ def read_truth(path: str | Path, size_px: tuple[int, int]) -> list[TrueFlow]:
         flows = [flow for file in files for flow in _of_file(file, size_px)]
         spans = _spans_beside(path, files[0].parent, len(flows))
         flows = (
-            [replace(flow, span_s=span) for flow, span in zip(flows, spans, strict=True)] if spans else flows
+            [replace(flow, span_s=span) for flow, span in zip(flows, spans, strict=True)]
+            if spans
+            else flows
         )
     elif path.is_file():
         flows = _of_file(path, size_px)
@@ -104,7 +106,8 @@ def read_truth(path: str | Path, size_px: tuple[int, int]) -> list[TrueFlow]:
 
 
 def size_of(path: str | Path) -> tuple[int, int] | None:
-    """(height, width) of the flow at a path, or None where it cannot tell by itself (tables of text)."""
+    """(height, width) of the flow at a path, or None where it cannot tell by itself
+    (tables of text)."""
     path = Path(path)
     file = folders.flow_files(path)[0] if path.is_dir() else path
     if not file.is_file() or file.suffix.lower() in (".txt", ".csv"):
@@ -191,12 +194,14 @@ def _of_arrays(path):
 
 
 def _spans_of(path, arrays, count):
-    """[(from, to) or None] by the arrays t0 and t1, or by timestamps, at each of which a flow begins that
-    ends at the next (MVSEC)."""
+    """[(from, to) or None] by the arrays t0 and t1, or by timestamps, at each of which a flow
+    begins that ends at the next (MVSEC)."""
     if "t0" in arrays and "t1" in arrays:
         ends = np.stack([arrays["t0"].reshape(-1), arrays["t1"].reshape(-1)], -1).astype(np.float64)
         return _checked_spans(path, ends, count)
-    times = next((arrays[name].reshape(-1).astype(np.float64) for name in TIMES if name in arrays), None)
+    times = next(
+        (arrays[name].reshape(-1).astype(np.float64) for name in TIMES if name in arrays), None
+    )
     if times is None:
         return [None] * count
     if len(times) == count + 1 or (len(times) == count and count > 1):
@@ -217,8 +222,8 @@ def _spans_beside(folder, inside, count):
 
 
 def read_spans(path: Path, count: int) -> list[tuple[float, float]]:
-    """[(from, to)] seconds of ``count`` flows by lines of two times, or of one and one more than there are
-    flows; whole numbers are microseconds.
+    """[(from, to)] seconds of ``count`` flows by lines of two times, or of one and one more than
+    there are flows; whole numbers are microseconds.
 
     Raises: FileFormatError for anything else.
     """
@@ -249,7 +254,9 @@ def _of_table(path, size_px):
         file = io.TextIOWrapper(opened, encoding="utf-8")
         first = file.readline(MOST_COLUMNS)
         words = first.lstrip("# ").replace(",", " ").lower().split()
-        header = bool(words) and not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf", words[0])
+        header = bool(words) and not re.fullmatch(
+            r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf", words[0]
+        )
         if not header:
             file.seek(0)
         with warnings.catch_warnings():
@@ -259,7 +266,11 @@ def _of_table(path, size_px):
     height, width = size_px
     if not header and table.shape == (2 * height, width):
         return _whole(path, table.reshape(2, height, width))
-    names = tuple(COLUMNS.get(word, "?") for word in words) if header else TABLES.get(table.shape[1], ())
+    names = (
+        tuple(COLUMNS.get(word, "?") for word in words)
+        if header
+        else TABLES.get(table.shape[1], ())
+    )
     columns = dict(zip(names, table.T, strict=False))
     if (
         not len(columns) == len(names) == table.shape[1]

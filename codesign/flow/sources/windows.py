@@ -1,5 +1,5 @@
-"""Windows of recordings as samples to learn from: what a recording has to tell, whatever its layout, pieces
-cut out of large pictures, and samples of a batch put together."""
+"""Windows of recordings as samples to learn from: what a recording has to tell, whatever its
+layout, pieces cut out of large pictures, and samples of a batch put together."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ ALIKE = 0.05  # windows of one source may differ in length by this share
 
 @dataclass(frozen=True)
 class Sample:
-    """counts: [2, bins, H, W]. flow_px: [2, H, W]. valid: [H, W]. seconds: length of the window. frames: [2,
-    H, W], or None."""
+    """counts: [2, bins, H, W]. flow_px: [2, H, W]. valid: [H, W]. seconds: length of the window.
+    frames: [2, H, W], or None."""
 
     counts: Tensor
     flow_px: Tensor
@@ -30,7 +30,8 @@ class Sample:
 
 
 class Recording:
-    """Events and true flow of one recording, by window. Layouts say ``flow``, and what else is not as here.
+    """Events and true flow of one recording, by window. Layouts say ``flow``, and what else is not
+    as here.
 
     size_px: (height, width). events: with ``window(t0_us, t1_us, size_px)``, an EventStream.
     """
@@ -42,7 +43,9 @@ class Recording:
         """The window of these times; ``which`` tells it to ``flow`` and ``frames``."""
         flow, valid = self.flow(*which)
         counts = self.counts(bins, *ends_us)
-        return Sample(counts, flow.float(), valid, (ends_us[1] - ends_us[0]) * 1e-6, self.frames(*which))
+        return Sample(
+            counts, flow.float(), valid, (ends_us[1] - ends_us[0]) * 1e-6, self.frames(*which)
+        )
 
     def flow(self, *which: Any) -> tuple[Tensor, Tensor]:
         """(flow_px [2, H, W] on the pixels of the window's start, valid [H, W])."""
@@ -68,7 +71,8 @@ class Windows:
 
     Args:
       recordings: what the windows are of.
-      windows: [(number of the recording, (t0_us, t1_us), *which)], as ``Recording.sample`` takes them.
+      windows: [(number of the recording, (t0_us, t1_us), *which)], as ``Recording.sample`` takes
+        them.
       bins: of the volumes.
       crop_px: (height, width) of a piece at a random place, or None.
       seed: of that place.
@@ -98,8 +102,8 @@ class Windows:
         return len(self.windows)
 
     def batch(self, indices: Iterable[int] | Tensor) -> FlowWindows:
-        """FlowWindows of these samples; each depends on its index and the seed alone. Frames are None
-        where a source has none."""
+        """FlowWindows of these samples; each depends on its index and the seed alone. Frames are
+        None where a source has none."""
         chosen = [int(index) for index in indices]
         if wrong := [index for index in chosen if not 0 <= index < len(self)]:
             raise DomainError(
@@ -108,7 +112,8 @@ class Windows:
         return collate([self._sample(index) for index in chosen])
 
     def _sample(self, index):
-        """Sample ``index``, or a piece of it at a place that depends on the seed and the number alone."""
+        """Sample ``index``, or a piece of it at a place that depends on the seed and the number
+        alone."""
         number, *window = self.windows[index]
         sample = self.recordings[number].sample(self.bins, *window)
         if self.crop_px is None:
@@ -129,8 +134,8 @@ class Windows:
 
 
 def collate(samples: Sequence[Sample]) -> FlowWindows:
-    """FlowWindows of samples. Flows stay those of each sample's own window; the times of the bins are those
-    of the mean window.
+    """FlowWindows of samples. Flows stay those of each sample's own window; the times of the bins
+    are those of the mean window.
 
     Raises: DomainError without a sample; ShapeError when sizes differ.
     """
@@ -144,7 +149,9 @@ def collate(samples: Sequence[Sample]) -> FlowWindows:
     bins = samples[0].counts.shape[1]
     seconds = sum(sample.seconds for sample in samples) / len(samples)
     centroid_s, collected_s = bin_times(bins, seconds)
-    volume = EventVolume(torch.stack([sample.counts for sample in samples]), centroid_s, collected_s)
+    volume = EventVolume(
+        torch.stack([sample.counts for sample in samples]), centroid_s, collected_s
+    )
     truth = FlowField(
         torch.stack([sample.flow_px for sample in samples]),
         torch.stack([sample.valid for sample in samples]),
@@ -159,7 +166,9 @@ def bin_times(bins: int, seconds: float) -> tuple[Tensor, Tensor]:
     bins = check_whole(bins, "bins", 1, MOST_STEPS)
     seconds = check_positive(seconds, "the length of the interval")
     if bins == 1:
-        return torch.tensor([seconds / 2], dtype=torch.float64), torch.tensor([seconds], dtype=torch.float64)
+        return torch.tensor([seconds / 2], dtype=torch.float64), torch.tensor(
+            [seconds], dtype=torch.float64
+        )
     node = torch.arange(bins, dtype=torch.float64) / (bins - 1)
     node[0], node[-1] = 1 / (3 * (bins - 1)), 1 - 1 / (3 * (bins - 1))
     collected = torch.full((bins,), seconds / (bins - 1), dtype=torch.float64)
@@ -168,7 +177,8 @@ def bin_times(bins: int, seconds: float) -> tuple[Tensor, Tensor]:
 
 
 def check_lengths(seconds: Sequence[float], name: str) -> None:
-    """Raise DomainError unless all windows of a source last alike within 5 percent of their median."""
+    """Raise DomainError unless all windows of a source last alike within 5 percent of their
+    median."""
     middle = sorted(seconds)[len(seconds) // 2]
     worst = max(seconds, key=lambda value: abs(value - middle))
     if abs(worst - middle) > ALIKE * middle:

@@ -1,5 +1,5 @@
-"""What a lens does to the light of an object at any distance: spots, fans, wavefront, point spread, MTF,
-distortion, field curvature, colour, depth of field."""
+"""What a lens does to the light of an object at any distance: spots, fans, wavefront, point spread,
+MTF, distortion, field curvature, colour, depth of field."""
 
 from codesign.doors import explain
 from codesign.lens.analysis.depth_of_field import (

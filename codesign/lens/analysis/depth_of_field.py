@@ -1,9 +1,9 @@
 """Depth of field: which object distances a fixed film shows with a blur below a limit.
 
-The blur of an axial point is the disc that its light fills on the film. Its diameter is linear in the
-vergence 1 / distance (from the entrance pupil), so both limits are closed forms; for a thin lens it is the
-circle of confusion. Traced limits hold the RMS spot instead, diameter / (2 sqrt 2) of an evenly filled disc,
-aberrations included.
+The blur of an axial point is the disc that its light fills on the film. Its diameter is linear in
+the vergence 1 / distance (from the entrance pupil), so both limits are closed forms; for a thin
+lens it is the circle of confusion. Traced limits hold the RMS spot instead, diameter / (2 sqrt 2)
+of an evenly filled disc, aberrations included.
 """
 
 import functools
@@ -27,8 +27,8 @@ CLOSEST_PER_MM = 1e3  # to a pupil that has no surface before it
 
 @dataclass(frozen=True)
 class DepthOfField:
-    """Metres from the entrance pupil of the d line, scalar tensors: the nearest and the farthest distance
-    within the limit (inf where parallel light is), and the sharpest."""
+    """Metres from the entrance pupil of the d line, scalar tensors: the nearest and the farthest
+    distance within the limit (inf where parallel light is), and the sharpest."""
 
     near_m: Tensor
     far_m: Tensor
@@ -43,10 +43,11 @@ def depth_of_field(
     """DepthOfField where the paraxial blur disc of an axial point is at most ``blur_mm`` across.
 
     Args:
-      blur_mm: diameter on the film, > 0; see ``GeoLens.focus_at`` for where the film stands. A near limit
-        before the lens is its first vertex.
+      blur_mm: diameter on the film, > 0; see ``GeoLens.focus_at`` for where the film stands. A near
+        limit before the lens is its first vertex.
     Gradient: to every lens tensor that bends or moves light, and to the blur.
-    Raises: DomainError for a limit that is not positive, and when nothing before the lens is that sharp.
+    Raises: DomainError for a limit that is not positive, and when nothing before the lens is that
+      sharp.
 
     Example:
     >>> from codesign import lens
@@ -60,9 +61,9 @@ def depth_of_field(
         lens.first_order(wavelength_um).entrance_pupil_diameter_mm * per_vergence.abs()
     )
     nearest = _nearest(lens)
-    if not float((sharpest + reach).detach()) > 0 or not float((sharpest - reach).detach()) < 1 / max(
-        nearest, 1e-300
-    ):
+    if not float((sharpest + reach).detach()) > 0 or not float(
+        (sharpest - reach).detach()
+    ) < 1 / max(nearest, 1e-300):
         raise DomainError(
             f"{lens.name}: no point before the lens has a blur of {float(blur_mm):.4g} mm or less on its "
             "film; move the film (focus_at), or allow more blur."
@@ -72,11 +73,11 @@ def depth_of_field(
 
 
 def hyperfocal_m(lens: GeoLens, blur_mm: float | Tensor, wavelength_um: float = D_UM) -> Tensor:
-    """The nearest distance to focus on (metres from the entrance pupil) for which parallel light is blurred
-    to a disc of ``blur_mm`` and no more, scalar: f^2 / (N blur) + f for a thin lens.
+    """The nearest distance to focus on (metres from the entrance pupil) for which parallel light is
+    blurred to a disc of ``blur_mm`` and no more, scalar: f^2 / (N blur) + f for a thin lens.
 
-    Gradient: as for ``depth_of_field``. Raises: DomainError for a limit that is not positive, or a diverging
-      lens.
+    Gradient: as for ``depth_of_field``. Raises: DomainError for a limit that is not positive, or a
+      diverging lens.
     """
     blur = _checked(lens, blur_mm)
     f = lens.first_order(wavelength_um)
@@ -96,10 +97,11 @@ def traced_depth_of_field(
     wavelength_um: float = D_UM,
     grid: int = 16,
 ) -> DepthOfField:
-    """DepthOfField where the RMS spot on the axis is at most that of an even disc ``blur_mm`` across.
+    """DepthOfField where the RMS spot on the axis is at most that of an even disc ``blur_mm``
+    across.
 
-    Aberrations share the blur: this range is the smaller the more of the limit they take. Args as for
-    ``depth_of_field``; grid: pupil samples across. Gradient: none (limits are searched, to
+    Aberrations share the blur: this range is the smaller the more of the limit they take. Args as
+    for ``depth_of_field``; grid: pupil samples across. Gradient: none (limits are searched, to
     1e-6).
     Raises: DomainError for a limit that is not positive, and when aberrations alone exceed it.
     """
@@ -143,7 +145,8 @@ def _least(function, low, high):
 
 
 def _edge(function, start, end, step):
-    """Where a function that is at most 0 at the start turns positive on the way to the end; the end if nowhere."""
+    """Where a function that is at most 0 at the start turns positive on the way to the end; the end
+    if nowhere."""
     from scipy.optimize import brentq
 
     inside = start
@@ -156,8 +159,8 @@ def _edge(function, start, end, step):
 
 
 def _film_heights(lens, wavelength_um):
-    """Height on the film, and reduced angle there, of two rays: of height 1 and slope 0, and of height 0 and
-    slope 1, at the centre of the entrance pupil."""
+    """Height on the film, and reduced angle there, of two rays: of height 1 and slope 0, and of
+    height 0 and slope 1, at the centre of the entrance pupil."""
     power, index = lens.surface_power(wavelength_um), lens.index(wavelength_um)
     pupil_z = lens.first_order().entrance_pupil_z_mm
     one, zero = torch.ones_like(pupil_z), torch.zeros_like(pupil_z)
@@ -169,7 +172,8 @@ def _film_heights(lens, wavelength_um):
 
 
 def _nearest(lens):
-    """Distance from the entrance pupil to the first vertex where that lies before it, mm, else 0."""
+    """Distance from the entrance pupil to the first vertex where that lies before it, mm, else
+    0."""
     return max(float(lens.first_order().entrance_pupil_z_mm.detach()), 0.0)
 
 
@@ -183,7 +187,9 @@ def _checked(lens, blur_mm):
     """The limit as a tensor. Raises: DomainError unless it is positive and finite."""
     blur = real_numbers(blur_mm, "limit of blur").to(lens.thickness_mm)
     if blur.ndim:
-        raise DomainError(f"limit of blur: {blur_mm} is not one finite number; give a diameter in mm.")
+        raise DomainError(
+            f"limit of blur: {blur_mm} is not one finite number; give a diameter in mm."
+        )
     if not 0 < float(blur.detach()) < math.inf:
         raise DomainError(
             f"a limit of {float(blur):.4g} mm of blur cannot be; give a positive diameter in mm."

@@ -37,8 +37,8 @@ def lateral_colour_mm(
     reference_um: float = D_UM,
     at_m: Distances = PARALLEL,
 ) -> Tensor:
-    """Chief ray heights minus that at the reference wavelength, [F, W] mm, [D, F, W] for D distances
-    ``at_m`` of the object (see ``trace_field``). Gradient: to every lens tensor."""
+    """Chief ray heights minus that at the reference wavelength, [F, W] mm, [D, F, W] for D
+    distances ``at_m`` of the object (see ``trace_field``). Gradient: to every lens tensor."""
     reference = chief_height_mm(lens, fields_rad, reference_um, at_m)
     heights = [chief_height_mm(lens, fields_rad, float(w), at_m) for w in wavelengths_um]
     return torch.stack([height - reference for height in heights], -1)
@@ -50,10 +50,12 @@ def chromatic_focus_shift_mm(
     reference_um: float = D_UM,
     at_m: Distances = PARALLEL,
 ) -> Tensor:
-    """Place of the paraxial image of an axial point minus that at the reference wavelength, [W] mm, [D, W]
-    for D distances ``at_m``. Gradient: to every lens tensor and to at_m."""
+    """Place of the paraxial image of an axial point minus that at the reference wavelength, [W] mm,
+    [D, W] for D distances ``at_m``. Gradient: to every lens tensor and to at_m."""
     vergence = vergence_per_mm(lens, at_m)
-    reference, *places = (image_place_mm(lens, vergence, float(w)) for w in (reference_um, *wavelengths_um))
+    reference, *places = (
+        image_place_mm(lens, vergence, float(w)) for w in (reference_um, *wavelengths_um)
+    )
     return torch.stack([place - reference for place in places], -1)
 
 
@@ -67,8 +69,9 @@ def chief_height_mm(
     wavelength_um: float = D_UM,
     at_m: Distances = PARALLEL,
 ) -> Tensor:
-    """Height y of the real chief ray on the image plane, [F] mm; [D, F] for D distances ``at_m`` of the
-    object, see ``trace_field``. Gradient: to every lens tensor (a chief ray is the same at every distance).
+    """Height y of the real chief ray on the image plane, [F] mm; [D, F] for D distances ``at_m`` of
+    the object, see ``trace_field``. Gradient: to every lens tensor (a chief ray is the same at
+    every distance).
     Raises: DomainError when one does not arrive."""
     return chief_ray(lens, fields_rad, wavelength_um, at_m=at_m).position_mm[..., 0, 1]
 
@@ -80,15 +83,16 @@ def distortion_percent(
     wavelength_um: float = D_UM,
     at_m: Distances = PARALLEL,
 ) -> Tensor:
-    """100 (y / (f m(field)) - 1) of the real chief ray, [F] percent, [D, F] for D distances; 0 on the axis.
+    """100 (y / (f m(field)) - 1) of the real chief ray, [F] percent, [D, F] for D distances; 0 on
+    the axis.
 
     Args:
       mapping: "f-tan" (a picture without distortion) or "f-theta" (a scan lens or fisheye).
-      at_m: metres to the object plane. f is the height of the paraxial image of that plane per tangent: the
-        focal length for parallel light. On a film that is not focused there (``GeoLens.focus_at``) the change
-        of scale by defocus is part of the figure.
-    Gradient: to every lens tensor and to at_m. Raises: DomainError for another mapping, or when a chief ray
-      does not arrive.
+      at_m: metres to the object plane. f is the height of the paraxial image of that plane per
+        tangent: the focal length for parallel light. On a film that is not focused there
+        (``GeoLens.focus_at``) the change of scale by defocus is part of the figure.
+    Gradient: to every lens tensor and to at_m. Raises: DomainError for another mapping, or when a
+      chief ray does not arrive.
     """
     check_choice(mapping, "mapping", MAPPINGS)
     scale = image_scale_mm(lens, vergence_per_mm(lens, at_m), wavelength_um)
@@ -108,24 +112,27 @@ def focus_shift_mm(
     wavelength_um: float = D_UM,
     at_m: Distances = PARALLEL,
 ) -> Tensor:
-    """Tangential and sagittal focus of each field, along z from the image plane; the difference is the
-    astigmatism.
+    """Tangential and sagittal focus of each field, along z from the image plane; the difference is
+    the astigmatism.
 
-    Rays at +-REACH and +-2 REACH of the pupil radius stand for the infinitely thin bundle of Coddington's
-    equations; four points cancel the terms of third order in the reach, so what is left is rounding (below
-    1e-8 of the focal length).
+    Rays at +-REACH and +-2 REACH of the pupil radius stand for the infinitely thin bundle of
+    Coddington's equations; four points cancel the terms of third order in the reach, so what is
+    left is rounding (below 1e-8 of the focal length).
 
     Args:
       fields_rad: F angles.
       at_m: metres to the object plane, or D of them.
-    Returns: [F, 2] or [D, F, 2] mm, tangential (rays displaced in y) then sagittal (in x); positive behind
-      the image plane. Computed in float64, as the rays lie so close together, and given in the lens's
-      precision.
+    Returns: [F, 2] or [D, F, 2] mm, tangential (rays displaced in y) then sagittal (in x); positive
+      behind the image plane. Computed in float64, as the rays lie so close together, and given in
+      the lens's precision.
     Gradient: to every lens tensor and to at_m. Raises: DomainError when a field does not arrive.
     """
     dtype = lens.dtype
     lens = in_float64(lens)
-    line = torch.tensor([-2.0, -1.0, 1.0, 2.0], dtype=lens.dtype, device=lens.curvature_per_mm.device) * REACH
+    line = (
+        torch.tensor([-2.0, -1.0, 1.0, 2.0], dtype=lens.dtype, device=lens.curvature_per_mm.device)
+        * REACH
+    )
     zero = torch.zeros_like(line)
     pupil = torch.cat([torch.stack([zero, line], 1), torch.stack([line, zero], 1)])
     rays = trace_field(lens, fields_rad, pupil, wavelength_um, at_m=at_m)
@@ -138,17 +145,19 @@ def focus_shift_mm(
 
 
 def _slope_at_zero(values):
-    """Derivative at the middle of values [..., 4] at -2, -1, 1, 2 steps, per step, exact for cubics."""
+    """Derivative at the middle of values [..., 4] at -2, -1, 1, 2 steps, per step, exact for
+    cubics."""
     return (8 * (values[..., 2] - values[..., 1]) - (values[..., 3] - values[..., 0])) / 12
 
 
 @dataclass(frozen=True)
 class RayFan:
-    """Aberrations along a pupil diameter, relative to the reference point (the chief ray's, unless another
-    was given).
+    """Aberrations along a pupil diameter, relative to the reference point (the chief ray's, unless
+    another was given).
 
-    pupil: [M] in [-1, 1]. tangential_mm: [M] transverse aberration in y of rays (0, pupil); sagittal_mm: [M]
-      that in x of rays (pupil, 0). tangential_waves, sagittal_waves: [M] optical path differences.
+    pupil: [M] in [-1, 1]. tangential_mm: [M] transverse aberration in y of rays (0, pupil);
+      sagittal_mm: [M] that in x of rays (pupil, 0). tangential_waves, sagittal_waves: [M] optical
+      path differences.
       tangential_weight, sagittal_weight: [M], 0 where no ray arrives.
     """
 
@@ -173,11 +182,11 @@ def ray_fan(
     """RayFan of one object point and wavelength.
 
     Args:
-      count: rays per diameter, odd to hold the chief ray. reference_mm: [2] image point to which both
-        aberrations refer; None is the chief ray of this wavelength. Give that of a middle wavelength to see
-        lateral colour. vignetting, at_m (one distance): see ``trace_field``.
-    Gradient: aberrations to every lens tensor and to at_m. Raises: DomainError when no ray, or not the chief
-      ray, arrives.
+      count: rays per diameter, odd to hold the chief ray. reference_mm: [2] image point to which
+        both aberrations refer; None is the chief ray of this wavelength. Give that of a middle
+        wavelength to see lateral colour. vignetting, at_m (one distance): see ``trace_field``.
+    Gradient: aberrations to every lens tensor and to at_m. Raises: DomainError when no ray, or not
+      the chief ray, arrives.
     """
     like = lens.curvature_per_mm
     line = torch.linspace(-1, 1, count, dtype=like.dtype, device=like.device)
@@ -186,7 +195,9 @@ def ray_fan(
     rays, chief = trace_with_chief(lens, field_rad, pupil, wavelength_um, vignetting, at_m)
     centre = chief.position_mm[0] if reference_mm is None else reference_mm
     away = rays.position_mm - centre
-    waves = path_difference_mm(lens, rays, chief, wavelength_um, reference_mm) / (wavelength_um * 1e-3)
+    waves = path_difference_mm(lens, rays, chief, wavelength_um, reference_mm) / (
+        wavelength_um * 1e-3
+    )
     return RayFan(
         line,
         away[:count, 1],
@@ -210,8 +221,8 @@ def through_focus_spot_mm(
     vignetting: bool = False,
     at_m: float | Tensor = PARALLEL,
 ) -> Tensor:
-    """RMS spot about its mean for each field and plane, [F, Z] mm. Args: defocus_mm: [Z], positive further
-    from the lens; at_m: metres to the object plane. Gradient: to every lens tensor."""
+    """RMS spot about its mean for each field and plane, [F, Z] mm. Args: defocus_mm: [Z], positive
+    further from the lens; at_m: metres to the object plane. Gradient: to every lens tensor."""
     pupil = pupil_grid(grid, lens.dtype, lens.curvature_per_mm.device)
     wavelengths, shares = spectral_lines(light)
     one_distance(at_m)
@@ -222,7 +233,10 @@ def through_focus_spot_mm(
     return torch.stack(
         [
             torch.stack(
-                [spot_radius_mm(p + float(z) * s, w) for p, s, w in zip(place, slope, weight, strict=True)]
+                [
+                    spot_radius_mm(p + float(z) * s, w)
+                    for p, s, w in zip(place, slope, weight, strict=True)
+                ]
             )
             for z in defocus_mm
         ],
@@ -240,24 +254,28 @@ def through_focus_mtf(
     vignetting: bool = False,
     at_m: float | Tensor = PARALLEL,
 ) -> Tensor:
-    """MTF at one frequency on several planes, [2, Z] tangential, sagittal. Args: method: "diffraction" or
-    "geometric"; at_m: metres to the object plane. Gradient: to every lens tensor."""
+    """MTF at one frequency on several planes, [2, Z] tangential, sagittal. Args: method:
+    "diffraction" or "geometric"; at_m: metres to the object plane. Gradient: to every lens
+    tensor."""
     check_choice(method, "method", METHODS)
     behind = torch.zeros_like(lens.thickness_mm)
     behind[-1] = 1.0
     lenses = [lens.replace(thickness_mm=lens.thickness_mm + float(z) * behind) for z in defocus_mm]
     options = {"light": light, "vignetting": vignetting, "at_m": at_m}
-    return torch.cat([METHODS[method](geo, field_rad, [frequency_per_mm], **options) for geo in lenses], 1)
+    return torch.cat(
+        [METHODS[method](geo, field_rad, [frequency_per_mm], **options) for geo in lenses], 1
+    )
 
 
 def relative_illumination(lens: GeoLens, fields_rad: Sequence[float], grid: int = 24) -> Tensor:
-    """Irradiance of the image of a uniform world at each field, relative to the axis, vignetting included.
+    """Irradiance of the image of a uniform world at each field, relative to the axis, vignetting
+    included.
 
     Args:
       fields_rad: angles from the axis.
       grid: pupil points across the stop.
-    Returns: [fields], computed in float64 and given in the lens's precision. For an ideal lens of small
-      aperture without distortion it is cos^4 of the field angle.
+    Returns: [fields], computed in float64 and given in the lens's precision. For an ideal lens of
+      small aperture without distortion it is cos^4 of the field angle.
     Gradient: to every lens tensor.
     Raises: DomainError for a field that no ray passes.
     Source: E = integral of radiance over image-space direction cosines (Slyusarev; Rimmer, Relative

@@ -1,7 +1,7 @@
 """Modulation transfer: by diffraction, geometric, and that of a perfect lens.
 
-Tangential means a pattern that varies along y, the direction of the field (its lines lie across it); sagittal
-one that varies along x.
+Tangential means a pattern that varies along y, the direction of the field
+(its lines lie across it); sagittal one that varies along x.
 """
 
 import math
@@ -25,8 +25,8 @@ def ideal_mtf(
     fno: float | Tensor,
     wavelength_um: float = D_UM,
 ) -> Tensor:
-    """MTF of a perfect lens with a round pupil, (2 / pi) (acos v - v sqrt(1 - v^2)), v = frequency x
-    wavelength x f-number. Shape of the frequency; 0 beyond v = 1."""
+    """MTF of a perfect lens with a round pupil, (2 / pi) (acos v - v sqrt(1 - v^2)), v = frequency
+    x wavelength x f-number. Shape of the frequency; 0 beyond v = 1."""
     v = (torch.as_tensor(frequency_per_mm) * (wavelength_um * 1e-3 * fno)).abs().clamp_max(1.0)
     return 2 / math.pi * (v.acos() - v * (1 - v * v).sqrt())
 
@@ -42,19 +42,21 @@ def diffraction_mtf(
 ) -> Tensor:
     """MTF with diffraction of one field, from the Fourier transform of the point spread.
 
-    Several wavelengths add as complex transfer functions about one image point, so that lateral colour
-    counts.
+    Several wavelengths add as complex transfer functions about one image point, so that lateral
+    colour counts.
 
     Args:
       frequency_per_mm: [K] line pairs per mm in the image.
       light, grid, vignetting, at_m: see ``psf_on_pixels``.
     Returns: [2, K] tangential, sagittal, in [0, 1]; exactly 0 beyond the cut-off.
-    Gradient: to every lens tensor. Raises: DomainError for a negative frequency, and see ``pupil_function``.
+    Gradient: to every lens tensor. Raises: DomainError for a negative frequency, and see
+      ``pupil_function``.
     """
     frequency = _frequencies(lens, frequency_per_mm)
     _, pupils = pupil_functions(lens, field_rad, light, grid, vignetting, at_m)
     transfers = (
-        share * torch.stack([_transfer(pupil, axis, frequency) for axis in (1, 0)]) for share, pupil in pupils
+        share * torch.stack([_transfer(pupil, axis, frequency) for axis in (1, 0)])
+        for share, pupil in pupils
     )
     return sum(transfers, torch.zeros_like(frequency)).abs()
 
@@ -68,8 +70,8 @@ def geometric_mtf(
     vignetting: bool = False,
     at_m: float | Tensor = PARALLEL,
 ) -> Tensor:
-    """MTF of the rays alone, |mean of exp(-2 pi i frequency x)|, [2, K] tangential, sagittal. Arguments and
-    gradient as for ``diffraction_mtf``.
+    """MTF of the rays alone, |mean of exp(-2 pi i frequency x)|, [2, K] tangential, sagittal.
+    Arguments and gradient as for ``diffraction_mtf``.
 
     Multiply by ``ideal_mtf`` for the usual estimate between the two limits.
     """
@@ -79,13 +81,15 @@ def geometric_mtf(
     found = []
     for axis in (1, 0):
         phase = 2 * math.pi * frequency[:, None] * away[:, axis]
-        found.append(torch.complex((phase.cos() * weight).sum(1), -(phase.sin() * weight).sum(1)).abs())
+        found.append(
+            torch.complex((phase.cos() * weight).sum(1), -(phase.sin() * weight).sum(1)).abs()
+        )
     return torch.stack(found)
 
 
 def _transfer(pupil, axis, frequency):
-    """Complex transfer along an axis (0: x, 1: y) at frequencies [K], from the line spread of the zero-padded
-    pupil."""
+    """Complex transfer along an axis (0: x, 1: y) at frequencies [K], from the line spread of the
+    zero-padded pupil."""
     n = pupil.field.shape[0]
     field = pupil.field if axis else pupil.field.T
     # line spread along y: by Parseval, |.|^2 may be summed over x in the pupil instead of the image
@@ -95,12 +99,16 @@ def _transfer(pupil, axis, frequency):
     number = torch.arange(n * PADDING, dtype=frequency.dtype, device=frequency.device)
     place = (number - n * PADDING // 2) * (pupil.wavelength_mm / (2 * radius * PADDING))
     phase = 2 * math.pi * frequency[:, None] * place
-    found = torch.complex(phase.cos() @ line_spread, -(phase.sin() @ line_spread)) / line_spread.sum()
+    found = (
+        torch.complex(phase.cos() @ line_spread, -(phase.sin() @ line_spread)) / line_spread.sum()
+    )
     return torch.where(frequency < 2 * radius / pupil.wavelength_mm, found, 0)
 
 
 def _frequencies(lens, values):
-    frequency = torch.as_tensor(values, dtype=lens.dtype, device=lens.curvature_per_mm.device).reshape(-1)
+    frequency = torch.as_tensor(
+        values, dtype=lens.dtype, device=lens.curvature_per_mm.device
+    ).reshape(-1)
     if not bool((frequency >= 0).all()):
         raise DomainError(f"frequencies {frequency.tolist()} must be at least 0 line pairs per mm.")
     return frequency

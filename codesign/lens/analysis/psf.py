@@ -1,5 +1,5 @@
-"""Point spread functions: by diffraction from the pupil's wavefront, and geometric by counting rays on
-pixels."""
+"""Point spread functions: by diffraction from the pupil's wavefront, and geometric by counting rays
+on pixels."""
 
 import itertools
 from dataclasses import dataclass
@@ -19,11 +19,11 @@ from codesign.lens.glass import D_UM
 
 @dataclass(frozen=True)
 class Psf:
-    """A point image. Rows along +y, columns along +x of the lens; the reference point lies on [K // 2, K //
-    2] of K rows and columns.
+    """A point image. Rows along +y, columns along +x of the lens; the reference point lies on
+    [K // 2, K // 2] of K rows and columns.
 
-    energy: [K, K] share of the light per pixel. pitch_mm: [2] pixel size (x, y). reference_mm: [2] the
-      reference point on the image plane.
+    energy: [K, K] share of the light per pixel. pitch_mm: [2] pixel size (x, y). reference_mm: [2]
+      the reference point on the image plane.
     """
 
     energy: Tensor
@@ -42,9 +42,9 @@ def diffraction_psf(
 ) -> Psf:
     """Psf by a Fourier transform of the pupil, zero-padded from n to n * padding cells.
 
-    The pixel is then wavelength / (2 r padding), r the pupil's radius in direction cosines: a quarter of the
-    Airy scale wavelength times f-number per unit of padding 4. The picture repeats with n wavelength times
-    f-number. Energy sums to 1.
+    The pixel is then wavelength / (2 r padding), r the pupil's radius in direction cosines: a
+    quarter of the Airy scale wavelength times f-number per unit of padding 4. The picture repeats
+    with n wavelength times f-number. Energy sums to 1.
 
     Args:
       grid, vignetting, at_m: see ``pupil_function``.
@@ -54,7 +54,8 @@ def diffraction_psf(
     padding = check_whole(padding, "padding", 2)
     pupil = pupil_function(lens, field_rad, wavelength_um, grid, vignetting, at_m=at_m)
     count = pupil.field.shape[0] * int(padding)
-    # signs in a chequer put the reference point into the middle; columns of padding alone need no transform
+    # signs in a chequer put the reference point into the middle; columns of padding alone need no
+    # transform
     sign = 1 - 2 * (torch.arange(pupil.field.shape[0], device=pupil.field.device) % 2)
     light = (pupil.field.real.square() + pupil.field.imag.square()).sum()
     # so that the energy sums to 1 (Parseval)
@@ -75,20 +76,20 @@ def psf_on_pixels(
     vignetting: bool = False,
     at_m: float | Tensor = PARALLEL,
 ) -> Psf:
-    """Psf of one or several wavelengths by diffraction, on a pixel grid of one's own, about the chief ray of
-    the first wavelength.
+    """Psf of one or several wavelengths by diffraction, on a pixel grid of one's own, about the
+    chief ray of the first wavelength.
 
-    The Fourier integral is summed for each pixel centre (two matrix products), so wavelengths share the grid
-    and their lateral colour is in it. The energy of a pixel is the density at its centre times its area; the
-    sum tells the share that falls on the grid.
+    The Fourier integral is summed for each pixel centre (two matrix products), so wavelengths share
+    the grid and their lateral colour is in it. The energy of a pixel is the density at its centre
+    times its area; the sum tells the share that falls on the grid.
 
     Args:
       pixel_mm: size of a square pixel.
       pixels: rows and columns.
       light: see ``spectral_lines``.
       at_m: metres to the object plane, see ``wavefront``.
-    Gradient: to every lens tensor. Raises: DomainError, see ``pupil_function``, and when the grid is wider
-      than the sampled pupil's period.
+    Gradient: to every lens tensor. Raises: DomainError, see ``pupil_function``, and when the grid
+      is wider than the sampled pupil's period.
     """
     pixel_mm, pixels = _pixels(pixel_mm, pixels)
     reference, pupils = pupil_functions(lens, field_rad, light, grid, vignetting, at_m)
@@ -117,8 +118,8 @@ def geometric_psf(
     vignetting: bool = False,
     at_m: float | Tensor = PARALLEL,
 ) -> Psf:
-    """Psf by rays: each ray's weight is shared bilinearly among the four pixel centres around it. About the
-    chief ray of the first wavelength.
+    """Psf by rays: each ray's weight is shared bilinearly among the four pixel centres around it.
+    About the chief ray of the first wavelength.
 
     Args:
       grid: pupil cells across.
@@ -140,7 +141,9 @@ def geometric_psf(
         on = ((at >= 0) & (at < pixels)).all(1)
         pixel = at[:, 1] * pixels + at[:, 0]
         energy = energy.index_add(0, pixel[on], (weight * parts[0] * parts[1])[on])
-    return Psf(energy.reshape(pixels, pixels), torch.full((2,), pixel_mm, dtype=lens.dtype), reference)
+    return Psf(
+        energy.reshape(pixels, pixels), torch.full((2,), pixel_mm, dtype=lens.dtype), reference
+    )
 
 
 def _pixels(pixel_mm, pixels):

@@ -1,4 +1,5 @@
-"""The rays every analysis of a lens is made of: the light of object points, traced to the image plane."""
+"""The rays every analysis of a lens is made of: the light of object points, traced to the image
+plane."""
 
 import math
 from collections.abc import Sequence
@@ -47,8 +48,9 @@ def pupil_grid(
 class SourceRays:
     """Rays of object points before the lens, with leading axes [...] of distances and fields.
 
-    origin_mm, direction: [..., M, 3]. path_mm: [..., M] distance from the wavefront of the object point that
-      passes through the centre of the entrance pupil; a sphere, or the plane of parallel light.
+    origin_mm, direction: [..., M, 3]. path_mm: [..., M] distance from the wavefront of the object
+      point that passes through the centre of the entrance pupil; a sphere, or the plane of parallel
+      light.
     """
 
     origin_mm: Tensor
@@ -63,12 +65,12 @@ def source_rays(
     at_m: Distances = PARALLEL,
     start_z_mm: float = -5.0,
 ) -> SourceRays:
-    """The rays all analyses start with; the one place that decides where pupil points lie (on the paraxial
-    entrance pupil of the d line) and where object points do.
+    """The rays all analyses start with; the one place that decides where pupil points lie (on the
+    paraxial entrance pupil of the d line) and where object points do.
 
-    The object point of a field lies on the plane ``at_m`` before the entrance pupil and is seen under the
-    field angle from the pupil's centre. Its light reaches the pupil point q along (q / distance + (0, tan
-    field), 1), which holds for parallel light too.
+    The object point of a field lies on the plane ``at_m`` before the entrance pupil and is seen
+    under the field angle from the pupil's centre. Its light reaches the pupil point q along (q /
+    distance + (0, tan field), 1), which holds for parallel light too.
 
     Args:
       fields_rad: an angle in +y, or F of them.
@@ -76,7 +78,8 @@ def source_rays(
       at_m: a distance, or D of them; see ``vergence_per_mm``.
       start_z_mm: plane on which the rays are given, from the first vertex.
     Returns: SourceRays with the axes [D, F], as far as several were given.
-    Gradient: to the lens, whose pupil moves, and to at_m. Raises: DomainError for a distance inside the lens.
+    Gradient: to the lens, whose pupil moves, and to at_m. Raises: DomainError for a distance inside
+      the lens.
     """
     if pupil.ndim != 2 or pupil.shape[1] != 2 or pupil.shape[0] == 0:
         raise ShapeError(f"pupil points must be [M >= 1, 2], got {tuple(pupil.shape)}.")
@@ -93,7 +96,11 @@ def source_rays(
     along = (near * x, sine[..., None] + near * y, cosine[..., None])
     direction = torch.stack([(part / length).expand(length.shape) for part in along], -1)
     back = (start_z_mm - f.entrance_pupil_z_mm) / direction[..., 2]
-    start = (x + direction[..., 0] * back, y + direction[..., 1] * back, torch.full_like(back, start_z_mm))
+    start = (
+        x + direction[..., 0] * back,
+        y + direction[..., 1] * back,
+        torch.full_like(back, start_z_mm),
+    )
     # lean / (length + 1): distance of q from the object, less that of the pupil's centre, free of
     # cancellation
     path = lean / (length + 1) + back
@@ -111,10 +118,11 @@ def field_rays(
     start_z_mm: float = -5.0,
     at_m: float | Tensor = PARALLEL,
 ) -> tuple[Tensor, Tensor]:
-    """Rays of one object point, at one field angle (in +y), through points of the paraxial entrance pupil.
+    """Rays of one object point, at one field angle (in +y), through points of the paraxial entrance
+    pupil.
 
-    Args: field_rad scalar; pupil [M, 2] on the unit disc (placed at the pupil of the d line for every
-      wavelength); at_m: see ``source_rays``.
+    Args: field_rad scalar; pupil [M, 2] on the unit disc (placed at the pupil of the d line for
+      every wavelength); at_m: see ``source_rays``.
     Returns: origins and directions [M, 3].
     Gradient: to the lens, since the pupil moves with it, and to at_m.
     """
@@ -126,10 +134,10 @@ def field_rays(
 class ImageRays:
     """Rays of one wavelength on the image plane, with leading axes [...] of distances and fields.
 
-    position_mm: [..., M, 2] (x, y). direction: [..., M, 3] unit. path_mm: [..., M] optical path to the plane
-      from the wavefront of the object point through the centre of the entrance pupil. weight: [..., M] >= 0,
-      0 for rays that do not arrive. index: refractive index in image space. transmission: [..., M] what the
-      apertures' soft edges let pass.
+    position_mm: [..., M, 2] (x, y). direction: [..., M, 3] unit. path_mm: [..., M] optical path to
+      the plane from the wavefront of the object point through the centre of the entrance pupil.
+      weight: [..., M] >= 0, 0 for rays that do not arrive. index: refractive index in image space.
+      transmission: [..., M] what the apertures' soft edges let pass.
     """
 
     position_mm: Tensor
@@ -166,12 +174,12 @@ def trace_field(
     """Trace object points through pupil points to the image plane, in one trace.
 
     Args:
-      field_rad: an angle in +y, or F of them. pupil: [M, 2] on the unit disc. vignetting: weigh rays by the
-        apertures' soft edges; otherwise every ray that arrives weighs 1. at_m: metres from the entrance pupil
-        to the object plane, or D of them; see ``source_rays``.
+      field_rad: an angle in +y, or F of them. pupil: [M, 2] on the unit disc. vignetting: weigh
+        rays by the apertures' soft edges; otherwise every ray that arrives weighs 1. at_m: metres
+        from the entrance pupil to the object plane, or D of them; see ``source_rays``.
     Returns: ImageRays with the axes [D, F, M], D and F as far as several were given.
-    Gradient: positions, directions and paths to every lens tensor and to at_m; with vignetting the weights
-      too.
+    Gradient: positions, directions and paths to every lens tensor and to at_m; with vignetting the
+      weights too.
     Raises: DomainError when no ray of a field arrives, or for a distance inside the lens.
     """
     rays = trace_source(lens, source_rays(lens, field_rad, pupil, at_m), wavelength_um)
@@ -192,10 +200,12 @@ def _lit(lens, rays, field_rad):
 
 
 def trace_source(lens: TracedLens, source: SourceRays, wavelength_um: float) -> ImageRays:
-    """ImageRays of source rays on the lens's own image plane, of weight 1 where they arrive; none need do
-    so."""
+    """ImageRays of source rays on the lens's own image plane, of weight 1 where they arrive; none
+    need do so."""
     shape = source.path_mm.shape
-    out = lens.trace(source.origin_mm.reshape(-1, 3), source.direction.reshape(-1, 3), wavelength_um)
+    out = lens.trace(
+        source.origin_mm.reshape(-1, 3), source.direction.reshape(-1, 3), wavelength_um
+    )
     index = lens.index(wavelength_um)
     return ImageRays(
         out.position_mm[:, :2].reshape(*shape, 2),
@@ -221,7 +231,9 @@ def trace_with_chief(
     both = trace_source(lens, source_rays(lens, field_rad, points, at_m), wavelength_um)
     rays = both.part(slice(-1))
     chief = both.part(slice(-1, None))
-    return _lit(lens, rays.vignetted() if vignetting else rays, field_rad), _lit(lens, chief, field_rad)
+    return _lit(lens, rays.vignetted() if vignetting else rays, field_rad), _lit(
+        lens, chief, field_rad
+    )
 
 
 def chief_ray(
@@ -230,26 +242,33 @@ def chief_ray(
     wavelength_um: float = D_UM,
     at_m: Distances = PARALLEL,
 ) -> ImageRays:
-    """The ray through the centre of the pupil, as ImageRays with M = 1. Raises: DomainError when it does not
-    arrive."""
+    """The ray through the centre of the pupil, as ImageRays with M = 1. Raises: DomainError when it
+    does not arrive."""
     centre = torch.zeros(1, 2, dtype=lens.dtype, device=lens.curvature_per_mm.device)
     return trace_field(lens, field_rad, centre, wavelength_um, at_m=at_m)
 
 
 def spectral_lines(light: Light) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Wavelengths (um) and weights that sum to 1, from a wavelength, a list of them (equal weights), or
-    anything with wavelengths_um and weights.
+    """Wavelengths (um) and weights that sum to 1, from a wavelength, a list of them
+    (equal weights), or anything with wavelengths_um and weights.
 
-    Raises: DomainError for no wavelength, one that is not positive, or weights that are negative or sum to 0.
+    Raises: DomainError for no wavelength, one that is not positive, or weights that are negative or
+      sum to 0.
     """
     given: Any = light
     if hasattr(given, "wavelengths_um"):
         wavelengths = [float(w) for w in given.wavelengths_um]
         weights = [float(w) for w in given.weights]
     else:
-        wavelengths = [float(given)] if isinstance(given, (int, float)) else [float(w) for w in given]
+        wavelengths = (
+            [float(given)] if isinstance(given, (int, float)) else [float(w) for w in given]
+        )
         weights = [1.0] * len(wavelengths)
-    if not wavelengths or len(wavelengths) != len(weights) or not all(0 < w < math.inf for w in wavelengths):
+    if (
+        not wavelengths
+        or len(wavelengths) != len(weights)
+        or not all(0 < w < math.inf for w in wavelengths)
+    ):
         raise DomainError(
             f"light of wavelengths {wavelengths} um with weights {weights}: give at least one positive "
             "wavelength, and one weight for each."

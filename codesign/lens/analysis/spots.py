@@ -29,14 +29,15 @@ def spots(
     grid: int = 32,
     at_m: Distances = PARALLEL,
 ) -> tuple[Tensor, Tensor]:
-    """Spot diagrams: ray positions on the image plane, [fields, M, 2] mm, and weights [fields, M] (1, or 0
-    for failed rays). All fields and distances are one trace.
+    """Spot diagrams: ray positions on the image plane, [fields, M, 2] mm, and weights [fields, M]
+    (1, or 0 for failed rays). All fields and distances are one trace.
 
     Equal weights over a square pupil grid, no clipping by apertures.
     Args:
-      at_m: metres from the entrance pupil to the object plane, inf for parallel light; of D distances the
-        results are [D, fields, M, 2] and [D, fields, M].
-    Gradient: positions to every lens tensor and to at_m. Raises: DomainError for a distance inside the lens.
+      at_m: metres from the entrance pupil to the object plane, inf for parallel light; of D
+        distances the results are [D, fields, M, 2] and [D, fields, M].
+    Gradient: positions to every lens tensor and to at_m. Raises: DomainError for a distance inside
+      the lens.
     """
     pupil = pupil_grid(grid, lens.curvature_per_mm.dtype, lens.curvature_per_mm.device)
     rays = trace_source(lens, source_rays(lens, fields_rad, pupil, at_m), wavelength_um)
@@ -50,8 +51,8 @@ def rms_spot_mm(
     grid: int = 32,
     at_m: Distances = PARALLEL,
 ) -> Tensor:
-    """RMS distance of rays from their mean point, [fields] mm; [D, fields] for D distances ``at_m``, see
-    ``spots``. Raises DomainError where no ray of a field arrives.
+    """RMS distance of rays from their mean point, [fields] mm; [D, fields] for D distances
+    ``at_m``, see ``spots``. Raises DomainError where no ray of a field arrives.
 
     Example:
     >>> from codesign import lens
@@ -86,10 +87,10 @@ def polychromatic_spot(
       light: see ``spectral_lines``.
       grid: pupil cells across.
       vignetting, at_m (one distance): see ``trace_field``.
-    Returns: positions [W, M, 2] mm on the image plane, and weights [W, M] that sum to 1 (rays of one
-      wavelength share its weight as far as they arrive).
-    Gradient: positions (with vignetting also weights) to every lens tensor and to at_m. Raises: DomainError
-      when no ray of a wavelength arrives.
+    Returns: positions [W, M, 2] mm on the image plane, and weights [W, M] that sum to 1 (rays of
+      one wavelength share its weight as far as they arrive).
+    Gradient: positions (with vignetting also weights) to every lens tensor and to at_m. Raises:
+      DomainError when no ray of a wavelength arrives.
     """
     one_distance(at_m)
     pupil = pupil_grid(grid, lens.dtype, lens.curvature_per_mm.device)
@@ -114,8 +115,8 @@ def lit_points(
 
 
 def spot_radius_mm(positions_mm: Tensor, weight: Tensor) -> Tensor:
-    """RMS distance from the weighted mean point. Args: positions [..., 2] mm, weight [...]. Returns: scalar
-    mm; its gradient is 0 at a point image."""
+    """RMS distance from the weighted mean point. Args: positions [..., 2] mm, weight [...].
+    Returns: scalar mm; its gradient is 0 at a point image."""
     if weight.shape != positions_mm.shape[:-1]:
         raise ShapeError(
             f"weight has shape {list(weight.shape)}, positions {list(positions_mm.shape)}; one each."
@@ -140,7 +141,8 @@ def encircled_energy(
     about_chief: bool = False,
     at_m: float | Tensor = PARALLEL,
 ) -> Tensor:
-    """Share of rays within circles about the spot's mean point (or the chief ray of the first wavelength).
+    """Share of rays within circles about the spot's mean point (or the chief ray of the first
+    wavelength).
 
     Args:
       radii_mm: [K] increasing or not; the others as for ``polychromatic_spot``.
@@ -163,7 +165,8 @@ def encircled_radius_mm(
     about_chief: bool = False,
     at_m: float | Tensor = PARALLEL,
 ) -> Tensor:
-    """Radius that holds a share of the rays, scalar mm. Gradient: that of the ray on the rim. Raises:
+    """Radius that holds a share of the rays, scalar mm. Gradient: that of the ray on the rim.
+    Raises:
     DomainError for a share outside (0, 1]."""
     check_number(share, "share of encircled energy", above=0.0, most=1.0)
     distance, reached = _distances(lens, field_rad, light, grid, vignetting, about_chief, at_m)

@@ -1,11 +1,11 @@
-"""Wavefront error of a lens: optical path differences from the reference sphere, their RMS, and the Strehl
-ratio.
+"""Wavefront error of a lens: optical path differences from the reference sphere, their RMS, and the
+Strehl ratio.
 
-Paths count from the object point, that is from its spherical wavefront through the centre of the entrance
-pupil (a plane for parallel light). The reference sphere is centred on the chief ray's image point (or
-another given point) and passes through the centre of the paraxial exit pupil. An optical path difference is
-positive where the wavefront is ahead of the sphere, so that undercorrected spherical aberration is positive
-(W040 = S_I / 8).
+Paths count from the object point, that is from its spherical wavefront through the centre of the
+entrance pupil (a plane for parallel light). The reference sphere is centred on the chief ray's
+image point (or another given point) and passes through the centre of the paraxial exit pupil. An
+optical path difference is positive where the wavefront is ahead of the sphere, so that
+undercorrected spherical aberration is positive (W040 = S_I / 8).
 Source: Welford, Aberrations of Optical Systems, ch. 7; Born and Wolf, ch. 9.
 """
 
@@ -27,10 +27,10 @@ from codesign.lens.traced import in_float64
 class Wavefront:
     """Optical path differences over the pupil.
 
-    pupil: [M, 2] points of the unit disc (entrance pupil). opd_mm: [M], positive where the wavefront is
-      ahead. weight: [M], 0 where no light passes. slope: [M, 2] direction cosines times index from the ray's
-      point on the reference sphere to its centre, minus those of the chief ray. reference_mm: [2] that
-      centre, on the image plane.
+    pupil: [M, 2] points of the unit disc (entrance pupil). opd_mm: [M], positive where the
+      wavefront is ahead. weight: [M], 0 where no light passes. slope: [M, 2] direction cosines
+      times index from the ray's point on the reference sphere to its centre, minus those of the
+      chief ray. reference_mm: [2] that centre, on the image plane.
     """
 
     pupil: Tensor
@@ -53,12 +53,14 @@ def path_difference_mm(
     wavelength_um: float,
     reference_mm: Tensor | None = None,
 ) -> Tensor:
-    """Optical path of the chief ray minus that of each ray, both up to the reference sphere, [M] mm.
+    """Optical path of the chief ray minus that of each ray, both up to the reference sphere, [M]
+    mm.
 
     Args:
       rays, chief: ImageRays of the lens.
       reference_mm: [2] centre of the sphere.
-    Raises: DomainError when the exit pupil lies in the image, or a sphere is too small for the rays.
+    Raises: DomainError when the exit pupil lies in the image, or a sphere is too small for the
+      rays.
     """
     return _on_sphere(lens, rays, chief, wavelength_um, reference_mm)[0]
 
@@ -76,13 +78,13 @@ def wavefront(
     """Wavefront of one object point.
 
     Args:
-      grid: pupil cells across (the points are those of ``pupil_grid``), unless ``pupil`` [M, 2] gives the
-        points themselves.
+      grid: pupil cells across (the points are those of ``pupil_grid``), unless ``pupil`` [M, 2]
+        gives the points themselves.
       vignetting, at_m (one distance): see ``trace_field``. reference_mm: [2] centre of the
         reference sphere; None is the chief ray's point.
     Returns: Wavefront, in the lens's precision; paths of many wavelengths are computed in float64.
-    Gradient: opd_mm to every lens tensor and to at_m. Raises: DomainError when no ray, or not the chief ray,
-      arrives.
+    Gradient: opd_mm to every lens tensor and to at_m. Raises: DomainError when no ray, or not the
+      chief ray, arrives.
     """
     like = lens.curvature_per_mm
     lens = in_float64(lens)
@@ -105,14 +107,15 @@ def remove_fit(front: Wavefront, tilt: bool = True, focus: bool = False) -> Wave
     basis = torch.stack(columns, 1)
     w = front.weight[:, None]
     normal = basis.T @ (basis * w)
-    # a fan has no extent across, so its normal matrix is singular: the pseudo-inverse fits what there is
+    # a fan has no extent across, so its normal matrix is singular: the pseudo-inverse fits what
+    # there is
     fit = torch.linalg.pinv(normal, hermitian=True) @ (basis.T @ (front.opd_mm[:, None] * w))
     return replace(front, opd_mm=front.opd_mm - (basis @ fit)[:, 0])
 
 
 def rms_waves(front: Wavefront) -> Tensor:
-    """RMS of the optical path difference about its mean, in waves; scalar. Gradient: to opd and weights; 0
-    for a perfect wavefront."""
+    """RMS of the optical path difference about its mean, in waves; scalar. Gradient: to opd and
+    weights; 0 for a perfect wavefront."""
     w = front.weight / front.weight.sum()
     away = front.waves - (front.waves * w).sum()
     return torch.linalg.vector_norm(away * torch.where(w > 0, w, 1).sqrt() * (w > 0))
@@ -125,16 +128,16 @@ def peak_to_valley_waves(front: Wavefront) -> Tensor:
 
 
 def strehl_direct(front: Wavefront) -> Tensor:
-    """Strehl ratio |mean of exp(-i k W)|^2 at the centre of the reference sphere; scalar in [0, 1]. Remove
-    the tilt first to follow the peak."""
+    """Strehl ratio |mean of exp(-i k W)|^2 at the centre of the reference sphere; scalar in [0, 1].
+    Remove the tilt first to follow the peak."""
     w = front.weight / front.weight.sum()
     phase = 2 * math.pi * front.waves
     return (w * phase.cos()).sum().square() + (w * phase.sin()).sum().square()
 
 
 def strehl_marechal(front: Wavefront) -> Tensor:
-    """Strehl ratio exp(-(2 pi sigma)^2) from the RMS in waves; good above about 0.3. Source: Mahajan, JOSA 73
-    (1983)."""
+    """Strehl ratio exp(-(2 pi sigma)^2) from the RMS in waves; good above about 0.3. Source:
+    Mahajan, JOSA 73 (1983)."""
     return torch.exp(-(2 * math.pi * rms_waves(front)).square())
 
 
@@ -144,7 +147,8 @@ def _on_sphere(lens, rays, chief, wavelength_um, reference_mm):
     bend = _sphere_curvature(lens, centre, wavelength_um)
     lengths = [_to_sphere(bundle, centre, bend) for bundle in (rays, chief)]
     towards = [
-        bundle.direction[:, :2] * (1 - bend * length)[:, None] - bend * (bundle.position_mm - centre)
+        bundle.direction[:, :2] * (1 - bend * length)[:, None]
+        - bend * (bundle.position_mm - centre)
         for bundle, length in zip((rays, chief), lengths, strict=True)
     ]
     return chief.index * (lengths[1] - lengths[0]) + (chief.path_mm - rays.path_mm), rays.index * (
@@ -153,8 +157,8 @@ def _on_sphere(lens, rays, chief, wavelength_um, reference_mm):
 
 
 def _sphere_curvature(lens, centre, wavelength_um):
-    """1 / radius of the reference sphere, positive when the exit pupil lies before the image; 0 for a
-    telecentric lens."""
+    """1 / radius of the reference sphere, positive when the exit pupil lies before the image; 0 for
+    a telecentric lens."""
     f = lens.first_order(wavelength_um)
     before = lens.thickness_mm[-1] - f.exit_pupil_z_mm  # mm from the exit pupil to the plane
     if abs(float(before.detach())) < 1e-9:
@@ -168,8 +172,8 @@ def _sphere_curvature(lens, centre, wavelength_um):
 
 
 def _to_sphere(rays, centre, bend):
-    """Signed distance along each ray to the reference sphere, plus its radius: free of cancellation, and
-    regular when the sphere is a plane."""
+    """Signed distance along each ray to the reference sphere, plus its radius: free of
+    cancellation, and regular when the sphere is a plane."""
     x, y = (rays.position_mm - centre).unbind(1)  # on the plane, so that z is 0
     axial = x * rays.direction[:, 0] + y * rays.direction[:, 1]
     across = x * x + y * y - axial.square()

@@ -1,13 +1,13 @@
-"""What a lens must be to exist: limits on thicknesses, gaps, angles, length, glass and rays, as smooth
-penalties and as a report.
+"""What a lens must be to exist: limits on thicknesses, gaps, angles, length, glass and rays, as
+smooth penalties and as a report.
 
     limits = Limits(glass_centre_mm=1.0, glass_edge_mm=1.0, air_gap_mm=0.2, track_mm=70.0)
     found = evaluate(lens, limits)
     loss = spot + penalty(found)
     print(report(found))
 
-Every Constraint is a value, a bound and a side. Its penalty is (violation / scale)^2: zero with zero slope
-where it holds, so values and slopes are continuous. Surfaces are counted from 1.
+Every Constraint is a value, a bound and a side. Its penalty is (violation / scale)^2: zero with
+zero slope where it holds, so values and slopes are continuous. Surfaces are counted from 1.
 """
 
 from collections.abc import Collection, Iterator
@@ -28,9 +28,11 @@ from codesign.lens.surface import sag_mm
 class Constraint:
     """One limit on one figure of a lens.
 
-    value: scalar tensor with its gradient. at_least: True for value >= bound, False for value <= bound.
-    scale: the violation that costs a penalty of 1, in the unit of the value. can_bind: False where the bound
-      is also the best value there is (no failed ray), so that it holds or is violated but never binds.
+    value: scalar tensor with its gradient. at_least: True for value >= bound, False for value <=
+      bound.
+    scale: the violation that costs a penalty of 1, in the unit of the value. can_bind: False where
+      the bound is also the best value there is (no failed ray), so that it holds or is violated but
+      never binds.
     """
 
     name: str
@@ -43,7 +45,8 @@ class Constraint:
 
     @property
     def slack(self) -> Tensor:
-        """How far the value stays inside its bound, in its unit; negative when violated. Differentiable."""
+        """How far the value stays inside its bound, in its unit; negative when violated.
+        Differentiable."""
         return self.value - self.bound if self.at_least else self.bound - self.value
 
     @property
@@ -62,7 +65,8 @@ class Constraint:
         return self.row.square()
 
     def state(self, tolerance: float = 1e-3) -> str:
-        """One of "violated", "binds" (within tolerance * scale of its bound on either side) and "free"."""
+        """One of "violated", "binds" (within tolerance * scale of its bound on either side) and
+        "free"."""
         share = float(self.slack.detach()) / self.scale
         if self.can_bind and abs(share) <= tolerance:
             return "binds"
@@ -73,16 +77,17 @@ class Constraint:
 class Limits:
     """What to hold; None leaves a figure free. Lengths in mm, angles in degrees.
 
-    glass_centre_mm, glass_centre_most_mm: centre thickness of glass. glass_edge_mm: thickness of glass at the
-      semi-aperture.
-    air_gap_mm: least air between neighbouring surfaces anywhere within the semi-aperture, the axis included.
-    track_mm: most length from the first vertex to the image. back_focus_mm: least distance from the last
-      surface to the image.
-    incidence_deg: most angle of incidence of any rim or chief ray of ``fields_rad``. steepness: most
-      semi-aperture over radius (1 is a hemisphere).
+    glass_centre_mm, glass_centre_most_mm: centre thickness of glass. glass_edge_mm: thickness of
+      glass at the semi-aperture.
+    air_gap_mm: least air between neighbouring surfaces anywhere within the semi-aperture, the axis
+      included.
+    track_mm: most length from the first vertex to the image. back_focus_mm: least distance from the
+      last surface to the image.
+    incidence_deg: most angle of incidence of any rim or chief ray of ``fields_rad``. steepness:
+      most semi-aperture over radius (1 is a hemisphere).
     rays: whether every rim and chief ray of ``fields_rad`` must arrive.
-    at_m: distance of the object whose rays count, metres from the entrance pupil, or several; inf is
-      parallel light.
+    at_m: distance of the object whose rays count, metres from the entrance pupil, or several; inf
+      is parallel light.
     scale_mm, scale_deg: violations that cost 1.
     """
 
@@ -113,8 +118,8 @@ class Limits:
 
 
 def gap_mm(lens: GeoLens, heights: Tensor, semi_aperture_mm: Tensor | None = None) -> Tensor:
-    """Distance along the axis between neighbouring surfaces, [S - 1, H] mm, at ``heights`` [H], shares of the
-    larger of their semi-apertures."""
+    """Distance along the axis between neighbouring surfaces, [S - 1, H] mm, at ``heights`` [H],
+    shares of the larger of their semi-apertures."""
     a = lens.semi_aperture_mm if semi_aperture_mm is None else semi_aperture_mm
     y = torch.maximum(a[:-1], a[1:])[:, None] * heights
 
@@ -137,9 +142,10 @@ def evaluate(
     """All constraints that ``limits`` asks for, a list of Constraint.
 
     Args:
-      semi_aperture_mm: [S] where edges and gaps are measured (may carry a gradient); the lens's own when left
-        out. See hits for semi-apertures sized by rays.
-    Gradient: to every lens tensor the figure depends on. A least gap has that of its narrowest place.
+      semi_aperture_mm: [S] where edges and gaps are measured (may carry a gradient); the lens's own
+        when left out. See hits for semi-apertures sized by rays.
+    Gradient: to every lens tensor the figure depends on. A least gap has that of its narrowest
+      place.
     """
     apertures = lens.semi_aperture_mm if semi_aperture_mm is None else semi_aperture_mm
     parts = _lengths(lens, limits, apertures), _rays(lens, limits)
@@ -157,8 +163,8 @@ def penalty(constraints: Collection[Constraint]) -> Tensor:
 
 
 def rows(constraints: Collection[Constraint]) -> Tensor:
-    """violation / scale of every constraint, [C]: residual rows for least squares whose squares sum to
-    ``penalty``."""
+    """violation / scale of every constraint, [C]: residual rows for least squares whose squares sum
+    to ``penalty``."""
     if not constraints:
         raise DomainError("there are no constraints; set at least one limit.")
     return torch.stack([c.row for c in constraints])
@@ -171,7 +177,8 @@ def active(constraints: Collection[Constraint], tolerance: float = 1e-3) -> list
 
 
 def report(constraints: Collection[Constraint], tolerance: float = 1e-3) -> str:
-    """A printable table: every constraint with value, bound, slack and state, the tightest first."""
+    """A printable table: every constraint with value, bound, slack and state, the tightest
+    first."""
     ordered = sorted(constraints, key=lambda c: float(c.slack.detach()) / c.scale)
     lines = [("constraint", "value", "bound", "slack", "unit", "state")]
     for c in ordered:
@@ -226,7 +233,14 @@ def _rays(lens, limits) -> Iterator[tuple[Any, ...]]:
         # a ray that fails is the business of ``rays``
         worst = torch.where(hits.passed, angle, 0.0).amax(1)
         for i, value in enumerate(worst.unbind(0)):
-            yield f"incidence on surface {i + 1}", value, limits.incidence_deg, MOST, limits.scale_deg, "deg"
+            yield (
+                f"incidence on surface {i + 1}",
+                value,
+                limits.incidence_deg,
+                MOST,
+                limits.scale_deg,
+                "deg",
+            )
     if limits.rays:
         # a radicand lacks the deficit: exactly 0 for a ray that passes
         deficit = lens.trace(origin, direction).deficit.sum()

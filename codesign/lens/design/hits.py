@@ -21,9 +21,9 @@ DENSER = 1.5  # index behind a surface whose normal is looked for: no ray is tot
 
 @dataclass(frozen=True)
 class Hits:
-    """Rays at every surface. height_mm: [S, N] distance from the vertex across the axis. cosine: [S, N] of
-    the angle of incidence, 1 on a dummy that borders no glass. passed: [S, N], False from the surface on
-    where a ray failed; its numbers then mean nothing."""
+    """Rays at every surface. height_mm: [S, N] distance from the vertex across the axis. cosine:
+    [S, N] of the angle of incidence, 1 on a dummy that borders no glass. passed: [S, N], False from
+    the surface on where a ray failed; its numbers then mean nothing."""
 
     height_mm: Tensor
     cosine: Tensor
@@ -36,14 +36,14 @@ def surface_hits(
     direction: Tensor,
     wavelength_um: float = D_UM,
 ) -> Hits:
-    """Trace rays once per surface, up to it, and once to the image. Args: origin_mm, direction [N, 3], see
-    GeoLens.trace. Returns: Hits.
+    """Trace rays once per surface, up to it, and once to the image. Args: origin_mm, direction
+    [N, 3], see GeoLens.trace. Returns: Hits.
 
-    The normal is read off the change of direction at the same surface before denser glass, n'd' - n d =
-    const N, so shapes, decentres and tilts need no second formula, and equal indices on both sides have a
-    normal too.
-    Gradient: heights and cosines to rays and to every lens tensor. Raises: DomainError for a lens with
-      diffractive phases, which bend off the normal.
+    The normal is read off the change of direction at the same surface before denser glass, n'd' - n
+    d = const N, so shapes, decentres and tilts need no second formula, and equal indices on both
+    sides have a normal too.
+    Gradient: heights and cosines to rays and to every lens tensor. Raises: DomainError for a lens
+      with diffractive phases, which bend off the normal.
     """
     if any(s.phase for s in lens.surfaces):
         raise DomainError(
@@ -82,7 +82,8 @@ def surface_hits(
 def rim_rays(
     lens: GeoLens, fields_rad: Sequence[float], count: int = 16, at_m: Distances = PARALLEL
 ) -> tuple[Tensor, Tensor]:
-    """The chief ray and ``count`` rays on the rim of the entrance pupil, for each field and distance.
+    """The chief ray and ``count`` rays on the rim of the entrance pupil, for each field and
+    distance.
     Returns: origins and directions [distances * fields * (count + 1), 3]."""
     number = torch.arange(count, dtype=lens.dtype, device=lens.curvature_per_mm.device)
     turn = number * (2 * torch.pi / count) + torch.pi / 2
@@ -98,12 +99,14 @@ def traced_semi_aperture_mm(
     margin: float = 0.05,
     at_m: Distances = PARALLEL,
 ) -> Tensor:
-    """Semi-aperture that lets the full pupil of all fields and distances pass, [S] mm: the largest height of
-    a rim ray, times 1 + margin.
+    """Semi-aperture that lets the full pupil of all fields and distances pass, [S] mm: the largest
+    height of a rim ray, times 1 + margin.
 
     Gradient: of the highest ray. Raises: DomainError when a rim ray fails, or for a margin below 0.
     """
-    check_number(margin, f"{lens.name}: margin", 0.0, remedy="it is added to semi-apertures as a share")
+    check_number(
+        margin, f"{lens.name}: margin", 0.0, remedy="it is added to semi-apertures as a share"
+    )
     rays = rim_rays(lens, fields_rad, at_m=at_m)
     failed = lens.trace(*rays).status != 0
     if bool(failed.any()):
@@ -118,12 +121,12 @@ def traced_semi_aperture_mm(
 def fit_apertures(
     lens: GeoLens, fields_rad: Sequence[float], at_m: Distances = PARALLEL, margin: float = 0.05
 ) -> GeoLens:
-    """The lens with the semi-apertures that its rays need, so that edges and gaps of a design that changed
-    are judged, and its light clipped, where its glass would really end.
+    """The lens with the semi-apertures that its rays need, so that edges and gaps of a design that
+    changed are judged, and its light clipped, where its glass would really end.
 
     Args:
-      fields_rad, at_m: whose full pupil passes; give both signs of a field for a lens with decentres or
-        tilts.
+      fields_rad, at_m: whose full pupil passes; give both signs of a field for a lens with
+        decentres or tilts.
       margin: share added to the highest ray, as far as the surface reaches.
     Returns: a lens as from ``replace``. Gradient: semi_aperture_mm follows the highest rays.
     Raises: DomainError when a rim ray fails, or for a margin below 0.
@@ -145,7 +148,9 @@ def paraxial_semi_aperture_mm(
     margin: float = 0.05,
     at_m: float | Tensor = PARALLEL,
 ) -> Tensor:
-    """The same from the paraxial marginal and chief ray of one distance, |y| + |y_chief|, [S] mm: defined
-    for every lens, without tracing. Differentiable."""
-    rays = paraxial_rays(lens, half_field_rad, vergence_per_mm=vergence_per_mm(lens, one_distance(at_m)))
+    """The same from the paraxial marginal and chief ray of one distance, |y| + |y_chief|, [S] mm:
+    defined for every lens, without tracing. Differentiable."""
+    rays = paraxial_rays(
+        lens, half_field_rad, vergence_per_mm=vergence_per_mm(lens, one_distance(at_m))
+    )
     return (rays.marginal_height_mm.abs() + rays.chief_height_mm.abs()) * (1 + margin)

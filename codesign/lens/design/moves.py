@@ -1,12 +1,14 @@
 """Elements taken out, exchanged for another glass, or moved as rigid bodies.
 
-Moves between lens forms leave all other surfaces where they are, keep the focal length and the f-number, and
-the image plane as far from the paraxial focus as it was. Elements are single pieces of glass: a cemented
-doublet is two. Re-optimisation around these moves is in ``codesign.optimise.lens_moves``.
+Moves between lens forms leave all other surfaces where they are, keep the focal length and the
+f-number, and the image plane as far from the paraxial focus as it was. Elements are single pieces
+of glass: a cemented doublet is two. Re-optimisation around these moves is in
+``codesign.optimise.lens_moves``.
 
-Errors of mounting: the lens knows a decentre and a tilt per surface. A rigid motion turns every vertex about
-the vertex of the first face, so that those behind it move sideways and along the axis, and turns every axis.
-Surfaces are symmetric about their axes, so two angles say where an axis points.
+Errors of mounting: the lens knows a decentre and a tilt per surface. A rigid motion turns every
+vertex about the vertex of the first face, so that those behind it move sideways and along the axis,
+and turns every axis. Surfaces are symmetric about their axes, so two angles say where an axis
+points.
 """
 
 import math
@@ -28,8 +30,8 @@ VD_PER_ND = 100.0  # an Abbe number of 1 counts like an index of 0.01
 
 
 def elements(lens: GeoLens) -> tuple[tuple[int, int], ...]:
-    """Front and back surface (counted from 0) of every element, from the object: one pair per piece of
-    glass, so that neighbours in a cemented group share a surface.
+    """Front and back surface (counted from 0) of every element, from the object: one pair per piece
+    of glass, so that neighbours in a cemented group share a surface.
 
     >>> from codesign import lens
     >>> lens.design.elements(lens.load("cooke-triplet"))
@@ -39,8 +41,8 @@ def elements(lens: GeoLens) -> tuple[tuple[int, int], ...]:
 
 
 def groups(lens: GeoLens) -> tuple[tuple[int, int], ...]:
-    """First and last surface (counted from 0) of every group: elements that share no surface with another,
-    and cemented ones as a whole."""
+    """First and last surface (counted from 0) of every group: elements that share no surface with
+    another, and cemented ones as a whole."""
     found: list[tuple[int, int]] = []
     for front, back in elements(lens):
         if found and found[-1][1] == front:
@@ -52,14 +54,13 @@ def groups(lens: GeoLens) -> tuple[tuple[int, int], ...]:
 def without_element(lens: GeoLens, element: int) -> GeoLens:
     """The lens without one element; air takes its place.
 
-    An element that is cemented to another leaves the cemented face to that one. Where the stop was on a face
-    that goes, a plane stop stays in its place.
-    Args:
+    An element that is cemented to another leaves the cemented face to that one. Where the stop was
+    on a face that goes, a plane stop stays in its place. Args:
       element: its number in ``elements(lens)``, counted from 0; from the last when negative.
     Returns: a lens of its own, built from today's values. Its focal length is the old one, held by
       ``hold_efl``. A semi-aperture beyond the reach of its surface becomes that reach.
-    Raises: DomainError for an element that is not there, is the only one, or touches a mirror; and when the
-      rest cannot have the focal length with the image behind it.
+    Raises: DomainError for an element that is not there, is the only one, or touches a mirror; and
+      when the rest cannot have the focal length with the image behind it.
 
     >>> from codesign import lens
     >>> dialyte = lens.design.without_element(lens.load("cooke-triplet"), 1)
@@ -86,8 +87,8 @@ def without_element(lens: GeoLens, element: int) -> GeoLens:
 
 
 def flattened(lens: GeoLens, element: int, share: float) -> GeoLens:
-    """The lens on its way to ``without_element``: at ``share`` 1 the element is a plane-parallel plate, or a
-    shell of equal curvatures where it is cemented to another; at 0 it is as now.
+    """The lens on its way to ``without_element``: at ``share`` 1 the element is a plane-parallel
+    plate, or a shell of equal curvatures where it is cemented to another; at 0 it is as now.
 
     Gradient: to the lens tensors. Focal length and focus are left alone.
     """
@@ -106,13 +107,13 @@ def flattened(lens: GeoLens, element: int, share: float) -> GeoLens:
 
 
 def with_glass(lens: GeoLens, surface: int, medium: Glass | str) -> GeoLens:
-    """The lens with another glass behind a surface (counted from 0), focal length, f-number and defocus as
-    before; ``GeoLens.replace_glass`` leaves them as they come.
+    """The lens with another glass behind a surface (counted from 0), focal length, f-number and
+    defocus as before; ``GeoLens.replace_glass`` leaves them as they come.
 
     Args:
       medium: a Glass, or a name of the catalogue.
-    Returns, Raises: as ``without_element``; DomainError for a gap that holds no glass, and for air in its
-      place.
+    Returns, Raises: as ``without_element``; DomainError for a gap that holds no glass, and for air
+      in its place.
     """
     if surface not in [front for front, _ in elements(lens)]:
         fronts = ", ".join(str(front) for front, _ in elements(lens))
@@ -139,8 +140,8 @@ def neighbour_glasses(
       medium: a Glass, or a name of the catalogue.
       apart: least distance; other makers' versions of the same glass lie closer and are left out.
       among: names of the catalogue to choose from, None for all.
-    Returns: at most ``count`` glasses. Raises: DomainError for a name the catalogue does not know, or a
-      medium without dispersion.
+    Returns: at most ``count`` glasses. Raises: DomainError for a name the catalogue does not know,
+      or a medium without dispersion.
 
     >>> from codesign import lens
     >>> [glass.name for glass in lens.design.neighbour_glasses("F2", 3)]
@@ -164,9 +165,13 @@ def neighbour_glasses(
 
 def _element_faces(lens, pairs, element):
     if not pairs:
-        raise DomainError(f"{lens.name}: it has no element, as no gap between its surfaces is of glass.")
+        raise DomainError(
+            f"{lens.name}: it has no element, as no gap between its surfaces is of glass."
+        )
     if not isinstance(element, int) or not -len(pairs) <= element < len(pairs):
-        raise DomainError(f"{lens.name}: there is no element {element}; it has 0 to {len(pairs) - 1}.")
+        raise DomainError(
+            f"{lens.name}: there is no element {element}; it has 0 to {len(pairs) - 1}."
+        )
     front, back = pairs[element]
     if lens.mirrors[front] or lens.mirrors[back]:
         raise DomainError(
@@ -188,12 +193,15 @@ def _surfaces(lens):
 
 
 def _without(surfaces, at):
-    """The list without a surface, the gap in front of it longer; a plane stop in the place of a stop."""
+    """The list without a surface, the gap in front of it longer; a plane stop in the place of a
+    stop."""
     found = list(surfaces)
     gone = found.pop(at)
     if gone.is_stop:
         medium = found[at - 1].medium if at else None
-        found.insert(at, Surface(math.inf, gone.thickness_mm, medium, gone.semi_aperture_mm, is_stop=True))
+        found.insert(
+            at, Surface(math.inf, gone.thickness_mm, medium, gone.semi_aperture_mm, is_stop=True)
+        )
         return found
     if at:
         before = found[at - 1]
@@ -232,7 +240,9 @@ def _within_reach(surface):
     square = (1 + surface.conic) * surface.curvature_per_mm**2
     most = 1 / math.sqrt(square) if square > 0 else math.inf
     return (
-        surface if surface.semi_aperture_mm <= most else replace(surface, semi_aperture_mm=most * (1 - 1e-9))
+        surface
+        if surface.semi_aperture_mm <= most
+        else replace(surface, semi_aperture_mm=most * (1 - 1e-9))
     )
 
 
@@ -243,19 +253,20 @@ def moved_element(
     tilt_rad: Tensor | Sequence[float] | None = None,
     wedge_rad: Tensor | Sequence[float] | None = None,
 ) -> GeoLens:
-    """The lens with the surfaces of one element moved as a rigid body; exact, however large the angles.
+    """The lens with the surfaces of one element moved as a rigid body; exact, however large the
+    angles.
 
     Args:
       faces: first and last surface (counted from 0), see ``moves.elements`` and ``moves.groups``.
-      decentre_mm: [2] of the vertex of the first face, x and y. tilt_rad: [2] about x, then about y, around
-        that vertex. wedge_rad: [2] tilt of the last face alone, about x and about y, around its own vertex
-        and before the element is tilted. None is no error.
-    Returns: a lens as from ``replace``, with other decentres, tilts and thicknesses (the gap in front of a
-      vertex that moves along the axis and the one behind it). Errors that the surfaces have already are
-      turned along.
+      decentre_mm: [2] of the vertex of the first face, x and y. tilt_rad: [2] about x, then about
+        y, around that vertex. wedge_rad: [2] tilt of the last face alone, about x and about y,
+        around its own vertex and before the element is tilted. None is no error.
+    Returns: a lens as from ``replace``, with other decentres, tilts and thicknesses (the gap in
+      front of a vertex that moves along the axis and the one behind it). Errors that the surfaces
+      have already are turned along.
     Gradient: to the errors and to every tensor of the lens.
-    Raises: DomainError for faces that are not there or a mirror between them, whose axis is unfolded;
-      ShapeError.
+    Raises: DomainError for faces that are not there or a mirror between them, whose axis is
+      unfolded; ShapeError.
     """
     count = len(lens.surfaces)
     if len(faces) != 2 or not all(isinstance(face, int) for face in faces):
@@ -271,7 +282,11 @@ def moved_element(
         )
     like = lens.thickness_mm
     errors = []
-    for label, value in (("decentre_mm", decentre_mm), ("tilt_rad", tilt_rad), ("wedge_rad", wedge_rad)):
+    for label, value in (
+        ("decentre_mm", decentre_mm),
+        ("tilt_rad", tilt_rad),
+        ("wedge_rad", wedge_rad),
+    ):
         value = like.new_zeros(2) if value is None else real_numbers(value, label).to(like)
         if value.shape != (2,):
             raise ShapeError(f"{label} is [2], x and y, got shape {tuple(value.shape)}.")
@@ -298,8 +313,8 @@ def moved_element(
 
 
 def _rotation(angles):
-    """Turn about x, then about the y that came of it, [3, 3]: from the axes of a surface to those of the
-    lens."""
+    """Turn about x, then about the y that came of it, [3, 3]: from the axes of a surface to those
+    of the lens."""
     (ca, cb), (sa, sb) = angles.cos(), angles.sin()
     zero = torch.zeros_like(ca)
     return torch.stack([cb, zero, sb, sa * sb, ca, -sa * cb, -ca * sb, sa, ca * cb]).reshape(3, 3)

@@ -1,20 +1,21 @@
-"""What manufacturing errors do to a lens: the errors, their sensitivities, linear forecasts, and Monte Carlo
-to judge.
+"""What manufacturing errors do to a lens: the errors, their sensitivities, linear forecasts, and
+Monte Carlo to judge.
 
-    tolerances = Tolerances(radius_relative=1e-3, thickness_mm=0.02, index=5e-4, element_decentre_mm=0.01)
-    J = sensitivities(geo, tolerances, linear_figures(0.3))
-    trials = monte_carlo(geo, tolerances, linear_figures(0.3), 1000, torch.Generator().manual_seed(0))
+    tolerances = Tolerances(radius_relative=1e-3, thickness_mm=0.02, index=5e-4,
+    element_decentre_mm=0.01) J = sensitivities(geo, tolerances, linear_figures(0.3)) trials =
+    monte_carlo(geo, tolerances, linear_figures(0.3), 1000, torch.Generator().manual_seed(0))
 
-A figure is a function from a lens to a vector [K]. Errors are independent, normal, and each number of
-Tolerances is one standard deviation. A compensator is a function from the faulty lens to the one that is
-used, such as ``functools.partial(solves.focus_rays, fields_rad=(0.0, 0.3), grid=8)``; every function takes
-it the same way.
+A figure is a function from a lens to a vector [K]. Errors are independent, normal, and each number
+of Tolerances is one standard deviation. A compensator is a function from the faulty lens to the one
+that is used, such as ``functools.partial(solves.focus_rays, fields_rad=(0.0, 0.3), grid=8)``; every
+function takes it the same way.
 
-The spot: near an optimum its slope vanishes, so the linear forecast fails; the ray errors themselves stay
-linear. With r the ray errors of the nominal lens about their spot's mean (divided by the root of the ray
-count, so that r.r is the squared RMS spot) and A their change per standard deviation of each error, an error
-e gives |r + A e|^2. For independent normal e this has mean r.r + tr(A^T A) and variance 4 |A^T r|^2 + 2
-tr((A^T A)^2). What is left out is the curvature of the rays themselves, r . d2r / de2.
+The spot: near an optimum its slope vanishes, so the linear forecast fails; the ray errors
+themselves stay linear. With r the ray errors of the nominal lens about their spot's mean (divided
+by the root of the ray count, so that r.r is the squared RMS spot) and A their change per standard
+deviation of each error, an error e gives |r + A e|^2. For independent normal e this has mean r.r +
+tr(A^T A) and variance 4 |A^T r|^2 + 2 tr((A^T A)^2). What is left out is the curvature of the rays
+themselves, r . d2r / de2.
 """
 
 import math
@@ -44,14 +45,15 @@ OF_ELEMENT = "element "  # before the argument of ``moved_element``
 class Tolerances:
     """Standard deviations of independent normal errors, all at least 0; 0 leaves that kind out.
 
-    radius_relative: of every radius, as a share. radius_mm: of every radius, mm. fringes: rings of Newton's
-      power fringes over the semi-aperture, at 546 nm (N rings change the curvature by N wavelength /
-      semi-aperture^2). The three add in squares.
-    thickness_mm: of every thickness but the last, which is the focus. index: of every glass, the same at
-      every wavelength.
+    radius_relative: of every radius, as a share. radius_mm: of every radius, mm. fringes: rings of
+      Newton's power fringes over the semi-aperture, at 546 nm (N rings change the curvature by N
+      wavelength / semi-aperture^2). The three add in squares.
+    thickness_mm: of every thickness but the last, which is the focus. index: of every glass, the
+      same at every wavelength.
     decentre_mm: of every surface, in x and in y. tilt_deg: of every surface, about x and about y.
-    element_decentre_mm, element_tilt_deg, element_wedge_deg: of every element, a cemented group being one,
-      moved as a rigid body; in x and y, and about x and y. See ``element_errors.moved_element``.
+    element_decentre_mm, element_tilt_deg, element_wedge_deg: of every element, a cemented group
+      being one, moved as a rigid body; in x and y, and about x and y. See
+      ``element_errors.moved_element``.
     """
 
     radius_relative: float = 0.0
@@ -74,8 +76,8 @@ class Tolerances:
 
 @dataclass(frozen=True)
 class Error:
-    """One independent error: a name with the surfaces counted from 1, the lens tensor (or the argument of
-    ``moved_element``) and the entry it changes, and its standard deviation."""
+    """One independent error: a name with the surfaces counted from 1, the lens tensor (or the
+    argument of ``moved_element``) and the entry it changes, and its standard deviation."""
 
     name: str
     tensor: str
@@ -89,11 +91,13 @@ class Error:
 
 
 def errors_of(lens: GeoLens, tolerances: Tolerances | Sequence[Error]) -> list[Error]:
-    """The independent errors of a lens under ``tolerances``, a list of Error, surface by surface and then
-    element by element; errors given as such stay as they are. A plane keeps its radius but not its fringes.
+    """The independent errors of a lens under ``tolerances``, a list of Error, surface by surface
+    and then element by element; errors given as such stay as they are. A plane keeps its radius but
+    not its fringes.
 
     Surfaces that do not bend light (a stop in air) have no shape or place to get wrong.
-    Raises: DomainError for tolerances of elements with a mirror in them, or that the light passes twice.
+    Raises: DomainError for tolerances of elements with a mirror in them, or that the light passes
+      twice.
     """
     if not isinstance(tolerances, Tolerances):
         return list(tolerances)
@@ -143,7 +147,9 @@ def _two(noun, where, tensor, row, deviation):
 
 def _check_body(lens, first, last):
     surfaces = lens.to_surfaces()
-    if any(lens.mirrors[first : last + 1]) or any(passes_of(surfaces, i) for i in range(first, last)):
+    if any(lens.mirrors[first : last + 1]) or any(
+        passes_of(surfaces, i) for i in range(first, last)
+    ):
         raise DomainError(
             f"{lens.name}: element {first + 1}-{last + 1} holds a mirror or is passed twice by the light, "
             "and moving it as a body is not modelled; give tolerances of surfaces instead of elements."
@@ -151,10 +157,12 @@ def _check_body(lens, first, last):
 
 
 def perturbed(lens: GeoLens, errors: Sequence[Error], amounts: Tensor) -> GeoLens:
-    """The lens with errors of ``amounts`` [P] standard deviations. Gradient: to the amounts and to the
-    lens."""
+    """The lens with errors of ``amounts`` [P] standard deviations. Gradient: to the amounts and to
+    the lens."""
     if amounts.shape != (len(errors),):
-        raise ShapeError(f"{len(errors)} errors need as many amounts, got shape {tuple(amounts.shape)}.")
+        raise ShapeError(
+            f"{len(errors)} errors need as many amounts, got shape {tuple(amounts.shape)}."
+        )
     tensors = {}
     bodies = {}
     elements = groups(lens)
@@ -162,8 +170,12 @@ def perturbed(lens: GeoLens, errors: Sequence[Error], amounts: Tensor) -> GeoLen
         mine = [k for k, e in enumerate(errors) if e.tensor == name]
         of_element = name.startswith(OF_ELEMENT)
         base = lens.decentre_mm.new_zeros(len(elements), 2) if of_element else getattr(lens, name)
-        places = tuple(torch.tensor(axis) for axis in zip(*(errors[k].at for k in mine), strict=True))
-        sizes = torch.tensor([errors[k].deviation for k in mine], dtype=base.dtype, device=base.device)
+        places = tuple(
+            torch.tensor(axis) for axis in zip(*(errors[k].at for k in mine), strict=True)
+        )
+        sizes = torch.tensor(
+            [errors[k].deviation for k in mine], dtype=base.dtype, device=base.device
+        )
         faulty = base.index_put(places, sizes * amounts[mine], accumulate=True)
         if of_element:
             bodies[name.removeprefix(OF_ELEMENT)] = faulty
@@ -180,11 +192,13 @@ Compensator = Callable[[GeoLens], GeoLens]
 
 
 def linear_figures(half_field_rad: float, at_m: float = PARALLEL) -> Figures:
-    """Figures that errors change in proportion: the function lens -> [5] of EFL, BFL, distortion at the field
-    (relative), and the x and y of the axial spot's mean point; lengths in mm. Names: LINEAR_FIGURES.
+    """Figures that errors change in proportion: the function lens -> [5] of EFL, BFL, distortion at
+    the field (relative), and the x and y of the axial spot's mean point; lengths in mm. Names:
+    LINEAR_FIGURES.
 
     Args:
-      at_m: metres from the (faulty) lens's entrance pupil to the object of the spots and of the distortion.
+      at_m: metres from the (faulty) lens's entrance pupil to the object of the spots and of the
+        distortion.
     """
     one_distance(at_m)
 
@@ -196,7 +210,13 @@ def linear_figures(half_field_rad: float, at_m: float = PARALLEL) -> Figures:
         mean = (position * weight).sum(1)
         shift = mean[1, 1] - mean[0, 1]
         return torch.stack(
-            [f.efl_mm, f.bfl_mm, shift / (scale * math.tan(half_field_rad)) - 1, mean[0, 0], mean[0, 1]]
+            [
+                f.efl_mm,
+                f.bfl_mm,
+                shift / (scale * math.tan(half_field_rad)) - 1,
+                mean[0, 0],
+                mean[0, 1],
+            ]
         )
 
     return figures
@@ -223,14 +243,14 @@ def sensitivities(
     jacobian: Jacobian | None = None,
     compensate: Compensator | None = None,
 ) -> Tensor:
-    """Change of every figure per standard deviation of every error, [K, P]. The columns are in the order of
-    ``errors_of``.
+    """Change of every figure per standard deviation of every error, [K, P]. The columns are in the
+    order of ``errors_of``.
 
     Args:
       figures: lens -> [K].
-      jacobian: optimise.by_autograd for analytic gradients (K backward passes, best for few figures), or
-        optimise.by_differences(step), step in standard deviations; central differences of 0.1 when left out
-        (2 P evaluations).
+      jacobian: optimise.by_autograd for analytic gradients (K backward passes, best for few
+        figures), or optimise.by_differences(step), step in standard deviations; central differences
+        of 0.1 when left out (2 P evaluations).
       compensate: applied to the faulty lens first.
     Gradient: none.
     """
@@ -248,8 +268,8 @@ def sensitivities(
 
 @dataclass(frozen=True)
 class Trials:
-    """Monte Carlo: amounts [N, P] in standard deviations, figures [N, K], nominal [K], failed: trials without
-    a finite result (their figures are NaN)."""
+    """Monte Carlo: amounts [N, P] in standard deviations, figures [N, K], nominal [K], failed:
+    trials without a finite result (their figures are NaN)."""
 
     amounts: Tensor
     figures: Tensor
@@ -275,8 +295,8 @@ def monte_carlo(
     Args:
       generator: torch.Generator (CPU).
       compensate: applied to every faulty lens, and to the nominal one.
-    A lens that raises DomainError (no ray arrives, no focal length) is a failed trial: counted, never dropped
-    in silence.
+    A lens that raises DomainError (no ray arrives, no focal length) is a failed trial: counted,
+    never dropped in silence.
     """
     count = check_whole(count, "number of trials")
     errors = errors_of(lens, tolerances)
@@ -297,9 +317,9 @@ def monte_carlo(
 
 @dataclass(frozen=True)
 class Comparison:
-    """Linear forecast against trials, each [K]: standard deviations forecast and simulated, the correlation
-    of the changes forecast and simulated trial by trial, and how far the mean moved, in simulated standard
-    deviations (0 for a figure that is linear)."""
+    """Linear forecast against trials, each [K]: standard deviations forecast and simulated, the
+    correlation of the changes forecast and simulated trial by trial, and how far the mean moved, in
+    simulated standard deviations (0 for a figure that is linear)."""
 
     forecast: Tensor
     simulated: Tensor
@@ -308,8 +328,8 @@ class Comparison:
 
 
 def compare(slopes: Tensor, trials: Trials) -> Comparison:
-    """Comparison of ``sensitivities`` [K, P] with trials of the same lens and tolerances. A figure that
-    nothing changes has correlation 1."""
+    """Comparison of ``sensitivities`` [K, P] with trials of the same lens and tolerances. A figure
+    that nothing changes has correlation 1."""
     good = trials.figures.isfinite().all(1)
     if int(good.sum()) < 3:
         raise DomainError(
@@ -337,8 +357,8 @@ def worst_offenders(
     figure: int,
     most: int = 10,
 ) -> list[tuple[str, float, float]]:
-    """The errors that change one figure most: a list of (name, change per standard deviation, share of the
-    forecast variance)."""
+    """The errors that change one figure most: a list of (name, change per standard deviation, share
+    of the forecast variance)."""
     errors = errors_of(lens, tolerances)
     row = slopes[figure]
     total = float(row.square().sum())
@@ -349,8 +369,9 @@ def worst_offenders(
 
 @dataclass(frozen=True)
 class Forecast:
-    """Figures to second order in P independent errors of one standard deviation each: nominal + linear . e
-    + e . square e. nominal [...], or a number; linear [..., P]; square [..., P, P], symmetric."""
+    """Figures to second order in P independent errors of one standard deviation each: nominal +
+    linear . e + e . square e. nominal [...], or a number; linear [..., P]; square [..., P, P],
+    symmetric."""
 
     nominal: float | Tensor
     linear: Tensor
@@ -367,14 +388,18 @@ class Forecast:
         return self.nominal + torch.einsum("np,...p->n...", amounts, self.linear) + bent
 
     def moments(self, factors: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of the increase, [...], when every error has its factor [P] times the
-        deviation; 1 where None are given."""
+        """Mean and standard deviation of the increase, [...], when every error has its factor [P]
+        times the deviation; 1 where None are given."""
         v = self.linear.new_ones(self.linear.shape[-1]) if factors is None else factors.square()
-        return self.added @ v, (self.linear.square() @ v + 2 * (self.square.square() @ v) @ v).sqrt()
+        return self.added @ v, (
+            self.linear.square() @ v + 2 * (self.square.square() @ v) @ v
+        ).sqrt()
 
     def averaged(self) -> "Forecast":
         """The mean over the figures, as one."""
-        return Forecast(float(torch.as_tensor(self.nominal).mean()), self.linear.mean(0), self.square.mean(0))
+        return Forecast(
+            float(torch.as_tensor(self.nominal).mean()), self.linear.mean(0), self.square.mean(0)
+        )
 
 
 def spot_errors(
@@ -383,11 +408,12 @@ def spot_errors(
     grid: int = 12,
     at_m: Distances = PARALLEL,
 ) -> Callable[[GeoLens], Tensor]:
-    """The figure lens -> [F * M * 2]: ray errors about the mean point of their field over all wavelengths,
-    mm, divided by the root of the ray count.
+    """The figure lens -> [F * M * 2]: ray errors about the mean point of their field over all
+    wavelengths, mm, divided by the root of the ray count.
 
     Args:
-      at_m: metres to the object plane; of D distances each counts as so many more fields, [D * F * M * 2].
+      at_m: metres to the object plane; of D distances each counts as so many more fields,
+        [D * F * M * 2].
     Raises: DomainError when a ray fails.
     """
 
@@ -406,14 +432,14 @@ def spot_errors(
 
 
 def squared_spots(errors: Tensor, fields: int) -> Tensor:
-    """Squared RMS spots [F] mm^2 out of what ``spot_errors`` gives; fields: their number, times that of
-    distances."""
+    """Squared RMS spots [F] mm^2 out of what ``spot_errors`` gives; fields: their number, times
+    that of distances."""
     return errors.reshape(fields, -1).square().sum(1)
 
 
 def forecast_spot(nominal: Tensor, slopes: Tensor, fields: int) -> Forecast:
-    """Forecast of the squared RMS spots, [F] mm^2, from ray errors [F * M * 2] and their sensitivities
-    [F * M * 2, P]."""
+    """Forecast of the squared RMS spots, [F] mm^2, from ray errors [F * M * 2] and their
+    sensitivities [F * M * 2, P]."""
     r = nominal.reshape(fields, -1)
     A = slopes.reshape(fields, -1, slopes.shape[1])
     square = torch.einsum("fmp,fmq->fpq", A, A)

@@ -38,9 +38,9 @@ def with_plate(
       plate: None takes the lens's plate out.
       surface: from 0; None is the stop, -1 the last surface.
       z_mm: distance of the plate's plane from that surface's vertex, negative before the stop.
-    Returns: a lens as from ``replace``, which shares tensors and plate (a converted one has a plate of its
-      own); everything that traces rays sees the plate.
-      First-order figures and Seidel sums are those of the lens alone.
+    Returns: a lens as from ``replace``, which shares tensors and plate (a converted one has a plate
+      of its own); everything that traces rays sees the plate. First-order figures and Seidel sums
+      are those of the lens alone.
     Raises: DomainError for another surface, in glass, or where the plane meets a surface.
     """
     twin = lens.replace()
@@ -79,8 +79,8 @@ def with_plate(
 
 
 def cells_for_plate(lens: GeoLens, wavelength_um: float) -> int:
-    """Cells across the pupil that a lens's plate asks for, so that its phase steps by at most half a wave
-    from cell to cell and no detail of it falls between them; 0 without a plate. No gradient.
+    """Cells across the pupil that a lens's plate asks for, so that its phase steps by at most half
+    a wave from cell to cell and no detail of it falls between them; 0 without a plate. No gradient.
 
     The beam is that of the axis in parallel light, by its paraxial marginal ray.
     """
@@ -90,7 +90,9 @@ def cells_for_plate(lens: GeoLens, wavelength_um: float) -> int:
     gap, after = lens.plate_at
     index = lens.index(wavelength_um)
     with torch.no_grad():
-        radius = torch.as_tensor(lens.entrance_pupil_diameter_mm / 2, dtype=lens.dtype, device=index.device)
+        radius = torch.as_tensor(
+            lens.entrance_pupil_diameter_mm / 2, dtype=lens.dtype, device=index.device
+        )
         if gap >= 0:
             heights, angles = paraxial.yu_trace(
                 lens.surface_power(wavelength_um), lens.thickness_mm, index, radius, 0 * radius
@@ -110,16 +112,19 @@ def cells_for_plate(lens: GeoLens, wavelength_um: float) -> int:
 def plate_waves(
     lens: GeoLens, field_rad: float, pupil: Tensor, wavelength_um: float, at_m: float | Tensor
 ) -> tuple[Tensor, Tensor]:
-    """What a lens's plate adds to the light of an object point: optical path in waves where the rays of the
-    bare lens meet it, [M] for pupil points [M, 2], and whether it reaches there, [M] bool.
+    """What a lens's plate adds to the light of an object point: optical path in waves where the
+    rays of the bare lens meet it, [M] for pupil points [M, 2], and whether it reaches there, [M]
+    bool.
 
-    This is a thin element in the field of the lens, for plates of any slope and place; turned rays agree
-    with it to second order of the angle. Gradient: to the plate, the lens and at_m.
+    This is a thin element in the field of the lens, for plates of any slope and place; turned rays
+    agree with it to second order of the angle. Gradient: to the plate, the lens and at_m.
     """
     p = lens.prescription(wavelength_um)
     placed = p.plate
     if placed is None:
-        raise DomainError(f"{lens.name} has no phase plate; give it one with diffraction.with_plate.")
+        raise DomainError(
+            f"{lens.name} has no phase plate; give it one with diffraction.with_plate."
+        )
     source = source_rays(lens, field_rad, pupil, at_m)
     rays = to_plate(p, placed, source.origin_mm, source.direction)
     phase, _, reaches = placed.look(rays.position_mm[:, :2])
@@ -130,5 +135,7 @@ def _reach(lens, surface, sign):
     """How far a surface bulges towards +z (sign 1) or -z (-1) within its aperture, mm."""
     height = torch.linspace(0, 1, HEIGHTS, dtype=lens.dtype) * float(lens.semi_aperture_mm[surface])
     with torch.no_grad():
-        sag = sag_mm(height, lens.curvature_per_mm[surface], lens.conic[surface], lens.asphere[surface])
+        sag = sag_mm(
+            height, lens.curvature_per_mm[surface], lens.conic[surface], lens.asphere[surface]
+        )
     return float((sign * sag).max())

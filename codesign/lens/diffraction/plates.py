@@ -1,8 +1,8 @@
 """Thin phase plates, in Zernike terms or on a grid, that light and rays see alike.
 
-Zernike terms are in Noll's order, orthonormal over the unit disc: a term's mean square there is 1, so its
-coefficient is its RMS. Odd terms are those of the sine. Source: Noll, Zernike polynomials and atmospheric
-turbulence, JOSA 66 (1976).
+Zernike terms are in Noll's order, orthonormal over the unit disc: a term's mean square there is 1,
+so its coefficient is its RMS. Odd terms are those of the sine. Source: Noll, Zernike polynomials
+and atmospheric turbulence, JOSA 66 (1976).
 """
 
 import math
@@ -37,7 +37,8 @@ def zernike(terms: Sequence[int], points: Tensor) -> tuple[Tensor, Tensor]:
     Args:
       terms: K of Noll's indices, from 1.
       points: [N, 2] (x, y) in units of the disc's radius; beyond 1 the polynomials go on.
-    Returns: values [N, K]; slopes [N, K, 2] along x and y, per radius. Gradient: both to the points.
+    Returns: values [N, K]; slopes [N, K, 2] along x and y, per radius. Gradient: both to the
+      points.
     """
     x, y = points.unbind(1)
     r2 = x.square() + y.square()
@@ -52,9 +53,13 @@ def zernike(terms: Sequence[int], points: Tensor) -> tuple[Tensor, Tensor]:
         around = _turned(x, y, m, signed < 0)
         ahead, aside = _turned(x, y, m - 1, False), _turned(x, y, m - 1, True)
         turn = (aside, ahead) if signed < 0 else (ahead, -aside)
-        slope = [2 * at * bend * around + m * radial * by for at, by in zip((x, y), turn, strict=True)]
+        slope = [
+            2 * at * bend * around + m * radial * by for at, by in zip((x, y), turn, strict=True)
+        ]
         found.append((radial * around, torch.stack(slope, 1)))
-    return torch.stack([value for value, _ in found], 1), torch.stack([slope for _, slope in found], 1)
+    return torch.stack([value for value, _ in found], 1), torch.stack(
+        [slope for _, slope in found], 1
+    )
 
 
 def _turned(x, y, m, sine):
@@ -76,7 +81,9 @@ def _jacobi(k, a, b, t):
         if i == 1:
             before, now = now, (a + 1) + (a + b + 2) * (t - 1) / 2
             continue
-        ahead = (s - 1) * (s * (s - 2) * t + a * a - b * b) * now - 2 * (i + a - 1) * (i + b - 1) * s * before
+        ahead = (s - 1) * (s * (s - 2) * t + a * a - b * b) * now - 2 * (i + a - 1) * (
+            i + b - 1
+        ) * s * before
         before, now = now, ahead / (2 * i * (i + a + b) * (s - 2))
     return now
 
@@ -84,8 +91,9 @@ def _jacobi(k, a, b, t):
 class Plate(Replaceable):
     """What all plates are: a phase over (x, y) that adds optical path, positive phase more of it.
 
-    wavelength_um: where the phase holds. diffractive: whether the phase is the same at every wavelength (the
-      first order of a blazed grating, all light in it), or, as for a smooth relief, the optical path is.
+    wavelength_um: where the phase holds. diffractive: whether the phase is the same at every
+      wavelength (the first order of a blazed grating, all light in it), or, as for a smooth relief,
+      the optical path is.
     finest_mm: length below which the phase has no detail.
     """
 
@@ -107,8 +115,8 @@ class Plate(Replaceable):
         }
 
     def look(self, points_mm: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Phase [N] rad, its slope [N, 2] rad/mm, and whether the plate reaches there, [N] bool, at points
-        [N, 2] mm from the axis. Gradient: to the points and to what the plate is made of."""
+        """Phase [N] rad, its slope [N, 2] rad/mm, and whether the plate reaches there, [N] bool, at
+        points [N, 2] mm from the axis. Gradient: to the points and to what the plate is made of."""
         raise NotImplementedError
 
     def mm_per_rad(self, wavelength_um: float) -> float:
@@ -159,12 +167,16 @@ class ZernikePlate(Plate):
         values, slopes = zernike(self.terms, points_mm / self.radius_mm)
         weights = self.coefficients_rad.to(points_mm)
         reaches = torch.ones_like(values[:, 0], dtype=torch.bool)
-        return values @ weights, torch.einsum("nkc,k->nc", slopes, weights) / self.radius_mm, reaches
+        return (
+            values @ weights,
+            torch.einsum("nkc,k->nc", slopes, weights) / self.radius_mm,
+            reaches,
+        )
 
 
 class GridPlate(Plate):
-    """Phase given on a square grid about the axis; between the points the natural cubic spline through them,
-    so that rays meet a smooth slope.
+    """Phase given on a square grid about the axis; between the points the natural cubic spline
+    through them, so that rays meet a smooth slope.
 
     >>> import torch
     >>> from codesign.lens import diffraction
@@ -193,7 +205,9 @@ class GridPlate(Plate):
                 f"plate: phases on a grid must be [N, N] with N of at least 4, got {tuple(phase.shape)}."
             )
         if not (bool(phase.isfinite().all()) and 0 < pitch_mm < math.inf):
-            raise DomainError(f"plate: phases must be finite and their pitch positive, got {pitch_mm} mm.")
+            raise DomainError(
+                f"plate: phases must be finite and their pitch positive, got {pitch_mm} mm."
+            )
         self.phase_rad = nn.Parameter(phase)
         self.pitch_mm = self.finest_mm = float(pitch_mm)
         count = phase.shape[0]
@@ -208,7 +222,12 @@ class GridPlate(Plate):
         weights = self.spline @ self.phase_rad @ self.spline.T
         for _ in range(2):  # straight on by one point, along x and then along y
             weights = torch.cat(
-                [2 * weights[:, :1] - weights[:, 1:2], weights, 2 * weights[:, -1:] - weights[:, -2:-1]], 1
+                [
+                    2 * weights[:, :1] - weights[:, 1:2],
+                    weights,
+                    2 * weights[:, -1:] - weights[:, -2:-1],
+                ],
+                1,
             ).T
         at = points_mm / self.pitch_mm + (count - 1) / 2
         first = at.detach().floor().clamp(0, count - 2)
@@ -225,7 +244,8 @@ class GridPlate(Plate):
 
 
 def _cubic(u):
-    """Weights [N, 4] of the uniform cubic B-spline at a place u in its middle interval, and their slopes."""
+    """Weights [N, 4] of the uniform cubic B-spline at a place u in its middle interval, and their
+    slopes."""
     v = 1 - u
     weights = (v**3, 3 * u**3 - 6 * u**2 + 4, 3 * v**3 - 6 * v**2 + 4, u**3)
     slopes = (-3 * v**2, 9 * u**2 - 12 * u, 12 * v - 9 * v**2, 3 * u**2)

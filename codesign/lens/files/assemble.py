@@ -1,5 +1,5 @@
-"""From a file's description to a GeoLens: focus, pupil, field and apertures where the file leaves them to be
-computed."""
+"""From a file's description to a GeoLens: focus, pupil, field and apertures where the file leaves
+them to be computed."""
 
 import itertools
 import math
@@ -14,18 +14,19 @@ from codesign.lens.geolens import GeoLens
 from codesign.lens.paraxial import yu_trace
 from codesign.lens.surface import Surface, sag_mm
 
-# an aperture no file states: what the paraxial rays of pupil and field need, and 5 % for what they leave out
+# an aperture no file states: what the paraxial rays of pupil and field need, and 5 % for what they
+# leave out
 MARGIN = 1.05
-# share of the semi-aperture by which two faces of a glass may cross at the rim: files round apertures up, and
-# optimised designs cross where no ray passes
+# share of the semi-aperture by which two faces of a glass may cross at the rim: files round
+# apertures up, and optimised designs cross where no ray passes
 EDGE = 5e-3
 
 
 def assemble(lens: FileLens, dtype: torch.dtype = torch.float64) -> GeoLens:
     """GeoLens of a FileLens.
 
-    Returns: the lens; its soft edges are 2 % of the entrance pupil wide, 0.2 mm at most. A field given as a
-      height on the image counts as atan(height / focal length).
+    Returns: the lens; its soft edges are 2 % of the entrance pupil wide, 0.2 mm at most. A field
+      given as a height on the image counts as atan(height / focal length).
     Raises: FileFormatError or DomainError naming the surface, when it cannot exist.
     """
     if not 0 < len(lens.surfaces) <= MOST_SURFACES:
@@ -66,8 +67,8 @@ class Paraxial:
         self.stop = draft.stop_index
 
     def trace(self, y: float, u: float) -> tuple[list[float], float]:
-        """Heights at the surfaces, and the angle behind the last, of a ray that meets the first at height y
-        with slope u (in air)."""
+        """Heights at the surfaces, and the angle behind the last, of a ray that meets the first at
+        height y with slope u (in air)."""
         heights, angles = yu_trace(self.power, self.thickness, self.index, y, u)
         return heights, angles[-1] / self.index[-1]
 
@@ -92,8 +93,11 @@ class Paraxial:
 
 
 def _draft(rows, name):
-    """The lens with apertures so small that only shapes count. Raises: DomainError for surfaces that cannot be."""
-    surfaces = [replace(_surface(row), semi_aperture_mm=1e-9, inner_semi_aperture_mm=0.0) for row in rows]
+    """The lens with apertures so small that only shapes count. Raises: DomainError for surfaces
+    that cannot be."""
+    surfaces = [
+        replace(_surface(row), semi_aperture_mm=1e-9, inner_semi_aperture_mm=0.0) for row in rows
+    ]
     for row, surface in zip(rows, surfaces, strict=True):
         surface.check(f"surface {row.label}")
     return GeoLens(surfaces, 1.0, name=name)
@@ -131,7 +135,9 @@ def _pupil(lens, rows, optics):
             [stop / abs(heights[optics.stop])]
             if stop and heights[optics.stop]
             else [
-                r.semi_aperture / abs(y) for r, y in zip(rows, heights, strict=True) if r.semi_aperture and y
+                r.semi_aperture / abs(y)
+                for r, y in zip(rows, heights, strict=True)
+                if r.semi_aperture and y
             ]
         )
         if not limits:
@@ -181,8 +187,8 @@ def _half_field(lens, optics):
 
 
 def _open(rows, optics, diameter, half_field):
-    """Give every surface without an aperture one that lets the paraxial rays of pupil and field pass, as far
-    as its shape and the glass reach; the stop gets the image of the pupil."""
+    """Give every surface without an aperture one that lets the paraxial rays of pupil and field
+    pass, as far as its shape and the glass reach; the stop gets the image of the pupil."""
     slope = math.tan(math.radians(half_field or 0.0))
     marginal, _ = optics.trace(diameter / 2, 0.0)
     chief, _ = optics.trace(-slope * optics.entrance_pupil_mm() if slope else 0.0, slope)
@@ -204,10 +210,14 @@ def _open(rows, optics, diameter, half_field):
 
 
 def _edge(front, back):
-    """Heights up to the smaller aperture of two neighbours, and the distance along the axis between them
-    there, mm."""
-    heights = torch.linspace(0, min(front.semi_aperture, back.semi_aperture), 65, dtype=torch.float64)
-    front_mm, back_mm = (sag_mm(heights, row.curvature, row.conic, row.asphere) for row in (front, back))
+    """Heights up to the smaller aperture of two neighbours, and the distance along the axis between
+    them there, mm."""
+    heights = torch.linspace(
+        0, min(front.semi_aperture, back.semi_aperture), 65, dtype=torch.float64
+    )
+    front_mm, back_mm = (
+        sag_mm(heights, row.curvature, row.conic, row.asphere) for row in (front, back)
+    )
     # behind a mirror its shape is seen from the other side
     return heights, back_mm + front.thickness - (-front_mm if front.mirror else front_mm)
 

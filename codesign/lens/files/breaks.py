@@ -1,4 +1,5 @@
-"""The rigid frames that coordinate breaks carry from surface to surface, and the surfaces seen from the image."""
+"""The rigid frames that coordinate breaks carry from surface to surface, and the surfaces seen from
+the image."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -27,8 +28,8 @@ def along(distance: float) -> np.ndarray:
 def coordinate_break(parameters: Mapping[int, float]) -> np.ndarray:
     """The frame [4, 4] behind a break, in the one before it.
 
-    PARM 1, 2: decentre x, y. PARM 3, 4, 5: right-handed tilts about the x, y, z in force, degrees. PARM 6 is
-      0: decentre, then x, y, z; 1, which undoes it: z, y, x, then decentre.
+    PARM 1, 2: decentre x, y. PARM 3, 4, 5: right-handed tilts about the x, y, z in force, degrees.
+      PARM 6 is 0: decentre, then x, y, z; 1, which undoes it: z, y, x, then decentre.
     Raises: FileFormatError for other parameters.
     """
     for i, value in parameters.items():
@@ -58,8 +59,8 @@ def place(
     frames: Sequence[np.ndarray],
     image: np.ndarray,
 ) -> float:
-    """Write decentres, tilts and depths into the surfaces, seen from the image plane, whose normal through
-    its centre is the axis of the model.
+    """Write decentres, tilts and depths into the surfaces, seen from the image plane, whose normal
+    through its centre is the axis of the model.
 
     Args:
       frames: of the surfaces, and ``image``, in that of the object.

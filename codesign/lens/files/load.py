@@ -30,17 +30,17 @@ SEEN = 1e-3
 
 
 def load(source: str | Path, dtype: torch.dtype = torch.float64) -> GeoLens:
-    """Lens from a catalogue name (cooke-triplet, double-gauss, la1509) or a file; docs/lens_files.md says
-    what is read of each.
+    """Lens from a catalogue name (cooke-triplet, double-gauss, la1509) or a file;
+    docs/lens_files.md says what is read of each.
 
     Args:
-      source: name, or path with the extension .json (native, DeepLens or optiland), .zmx, .seq, or .txt
-        (DiffOptics).
+      source: name, or path with the extension .json (native, DeepLens or optiland), .zmx, .seq, or
+        .txt (DiffOptics).
       dtype: precision of the lens.
     Returns: GeoLens. Files are parsed, never executed; at most 2 MB and 500 surfaces are read.
     Warns: when coordinate breaks of a .zmx file put the stop beside the axis.
-    Raises: FileFormatError or DomainError, one sentence naming file, place, fault and remedy; nothing is half
-      loaded or dropped.
+    Raises: FileFormatError or DomainError, one sentence naming file, place, fault and remedy;
+      nothing is half loaded or dropped.
 
     Example:
     >>> from codesign import lens
@@ -51,7 +51,11 @@ def load(source: str | Path, dtype: torch.dtype = torch.float64) -> GeoLens:
     if str(source) in catalogue.LENSES:
         surfaces, diameter = catalogue.named_surfaces(str(source))
         return GeoLens(
-            surfaces, diameter, dtype, name=str(source), half_field_deg=catalogue.half_field_deg(str(source))
+            surfaces,
+            diameter,
+            dtype,
+            name=str(source),
+            half_field_deg=catalogue.half_field_deg(str(source)),
         )
     path = Path(source)
     if not os.path.exists(path):
@@ -94,16 +98,19 @@ def _from_json(text, name, dtype):
     return read_native(found, name, dtype)
 
 
-WRITERS = {".json": lambda lens: json.dumps(to_page(lens), indent=2, allow_nan=False) + "\n", ".zmx": to_zmx}
+WRITERS = {
+    ".json": lambda lens: json.dumps(to_page(lens), indent=2, allow_nan=False) + "\n",
+    ".zmx": to_zmx,
+}
 
 
 def save(lens: GeoLens, path: str | Path) -> None:
-    """Write the lens's current values to a .json file, exactly, or to a .zmx file for other programs
-    (docs/lens_files.md says what that keeps).
+    """Write the lens's current values to a .json file, exactly, or to a .zmx file for other
+    programs (docs/lens_files.md says what that keeps).
 
     A file that was there stays until the new one is whole.
-    Raises: FileFormatError when the place is not writable or the format cannot hold the lens; DomainError for
-      values that ``load`` would refuse.
+    Raises: FileFormatError when the place is not writable or the format cannot hold the lens;
+      DomainError for values that ``load`` would refuse.
 
     Example:
     >>> from codesign import lens

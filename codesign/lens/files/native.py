@@ -28,7 +28,15 @@ def read_native(page: Any, name: str, dtype: torch.dtype) -> GeoLens:
             "docs/lens_files.md."
         )
     p.only(
-        page, {"schema", "name", "entrance_pupil_diameter_mm", "soft_edge_mm", "half_field_deg", "surfaces"}
+        page,
+        {
+            "schema",
+            "name",
+            "entrance_pupil_diameter_mm",
+            "soft_edge_mm",
+            "half_field_deg",
+            "surfaces",
+        },
     )
     surfaces = []
     for i, row in enumerate(p.rows(page, "surfaces"), 1):
@@ -38,8 +46,12 @@ def read_native(page: Any, name: str, dtype: torch.dtype) -> GeoLens:
             surfaces.append(Surface(**fields).check("its shape"))
     diameter = p.number(page, "entrance_pupil_diameter_mm", infinite=True)
     soft_edge = p.number(page, "soft_edge_mm", 0.2)
-    half_field = p.number(page, "half_field_deg") if page.get("half_field_deg") is not None else None
-    return GeoLens(surfaces, diameter, dtype, soft_edge, title(page.get("name", name), name), half_field)
+    half_field = (
+        p.number(page, "half_field_deg") if page.get("half_field_deg") is not None else None
+    )
+    return GeoLens(
+        surfaces, diameter, dtype, soft_edge, title(page.get("name", name), name), half_field
+    )
 
 
 def _radius(row, key):
@@ -58,7 +70,9 @@ def _phase(row, key):
     if phase is None:
         return None
     if not isinstance(phase, dict):
-        raise FileFormatError(f"phase is {shown(phase)!r}, an object is needed; see docs/lens_files.md.")
+        raise FileFormatError(
+            f"phase is {shown(phase)!r}, an object is needed; see docs/lens_files.md."
+        )
     p.only(phase, {"coefficients", "order", "blaze_um"})
     order = phase.get("order", 1)
     if isinstance(order, bool) or not isinstance(order, int) or abs(order) > 10_000:
@@ -70,7 +84,9 @@ def _phase(row, key):
 def _pair(row, key):
     pair = p.numbers(row, key)
     if len(pair) not in (0, 2):
-        raise FileFormatError(f"{key} has {len(pair)} numbers, two (x and y) are needed; correct it.")
+        raise FileFormatError(
+            f"{key} has {len(pair)} numbers, two (x and y) are needed; correct it."
+        )
     return pair or (0.0, 0.0)
 
 
@@ -93,13 +109,18 @@ FIELDS = {
 
 
 def to_page(lens: GeoLens) -> Page:
-    """The page of a lens, as json writes it. Raises: DomainError for values that ``read_native`` would refuse."""
-    usual = {field.name: field.default for field in dataclasses.fields(Surface) if field.name in RARE}
+    """The page of a lens, as json writes it. Raises: DomainError for values that ``read_native``
+    would refuse."""
+    usual = {
+        field.name: field.default for field in dataclasses.fields(Surface) if field.name in RARE
+    }
     rows = []
     for i, s in enumerate(lens.to_surfaces(), 1):
         row = dataclasses.asdict(s.check(f"{lens.name}, surface {i}"))
         row["radius_mm"] = None if math.isinf(s.radius_mm) else s.radius_mm
-        rows.append({key: value for key, value in row.items() if key not in usual or value != usual[key]})
+        rows.append(
+            {key: value for key, value in row.items() if key not in usual or value != usual[key]}
+        )
     return {
         "schema": SCHEMAS[1],
         "name": lens.name,

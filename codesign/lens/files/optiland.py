@@ -41,8 +41,8 @@ def is_optiland(page: Any) -> bool:
 
 
 def read_optiland(page: Page, name: str) -> FileLens:
-    """FileLens of a page; solves and pickups keep the stored values. Raises: FileFormatError naming surface
-    and field."""
+    """FileLens of a page; solves and pickups keep the stored values. Raises: FileFormatError naming
+    surface and field."""
     entries = []
     for i, row in enumerate(p.rows(p.entry(page, "surface_group"), "surfaces", first=0)):
         with at(f"surface {i}"):
@@ -105,19 +105,29 @@ def _check_pupil(row):
 
 
 def _take_field(lens, fields):
-    if not isinstance(fields, dict) or not isinstance(fields.get("fields"), list) or not fields["fields"]:
+    if (
+        not isinstance(fields, dict)
+        or not isinstance(fields.get("fields"), list)
+        or not fields["fields"]
+    ):
         return
     first = fields["fields"][0] if isinstance(fields["fields"][0], dict) else {}
-    given = [page.get(key) for page in (fields, first) for key in ("field_definition", "field_type")]
+    given = [
+        page.get(key) for page in (fields, first) for key in ("field_definition", "field_type")
+    ]
     kind = next((kind for kind in given if kind is not None), None)
     kind = kind.get("field_type") if isinstance(kind, dict) else kind
     if not isinstance(kind, str) or kind not in FIELDS:
-        raise FileFormatError(f"the fields are given as {shown(kind)}; known are {', '.join(FIELDS)}.")
+        raise FileFormatError(
+            f"the fields are given as {shown(kind)}; known are {', '.join(FIELDS)}."
+        )
     _check_pupil(fields)
     points = [f for f in fields["fields"] if isinstance(f, dict)]
     lens.field = (
         FIELDS[kind],
-        max((math.hypot(p.number(f, "x", 0.0), p.number(f, "y", 0.0)) for f in points), default=0.0),
+        max(
+            (math.hypot(p.number(f, "x", 0.0), p.number(f, "y", 0.0)) for f in points), default=0.0
+        ),
     )
 
 
@@ -131,7 +141,9 @@ def _take_wavelength(lens, waves):
         if p.boolean(wave, "is_primary"):
             unit = wave.get("unit", "um")
             if unit not in ("um", "nm", "mm"):
-                raise FileFormatError(f"the unit of a wavelength is {shown(unit)}; give um, nm or mm.")
+                raise FileFormatError(
+                    f"the unit of a wavelength is {shown(unit)}; give um, nm or mm."
+                )
             lens.wavelength_um = p.number(wave, "value") * {"um": 1.0, "nm": 1e-3, "mm": 1e3}[unit]
 
 
@@ -143,8 +155,14 @@ def _place(row, infinite):
             "its axes refer to those of another surface (reference_cs), which is not read; give global axes."
         )
     if any(p.number(axes, key, 0.0) for key in ("rx", "ry")):
-        raise FileFormatError("it is tilted (rx, ry), which is not read; only untilted surfaces are.")
-    return p.number(axes, "x", 0.0), p.number(axes, "y", 0.0), p.number(axes, "z", infinite=infinite)
+        raise FileFormatError(
+            "it is tilted (rx, ry), which is not read; only untilted surfaces are."
+        )
+    return (
+        p.number(axes, "x", 0.0),
+        p.number(axes, "y", 0.0),
+        p.number(axes, "z", infinite=infinite),
+    )
 
 
 def _surface(row, label, thickness, place):
@@ -189,7 +207,9 @@ def boolean_mirror(row: Page) -> bool:
 
 def _curvature(shape):
     if p.present(shape, "type") not in SHAPES:
-        raise FileFormatError(f"geometry {shown(shape['type'])} is not read; {', '.join(SHAPES)} are.")
+        raise FileFormatError(
+            f"geometry {shown(shape['type'])} is not read; {', '.join(SHAPES)} are."
+        )
     radius = p.number(shape, "radius", math.inf, infinite=True)
     if radius == 0:
         raise FileFormatError("its radius is 0; a plane has the radius Infinity.")

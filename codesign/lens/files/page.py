@@ -15,8 +15,8 @@ MOST_NUMBERS = 16
 
 
 def parse(text: str) -> Any:
-    """The object a JSON text holds. Raises: FileFormatError when it is not JSON, nests deeper than 30, or has
-    a key twice."""
+    """The object a JSON text holds. Raises: FileFormatError when it is not JSON, nests deeper than
+    30, or has a key twice."""
     try:
         page = json.loads(text, object_pairs_hook=_once)
     except (ValueError, RecursionError) as error:
@@ -54,8 +54,8 @@ def _depth(page):
 
 
 def number(row: Page, key: str, default: float | None = None, infinite: bool = False) -> float:
-    """The number under a key, finite unless ``infinite``. Raises: FileFormatError when it is missing, of
-    another kind, or not finite."""
+    """The number under a key, finite unless ``infinite``. Raises: FileFormatError when it is
+    missing, of another kind, or not finite."""
     if key not in row and default is not None:
         return default
     value = present(row, key)
@@ -85,7 +85,8 @@ def boolean(row: Page, key: str) -> bool:
 
 
 def numbers(row: Page, key: str) -> tuple[float, ...]:
-    """The list of at most MOST_NUMBERS finite numbers under a key, empty when it is missing or null."""
+    """The list of at most MOST_NUMBERS finite numbers under a key, empty when it is missing or
+    null."""
     value = row.get(key)
     value = [] if value is None else value
     if not isinstance(value, list) or len(value) > MOST_NUMBERS:
@@ -107,7 +108,9 @@ def rows(page: Page, key: str, first: int = 1) -> list[Page]:
     """The list of 1 to MOST_SURFACES objects, surfaces numbered from ``first``, under a key."""
     value = page.get(key)
     if not isinstance(value, list) or not 0 < len(value) <= MOST_SURFACES:
-        raise FileFormatError(f'"{key}" must be a list of 1 to {MOST_SURFACES} surfaces; add at least one.')
+        raise FileFormatError(
+            f'"{key}" must be a list of 1 to {MOST_SURFACES} surfaces; add at least one.'
+        )
     for i, row in enumerate(value, first):
         if not isinstance(row, dict):
             raise FileFormatError(f"surface {i}: it is {shown(row)!r}, an object is needed.")
@@ -117,7 +120,9 @@ def rows(page: Page, key: str, first: int = 1) -> list[Page]:
 def only(row: Page, known: Container[str]) -> None:
     """Raise for a key that says something (not null, false, zero or empty) and is not known."""
     strange = [
-        key for key, value in row.items() if key not in known and value not in (None, False, 0, "", [], {})
+        key
+        for key, value in row.items()
+        if key not in known and value not in (None, False, 0, "", [], {})
     ]
     if strange:
         raise FileFormatError(

@@ -28,7 +28,8 @@ PUPILS = {"EPD": "diameter", "FNO": "working f-number", "NA": "numerical apertur
 FIELDS = {"AN": "angle", "OB": "object height", "IM": "image height", "RI": "image height"}
 SURROUNDINGS = {"TEM": 20.0, "PRE": 760.0}
 WORD = re.compile(r"'[^']*'|\"[^\"]*\"|\S+")
-# a statement, and what ends it: a semicolon, a comment, or the line; the first two only count outside quotes
+# a statement, and what ends it: a semicolon, a comment, or the line; the first two only count
+# outside quotes
 STATEMENT = re.compile(r"((?:'[^']*'?|\"[^\"]*\"?|[^'\";!])*)([;!]|$)")
 SURFACE_NAME = re.compile(r"S(\d{1,4}|O|I)", re.ASCII)
 # an object beyond this counts as infinitely far
@@ -38,8 +39,8 @@ FAR = 1e9
 def read_seq(text: str, name: str) -> FileLens:
     """FileLens of the text of a .seq file.
 
-    Without RDM, the first number of S is a curvature; without STO, the first surface is the stop (the
-    program's own defaults). Solves and pickups keep the stored values; PIM is solved again.
+    Without RDM, the first number of S is a curvature; without STO, the first surface is the stop
+    (the program's own defaults). Solves and pickups keep the stored values; PIM is solved again.
     Raises: FileFormatError naming surface or line for what is not understood.
     """
     system = System()
@@ -50,8 +51,8 @@ def read_seq(text: str, name: str) -> FileLens:
 
 
 def statements(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Statements of a .seq file as (line number, words): comments from ! dropped, lines ending in & joined,
-    statements parted at ;."""
+    """Statements of a .seq file as (line number, words): comments from ! dropped, lines ending in &
+    joined, statements parted at ;."""
     held = ""
     start = 0
     for at_line, line in lines(text):
@@ -68,7 +69,9 @@ def statements(text: str) -> Iterator[tuple[int, list[str]]]:
             if found[2] != ";":
                 break
     if held.strip():
-        raise FileFormatError(f"line {start}: the statement goes on (&) but the file ends; complete it.")
+        raise FileFormatError(
+            f"line {start}: the statement goes on (&) but the file ends; complete it."
+        )
 
 
 def _title(keyword, words):
@@ -207,7 +210,9 @@ class System:
             )
         self.image.check_image()
         self.object.check_object()
-        unit_mm, waves, reference = (self.values[name] for name in ("unit_mm", "waves_nm", "reference"))
+        unit_mm, waves, reference = (
+            self.values[name] for name in ("unit_mm", "waves_nm", "reference")
+        )
         found = []
         for surface in self.surfaces:
             with at(f"surface {surface.label}"):
@@ -233,7 +238,9 @@ class System:
         fields = self.values.get("fields", {})
         found = None
         for kind, label in FIELDS.items():
-            points = itertools.zip_longest(*(fields.get(axis + kind, []) for axis in "XY"), fillvalue=0.0)
+            points = itertools.zip_longest(
+                *(fields.get(axis + kind, []) for axis in "XY"), fillvalue=0.0
+            )
             heights = [math.hypot(*point) for point in points]
             found = (label, max(heights)) if heights else found
         return found

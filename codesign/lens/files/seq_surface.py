@@ -1,4 +1,5 @@
-"""One surface of a .seq file: a table of its commands, what of them can be traced, and the file's own glasses."""
+"""One surface of a .seq file: a table of its commands, what of them can be traced, and the file's
+own glasses."""
 
 import math
 from typing import Any
@@ -100,7 +101,9 @@ def _circle(keyword, words):
 
 def _diffraction(keyword, words):
     if words[0].upper() != "DOE":
-        raise FileFormatError(f"it diffracts as {shown(words[0])}; only DIF DOE with a radial phase is read.")
+        raise FileFormatError(
+            f"it diffracts as {shown(words[0])}; only DIF DOE with a radial phase is read."
+        )
     return True
 
 
@@ -120,7 +123,9 @@ def _order(keyword, words):
 
 def _path(keyword, words):
     if len(words) != 2 or words[0][:1].upper() != "C":
-        raise FileFormatError(f"HCO {shown(' '.join(words))} is not understood; give HCO C1 with its value.")
+        raise FileFormatError(
+            f"HCO {shown(' '.join(words))} is not understood; give HCO C1 with its value."
+        )
     term = whole(words[0][1:], "the number of a phase coefficient", 16)
     if term == 0:
         raise FileFormatError("HCO C0 is not understood; coefficients count from C1.")
@@ -149,8 +154,8 @@ SURFACE = {
     "HWL": Rule("wavelength_nm", one_number),
     "HCO": Rule("path", _path),
 }
-# labels, weights, variables, couplings, vignetting of the bundle, colours, solves and pickups: the values
-# they lead to stand in the file, or no ray changes
+# labels, weights, variables, couplings, vignetting of the bundle, colours, solves and pickups: the
+# values they lead to stand in the file, or no ray changes
 IDLE_WORDS = """
 INI WTW WTF WTX WTY VUX VLX VUY VLY SLB CCY CCX THC CUC GLC KC AC BC CC DC EC FC GC HC JC HCC XDC YDC ZDC
 ADC BDC CDC CUM THM GLM DER CLS PIK POL CA GO COM CWL PTC
@@ -177,7 +182,9 @@ class PrivateGlasses:
             # a formula: refused where it is used
             self.tables[_plain(first)] = rest[0]
         else:
-            self.tables[_plain(first)] = [number(word, f"an index of {shown(first)}") for word in rest]
+            self.tables[_plain(first)] = [
+                number(word, f"an index of {shown(first)}") for word in rest
+            ]
 
     def named(self, word: str) -> Glass | None:
         """Glass (or None for air) by the word behind a surface."""
@@ -193,7 +200,11 @@ class PrivateGlasses:
                 f"its glass {shown(name)} is given by a formula ({shown(table)}), which is not read; give "
                 "its indices at wavelengths (PWL)."
             )
-        if len(table) != len(self.waves_um) or len(set(self.waves_um)) < 2 or min(self.waves_um) <= 0:
+        if (
+            len(table) != len(self.waves_um)
+            or len(set(self.waves_um)) < 2
+            or min(self.waves_um) <= 0
+        ):
             raise FileFormatError(
                 f"its glass {shown(name)} has {len(table)} indices for {len(self.waves_um)} wavelengths; "
                 "give one each, for at least two positive wavelengths."
@@ -256,7 +267,12 @@ class SeqSurface:
         return self.glasses.named(self.values["filling"].get("medium", "AIR"))
 
     def check_image(self) -> None:
-        if self.curvature or self.medium is not None or self.mirror or any(self.values["moves"].values()):
+        if (
+            self.curvature
+            or self.medium is not None
+            or self.mirror
+            or any(self.values["moves"].values())
+        ):
             raise FileFormatError(
                 "the image surface is curved, tilted, shifted or followed by glass; only a flat image plane "
                 "across the axis is read."
@@ -270,13 +286,18 @@ class SeqSurface:
         """FileSurface of this surface, for a file in units of ``unit_mm``."""
         moves = self.values["moves"]
         # a turn about its own axis changes nothing
-        if any(value for name, value in moves.items() if name != "CDE") and "returns" not in self.values:
+        if (
+            any(value for name, value in moves.items() if name != "CDE")
+            and "returns" not in self.values
+        ):
             raise FileFormatError(
                 "it shifts or tilts everything behind it (a decentre without DAR); only single surfaces "
                 "that move are read."
             )
         if moves.get("ZDE"):
-            raise FileFormatError("it is shifted along the axis (ZDE); put that into the thicknesses.")
+            raise FileFormatError(
+                "it is shifted along the axis (ZDE); put that into the thicknesses."
+            )
         kind, conic, terms = self.get("kind", "SPH"), self.get("conic", 0.0), self.get("terms", {})
         if (conic and kind == "SPH") or (any(terms.values()) and kind != "ASP"):
             raise FileFormatError(
@@ -316,9 +337,12 @@ class SeqSurface:
             )
         wavelength_nm = self.get("wavelength_nm", 0.0)
         if wavelength_nm <= 0:
-            raise FileFormatError("its diffractive phase has no design wavelength; give HWL in nanometres.")
+            raise FileFormatError(
+                "its diffractive phase has no design wavelength; give HWL in nanometres."
+            )
         # radians per unit of path
         wave_number = 2 * math.pi * unit_mm / (wavelength_nm * 1e-6)
         return Phase(
-            tuple(wave_number * path.get(i, 0.0) for i in range(1, max(path) + 1)), self.get("order", 1)
+            tuple(wave_number * path.get(i, 0.0) for i in range(1, max(path) + 1)),
+            self.get("order", 1),
         )

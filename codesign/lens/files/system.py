@@ -1,6 +1,7 @@
 """A lens as files describe it, and its way to light that always travels along +z in millimetres.
 
-Files are signed along a fixed axis, in a unit of their own, with pupil and field given in many ways."""
+Files are signed along a fixed axis, in a unit of their own, with pupil and field given in many
+ways."""
 
 import dataclasses
 import math
@@ -13,14 +14,14 @@ from codesign.lens.surface import Phase, scaled_asphere, scaled_phase
 
 @dataclass
 class FileSurface:
-    """One surface in the convention of lens files: +z fixed, so curvature and thickness change sign behind a
-    mirror. Lengths in the file's unit.
+    """One surface in the convention of lens files: +z fixed, so curvature and thickness change sign
+    behind a mirror. Lengths in the file's unit.
 
-    label: its number in the file. semi_aperture: None where the file says nothing. fixed: whether that
-      aperture stops rays.
+    label: its number in the file. semi_aperture: None where the file says nothing. fixed: whether
+      that aperture stops rays.
     tilt_deg: right-handed about +x, then about +y. inner: radius of a central obstruction.
-    depth: of the vertex along the axis of the image plane, from there, where coordinate breaks tilt or
-      shift; the thickness stays the one along the light.
+    depth: of the vertex along the axis of the image plane, from there, where coordinate breaks tilt
+      or shift; the thickness stays the one along the light.
     """
 
     label: int | str
@@ -44,12 +45,12 @@ class FileSurface:
 class FileLens:
     """All a file says of a lens; the object and the image surface are not among the surfaces.
 
-    pupil: ("diameter" | "f-number" | "working f-number" | "numerical aperture" | "stop", value; the last
-      needs none).
-    field: ("angle" degrees | "object height" | "image height", value) or None. object_distance: from the
-      object to the first surface.
-    focus: whether the last thickness is to be solved for the paraxial focus. defocus: added to the last
-      thickness. image_tilt_deg: between the axes of object and image plane.
+    pupil: ("diameter" | "f-number" | "working f-number" | "numerical aperture" | "stop", value; the
+      last needs none).
+    field: ("angle" degrees | "object height" | "image height", value) or None. object_distance:
+      from the object to the first surface.
+    focus: whether the last thickness is to be solved for the paraxial focus. defocus: added to the
+      last thickness. image_tilt_deg: between the axes of object and image plane.
     """
 
     name: str = "lens"
@@ -69,12 +70,13 @@ ROUNDING = 1e-9
 
 
 def unfold(lens: FileLens) -> list[FileSurface]:
-    """The surfaces with lengths in millimetres and all signs along the light; dummy planes at which the light
-    steps back are folded away.
+    """The surfaces with lengths in millimetres and all signs along the light; dummy planes at which
+    the light steps back are folded away.
 
     Args:
       lens: FileLens.
-    Returns: list of FileSurface; the last thickness is 0 where the paraxial focus is to be solved for.
+    Returns: list of FileSurface; the last thickness is 0 where the paraxial focus is to be solved
+      for.
     Raises: FileFormatError when the light would have to travel backwards.
     """
     found = []
@@ -98,8 +100,8 @@ def unfold(lens: FileLens) -> list[FileSurface]:
 
 
 def placed(surfaces: list[FileSurface]) -> list[FileSurface]:
-    """The surfaces of ``unfold`` with thicknesses along the axis of the image plane, where coordinate breaks
-    moved some; as they were elsewhere. Raises: FileFormatError as there."""
+    """The surfaces of ``unfold`` with thicknesses along the axis of the image plane, where
+    coordinate breaks moved some; as they were elsewhere. Raises: FileFormatError as there."""
     depths = [surface.depth for surface in surfaces] + [0.0]
     found = []
     sign = 1.0
@@ -112,8 +114,8 @@ def placed(surfaces: list[FileSurface]) -> list[FileSurface]:
 
 
 def in_mm(surface: FileSurface, unit_mm: float, sign: float) -> FileSurface:
-    """The surface in millimetres, its shape and tilt mirrored in z where ``sign`` is -1; its thickness is
-    left alone."""
+    """The surface in millimetres, its shape and tilt mirrored in z where ``sign`` is -1; its
+    thickness is left alone."""
     aperture = None if surface.semi_aperture is None else surface.semi_aperture * unit_mm
     x, y = surface.decentre
     about_x, about_y = surface.tilt_deg
@@ -131,10 +133,13 @@ def in_mm(surface: FileSurface, unit_mm: float, sign: float) -> FileSurface:
 
 
 def is_dummy(surface: FileSurface, medium_before: Glass | None) -> bool:
-    """Whether a surface does nothing to any ray: a plane within one medium that neither stops nor turns
-    light."""
+    """Whether a surface does nothing to any ray: a plane within one medium that neither stops nor
+    turns light."""
     plain = (
-        surface.curvature == 0 and not any(surface.asphere) and surface.phase is None and not surface.mirror
+        surface.curvature == 0
+        and not any(surface.asphere)
+        and surface.phase is None
+        and not surface.mirror
     )
     return (
         plain

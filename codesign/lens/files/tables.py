@@ -12,8 +12,8 @@ from codesign.lens.glass import Glass
 
 SHAPES = ("Spheric", "Aspheric", "Aperture", "Stop", "Plane")
 AIR = ("air", "vacuum", "occluder")
-# positions and sizes given a second time, in brackets where the writer meant them for the eye, and how
-# diffraction of the stop was sampled
+# positions and sizes given a second time, in brackets where the writer meant them for the eye, and
+# how diffraction of the stop was sampled
 KNOWN = {
     "idx",
     "type",
@@ -45,8 +45,8 @@ def is_deeplens(page: Any) -> bool:
 
 
 def read_deeplens(page: Page, name: str) -> FileLens:
-    """FileLens of a page. The stop is the surface of type Stop or Aperture, else the one with the smallest
-    aperture (as that program has it); its radius sets the pupil.
+    """FileLens of a page. The stop is the surface of type Stop or Aperture, else the one with the
+    smallest aperture (as that program has it); its radius sets the pupil.
 
     The header's focal length and f-number are not used: they follow from the surfaces. Raises:
     FileFormatError naming surface and field.
@@ -63,7 +63,9 @@ def read_deeplens(page: Page, name: str) -> FileLens:
     _mark_stop(surfaces, stops)
     _check_places(page)
     info = page.get("info")
-    return FileLens(name if info in (None, "None") else title(info, name), surfaces, pupil=("stop", 0.0))
+    return FileLens(
+        name if info in (None, "None") else title(info, name), surfaces, pupil=("stop", 0.0)
+    )
 
 
 def _check_front(row, medium):
@@ -93,8 +95,11 @@ def _check_places(page):
 
 
 def _mark_stop(surfaces, stops):
-    """Mark the surface of the only index in ``stops``, else the first with the smallest aperture."""
-    at_stop = surfaces[stops[0]] if stops else min(surfaces, key=lambda surface: surface.semi_aperture)
+    """Mark the surface of the only index in ``stops``, else the first with the smallest
+    aperture."""
+    at_stop = (
+        surfaces[stops[0]] if stops else min(surfaces, key=lambda surface: surface.semi_aperture)
+    )
     at_stop.is_stop = True
 
 
@@ -104,7 +109,9 @@ def _surface(row, label):
         raise FileFormatError(f"type {shown(kind)} is not read; {', '.join(SHAPES)} are.")
     p.only({key: value for key, value in row.items() if not key.startswith("(")}, KNOWN)
     if p.boolean(row, "is_square"):
-        raise FileFormatError("its aperture is square, only circles are read; set is_square to false.")
+        raise FileFormatError(
+            "its aperture is square, only circles are read; set is_square to false."
+        )
     conic = p.number(row, "k", 0.0)
     asphere = _asphere(row)
     if kind != "Aspheric" and (conic or any(asphere)):
@@ -138,15 +145,17 @@ def _curvature(row):
         radius = p.number(row, "roc", infinite=True)
         found.append(1 / radius if radius else 0.0)
     if len(found) == 2 and abs(found[0] - found[1]) > EQUAL * max(map(abs, found)):
-        raise FileFormatError(f"c is {found[0]:.9g} but 1 / roc is {found[1]:.9g}; keep the right one.")
+        raise FileFormatError(
+            f"c is {found[0]:.9g} but 1 / roc is {found[1]:.9g}; keep the right one."
+        )
     if not found and row["type"] in ("Spheric", "Aspheric"):
         raise FileFormatError("it has neither c nor roc; give one.")
     return found[0] if found else 0.0
 
 
 def _asphere(row):
-    """Coefficients of r^2, r^4, ...: the list ``ai`` begins at r^2, unless the single fields show that it
-    begins at r^4."""
+    """Coefficients of r^2, r^4, ...: the list ``ai`` begins at r^2, unless the single fields show
+    that it begins at r^4."""
     terms = p.numbers(row, "ai")
     single = {int(key[2:]) // 2: p.number(row, key) for key in row if re.fullmatch(r"ai\d+", key)}
     if not single:
@@ -160,7 +169,9 @@ def _asphere(row):
         ):
             return listed
     if terms:
-        raise FileFormatError("the list ai and the fields ai2, ai4, ... disagree; keep one of them.")
+        raise FileFormatError(
+            "the list ai and the fields ai2, ai4, ... disagree; keep one of them."
+        )
     return tuple(single.get(i, 0.0) for i in range(1, last + 1))
 
 
@@ -170,7 +181,9 @@ def _medium(text):
     pair = text.split("/")
     if len(pair) == 2:
         return Glass.from_abbe(
-            number(pair[0].strip(), "the index nd"), number(pair[1].strip(), "the Abbe number"), text
+            number(pair[0].strip(), "the index nd"),
+            number(pair[1].strip(), "the Abbe number"),
+            text,
         )
     return Glass.named(text)
 
@@ -178,9 +191,9 @@ def _medium(text):
 def read_diffoptics(text: str, name: str) -> FileLens:
     """FileLens of the text of a table.
 
-    The distance of a row leads to it from the row before; radius 0 is a plane; the numbers behind the
-    material are the conic constant and the coefficients of r^4, r^6, ... The row A is the stop, else the
-    surface with the smallest diameter. Raises: FileFormatError naming the row.
+    The distance of a row leads to it from the row before; radius 0 is a plane; the numbers behind
+    the material are the conic constant and the coefficients of r^4, r^6, ... The row A is the stop,
+    else the surface with the smallest diameter. Raises: FileFormatError naming the row.
     """
     table = [(i, line.split()) for i, line in lines(text) if line.strip()]
     if len(table) < 4 or [w.lower() for w in table[1][1][:3]] != ["type", "distance", "roc"]:
@@ -231,7 +244,9 @@ def _check_image(words):
 
 def _table_surface(kind, words, label):
     if kind not in ("S", "A", "X"):
-        raise FileFormatError(f"type {shown(kind)} is not read; O, S, A, I are, and X without coefficients.")
+        raise FileFormatError(
+            f"type {shown(kind)} is not read; O, S, A, I are, and X without coefficients."
+        )
     radius = number(words[2], "the radius")
     diameter = number(words[3], "the diameter")
     rest = [number(w, "a coefficient") for w in words[5:]]
@@ -244,5 +259,12 @@ def _table_surface(kind, words, label):
     asphere = (0.0, *rest[1:]) if kind == "S" and any(rest[1:]) else ()
     conic = rest[0] if kind == "S" and rest else 0.0
     return FileSurface(
-        label, 1 / radius if radius else 0.0, 0.0, _medium(words[4]), diameter / 2, True, conic, asphere
+        label,
+        1 / radius if radius else 0.0,
+        0.0,
+        _medium(words[4]),
+        diameter / 2,
+        True,
+        conic,
+        asphere,
     )

@@ -1,5 +1,5 @@
-"""The text of a lens file, and the numbers in it, read within bounds whatever the file holds; and tables that say
-what each keyword of a file sets, or why it is refused."""
+"""The text of a lens file, and the numbers in it, read within bounds whatever the file holds; and
+tables that say what each keyword of a file sets, or why it is refused."""
 
 import codecs
 import math
@@ -23,8 +23,8 @@ CONTROL = re.compile(r"[\x00-\x08\x0b\x0e-\x1f\x7f]")
 def read_text(path: str | Path) -> str:
     """The text of a file in UTF-8, UTF-16 (either byte order) or Latin-1, of at most LARGEST_BYTES.
 
-    Raises: FileFormatError for what is not a regular file (a pipe is not waited for), is too long, or is not
-      text.
+    Raises: FileFormatError for what is not a regular file (a pipe is not waited for), is too long,
+      or is not text.
     """
     content = read_bytes(path, LARGEST_BYTES)
     try:
@@ -35,7 +35,9 @@ def read_text(path: str | Path) -> str:
         ) from error
     text = text.removeprefix("\ufeff").rstrip("\x1a")
     if max(text.count("\n"), text.count("\r")) > MOST_LINES:
-        raise FileFormatError(f"it has more than {MOST_LINES} lines, which no lens needs; is it a lens file?")
+        raise FileFormatError(
+            f"it has more than {MOST_LINES} lines, which no lens needs; is it a lens file?"
+        )
     strange = CONTROL.search(text)
     if strange:
         raise FileFormatError(
@@ -86,7 +88,10 @@ def shown(value: object) -> str:
 
 def title(value: object, otherwise: str) -> str:
     """A name on one line of at most 80 printable characters; ``otherwise`` where there is none."""
-    return "".join(c for c in " ".join(str(value).split()) if c.isprintable())[:80].strip() or otherwise
+    return (
+        "".join(c for c in " ".join(str(value).split()) if c.isprintable())[:80].strip()
+        or otherwise
+    )
 
 
 @contextmanager
@@ -101,7 +106,8 @@ def at(place: str) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Rule:
-    """A keyword sets the value of this name to ``make(keyword, words behind it)``; dictionaries add up.
+    """A keyword sets the value of this name to ``make(keyword, words behind it)``; dictionaries add
+    up.
 
     least: how many words must stand behind it.
     """
@@ -111,13 +117,15 @@ class Rule:
     least: int = 1
 
 
-# a keyword's rule, or the sentence that refuses it; the empty one is of what changes no ray and is passed over
+# a keyword's rule, or the sentence that refuses it; the empty one is of what changes no ray and is
+# passed over
 Table = Mapping[str, Rule | str]
 IDLE = ""
 
 
 def take(values: dict[str, Any], table: Table, keyword: str, words: list[str]) -> None:
-    """Set what a keyword of the table sets. Raises: FileFormatError where it is refused or has no value."""
+    """Set what a keyword of the table sets. Raises: FileFormatError where it is refused or has no
+    value."""
     rule = table[keyword]
     if isinstance(rule, str):
         if rule != IDLE:

@@ -41,7 +41,9 @@ def _sequential(keyword, words):
 
 def _unit(keyword, words):
     if words[0].upper() not in UNITS_MM:
-        raise FileFormatError(f"unit '{shown(words[0])}' is not known; known are {', '.join(UNITS_MM)}.")
+        raise FileFormatError(
+            f"unit '{shown(words[0])}' is not known; known are {', '.join(UNITS_MM)}."
+        )
     return UNITS_MM[words[0].upper()]
 
 
@@ -119,8 +121,8 @@ HEADER = {
 def read_zmx(text: str, name: str) -> FileLens:
     """FileLens of the text of a .zmx file; several configurations (a zoom) are refused.
 
-    Raises: FileFormatError naming surface and reason for anything in a surface that is not understood, or
-      that no GeoLens can be.
+    Raises: FileFormatError naming surface and reason for anything in a surface that is not
+      understood, or that no GeoLens can be.
     """
     header: dict[str, Any] = {}
     entries: list[Entry] = []
@@ -155,7 +157,8 @@ def read_zmx(text: str, name: str) -> FileLens:
 
 
 def _lens(header, entries, name):
-    """FileLens of the values of the header and the entries of the surfaces, object and image included."""
+    """FileLens of the values of the header and the entries of the surfaces, object and image
+    included."""
     if len(entries) < 3:
         raise FileFormatError(
             f"it has {len(entries)} surfaces; a lens needs at least object, one surface and image (SURF "

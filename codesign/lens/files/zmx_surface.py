@@ -33,8 +33,8 @@ REASONS = {
     "ODDASPHE": "odd powers of the height are not read",
     "DGRATING": "a ruled grating has no axis of revolution",
 }
-# solves, pickups, tolerances, drawing, coatings, mechanical sizes and labels: the values they lead to stand
-# in the file, or no ray changes
+# solves, pickups, tolerances, drawing, coatings, mechanical sizes and labels: the values they lead
+# to stand in the file, or no ray changes
 IDLE_WORDS = """
 SLAB HIDE MIRR POPS FIMP COAT COMM PZUP PPAR VPAR VDSZ VCON PKUP MAZH MARG EDGE MEMA OEMA TCMM TCED CHZN
 SCOL SOPA DRAW NOTE RCMF
@@ -86,7 +86,9 @@ def _ring(keyword, words):
 
 def _centred(keyword, words):
     if any(all_numbers(keyword, words)):
-        raise FileFormatError("its aperture is off the axis (OBDC); only circles around the axis are read.")
+        raise FileFormatError(
+            "its aperture is off the axis (OBDC); only circles around the axis are read."
+        )
 
 
 def _straight(keyword, words):
@@ -137,8 +139,8 @@ class Entry:
         self.seen: set[str] = set()
 
     def take(self, keyword: str, words: list[str]) -> None:
-        """Take one line. Raises: FileFormatError when it is not understood, comes twice, or asks for what
-        cannot be traced."""
+        """Take one line. Raises: FileFormatError when it is not understood, comes twice, or asks
+        for what cannot be traced."""
         if keyword not in SURFACE:
             raise FileFormatError(
                 f"keyword '{shown(keyword)}' is not understood; delete the line if it changes no ray."
@@ -160,7 +162,11 @@ class Entry:
             )
 
     def check_image(self) -> None:
-        if self.get("curvature") or self.kind not in TYPES or any(self.get("parameters", {}).values()):
+        if (
+            self.get("curvature")
+            or self.kind not in TYPES
+            or any(self.get("parameters", {}).values())
+        ):
             raise FileFormatError(
                 f"surface {self.label} is a curved or special image surface; only a flat image plane is read."
             )
@@ -175,8 +181,8 @@ class Entry:
         return any(value for i, value in self.get("parameters", {}).items() if i != 6)
 
     def coordinate_break(self) -> np.ndarray:
-        """The frame [4, 4] behind this coordinate break, before its thickness; the light stays in its
-        medium."""
+        """The frame [4, 4] behind this coordinate break, before its thickness; the light stays in
+        its medium."""
         self._check_lines()
         if {"is_stop", "glass"} & self.values.keys() or any(self.get("extra", {}).values()):
             raise FileFormatError(
@@ -233,7 +239,9 @@ def _medium(words):
     if words[0] != "___BLANK":
         return Glass.named(words[0])
     if len(words) < 5:
-        raise FileFormatError("its model glass has no index and Abbe number; write GLAS ___BLANK 1 0 nd Vd.")
+        raise FileFormatError(
+            "its model glass has no index and Abbe number; write GLAS ___BLANK 1 0 nd Vd."
+        )
     return Glass.from_abbe(number(words[3], "the index nd"), number(words[4], "the Abbe number"))
 
 

@@ -8,12 +8,12 @@ MOST_TERMS = 8  # of an even asphere
 # of a model glass
 LEAST_ABBE = 10
 MOST_ABBE = 150
-# a glass goes by its catalogue name when its indices at F, d and C are the catalogue's to this; published
-# tables round to 1e-9
+# a glass goes by its catalogue name when its indices at F, d and C are the catalogue's to this;
+# published tables round to 1e-9
 SAME_INDEX = 1e-8
-# how a glass's source begins -> the catalogue that every program has. Names of plastics and crystals stand
-# for other media elsewhere (COC of one program is 3 % of a focal length from that of another), so they are
-# not written
+# how a glass's source begins -> the catalogue that every program has. Names of plastics and
+# crystals stand for other media elsewhere (COC of one program is 3 % of a focal length from that of
+# another), so they are not written
 CATALOGUES = {
     "Schott, optical glass": "SCHOTT",
     "Schott, earlier glasses": "SCHOTT",
@@ -28,13 +28,14 @@ CATALOGUES = {
 def to_zmx(lens: GeoLens) -> str:
     """The text of a .zmx file of the lens's current values; numbers keep all their digits.
 
-    Kept: curvatures, thicknesses and aspheres with their signs along a fixed axis, conics, stop, apertures
-      and central obstructions, mirrors, entrance pupil diameter, half field, name. A glass of the catalogue
-      keeps its name, with its true nd and Vd beside it and its maker among the catalogues, so that a program
-      that has another glass of that name can tell; any other, plastics among them, becomes a model glass of
-      nd and Vd. Not kept: the width of the soft edges.
-    Raises: DomainError for values that cannot be; FileFormatError for what a centred .zmx surface cannot
-      hold.
+    Kept: curvatures, thicknesses and aspheres with their signs along a fixed axis, conics, stop,
+      apertures and central obstructions, mirrors, entrance pupil diameter, half field, name. A
+      glass of the catalogue keeps its name, with its true nd and Vd beside it and its maker among
+      the catalogues, so that a program that has another glass of that name can tell; any other,
+      plastics among them, becomes a model glass of nd and Vd. Not kept: the width of the soft
+      edges.
+    Raises: DomainError for values that cannot be; FileFormatError for what a centred .zmx surface
+      cannot hold.
     """
     field = lens.half_field_deg or 0.0
     surfaces = lens.to_surfaces()
@@ -57,7 +58,9 @@ def to_zmx(lens: GeoLens) -> str:
     lines = []
     for i, surface in enumerate(surfaces, 1):
         surface.check(f"{lens.name}, surface {i}")
-        lines += _block(i, _surface(surface, sign, f"{lens.name}, surface {i}", i == lens.stop_index + 1))
+        lines += _block(
+            i, _surface(surface, sign, f"{lens.name}, surface {i}", i == lens.stop_index + 1)
+        )
         sign = -sign if surface.mirror else sign
     tail = _block(len(surfaces) + 1, ["TYPE STANDARD", "CURV 0", "DISZ 0"])
     return "\n".join([*head, *lines, *tail]) + "\n"
@@ -116,21 +119,25 @@ def _glass(surface, label):
 
 
 def _catalogues(surfaces):
-    """The line of the catalogues that hold the named glasses, in the order of their use; none without
-    such."""
+    """The line of the catalogues that hold the named glasses, in the order of their use; none
+    without such."""
     used = [s.medium for s in surfaces if s.medium not in (None, AIR) and _is_named(s.medium)]
     makers = dict.fromkeys(_catalogue(Glass.named(glass.name)) for glass in used)
     return [f"GCAT {' '.join(makers)}"] if makers else []
 
 
 def _catalogue(known):
-    return next((name for begins, name in CATALOGUES.items() if known.source.startswith(begins)), "")
+    return next(
+        (name for begins, name in CATALOGUES.items() if known.source.startswith(begins)), ""
+    )
 
 
 def _is_named(glass):
     try:
         known = Glass.named(glass.name)
-        same = all(abs(known.index(w) - glass.index(w)) < SAME_INDEX for w in WAVELENGTH_UM.values())
+        same = all(
+            abs(known.index(w) - glass.index(w)) < SAME_INDEX for w in WAVELENGTH_UM.values()
+        )
     except CodesignError:
         return False
     # 1.6123/44.1 is a name too, but only here

@@ -1,5 +1,5 @@
-"""Curves in a scene where radiance may jump: edges of meshes, rims, the outlines of spheres and cylinders as
-seen from a point, and where shapes pass through each other."""
+"""Curves in a scene where radiance may jump: edges of meshes, rims, the outlines of spheres and
+cylinders as seen from a point, and where shapes pass through each other."""
 
 from typing import Any
 
@@ -14,8 +14,8 @@ from codesign.render.silhouettes.shapes import Ball, Disk, Mesh, Shape, Tube
 
 
 def outlines(shapes: list[Shape]) -> list[Any]:
-    """All curves of the shapes of a scene: a list of Segments, Circles, Spheres, Cylinders, Meridians,
-    Intersections, and of Overlaps that refuse to be seen."""
+    """All curves of the shapes of a scene: a list of Segments, Circles, Spheres, Cylinders,
+    Meridians, Intersections, and of Overlaps that refuse to be seen."""
     if not shapes:
         return []
     apart_m = tolerance(np.concatenate([shape.corners() for shape in shapes]))
@@ -34,7 +34,9 @@ def outlines(shapes: list[Shape]) -> list[Any]:
         for rim, far in zip(s.rims(), both, strict=False)
     ]
     meridians = [
-        (s.centre, *s.seam) for s in shapes if isinstance(s, Ball) and s.light is None and s.seam is not None
+        (s.centre, *s.seam)
+        for s in shapes
+        if isinstance(s, Ball) and s.light is None and s.seam is not None
     ]
     found = []
     if any(map(len, edges)):

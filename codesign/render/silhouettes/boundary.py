@@ -1,12 +1,13 @@
-"""The part of a frame's gradient that automatic differentiation misses: silhouettes and edges that move
-across the film.
+"""The part of a frame's gradient that automatic differentiation misses: silhouettes and edges that
+move across the film.
 
-With pupil point q fixed, the film is cut by curves where radiance jumps. When such a curve moves by v along
-its normal n, a pixel gains (L- - L+) v per length of curve, L- and L+ the radiances before and behind it
-along n. The term is estimated by points on the curves, and enters as w (x(y, q) . n), whose value is taken
-out again and whose gradient is that of the film position x of the world point y: through the lens, the pose
-of the camera and that of the object, whatever they depend on. Sources: Li et al., Differentiable Monte Carlo
-ray tracing through edge sampling, SIGGRAPH Asia 2018 (the term); Reynolds' transport theorem.
+With pupil point q fixed, the film is cut by curves where radiance jumps. When such a curve moves by
+v along its normal n, a pixel gains (L- - L+) v per length of curve, L- and L+ the radiances before
+and behind it along n. The term is estimated by points on the curves, and enters as w (x(y, q) . n),
+whose value is taken out again and whose gradient is that of the film position x of the world point
+y: through the lens, the pose of the camera and that of the object, whatever they depend on.
+Sources: Li et al., Differentiable Monte Carlo ray tracing through edge sampling, SIGGRAPH Asia 2018
+(the term); Reynolds' transport theorem.
 """
 
 import math
@@ -28,7 +29,8 @@ CONTRAST = 1e-3
 
 
 def boundary_term(camera: Camera, views: Views, per_px: float = 2.5) -> Tensor:
-    """Zero-valued image [..., T, *film.shape] whose gradient is that of moving silhouettes and edges.
+    """Zero-valued image [..., T, *film.shape] whose gradient is that of moving silhouettes and
+    edges.
 
     Args:
       camera: as for ``frames``.
@@ -56,9 +58,8 @@ def boundary_term(camera: Camera, views: Views, per_px: float = 2.5) -> Tensor:
 
 
 def radiance_jumps(camera: Camera, views: Views) -> bool:
-    """Whether any frame shows an edge or outline at which radiance jumps by more than CONTRAST of what is
-    seen there;
-    looked at by few points. Raises: as ``boundary_term``."""
+    """Whether any frame shows an edge or outline at which radiance jumps by more than CONTRAST of
+    what is seen there; looked at by few points. Raises: as ``boundary_term``."""
     found = _seen(camera, views.detach(), GLANCE_PER_PX)
     return found is not None and bool((found.contrast > CONTRAST).any())
 

@@ -1,5 +1,6 @@
-"""FieldOfView of a scene that were looked at, and which other views need no look of their own: those that
-show nothing which lies more than WITHIN_PX from what was seen, wherever it is, in view or beside it."""
+"""FieldOfView of a scene that were looked at, and which other views need no look of their own:
+those that show nothing which lies more than WITHIN_PX from what was seen, wherever it is, in view
+or beside it."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -18,8 +19,8 @@ MOST = 256  # views that are kept of a scene
 
 @dataclass(frozen=True)
 class Looked:
-    """A view that was found right: the camera [parts, 4, 4] in the axes of every part, the distance [parts]
-    of the nearest surface of each, and what of space falls on the film."""
+    """A view that was found right: the camera [parts, 4, 4] in the axes of every part, the distance
+    [parts] of the nearest surface of each, and what of space falls on the film."""
 
     cameras: Tensor
     nearest_m: Tensor
@@ -31,7 +32,9 @@ class Looked:
         lens_px = self.view.differs_px(view, float(self.nearest_m.min()))
         apart = inverse(moved[:1]) @ moved
         near_m = self.nearest_m[:, None] - view.aperture_m
-        moved_px, apart_px = (_rad(motion, near_m).amax(0) * view.steepest for motion in (moved, apart))
+        moved_px, apart_px = (
+            _rad(motion, near_m).amax(0) * view.steepest for motion in (moved, apart)
+        )
         return (moved_px + lens_px < WITHIN_PX) & (apart_px < APART_PX)
 
 
@@ -44,8 +47,8 @@ def _rad(motion, near_m):
 
 
 def nearest_m(parts: tuple[Any, ...], cameras: Tensor) -> Tensor:
-    """Distance [parts] from cameras [parts, 4, 4] of the nearest surface of every part, 0 for those that do
-    not say."""
+    """Distance [parts] from cameras [parts, 4, 4] of the nearest surface of every part, 0 for those
+    that do not say."""
     eyes = cameras[:, :3, 3].cpu()
     return torch.tensor(
         [
@@ -57,7 +60,8 @@ def nearest_m(parts: tuple[Any, ...], cameras: Tensor) -> Tensor:
 
 
 def looked_at(parts: tuple[Any, ...], film: Any) -> list[Looked]:
-    """The views of these parts on such a film that were found right, kept by the first part where it can keep
-    anything, with the other parts, so that none of them makes way for another of its name."""
+    """The views of these parts on such a film that were found right, kept by the first part where
+    it can keep anything, with the other parts, so that none of them makes way for another of its
+    name."""
     kept = getattr(parts[0], "__dict__", {}).setdefault("_looked_at", {})
     return kept.setdefault((tuple(map(id, parts)), film), (parts, []))[1]

@@ -1,8 +1,9 @@
-"""Where shapes pass through each other, and a mesh through itself: segments along which two triangles cross.
+"""Where shapes pass through each other, and a mesh through itself: segments along which two
+triangles cross.
 
 Round shapes stand as fine triangles here; their segments are carried onto the true curve in
-``intersections``. Where faces of different radiance lie in one plane, one over the other, rounding decides
-which is met: such views are refused.
+``intersections``. Where faces of different radiance lie in one plane, one over the other, rounding
+decides which is met: such views are refused.
 """
 
 from dataclasses import dataclass
@@ -24,8 +25,8 @@ BLOCK = 1_000_000  # pairs at a time
 
 @dataclass(frozen=True)
 class Triangles(Rows):
-    """corners: [N, 3, 3]; place: [N, 3], equal for corners of one shape at one place; shape, face: [N],
-    numbers."""
+    """corners: [N, 3, 3]; place: [N, 3], equal for corners of one shape at one place; shape, face:
+    [N], numbers."""
 
     corners: np.ndarray
     place: np.ndarray
@@ -35,8 +36,8 @@ class Triangles(Rows):
 
 @dataclass(frozen=True)
 class Crossings(Rows):
-    """Segments start, end [n, 3] along which two triangles cross; normals: [n, 2, 3] of these; shapes: [n,
-    2], their numbers."""
+    """Segments start, end [n, 3] along which two triangles cross; normals: [n, 2, 3] of these;
+    shapes: [n, 2], their numbers."""
 
     start: np.ndarray
     end: np.ndarray
@@ -46,8 +47,8 @@ class Crossings(Rows):
 
 @dataclass(frozen=True)
 class Overlaps(Curve):
-    """A line start, end [n, 3] across every overlap; normal: [n, 3] of both faces; names: of their shapes
-    [n]. No radiance can be read there: where it is asked how, the scene is refused."""
+    """A line start, end [n, 3] across every overlap; normal: [n, 3] of both faces; names: of their
+    shapes [n]. No radiance can be read there: where it is asked how, the scene is refused."""
 
     start: Tensor
     end: Tensor
@@ -76,15 +77,18 @@ class Overlaps(Curve):
 
 
 def find_crossings(shapes: list[Shape], apart_m: float = 0.0) -> tuple[Crossings, Overlaps | None]:
-    """All segments along which the shapes cross each other, and meshes themselves; and where faces of
-    different radiance lie in one plane and overlap by more than ``apart_m``."""
+    """All segments along which the shapes cross each other, and meshes themselves; and where faces
+    of different radiance lie in one plane and overlap by more than ``apart_m``."""
     triangles = _near_others(shapes)
     noise = ROUNDING * float(np.abs(triangles.corners).max(initial=0))
     pairs = touching(triangles.corners, noise)
     own = triangles.shape[pairs[:, 0]] == triangles.shape[pairs[:, 1]]
     mesh = np.array([isinstance(shape, Mesh) for shape in shapes])[triangles.shape[pairs[:, 0]]]
     pairs = pairs[~own | (mesh & ~_neighbours(triangles.place, pairs))]
-    found = [_crossing(triangles, pairs[k : k + BLOCK], noise) for k in range(0, max(len(pairs), 1), BLOCK)]
+    found = [
+        _crossing(triangles, pairs[k : k + BLOCK], noise)
+        for k in range(0, max(len(pairs), 1), BLOCK)
+    ]
     return (
         Crossings.joined([part for part, _ in found]),
         _overlaps(shapes, triangles, np.concatenate([level for _, level in found]), apart_m),
@@ -104,7 +108,8 @@ def _overlaps(shapes, triangles, pairs, apart_m):
     if not kept:
         return None
     names = [
-        (shapes[a].name, shapes[b].name) for a, b in zip(one.shape[rows], other.shape[rows], strict=True)
+        (shapes[a].name, shapes[b].name)
+        for a, b in zip(one.shape[rows], other.shape[rows], strict=True)
     ]
     return Overlaps(
         *(torch.tensor(v[kept]) for v in (middle, end, normal[rows])), tuple(names[k] for k in kept)
@@ -113,7 +118,9 @@ def _overlaps(shapes, triangles, pairs, apart_m):
 
 def _neighbours(place, pairs):
     """Whether pairs [n, 2] of triangles with corners at places [N, 3] share one."""
-    columns = [[np.ascontiguousarray(place[:, k])[pairs[:, side]] for k in range(3)] for side in (0, 1)]
+    columns = [
+        [np.ascontiguousarray(place[:, k])[pairs[:, side]] for k in range(3)] for side in (0, 1)
+    ]
     shared = np.zeros(len(pairs), dtype=bool)
     for a in columns[0]:
         for b in columns[1]:
@@ -122,8 +129,8 @@ def _neighbours(place, pairs):
 
 
 def _near_others(shapes):
-    """Triangles of all shapes: of meshes all, since they may cross themselves; of others those within the box
-    of another shape."""
+    """Triangles of all shapes: of meshes all, since they may cross themselves; of others those
+    within the box of another shape."""
     lows, highs = (np.stack([of(s.corners(), 0) for s in shapes]) for of in (np.min, np.max))
     parts = []
     for number, shape in enumerate(shapes):
@@ -140,7 +147,9 @@ def _near_others(shapes):
         kept &= across(corners).any(1)
         place = welded(vertices, 0.0)[faces] if kept.any() else faces
         parts.append(
-            Triangles(corners[kept], place[kept], np.full(int(kept.sum()), number), np.nonzero(kept)[0])
+            Triangles(
+                corners[kept], place[kept], np.full(int(kept.sum()), number), np.nonzero(kept)[0]
+            )
         )
     return Triangles.joined(parts)
 
@@ -157,26 +166,35 @@ def tessellated(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
     if isinstance(shape, Ball):
         rise = np.pi * np.arange(AROUND // 2 + 1) / (AROUND // 2)
         ring = np.stack([np.cos(turn), np.sin(turn), 0 * turn], 1)
-        grid = np.sin(rise)[:, None, None] * ring + np.cos(rise)[:, None, None] * np.array([0.0, 0.0, 1.0])
+        grid = np.sin(rise)[:, None, None] * ring + np.cos(rise)[:, None, None] * np.array(
+            [0.0, 0.0, 1.0]
+        )
         row = AROUND * np.arange(AROUND // 2)[:, None]
         lower = np.stack([row + k, row + AROUND + k, row + AROUND + following], -1).reshape(-1, 3)
         upper = np.stack([row + k, row + AROUND + following, row + following], -1).reshape(-1, 3)
-        return shape.centre + wider * shape.radius * grid.reshape(-1, 3), np.concatenate([lower, upper])
+        return shape.centre + wider * shape.radius * grid.reshape(-1, 3), np.concatenate(
+            [lower, upper]
+        )
     around = np.cos(turn)[:, None] * shape.u + np.sin(turn)[:, None] * shape.v
     if isinstance(shape, Disk):
         rim = shape.centre + (1 + (np.pi / AROUND) ** 2) * around
-        return np.concatenate([rim, shape.centre[None]]), np.stack([k, following, 0 * k + AROUND], 1)
+        return np.concatenate([rim, shape.centre[None]]), np.stack(
+            [k, following, 0 * k + AROUND], 1
+        )
     ring = wider * around
     sides = np.concatenate(
-        [np.stack([k, following, AROUND + k], 1), np.stack([following, AROUND + following, AROUND + k], 1)]
+        [
+            np.stack([k, following, AROUND + k], 1),
+            np.stack([following, AROUND + following, AROUND + k], 1),
+        ]
     )
     return np.concatenate([shape.start + ring, shape.end + ring]), sides
 
 
 def _crossing(triangles, pairs, noise):
-    """Crossings of pairs [n, 2] of triangles, and the pairs [m, 2] that lie in one plane and face one way. A
-    corner on the other's plane counts as above it, so that an edge that lies in a face is found from one of
-    its sides at most."""
+    """Crossings of pairs [n, 2] of triangles, and the pairs [m, 2] that lie in one plane and face
+    one way. A corner on the other's plane counts as above it, so that an edge that lies in a face
+    is found from one of its sides at most."""
     pair = [triangles[pairs[:, side]] for side in (0, 1)]
     normals = [normals_of(side.corners) for side in pair]
     height = [
@@ -211,9 +229,8 @@ def _crossing(triangles, pairs, noise):
 
 
 def _on_plane(corners, height):
-    """The two points [n, 2, 3] where sides of triangles [n, 3, 3] meet a plane over which corners are
-    ``height``
-    [n, 3]: one corner lies on one side, the two others on the other."""
+    """The two points [n, 2, 3] where sides of triangles [n, 3, 3] meet a plane over which corners
+    are ``height`` [n, 3]: one corner lies on one side, the two others on the other."""
     above = height >= 0
     lone = np.where(above.sum(1) == 1, above.argmax(1), (~above).argmax(1))[:, None]
     rows = np.arange(len(corners))[:, None]
@@ -225,15 +242,17 @@ def _on_plane(corners, height):
 def overlaps(
     first: np.ndarray, second: np.ndarray, normal: np.ndarray, apart_m: float
 ) -> tuple[np.ndarray, ...]:
-    """Of triangles [n, 3, 3] in one plane each, with normals [n, 3]: the rows of those that overlap by more
-    than ``apart_m``, and the middle [m, 3] and a far end [m, 3] of what they share."""
+    """Of triangles [n, 3, 3] in one plane each, with normals [n, 3]: the rows of those that overlap
+    by more than ``apart_m``, and the middle [m, 3] and a far end [m, 3] of what they share."""
     origin = first[:, :1]
     u = first[:, 1] - first[:, 0]
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     axes = np.stack([u, np.cross(normal, u)], 2)
     p, q = ((corners - origin) @ axes for corners in (first, second))
     along = np.concatenate([np.roll(corners, -1, axis=1) - corners for corners in (p, q)], 1)
-    across = np.stack([-along[..., 1], along[..., 0]], 2) / np.linalg.norm(along, axis=2, keepdims=True)
+    across = np.stack([-along[..., 1], along[..., 0]], 2) / np.linalg.norm(
+        along, axis=2, keepdims=True
+    )
     a, b = ((corners[:, None] * across[:, :, None]).sum(3) for corners in (p, q))
     depth = (np.minimum(a.max(2), b.max(2)) - np.maximum(a.min(2), b.min(2))).min(1)
     rows = np.nonzero(depth > apart_m)[0]

@@ -1,7 +1,8 @@
-"""Points on the curves of a scene that fall on the film, for every frame: where the boundary term is sampled.
+"""Points on the curves of a scene that fall on the film, for every frame: where the boundary term
+is sampled.
 
-A curve is cut into short pieces that are nearly straight on the film; each is clipped to the film, widened by
-what a lens out of focus spreads, and what is left gets points evenly along its length.
+A curve is cut into short pieces that are nearly straight on the film; each is clipped to the film,
+widened by what a lens out of focus spreads, and what is left gets points evenly along its length.
 """
 
 import math
@@ -17,14 +18,15 @@ from codesign.render.camera import Camera, lines
 from codesign.render.film import border_px, film_pupil_pattern
 from codesign.render.rows import Rows
 
-# length of a piece on the film, and its angle, at most: one that reaches behind the camera is left out
+# length of a piece on the film, and its angle, at most: one that reaches behind the camera is left
+# out
 PIECE_PX = 8.0
 PIECE_RAD = 0.1
 MARGIN_PX = 1.0  # beyond the film, on top of the blur
 # of the film's field, for what chief rays of the border do not say: colour, pupil aberration
 WIDER = 1.02
-# of a camera nearer to a curve than this the piece would be long on the film without end: at 1e-6 m a robot's
-# own body took 15 GB of points
+# of a camera nearer to a curve than this the piece would be long on the film without end: at 1e-6 m
+# a robot's own body took 15 GB of points
 IN_FRONT_M = 1e-3
 STEP = 1e-4  # of a piece, for the direction of its curve
 PUPILS = 4096
@@ -39,12 +41,14 @@ FLOAT32_RAD = 5e-7
 class CurvePoints(Rows):
     """Sampled points of curves, in the axes of the part of the scene that the curve belongs to.
 
-    world_m, ahead_m [n, 3]: the point, and the same curve a little further on. share [n]: how many such steps
-    each point stands for. aside_rad, near_rad [n]: how far to the sides radiance is safely read from afar and
-    from NEARBY of the way, both as seen from the viewpoint. face_slope [n]: tangent of the view's angle to
-    the steeper of the faces on both sides, infinite where what is seen may lie far behind. apex_m [n, 2, 3]:
-    third corners of the triangles on both sides, NaN where there are none. pupil [n, 2]; colour, window,
-    frame, part [n]: numbers of the wavelength, the window of the film, the frame and the part of the scene.
+    world_m, ahead_m [n, 3]: the point, and the same curve a little further on. share [n]: how many
+    such steps each point stands for. aside_rad, near_rad [n]: how far to the sides radiance is
+    safely read from afar and from NEARBY of the way, both as seen from the viewpoint. face_slope
+    [n]: tangent of the view's angle to the steeper of the faces on both sides, infinite where what
+    is seen may lie far behind. apex_m [n, 2, 3]:
+    third corners of the triangles on both sides, NaN where there are none. pupil [n, 2]; colour,
+    window, frame, part [n]: numbers of the wavelength, the window of the film, the frame and the
+    part of the scene.
     """
 
     world_m: Tensor
@@ -68,11 +72,12 @@ def curve_points(
     frames_each: int,
     per_px: float,
 ) -> CurvePoints | None:
-    """Points on all curves that may fall on the film, about ``per_px`` per pixel length; None for none.
+    """Points on all curves that may fall on the film, about ``per_px`` per pixel length; None for
+    none.
 
-    Args: field: of the camera. curves: of every part of the scene, in its own axes. cameras [parts, F, 4, 4]:
-      the camera in the axes of every part. frames_each: frames of a trajectory; every trajectory draws the
-      same numbers.
+    Args: field: of the camera. curves: of every part of the scene, in its own axes. cameras
+      [parts, F, 4, 4]: the camera in the axes of every part. frames_each: frames of a trajectory;
+      every trajectory draws the same numbers.
     """
     count = cameras.shape[1]
     found = []
@@ -83,15 +88,17 @@ def curve_points(
             for curve in of_part:
                 pieces = _in_view(view, curve, cameras[part], frames)
                 if pieces is not None:
-                    found.append(_on_pieces(view, curve, pieces, cameras[part], part, per_px, generator))
+                    found.append(
+                        _on_pieces(view, curve, pieces, cameras[part], part, per_px, generator)
+                    )
     return CurvePoints.joined(found) if found else None
 
 
 @dataclass(frozen=True)
 class _Pieces(Rows):
-    """Pieces of one curve that touch a window in a frame: index [n], bounds [n, 2], what is left of their
-    length on the film: start and end share [n], length px [n], depths of their ends [n, 2]; frame and window
-    [n]."""
+    """Pieces of one curve that touch a window in a frame: index [n], bounds [n, 2], what is left of
+    their length on the film: start and end share [n], length px [n], depths of their ends [n, 2];
+    frame and window [n]."""
 
     index: Tensor
     bounds: Tensor
@@ -151,8 +158,8 @@ def _on_pieces(view, curve, pieces, cameras, part, per_px, generator):
 
 
 def known_beside(curve: Any, index: Tensor, y: Tensor, viewpoint: Tensor) -> tuple[Tensor, ...]:
-    """Columns aside_rad .. apex_m of CurvePoints at points y [n, 3] of the curves ``index`` [n], seen from
-    viewpoints [n, 3]."""
+    """Columns aside_rad .. apex_m of CurvePoints at points y [n, 3] of the curves ``index`` [n],
+    seen from viewpoints [n, 3]."""
     aside, near = (
         torch.maximum(
             curve.aside_rad(index, eye),
@@ -170,8 +177,9 @@ def piece_rad(slope_per_px: float) -> float:
 
 
 class FieldOfView:
-    """What of space falls on the windows of a film, in rough pixels: slopes from the pupil's centre over the
-    slope of a pixel at the axis, in which straight lines are straight whatever the distortion."""
+    """What of space falls on the windows of a film, in rough pixels: slopes from the pupil's centre
+    over the slope of a pixel at the axis, in which straight lines are straight whatever the
+    distortion."""
 
     def __init__(self, camera: Camera):
         self.seed = camera.seed
@@ -193,8 +201,8 @@ class FieldOfView:
         return abs(self.px_per_slope) * (1 + float(reach.square().sum()))
 
     def differs_px(self, other: "FieldOfView", nearest_m: float) -> float:
-        """By how much at most other rays fall on the film through another lens, of what is so far away or
-        further."""
+        """By how much at most other rays fall on the film through another lens, of what is so far
+        away or further."""
         if self.shift.shape != other.shift.shape or not nearest_m > 0:
             return math.inf
         field, spread, shift = (
@@ -211,8 +219,8 @@ class FieldOfView:
         return (field + spread + shift / nearest_m) * abs(other.px_per_slope)
 
     def _box(self, camera, pixels):
-        """Lowest and highest rough pixel of film positions; the axis scale where no chief ray reaches the
-        film."""
+        """Lowest and highest rough pixel of film positions; the axis scale where no chief ray
+        reaches the film."""
         rays = camera.rays_through(pixels, torch.zeros_like(pixels))
         at = lines(rays)[1] * self.px_per_slope
         straight = pixels - camera.film.middle_px
@@ -222,8 +230,9 @@ class FieldOfView:
         return middle - half, middle + half
 
     def _blur(self, camera):
-        """Differences of slope [k, 2] and of place at the pupil [k, 2] m between rays of a film point through
-        the pupil's rim and the straight line from its middle to where its chief ray points."""
+        """Differences of slope [k, 2] and of place at the pupil [k, 2] m between rays of a film
+        point through the pupil's rim and the straight line from its middle to where its chief ray
+        points."""
         none = torch.zeros(1, 2, dtype=torch.float64)
         if not self.aperture_m:
             return none, none
@@ -240,17 +249,20 @@ class FieldOfView:
         return ((slope - straight)[passes], base[passes]) if bool(passes.any()) else (none, none)
 
     def _blur_px(self, depth_m):
-        """Radius [n] px of the blur of points at depths [n]; the larger of two ends bounds all between
-        them."""
+        """Radius [n] px of the blur of points at depths [n]; the larger of two ends bounds all
+        between them."""
         near = 1 / depth_m
         return (self.spread[:, None] + self.shift[:, None] * near[:, None]).norm(dim=2).amax(
             0
         ) * self.px_per_slope
 
     def clipped(self, window, start_cam_m, end_cam_m):
-        """Of pieces from [n, 3] to [n, 3] in camera axes, the rows that touch a window, and for these (start,
-        end [m] shares of its length on the film, length [m] px that is left, depths of its ends [m, 2])."""
-        front = torch.nonzero((start_cam_m[:, 2] > IN_FRONT_M) & (end_cam_m[:, 2] > IN_FRONT_M))[:, 0]
+        """Of pieces from [n, 3] to [n, 3] in camera axes, the rows that touch a window, and for
+        these (start, end [m] shares of its length on the film, length [m] px that is left, depths
+        of its ends [m, 2])."""
+        front = torch.nonzero((start_cam_m[:, 2] > IN_FRONT_M) & (end_cam_m[:, 2] > IN_FRONT_M))[
+            :, 0
+        ]
         a, b = (p[front] for p in (start_cam_m, end_cam_m))
         depths = torch.stack([a[:, 2], b[:, 2]], 1)
         margin = torch.maximum(self._blur_px(a[:, 2]), self._blur_px(b[:, 2]))[:, None]
@@ -263,7 +275,9 @@ class FieldOfView:
         )
         within = (a >= self.low[window] - margin) & (a <= self.high[window] + margin)
         enter = (
-            torch.where(still, torch.where(within, 0.0, 2.0), torch.minimum(first, last)).amax(1).clamp_min(0)
+            torch.where(still, torch.where(within, 0.0, 2.0), torch.minimum(first, last))
+            .amax(1)
+            .clamp_min(0)
         )
         leave = torch.where(still, 1.0, torch.maximum(first, last)).amin(1).clamp_max(1)
         rows = torch.nonzero(leave > enter)[:, 0]
@@ -276,11 +290,12 @@ def places(
     per_px: float,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Where points lie on pieces of the given lengths [m] px: piece [n], position within it [n] 0..1, and
-    share of the piece each stands for [n].
+    """Where points lie on pieces of the given lengths [m] px: piece [n], position within it [n]
+    0..1, and share of the piece each stands for [n].
 
-    A piece longer than the spacing of points is cut into equal parts with a point in each, so that what is
-    constant along it is summed exactly; shorter ones are thinned together, evenly along their total length.
+    A piece longer than the spacing of points is cut into equal parts with a point in each, so that
+    what is constant along it is summed exactly; shorter ones are thinned together, evenly along
+    their total length.
     """
     long = torch.nonzero(length_px * per_px >= 1)[:, 0]
     count = (length_px[long] * per_px).ceil().long()
@@ -292,7 +307,11 @@ def places(
     few = int(torch.ceil(total[-1] * per_px)) if short.numel() else 0
     if few == 0:
         return long[which], inside, 1 / count[which].double()
-    at = (torch.arange(few) + torch.rand(1, generator=generator, dtype=torch.float64)) / few * total[-1]
+    at = (
+        (torch.arange(few) + torch.rand(1, generator=generator, dtype=torch.float64))
+        / few
+        * total[-1]
+    )
     piece = torch.searchsorted(total, at).clamp_max(short.numel() - 1)
     size = length_px[short[piece]].clamp_min(1e-12)
     within = (1 - (total[piece] - at) / size).clamp(0, 1)

@@ -1,18 +1,19 @@
-"""Curves at which radiance may jump, as seen from a point: straight edges, rims, and the outlines of spheres
-and cylinders.
+"""Curves at which radiance may jump, as seen from a point: straight edges, rims, and the outlines
+of spheres and cylinders.
 
-A curve is cut into pieces [s0, s1] of its parameter; a piece becomes a point of the world once a parameter
-and a viewpoint are given. ``aside_rad`` says how far to either side of the true curve the radiances before
-and behind it are read, ``counts`` whether the curve is one from a place of the pupil, and ``face_slope`` how
-steeply the faces on both its sides are seen.
+A curve is cut into pieces [s0, s1] of its parameter; a piece becomes a point of the world once a
+parameter and a viewpoint are given. ``aside_rad`` says how far to either side of the true curve the
+radiances before and behind it are read, ``counts`` whether the curve is one from a place of the
+pupil, and ``face_slope`` how steeply the faces on both its sides are seen.
 
-Rays are cast in float32. Mitsuba finds a sphere or cylinder of radius r at distance d by the sign of
-b^2 - 4 a c, of size (r / d)^2 of its terms; an error of one part in 2^23 of these moves the edge by
-2^-23 d / r rad. Measured by bisection at d / r from 1.2 to 5000, coordinates up to 100 m from the origin: at
-most 1.05 times that for both, and 2^-23 times coordinate over distance where that is larger (cylinders, whose
-matrix is inverted in float32). A straight edge moves by 2^-23 times 2 or less times the distance of its
-furthest end over that of the ray's point. Readings lie at twice that, never deeper in the shape than half its
-radius; where the edge itself may lie there (beyond some 2,000 radii) the curve is refused.
+Rays are cast in float32. Mitsuba finds a sphere or cylinder of radius r at distance d by the sign
+of b^2 - 4 a c, of size (r / d)^2 of its terms; an error of one part in 2^23 of these moves the edge
+by 2^-23 d / r rad. Measured by bisection at d / r from 1.2 to 5000, coordinates up to 100 m from
+the origin: at most 1.05 times that for both, and 2^-23 times coordinate over distance where that is
+larger (cylinders, whose matrix is inverted in float32). A straight edge moves by 2^-23 times 2 or
+less times the distance of its furthest end over that of the ray's point. Readings lie at twice
+that, never deeper in the shape than half its radius; where the edge itself may lie there
+(beyond some 2,000 radii) the curve is refused.
 """
 
 from dataclasses import dataclass, fields
@@ -39,28 +40,30 @@ class Curve:
     """A curve that counts from everywhere, with nothing known of the surfaces beside it."""
 
     def counts(self, index: Tensor, y: Tensor, viewpoint: Tensor) -> Tensor:
-        """Whether [n] the curves ``index`` [n] are any at their points y [n, 3] from the viewpoint [n, 3]
-        itself: next to an outline lie edges that are one from elsewhere in the pupil, and would be counted
-          with it."""
+        """Whether [n] the curves ``index`` [n] are any at their points y [n, 3] from the viewpoint
+        [n, 3]
+        itself: next to an outline lie edges that are one from elsewhere in the pupil, and would be
+          counted with it."""
         return torch.ones_like(index, dtype=torch.bool)
 
     def face_slope(self, index: Tensor, y: Tensor, viewpoint: Tensor) -> Tensor:
-        """Tangent [n] of the angle between view and normal of the steeper of the faces on both sides of
-        points y [n, 3], where both are seen: a reading from farther away than they lie has missed them.
-        Infinite elsewhere."""
+        """Tangent [n] of the angle between view and normal of the steeper of the faces on both
+        sides of points y [n, 3], where both are seen: a reading from farther away than they lie has
+        missed them. Infinite elsewhere."""
         return torch.full(index.shape, torch.inf, dtype=torch.float64)
 
     def apex_m(self, index: Tensor) -> Tensor:
-        """Third corners [n, 2, 3] of the triangles on both sides of the curves ``index`` [n], NaN where there
-        are none."""
+        """Third corners [n, 2, 3] of the triangles on both sides of the curves ``index`` [n], NaN
+        where there are none."""
         return torch.full((*index.shape, 2, 3), torch.nan, dtype=torch.float64)
 
 
 @dataclass(frozen=True)
 class Segments(Curve):
-    """Straight edges. start, end: [E, 3]. normals: [E, 2, 3] of the two faces, on the side that shines, 0
-    where none is known; always: [E] bool, True where it counts from every side but that from which both faces
-    are black (rims, seams, sharp creases). width_m: [E], how far apart edges lie that count as this one.
+    """Straight edges. start, end: [E, 3]. normals: [E, 2, 3] of the two faces, on the side that
+    shines, 0 where none is known; always: [E] bool, True where it counts from every side but that
+    from which both faces are black (rims, seams, sharp creases). width_m: [E], how far apart edges
+    lie that count as this one.
     apexes: [E, 2, 3], third corners of the two faces, NaN for none."""
 
     start: Tensor
@@ -76,8 +79,8 @@ class Segments(Curve):
         return cls(*(torch.tensor(getattr(edges, field.name)) for field in fields(cls)))
 
     def pieces(self, viewpoint, angle, within_m=0.0):
-        """Indices and parameters [n], [n, 2] of pieces that subtend at most ``angle`` from the viewpoint [3]
-        and may be outlines from there or from a place at most ``within_m`` away."""
+        """Indices and parameters [n], [n, 2] of pieces that subtend at most ``angle`` from the
+        viewpoint [3] and may be outlines from there or from a place at most ``within_m`` away."""
         facing = self._facing(slice(None), viewpoint)
         outline = (facing.amin(1) <= within_m) & (facing.amax(1) >= -within_m)
         black = (facing < -within_m).all(1)
@@ -99,8 +102,8 @@ class Segments(Curve):
         return on_line(self, index, s)
 
     def aside_rad(self, index, viewpoint):
-        """Angle [n] from the viewpoint [3] or [n, 3] at which radiances beside the curves ``index`` [n] are
-        read."""
+        """Angle [n] from the viewpoint [3] or [n, 3] at which radiances beside the curves ``index``
+        [n] are read."""
         start = self.start[index]
         end = self.end[index]
         a = start - viewpoint
@@ -114,7 +117,9 @@ class Segments(Curve):
     def face_slope(self, index, y, viewpoint):
         """As for Curve, of creases."""
         facing = self._facing(index, viewpoint).amin(1) / (viewpoint - y).norm(dim=1)
-        return torch.where(facing > 0, (1 - facing.square()).clamp_min(0).sqrt() / facing, torch.inf)
+        return torch.where(
+            facing > 0, (1 - facing.square()).clamp_min(0).sqrt() / facing, torch.inf
+        )
 
     def apex_m(self, index):
         """As for Curve."""
@@ -123,9 +128,9 @@ class Segments(Curve):
 
 @dataclass(frozen=True)
 class Circles(Curve):
-    """Rims of disks and cylinders: centre + cos u + sin v, with u and v of the rim's radius; axis: from there
-    to the cylinder's other end, 0 for disks; [C, 3] each. width_m: [C], how far apart rims lie that count as
-    this one."""
+    """Rims of disks and cylinders: centre + cos u + sin v, with u and v of the rim's radius; axis:
+    from there to the cylinder's other end, 0 for disks; [C, 3] each. width_m: [C], how far apart
+    rims lie that count as this one."""
 
     centre: Tensor
     u: Tensor
@@ -134,8 +139,8 @@ class Circles(Curve):
     width_m: Tensor
 
     def pieces(self, viewpoint, angle, within_m=0.0):
-        """As for Segments; all of every rim, cut where it turns back as seen from the viewpoint: a piece that
-        went out and came back would look short and be long."""
+        """As for Segments; all of every rim, cut where it turns back as seen from the viewpoint: a
+        piece that went out and came back would look short and be long."""
         first, share = self._facing(viewpoint)
         arcs = torch.stack([share, 1 - share], 1).reshape(-1)
         index, s = cut(torch.arange(arcs.numel()), (arcs * ROUND).ceil().clamp_min(1).long())
@@ -143,8 +148,9 @@ class Circles(Curve):
         return index // 2, begin[index, None] + arcs[index, None] * s
 
     def _facing(self, viewpoint):
-        """Where the arc that faces the viewpoint begins, and its share of the rim: it ends where lines from
-        the viewpoint's foot in the rim's plane are tangent. Half the rim where there are none."""
+        """Where the arc that faces the viewpoint begins, and its share of the rim: it ends where
+        lines from the viewpoint's foot in the rim's plane are tangent. Half the rim where there are
+        none."""
         towards = viewpoint - self.centre
         across = torch.linalg.cross(self.u, self.v)
         size = across.square().sum(1)
@@ -160,7 +166,8 @@ class Circles(Curve):
         return self.centre[index] + turn.cos() * self.u[index] + turn.sin() * self.v[index]
 
     def aside_rad(self, index, viewpoint):
-        """As for Segments. The rim of a tube is where the ray's distance, good to 2^-23 d^2 / r, ends it."""
+        """As for Segments. The rim of a tube is where the ray's distance, good to 2^-23 d^2 / r,
+        ends it."""
         centre = self.centre[index]
         radius = torch.minimum(self.u[index].norm(dim=1), self.v[index].norm(dim=1))
         distance = torch.maximum((centre - viewpoint).norm(dim=1), radius)
@@ -179,10 +186,11 @@ class Circles(Curve):
 
 @dataclass(frozen=True)
 class Spheres(Curve):
-    """Outlines of spheres: the circle where rays from the viewpoint are tangent. centre: [C, 3]; radius:
-    [C]. Parameters run over 0..1, 2..3 or 4..5: where on the circle they begin is told from the first, second
-    or third axis, the one farthest from the view, so that they name the same place from all points of a
-    pupil."""
+    """Outlines of spheres: the circle where rays from the viewpoint are tangent. centre: [C, 3];
+    radius:
+    [C]. Parameters run over 0..1, 2..3 or 4..5: where on the circle they begin is told from the
+    first, second or third axis, the one farthest from the view, so that they name the same place
+    from all points of a pupil."""
 
     centre: Tensor
     radius: Tensor
@@ -206,7 +214,8 @@ class Spheres(Curve):
         u, v = _across(axis, beside.long())
         turn = 2 * torch.pi * (s - 2 * beside)[:, None]
         return centre + radius[:, None] * (
-            share * axis + (1 - share.square()).clamp_min(0).sqrt() * (turn.cos() * u + turn.sin() * v)
+            share * axis
+            + (1 - share.square()).clamp_min(0).sqrt() * (turn.cos() * u + turn.sin() * v)
         )
 
     def aside_rad(self, index, viewpoint):
@@ -218,8 +227,8 @@ class Spheres(Curve):
 
 @dataclass(frozen=True)
 class Cylinders(Curve):
-    """Outlines of cylinders without caps: lines where rays from the viewpoint are tangent, ``side`` +1 or -1
-    of the axis. start, end: [C, 3] of a part of the axis; radius, side: [C]."""
+    """Outlines of cylinders without caps: lines where rays from the viewpoint are tangent, ``side``
+    +1 or -1 of the axis. start, end: [C, 3] of a part of the axis; radius, side: [C]."""
 
     start: Tensor
     end: Tensor
@@ -228,7 +237,8 @@ class Cylinders(Curve):
 
     @classmethod
     def of(cls, start, end, radius):
-        """Both lines of cylinders with axes start, end [C, 3] and radius [C], in PARTS parts each."""
+        """Both lines of cylinders with axes start, end [C, 3] and radius [C], in PARTS parts
+        each."""
         share = torch.linspace(0, 1, PARTS + 1, dtype=torch.float64)[:, None, None]
         ends = start + share * (end - start)
         count = PARTS * start.shape[0]
@@ -267,18 +277,21 @@ class Cylinders(Curve):
         towards, _ = self._across(viewpoint, index)
         middle = (self.start + self.end)[index] / 2
         distance = (middle - viewpoint).norm(dim=1)
-        return _beside_round("cylinder", middle, self.radius[index], towards.norm(dim=1), distance, viewpoint)
+        return _beside_round(
+            "cylinder", middle, self.radius[index], towards.norm(dim=1), distance, viewpoint
+        )
 
     def _across(self, viewpoint, index=slice(None)):
-        """From the axis to the viewpoint, across the axis [n, 3], and the axis' direction [n, 3]."""
+        """From the axis to the viewpoint, across the axis [n, 3], and the axis' direction
+        [n, 3]."""
         axis = torch.nn.functional.normalize((self.end - self.start)[index], dim=1)
         towards = viewpoint - self.start[index]
         return towards - (towards * axis).sum(1, keepdim=True) * axis, axis
 
 
 def _beside_round(kind, place, radius, across, distance, viewpoint):
-    """Reading angle beside round shapes whose axis is ``across`` [n] away in the plane of their curvature and
-    ``distance`` [n] along the ray; see the head of this file."""
+    """Reading angle beside round shapes whose axis is ``across`` [n] away in the plane of their
+    curvature and ``distance`` [n] along the ray; see the head of this file."""
     slant = across / distance  # what lies along the axis is seen foreshortened
     error = EPS * across / radius * slant
     coordinates = rounding_rad(viewpoint, place.norm(dim=1), distance)
@@ -296,9 +309,9 @@ def _beside_round(kind, place, radius, across, distance, viewpoint):
 
 
 def behind_itself(away: Tensor, towards: Tensor, axis: Tensor) -> Tensor:
-    """Whether points [..., 3] of a round shape, ``away`` from its centre and with ``towards`` left to the
-    viewpoint, lie behind the shape's own near side; ``axis`` of a cylinder from its centre to its other end,
-    0 for a sphere."""
+    """Whether points [..., 3] of a round shape, ``away`` from its centre and with ``towards`` left
+    to the viewpoint, lie behind the shape's own near side; ``axis`` of a cylinder from its centre
+    to its other end, 0 for a sphere."""
     square = axis.square().sum(-1).clamp_min(1e-300)
     across, sight = (v - ((v * axis).sum(-1) / square)[..., None] * axis for v in (away, towards))
     outward = (across * sight).sum(-1)
@@ -308,7 +321,8 @@ def behind_itself(away: Tensor, towards: Tensor, axis: Tensor) -> Tensor:
 
 
 def rounding_rad(viewpoint, size, distance):
-    """Angle [n] that rounding of coordinates of the given size [n] m and of the viewpoint may make."""
+    """Angle [n] that rounding of coordinates of the given size [n] m and of the viewpoint may
+    make."""
     return SAFETY * EPS * (viewpoint.norm(dim=-1) + size) / distance.clamp_min(1e-6)
 
 
@@ -325,15 +339,18 @@ def _nearest(a, b):
 
 
 def pieces_of(a, b, angle):
-    """Number [n] of pieces of segments a to b [n, 3] that subtend at most ``angle`` from the origin."""
+    """Number [n] of pieces of segments a to b [n, 3] that subtend at most ``angle`` from the
+    origin."""
     pieces = (b - a).norm(dim=1) / (_nearest(a, b).clamp_min(1e-6) * angle)
     return pieces.ceil().clamp(1, 4096).long()
 
 
 def cut_line(lines, index, viewpoint, angle):
-    """Pieces, as ``cut`` has them, of lines start to end [n, 3] that subtend at most ``angle`` from the
-    viewpoint."""
-    return cut(index, pieces_of(lines.start[index] - viewpoint, lines.end[index] - viewpoint, angle))
+    """Pieces, as ``cut`` has them, of lines start to end [n, 3] that subtend at most ``angle`` from
+    the viewpoint."""
+    return cut(
+        index, pieces_of(lines.start[index] - viewpoint, lines.end[index] - viewpoint, angle)
+    )
 
 
 def on_line(lines, index, s):
@@ -350,8 +367,8 @@ def cut(index, count):
 
 
 def _across(axis, beside):
-    """Two unit vectors [n, 3] across unit vectors [n, 3], the first across the coordinate axis ``beside`` [n]
-    too."""
+    """Two unit vectors [n, 3] across unit vectors [n, 3], the first across the coordinate axis
+    ``beside`` [n] too."""
     helper = torch.eye(3, dtype=axis.dtype)[beside]
     u = torch.nn.functional.normalize(torch.linalg.cross(axis, helper), dim=1)
     return u, torch.linalg.cross(axis, u)
@@ -359,8 +376,8 @@ def _across(axis, beside):
 
 @dataclass(frozen=True)
 class Meridians(Curve):
-    """Half circles centre + sin u + cos v for angles 0 to pi. centre, u, v: [C, 3], u and v of the sphere's
-    radius."""
+    """Half circles centre + sin u + cos v for angles 0 to pi. centre, u, v: [C, 3], u and v of the
+    sphere's radius."""
 
     centre: Tensor
     u: Tensor
@@ -397,7 +414,9 @@ class Meridians(Curve):
     def face_slope(self, index: Tensor, y: Tensor, viewpoint: Tensor) -> Tensor:
         """As for Curve: of the sphere, on both sides."""
         cosine = self._cosine(index, y, viewpoint)
-        return torch.where(cosine > 0, (1 - cosine.square()).clamp_min(0).sqrt() / cosine, torch.inf)
+        return torch.where(
+            cosine > 0, (1 - cosine.square()).clamp_min(0).sqrt() / cosine, torch.inf
+        )
 
     def _cosine(self, index, y, viewpoint):
         towards = torch.nn.functional.normalize(viewpoint - y, dim=1)

@@ -1,5 +1,5 @@
-"""Straight edges of triangle meshes that may part two radiances; and what coincides counts once: seams of
-walls, edges that overlap in part, a tube's end and its lid."""
+"""Straight edges of triangle meshes that may part two radiances; and what coincides counts once:
+seams of walls, edges that overlap in part, a tube's end and its lid."""
 
 from dataclasses import dataclass, replace
 
@@ -16,8 +16,8 @@ SAME_POINT = 1e-6
 ROUNDING = 2.0**-21  # of float32 coordinates, four units in the last place
 # share of the largest by which what radiance is looked up by may differ across an edge
 SAME_VALUE = 1e-6
-# cosine of the angle of two faces: above the first an edge is none, below the second it may part two
-# radiances
+# cosine of the angle of two faces: above the first an edge is none, below the second it may part
+# two radiances
 FLAT = 1 - 1e-6
 SHARP = 0.98
 SAME_PLACE_M = 1e-4  # curves nearer than this are one; they are read from farther aside by as much
@@ -27,10 +27,10 @@ BITS = 10  # of each coordinate in the order along a space-filling curve
 
 @dataclass(frozen=True)
 class Edges(Rows):
-    """start, end: [E, 3]. normals: [E, 2, 3] of the two faces, the side that shines. always: [E], True where
-    an edge counts from every side. free: [E], True where not just two faces of one mesh meet. width_m: [E],
-    how far apart edges lie that count as this one. apexes: [E, 2, 3], third corners of the two faces, NaN for
-    none and where more than two meet."""
+    """start, end: [E, 3]. normals: [E, 2, 3] of the two faces, the side that shines. always: [E],
+    True where an edge counts from every side. free: [E], True where not just two faces of one mesh
+    meet. width_m: [E], how far apart edges lie that count as this one. apexes: [E, 2, 3], third
+    corners of the two faces, NaN for none and where more than two meet."""
 
     start: np.ndarray
     end: np.ndarray
@@ -54,7 +54,13 @@ def segments(start: np.ndarray, end: np.ndarray) -> Edges:
     count = len(start)
     yes = np.ones(count, dtype=bool)
     return Edges(
-        start, end, np.zeros((count, 2, 3)), yes, yes, np.zeros(count), np.full((count, 2, 3), np.nan)
+        start,
+        end,
+        np.zeros((count, 2, 3)),
+        yes,
+        yes,
+        np.zeros(count),
+        np.full((count, 2, 3), np.nan),
     )
 
 
@@ -63,10 +69,10 @@ def mesh_edges(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray | Non
 
     Args:
       values: [F, 3, k] by which radiance is looked up at the corners of every face; None for one
-    radiance. Vertices at one place are one. An edge of two faces counts from every side where they are
-    creased sharply or their values differ along it, as a silhouette where they are creased at all; an edge of
-    one face, or of three and more, counts always, and so does one between faces wound against each other, of
-    which one is black. Faces without area are left out.
+    radiance. Vertices at one place are one. An edge of two faces counts from every side where they
+    are creased sharply or their values differ along it, as a silhouette where they are creased at
+    all; an edge of one face, or of three and more, counts always, and so does one between faces
+    wound against each other, of which one is black. Faces without area are left out.
     """
     place = welded(vertices, np.ptp(vertices, axis=0).max(initial=0) * SAME_POINT)
     at = place[faces]
@@ -101,18 +107,22 @@ def mesh_edges(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray | Non
 
 
 def _differ(values, one, other, forward):
-    """Whether the values [F, 3, k] of two faces differ at an end of their common edge: corner numbers ``one``
-    and ``other`` [E] of its beginning in either face, ``forward`` [3 F] whether that is its lower end."""
+    """Whether the values [F, 3, k] of two faces differ at an end of their common edge: corner
+    numbers ``one`` and ``other`` [E] of its beginning in either face, ``forward`` [3 F] whether
+    that is its lower end."""
     begin = values.reshape(-1, values.shape[2])
     end = np.roll(values, -1, axis=1).reshape(-1, values.shape[2])
     low = np.where(forward[:, None], begin, end)
     high = np.where(forward[:, None], end, begin)
-    apart = np.maximum(np.abs(low[one] - low[other]), np.abs(high[one] - high[other])).max(1, initial=0)
+    apart = np.maximum(np.abs(low[one] - low[other]), np.abs(high[one] - high[other])).max(
+        1, initial=0
+    )
     return apart > SAME_VALUE * np.abs(values).max(initial=0)
 
 
 def welded(points: np.ndarray, apart_m: float) -> np.ndarray:
-    """Numbers [N] of places: points [N, 3] nearer than ``apart_m``, or than float32 rounding, share one."""
+    """Numbers [N] of places: points [N, 3] nearer than ``apart_m``, or than float32 rounding, share
+    one."""
     order, number = _equal(points)
     unique = points[order[np.nonzero(np.diff(number, prepend=-1))[0]]]
     place = np.empty(len(points), dtype=np.int64)
@@ -122,14 +132,16 @@ def welded(points: np.ndarray, apart_m: float) -> np.ndarray:
     if not len(pairs):
         return place
     size = len(unique)
-    graph = coo_matrix((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(size, size))
+    graph = coo_matrix(
+        (np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(size, size)
+    )
     return connected_components(graph, directed=False)[1][place]
 
 
 def _equal(points):
-    """An order of points [N, 3] with equal ones side by side, and their numbers [N] in it: sorted by a
-    mixture of their coordinates, since sorting rows takes ten times as long. Should two places have one
-    mixture, equal points may get several numbers."""
+    """An order of points [N, 3] with equal ones side by side, and their numbers [N] in it: sorted
+    by a mixture of their coordinates, since sorting rows takes ten times as long. Should two places
+    have one mixture, equal points may get several numbers."""
     mixed = points[:, 0] + np.pi * points[:, 1] + np.e * points[:, 2]
     order = np.argsort(mixed)
     ordered = points[order]
@@ -137,8 +149,9 @@ def _equal(points):
 
 
 def tolerance(points: np.ndarray) -> float:
-    """Distance, metres, below which curves of a scene with points [N, 3] are one: SAME_PLACE_M, less where
-    the scene is smaller than a metre, more where its coordinates are rounded so coarsely."""
+    """Distance, metres, below which curves of a scene with points [N, 3] are one: SAME_PLACE_M,
+    less where the scene is smaller than a metre, more where its coordinates are rounded so
+    coarsely."""
     size = float(np.ptp(points, axis=0).max(initial=0))
     return max(SAME_PLACE_M * min(size, 1.0), ROUNDING * float(np.abs(points).max(initial=0)))
 
@@ -146,8 +159,8 @@ def tolerance(points: np.ndarray) -> float:
 def edges_once(parts: list[Edges], apart_m: float) -> Edges:
     """Edges of several shapes, each stretch of a line once, however many edges overlap there.
 
-    Edges are cut where an end of another lies on them; what then has the same ends is one, and counts from
-    every side.
+    Edges are cut where an end of another lies on them; what then has the same ends is one, and
+    counts from every side.
     """
     parts = [part for part in parts if len(part)]
     edges = Edges.joined(parts)
@@ -166,7 +179,9 @@ def edges_once(parts: list[Edges], apart_m: float) -> Edges:
     off = off[whole]
     place = np.sort(place[:, whole], axis=0)
     both = place[0] * (place.max(initial=0) + 1) + place[1]
-    _, first, which, count = np.unique(both, return_index=True, return_inverse=True, return_counts=True)
+    _, first, which, count = np.unique(
+        both, return_index=True, return_inverse=True, return_counts=True
+    )
     middle = (cut.start + cut.end) / 2
     apart = np.maximum(_from_line(middle, cut[first][which]), off)
     width = np.zeros(len(first))
@@ -215,7 +230,9 @@ def _cut_at_ends(edges, apart_m):
     widest = np.zeros(len(edges))
     np.maximum.at(widest, which, off[order])
     return (
-        replace(cut, start=cut.start + share[:, None] * along, end=cut.start + until[:, None] * along),
+        replace(
+            cut, start=cut.start + share[:, None] * along, end=cut.start + until[:, None] * along
+        ),
         widest[which],
     )
 
@@ -225,10 +242,13 @@ def within_reach(
     points: np.ndarray,
     reach: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs [n], [n] of the number of a point and of what in a tree is nearer to it than its reach."""
+    """Pairs [n], [n] of the number of a point and of what in a tree is nearer to it than its
+    reach."""
     near = tree.query_ball_point(points, reach)
     numbers = [np.zeros(0, dtype=np.int64), *(np.array(found, dtype=np.int64) for found in near)]
-    return np.repeat(np.arange(len(points)), [len(found) for found in near]), np.concatenate(numbers)
+    return np.repeat(np.arange(len(points)), [len(found) for found in near]), np.concatenate(
+        numbers
+    )
 
 
 def _from_line(points, edges):
@@ -245,9 +265,9 @@ def rims_once(
     width_m: np.ndarray,
     apart_m: float,
 ) -> tuple[np.ndarray, ...]:
-    """Rims centre + cos u + sin v with the ``axis`` of their cylinders, [C, 3] each, that are not one curve
-    with an earlier one, whose axis is then that of either; and ``width_m`` [C], grown by how far apart those
-    lie that are."""
+    """Rims centre + cos u + sin v with the ``axis`` of their cylinders, [C, 3] each, that are not
+    one curve with an earlier one, whose axis is then that of either; and ``width_m`` [C], grown by
+    how far apart those lie that are."""
     # the same however u and v are turned
     shape = np.einsum("ni,nj->nij", u, u) + np.einsum("ni,nj->nij", v, v)
     radius = np.sqrt(np.trace(shape, axis1=1, axis2=2) / 2)
@@ -256,7 +276,9 @@ def rims_once(
     width = width_m.copy()
     pairs = cKDTree(centre).query_pairs(apart_m, output_type="ndarray")
     for i, j in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]:
-        apart = np.linalg.norm(centre[i] - centre[j]) + np.linalg.norm(shape[i] - shape[j]) / radius[i]
+        apart = (
+            np.linalg.norm(centre[i] - centre[j]) + np.linalg.norm(shape[i] - shape[j]) / radius[i]
+        )
         if kept[i] and kept[j] and apart < apart_m:
             kept[j] = False
             axis[i] = axis[i] if axis[i].any() else axis[j]
@@ -265,8 +287,8 @@ def rims_once(
 
 
 def touching(corners: np.ndarray, margin_m: float) -> np.ndarray:
-    """Pairs [n, 2], first below second, of triangles or edges, by their corners [N, k, 3], whose boxes come
-    nearer than ``margin_m``."""
+    """Pairs [n, 2], first below second, of triangles or edges, by their corners [N, k, 3], whose
+    boxes come nearer than ``margin_m``."""
     count = len(corners)
     if count < 2:
         return np.zeros((0, 2), dtype=np.int64)
@@ -279,7 +301,9 @@ def touching(corners: np.ndarray, margin_m: float) -> np.ndarray:
     levels = [(low, high)]
     while levels[-1][0].shape[1] > 1:
         low, high = levels[-1]
-        levels.append((np.minimum(low[:, ::2], low[:, 1::2]), np.maximum(high[:, ::2], high[:, 1::2])))
+        levels.append(
+            (np.minimum(low[:, ::2], low[:, 1::2]), np.maximum(high[:, ::2], high[:, 1::2]))
+        )
     a = b = np.zeros(1, dtype=np.int32)
     for low, high in reversed(levels[:-1]):
         apart = np.nonzero(a != b)[0]
@@ -298,9 +322,9 @@ def touching(corners: np.ndarray, margin_m: float) -> np.ndarray:
 def _along_curve(points):
     """Morton codes [N] of points [N, 3]: neighbours in space are near in their order."""
     low = points.min(0)
-    cells = ((points - low) / max(float((points.max(0) - low).max()), 1e-300) * (2**BITS - 1)).astype(
-        np.int64
-    )
+    cells = (
+        (points - low) / max(float((points.max(0) - low).max()), 1e-300) * (2**BITS - 1)
+    ).astype(np.int64)
     code = np.zeros(len(points), dtype=np.int64)
     for bit in range(BITS):
         for axis in range(3):

@@ -1,4 +1,5 @@
-"""Curves along which a round shape passes through another one: short chords, carried onto both surfaces."""
+"""Curves along which a round shape passes through another one: short chords, carried onto both
+surfaces."""
 
 from dataclasses import dataclass, replace
 
@@ -27,10 +28,10 @@ FOUND = 1e-9  # share of the radius by which a point may miss the surfaces
 
 @dataclass(frozen=True)
 class Intersections(Curve, Rows):
-    """Pieces start, end [n, 3] of curves on two surfaces each, f(x) = (x - c) A (x - c) + b (x - c) + k = 0
-    with gradients of length one: c, b, axis [n, 2, 3], A [n, 2, 3, 3], k [n, 2], axis that of a tube from c
-    to its other end, 0 for others; curve: [n], which pieces are one curve; radius: [n], the lesser one of the
-    two surfaces."""
+    """Pieces start, end [n, 3] of curves on two surfaces each, f(x) = (x - c) A (x - c) + b (x - c)
+    + k = 0 with gradients of length one: c, b, axis [n, 2, 3], A [n, 2, 3, 3], k [n, 2], axis that
+    of a tube from c to its other end, 0 for others; curve: [n], which pieces are one curve; radius:
+    [n], the lesser one of the two surfaces."""
 
     start: Tensor
     end: Tensor
@@ -56,8 +57,8 @@ class Intersections(Curve, Rows):
         return ~((self.k[index] < 0) & behind_itself(away, towards, self.axis[index])).any(1)
 
     def onto(self, piece, x):
-        """Points x [n, 3] near pieces [n] carried onto both surfaces, and how far [n] they still are from
-        these."""
+        """Points x [n, 3] near pieces [n] carried onto both surfaces, and how far [n] they still
+        are from these."""
         c, A, b, k = (v[piece] for v in (self.c, self.A, self.b, self.k))
 
         def surfaces(x):
@@ -68,7 +69,9 @@ class Intersections(Curve, Rows):
         for _ in range(TURNS):
             f, slopes = surfaces(x)
             first, second = slopes.unbind(1)
-            p, q, r = ((u * v).sum(1) for u, v in ((first, first), (first, second), (second, second)))
+            p, q, r = (
+                (u * v).sum(1) for u, v in ((first, first), (first, second), (second, second))
+            )
             p, r = p + 1e-12, r + 1e-12
             s, t = ((r * f[:, 0] - q * f[:, 1]), (p * f[:, 1] - q * f[:, 0]))
             x = x - (s[:, None] * first + t[:, None] * second) / (p * r - q * q)[:, None]
@@ -96,8 +99,9 @@ class Intersections(Curve, Rows):
 def on_surfaces(
     found: Crossings, shapes: list[Shape], apart_m: float
 ) -> tuple[Intersections | None, np.ndarray]:
-    """The crossings of which one surface is round, on these surfaces, less those that run along the rim of a
-    tube or disk; and for every shape how far [S, 2] such a crossing lies from its two rims."""
+    """The crossings of which one surface is round, on these surfaces, less those that run along the
+    rim of a tube or disk; and for every shape how far [S, 2] such a crossing lies from its two
+    rims."""
     width = np.zeros((len(shapes), 2))
     if not len(found.start):
         return None, width
@@ -106,9 +110,13 @@ def on_surfaces(
     least = torch.tensor(np.minimum(sides[0][5], sides[1][5]))
     _, curve = np.unique(found.shapes, axis=0, return_inverse=True)
     curve = torch.tensor(curve.reshape(-1))
-    pieces = Intersections(torch.tensor(found.start), torch.tensor(found.end), c, A, b, k, axis, curve, least)
+    pieces = Intersections(
+        torch.tensor(found.start), torch.tensor(found.end), c, A, b, k, axis, curve, least
+    )
     every = torch.arange(len(curve))
-    (start, miss_start), (end, miss_end) = (pieces.onto(every, x) for x in (pieces.start, pieces.end))
+    (start, miss_start), (end, miss_end) = (
+        pieces.onto(every, x) for x in (pieces.start, pieces.end)
+    )
     length = (pieces.end - pieces.start).norm(dim=1)
     moved = torch.maximum((start - pieces.start).norm(dim=1), (end - pieces.end).norm(dim=1))
     good = (torch.maximum(miss_start, miss_end) < FOUND * least) & (
@@ -127,8 +135,8 @@ def on_surfaces(
 
 
 def _surfaces(found, shapes, side):
-    """c, b [n, 3], A [n, 3, 3], k [n], axis [n, 3] and radius [n] of one side of all crossings, infinite
-    where it is flat."""
+    """c, b [n, 3], A [n, 3, 3], k [n], axis [n, 3] and radius [n] of one side of all crossings,
+    infinite where it is flat."""
     count = len(found.start)
     c = found.start.copy()
     A = np.zeros((count, 3, 3))

@@ -1,11 +1,12 @@
-"""Radiances on both sides of points on curves, where the camera's own rays see these, and whether they are
-seen.
+"""Radiances on both sides of points on curves, where the camera's own rays see these, and whether
+they are seen.
 
-A point is hidden when the rays that pass it on either side meet something before it. They pass aside, where a
-slanting surface lies nearer than at the curve itself: where that is in doubt a second pair of rays, twice as
-far aside, tells how the surface goes on, and it is taken back to the curve along a straight line. What is
-left is rounding of float32. Faces narrower than radiance is read beside their edges (slivers) are read along
-their normal: rays from the camera would pass over them, and both their edges would tell of one jump.
+A point is hidden when the rays that pass it on either side meet something before it. They pass
+aside, where a slanting surface lies nearer than at the curve itself: where that is in doubt a
+second pair of rays, twice as far aside, tells how the surface goes on, and it is taken back to the
+curve along a straight line. What is left is rounding of float32. Faces narrower than radiance is
+read beside their edges (slivers) are read along their normal: rays from the camera would pass over
+them, and both their edges would tell of one jump.
 """
 
 import math
@@ -22,14 +23,15 @@ from codesign.render.rows import Rows
 from codesign.render.silhouettes.curve_points import IN_FRONT_M, NEARBY, CurvePoints
 from codesign.render.wavefront import look
 
-# px, of the film position for the derivative of a ray; the change up to which its root is taken as found,
-# since the next would be of its square
+# px, of the film position for the derivative of a ray; the change up to which its root is taken as
+# found, since the next would be of its square
 STEP_PX = 1e-3
 FOUND_PX = 1e-4
 DOUBTFUL = 0.05  # share of the distance by which a slanting surface may come nearer beside its edge
 ROUNDING = 2.0**-21  # of float32 distances, four units in the last place
 SAFETY = 2.0
-# share of the contrast of a sliver by which what is seen beyond it may differ from what is before it
+# share of the contrast of a sliver by which what is seen beyond it may differ from what is before
+# it
 SAME = 0.05
 NARROW = 4.0  # times as wide as radiance is read to the side: wider faces are met
 WITHIN = 0.1  # share of the way from an edge to the corner beyond it at which a face is read
@@ -39,11 +41,11 @@ THIN = 1e-9
 
 @dataclass(frozen=True)
 class Jumps(Rows):
-    """Points of curves on the film. row: [n], number of the given point. world [n, 3], frame and part [n], in
-    the axes of the part; film position [n, 2] px, pupil [n, 2], colour [n], pixel [n] of the sequence; normal
-    [n, 2] of the curve on the film; before, behind [n]: radiances along it; seen [n] bool; weight [n] of the
-    jump; per_miss: the motion along the normal per miss of the ray in space, [n, 2] px/m; aside_px [n]: how
-    far to the sides radiances are read."""
+    """Points of curves on the film. row: [n], number of the given point. world [n, 3], frame and
+    part [n], in the axes of the part; film position [n, 2] px, pupil [n, 2], colour [n], pixel [n]
+    of the sequence; normal [n, 2] of the curve on the film; before, behind [n]: radiances along it;
+    seen [n] bool; weight [n] of the jump; per_miss: the motion along the normal per miss of the ray
+    in space, [n, 2] px/m; aside_px [n]: how far to the sides radiances are read."""
 
     row: Tensor
     world_m: Tensor
@@ -64,12 +66,14 @@ class Jumps(Rows):
     @property
     def contrast(self) -> Tensor:
         """[n], of the two radiances."""
-        return (self.before - self.behind).abs() / torch.maximum(self.before, self.behind).clamp_min(1e-30)
+        return (self.before - self.behind).abs() / torch.maximum(
+            self.before, self.behind
+        ).clamp_min(1e-30)
 
 
 def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> Jumps | None:
-    """The points that fall on the film, with their jumps of radiance, of weight 0 where they are hidden; None
-    for none.
+    """The points that fall on the film, with their jumps of radiance, of weight 0 where they are
+    hidden; None for none.
     cameras: [parts, F, 4, 4]."""
     back = inverse(cameras)[points.part, points.frame]
     y, on = apply(back, torch.stack([points.world_m, points.ahead_m], 1)).unbind(1)
@@ -95,7 +99,9 @@ def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> J
     )
     normal = torch.stack([-tangent[:, 1], tangent[:, 0]], 1) / length[:, None]
     aside_px = points.aside_rad / _rad_per_px(y, per_px, slope, normal)
-    before, behind, seen = _sides(camera, scene, cameras, points, y, on, x, aside_px[:, None] * normal)
+    before, behind, seen = _sides(
+        camera, scene, cameras, points, y, on, x, aside_px[:, None] * normal
+    )
     return Jumps(
         row,
         points.world_m,
@@ -116,17 +122,24 @@ def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> J
 
 
 def _sides(camera, scene, cameras, points, y, on, x, aside):
-    """Radiances [n] before and behind points y [n, 3] of curves, which go on to ``on`` [n, 3], at film
-    positions x [n, 2], ``aside`` [n, 2] px to either side, and whether the points are seen [n]."""
+    """Radiances [n] before and behind points y [n, 3] of curves, which go on to ``on`` [n, 3], at
+    film positions x [n, 2], ``aside`` [n, 2] px to either side, and whether the points are seen
+    [n]."""
     q, colour = (v.repeat(2, *[1] * (v.ndim - 1)) for v in (points.pupil, points.colour))
     rays = camera.coloured_rays(torch.cat([x - aside, x + aside]), q, colour)
     light = camera.light(rays, colour).detach()
-    origin, direction, weight = (v.unflatten(0, (2, -1)) for v in (rays.origin_m, rays.direction, light))
+    origin, direction, weight = (
+        v.unflatten(0, (2, -1)) for v in (rays.origin_m, rays.direction, light)
+    )
     reach = (y - origin[0]).norm(dim=1)
 
     def read(rows, share, start=0.0):
-        """At a share [n] of the way aside, from where the share ``start`` of the distance is left behind."""
-        o, d = (v[:, rows].mean(0) + share[:, None] * (v - v.mean(0))[:, rows] for v in (origin, direction))
+        """At a share [n] of the way aside, from where the share ``start`` of the distance is left
+        behind."""
+        o, d = (
+            v[:, rows].mean(0) + share[:, None] * (v - v.mean(0))[:, rows]
+            for v in (origin, direction)
+        )
         skipped = start * reach[rows]
         o = o + skipped[:, None] * d
         frame = points.frame[rows].repeat(2)
@@ -149,7 +162,8 @@ def _sides(camera, scene, cameras, points, y, on, x, aside):
         rounding[rows] *= 1 + steepness
     seen = nearest.amax(0) > reach - rounding
     side, row, own = sliver_radiance(scene, cameras, points, y, on, origin.mean(0), direction)
-    # what is narrower than a reading as a whole is left alone: nearly the same is seen on both its sides
+    # what is narrower than a reading as a whole is left alone: nearly the same is seen on both its
+    # sides
     differ = (light[0, row] - light[1, row]).abs() > SAME * (own - light[side, row]).abs()
     side, row, own = side[differ], row[differ], own[differ]
     light[side, row] = weight[side, row] * own
@@ -168,8 +182,8 @@ def _rad_per_px(y, per_px, slope, normal):
 
 
 def _first_guess(camera, y, points):
-    """Film position [n, 2] px of points y [n, 3]: as the lens sends light there, or else along the chief ray
-    of the axis's scale."""
+    """Film position [n, 2] px of points y [n, 3]: as the lens sends light there, or else along the
+    chief ray of the axis's scale."""
     film = camera.film
     if not hasattr(camera.lens, "film_points"):
         return film.middle_px + y[:, :2] / y[:, 2:] / camera.slope_per_px()
@@ -181,7 +195,8 @@ def _first_guess(camera, y, points):
 
 
 def _pixels(film, x, window):
-    """Flat number of the pixel of the given windows [n] that holds each position [n, 2], -1 outside."""
+    """Flat number of the pixel of the given windows [n] that holds each position [n, 2], -1
+    outside."""
     column, row = (x - film.corners_px[window] + 0.5).floor().unbind(1)
     inside = (column >= 0) & (column < film.width_px) & (row >= 0) & (row < film.height_px)
     number = window * (film.width_px * film.height_px) + row * film.width_px + column
@@ -197,8 +212,8 @@ def sliver_radiance(
     origin: Tensor,
     sides: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(side [k], row [k], radiance [k]) where the face that is seen beside a straight edge is a sliver: read
-    along its normal, since radiance is the same in all directions.
+    """(side [k], row [k], radiance [k]) where the face that is seen beside a straight edge is a
+    sliver: read along its normal, since radiance is the same in all directions.
 
     Args:
       cameras: [parts, F, 4, 4].
@@ -207,7 +222,13 @@ def sliver_radiance(
       sides: [2, n, 3], directions of the rays before and behind them.
     """
     known = torch.nonzero(points.apex_m.isfinite().all(2).any(1))[:, 0]
-    points, y, on, origin, sides = points[known], y[known], on[known], origin[known], sides[:, known]
+    points, y, on, origin, sides = (
+        points[known],
+        y[known],
+        on[known],
+        origin[known],
+        sides[:, known],
+    )
     back = inverse(cameras)[points.part, points.frame]
     apex = apply(back, points.apex_m)
     ahead = normalize(y - origin, dim=1)

@@ -1,10 +1,11 @@
-"""Does a scene list every curve where radiance jumps, and each once? Asked of the picture, not of the
-geometry.
+"""Does a scene list every curve where radiance jumps, and each once? Asked of the picture, not of
+the geometry.
 
 Lines are laid across the film, each through one point of the pupil; where radiance differs between
-neighbouring rays the larger difference is halved again and again, until what is left is a jump or a slope.
-The listed curves that cross the line there are read as the boundary term reads them, and their jumps together
-must be the one that was found. What differs makes the gradient of that term wrong, and is refused.
+neighbouring rays the larger difference is halved again and again, until what is left is a jump or a
+slope. The listed curves that cross the line there are read as the boundary term reads them, and
+their jumps together must be the one that was found. What differs makes the gradient of that term
+wrong, and is refused.
 """
 
 from collections.abc import Sequence
@@ -23,7 +24,12 @@ from codesign.render.film import coarse_pixels, film_pupil_pattern
 from codesign.render.moving import parts, says_distance
 from codesign.render.rows import Rows
 from codesign.render.silhouettes.certified_views import MOST, Looked, looked_at, nearest_m
-from codesign.render.silhouettes.curve_points import CurvePoints, FieldOfView, known_beside, piece_rad
+from codesign.render.silhouettes.curve_points import (
+    CurvePoints,
+    FieldOfView,
+    known_beside,
+    piece_rad,
+)
 from codesign.render.silhouettes.edges import within_reach
 from codesign.render.silhouettes.jumps import SAFETY, jumps
 from codesign.render.wavefront import look
@@ -49,9 +55,9 @@ DOUBTFUL = 0.005  # from which on a first look, of a few lines, is followed by a
 
 @dataclass(frozen=True)
 class Listing:
-    """Of the jumps in a view, weighted by their size: the share that is on no listed curve, the share that
-    curves have beyond what is seen, and the place where most is amiss in world axes (or the axes of the
-    static part); crossings: how many jumps were found."""
+    """Of the jumps in a view, weighted by their size: the share that is on no listed curve, the
+    share that curves have beyond what is seen, and the place where most is amiss in world axes (or
+    the axes of the static part); crossings: how many jumps were found."""
 
     unlisted: float
     doubled: float
@@ -62,9 +68,9 @@ class Listing:
 def listings(
     camera: Camera, scene: Any, curves: Sequence[Sequence[Any]], cameras: Tensor, lines: int = LINES
 ) -> list[Listing]:
-    """Whether the jumps of views lie on the listed curves, one by one. cameras: [parts, F, 4, 4], the camera
-    in the axes of every part; curves: of every part; lines: each way across the film, at most, in each of the
-    views."""
+    """Whether the jumps of views lie on the listed curves, one by one. cameras: [parts, F, 4, 4],
+    the camera in the axes of every part; curves: of every part; lines: each way across the film, at
+    most, in each of the views."""
     camera = camera.in_one_colour()
     with torch.no_grad():
         found = _crossings(camera, scene, cameras, lines)
@@ -88,9 +94,9 @@ def listings(
 def check_listed(
     camera: Camera, view: FieldOfView, scene: Any, curves: Sequence[Sequence[Any]], cameras: Tensor
 ) -> None:
-    """Raise DomainError when a frame of a sequence shows jumps of radiance that the scene does not list, or
-    lists twice. Looked at are frames that may show what was not looked at yet, by fewer lines where there are
-    many. field: of the camera; cameras: [parts, F, 4, 4]."""
+    """Raise DomainError when a frame of a sequence shows jumps of radiance that the scene does not
+    list, or lists twice. Looked at are frames that may show what was not looked at yet, by fewer
+    lines where there are many. field: of the camera; cameras: [parts, F, 4, 4]."""
     known = looked_at(parts(scene), camera.film)
     for start in range(0, cameras.shape[1], FRAMES):
         views = cameras[:, start : start + FRAMES]
@@ -110,9 +116,12 @@ def check_listed(
 
 
 def _check_frames(camera, scene, curves, cameras, rows, start):
-    """Look at frames ``rows`` of cameras [parts, F, 4, 4], of which the first is frame ``start``."""
+    """Look at frames ``rows`` of cameras [parts, F, 4, 4], of which the first is frame
+    ``start``."""
     lines = max(LEAST_LINES, LINES // len(rows))
-    for row, found in zip(rows, listings(camera, scene, curves, cameras[:, rows], lines), strict=True):
+    for row, found in zip(
+        rows, listings(camera, scene, curves, cameras[:, rows], lines), strict=True
+    ):
         if max(found.unlisted, found.doubled) > DOUBTFUL:  # a few crossings say little
             (found,) = listings(camera, scene, curves, cameras[:, row : row + 1], 8 * LINES)
         if max(found.unlisted, found.doubled) <= WRONG:
@@ -130,7 +139,8 @@ def _check_frames(camera, scene, curves, cameras, rows, start):
 
 
 def reach_m(camera: Camera, scene: Any, cameras: Tensor) -> float:
-    """Median distance of what a view shows, 1 where it shows nothing or a scene that does not say. cameras:
+    """Median distance of what a view shows, 1 where it shows nothing or a scene that does not say.
+    cameras:
     the camera [parts, 1, 4, 4] in the axes of every part."""
     if not all(says_distance(type(part)) for part in parts(scene)):
         return 1.0
@@ -143,8 +153,8 @@ def reach_m(camera: Camera, scene: Any, cameras: Tensor) -> float:
 
 
 def _lines(film, most):
-    """Points of lines across every window: film position [lines, points, 2] px for either way, with direction
-    [2], pupil [lines, 2] and window [lines]."""
+    """Points of lines across every window: film position [lines, points, 2] px for either way, with
+    direction [2], pupil [lines, 2] and window [lines]."""
     generator = torch.Generator().manual_seed(most)
     _, pupils = film_pupil_pattern(64, most)
     for window, corner in enumerate(film.corners_px):
@@ -157,13 +167,19 @@ def _lines(film, most):
             at = torch.stack([edges.expand(lines, -1), level[:, None].expand(-1, len(edges))], -1)
             at = (at if axis == 0 else at.flip(-1)) + corner
             turn = torch.randint(64, (lines,), generator=generator)
-            yield at, torch.eye(2, dtype=torch.float64)[axis], pupils[turn], torch.full((lines,), window)
+            yield (
+                at,
+                torch.eye(2, dtype=torch.float64)[axis],
+                pupils[turn],
+                torch.full((lines,), window),
+            )
 
 
 @dataclass(frozen=True)
 class _Steps(Rows):
-    """Neighbouring rays between which light changes: frame [n]; film position, light and distance of both [n,
-    2, 4]; direction of their line on the film and point of the pupil [n, 2]; window [n]."""
+    """Neighbouring rays between which light changes: frame [n]; film position, light and distance
+    of both [n, 2, 4]; direction of their line on the film and point of the pupil [n, 2]; window
+    [n]."""
 
     frame: Tensor
     ends: Tensor
@@ -226,16 +242,18 @@ def _crossings(camera, scene, cameras, most):
         return found
     # between faces that meet rays slip through a line without width
     aside = FOUND_PX * found.along
-    sides = [seen(found.frame, found.film_px + sign * aside, found.pupil)[:, 2:3] for sign in (-1, 1)]
+    sides = [
+        seen(found.frame, found.film_px + sign * aside, found.pupil)[:, 2:3] for sign in (-1, 1)
+    ]
     at, _, distance = found.ends.split([2, 1, 1], 2)
     found = replace(found, ends=torch.cat([at, torch.stack(sides, 1), distance], 2))
     return found[found.change.abs() > least[found.frame]]
 
 
 def _listed(camera, scene, curves, cameras, found):
-    """Of the steps that can be judged their frames [n] and changes of light [n]; the changes [n] along their
-    lines that the listed curves have there, as the boundary term reads them; and their places [n, 3] in
-    camera axes. A line along a curve tells little of it: there is one across."""
+    """Of the steps that can be judged their frames [n] and changes of light [n]; the changes [n]
+    along their lines that the listed curves have there, as the boundary term reads them; and their
+    places [n, 3] in camera axes. A line along a curve tells little of it: there is one across."""
     seen = camera.rays_through(found.film_px, found.pupil)
     place_cam_m = seen.origin_m + seen.direction * found.distance.clamp_max(1e6)[:, None]
     total = torch.zeros_like(found.change)
@@ -251,8 +269,8 @@ def _listed(camera, scene, curves, cameras, found):
     away = ((read.film_px - found.film_px[ray]) * read.normal).sum(1)
     met = torch.nonzero((away.abs() < SAFETY * read.aside_px + FOUND_PX) & (turned.abs() > 0))[:, 0]
     ray, turned, away, read = ray[met], turned[met], away[met], read[met]
-    # rounding leaves slivers at edges: the change that counts is that around the nearest curve, as far aside
-    # as it is read
+    # rounding leaves slivers at edges: the change that counts is that around the nearest curve, as
+    # far aside as it is read
     least = torch.full_like(total, torch.inf).scatter_reduce(0, ray, away.abs(), "amin")
     first = torch.nonzero(away.abs() == least[ray])[:, 0]
     nearest = torch.full_like(found.frame, -1).scatter_reduce(0, ray[first], first, "amax")
@@ -265,7 +283,14 @@ def _listed(camera, scene, curves, cameras, found):
     rows = torch.nonzero((nearest >= 0) & (slant > GRAZING))[:, 0]
     steps = found[rows]
     before, behind = (
-        _look(camera, scene, cameras, steps.frame, steps.film_px + far[rows, None] * steps.along, steps.pupil)
+        _look(
+            camera,
+            scene,
+            cameras,
+            steps.frame,
+            steps.film_px + far[rows, None] * steps.along,
+            steps.pupil,
+        )
         for far in (place - half, place + half)
     )
     change = found.change.index_put((rows,), behind[:, 2] - before[:, 2])
@@ -274,8 +299,8 @@ def _listed(camera, scene, curves, cameras, found):
 
 
 def _near_curves(camera, curves, cameras, found, seen):
-    """Pairs of the numbers of steps [n] and of CurvePoints [n] on the curves that their rays ``seen`` pass
-    by."""
+    """Pairs of the numbers of steps [n] and of CurvePoints [n] on the curves that their rays
+    ``seen`` pass by."""
     slope_per_px = camera.slope_per_px()
     near = []
     for part, of_part in enumerate(curves):
@@ -297,7 +322,12 @@ def _near_curves(camera, curves, cameras, found, seen):
                 count = curve.counts(index, y, o[ray]) & within
                 ray, index, y, ahead = (v[count] for v in (ray, index, y, ahead))
                 beside = known_beside(curve, index, y, o[ray])
-                of_ray = found.pupil[ray], torch.zeros_like(ray), found.window[ray], found.frame[ray]
+                of_ray = (
+                    found.pupil[ray],
+                    torch.zeros_like(ray),
+                    found.window[ray],
+                    found.frame[ray],
+                )
                 each = torch.ones_like(y[:, 0])
                 points = CurvePoints(y, ahead, each, *beside, *of_ray, torch.full_like(ray, part))
                 near.append((ray, points))
@@ -312,8 +342,8 @@ def _look(camera, scene, cameras, frame, at, pupil):
 
 
 def _near(curve, index, bounds, eye, origin, direction, distance, near_rad):
-    """Pairs (ray, piece) of which the chord of the piece passes near where the ray [n, 3] meets something at
-    a distance [n]."""
+    """Pairs (ray, piece) of which the chord of the piece passes near where the ray [n, 3] meets
+    something at a distance [n]."""
     if not index.numel():
         return index, index
     a, b = (curve.points(index, s, eye) for s in bounds.unbind(1))
@@ -321,7 +351,9 @@ def _near(curve, index, bounds, eye, origin, direction, distance, near_rad):
     half = (b - a).norm(dim=1) / 2
     share = float((half / (middle - eye).norm(dim=1).clamp_min(1e-9)).max()) + DEPTH
     at = origin + distance[:, None] * direction
-    near = within_reach(cKDTree(middle.numpy()), at.numpy(), (distance * share * (1 + share)).numpy())
+    near = within_reach(
+        cKDTree(middle.numpy()), at.numpy(), (distance * share * (1 + share)).numpy()
+    )
     ray, piece = map(torch.tensor, near)
     # in the plane across the ray
     p, q = (_across(v[piece] - origin[ray], direction[ray]) for v in (a, b))
@@ -333,8 +365,8 @@ def _near(curve, index, bounds, eye, origin, direction, distance, near_rad):
 
 
 def _place(curve, index, bounds, origin, direction):
-    """Whether the point of a curve that is nearest to a ray lies on its piece [n], that point and one a
-    little further on [n, 3]; by Newton's method along the piece and a little beyond it."""
+    """Whether the point of a curve that is nearest to a ray lies on its piece [n], that point and
+    one a little further on [n, 3]; by Newton's method along the piece and a little beyond it."""
     low, high = bounds.unbind(1)
     step = STEP * (high - low)
     s = (low + high) / 2
@@ -342,7 +374,9 @@ def _place(curve, index, bounds, origin, direction):
         y, ahead = (curve.points(index, at, origin) for at in (s, s + step))
         p, v = _across(y - origin, direction), _across(ahead - y, direction)
         s = s - step * ((p * v).sum(1) / v.square().sum(1).clamp_min(1e-30))
-        s = torch.minimum(torch.maximum(s, low - BEYOND * (high - low)), high + BEYOND * (high - low))
+        s = torch.minimum(
+            torch.maximum(s, low - BEYOND * (high - low)), high + BEYOND * (high - low)
+        )
     y, ahead = (curve.points(index, at, origin) for at in (s, s + step))
     return (s >= low) & (s < high), y, ahead
 

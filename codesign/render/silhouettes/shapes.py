@@ -1,6 +1,6 @@
-"""What a Mitsuba scene is made of, as its outline needs it: triangles with what their radiance is looked up
-by, spheres, disks and cylinders; and how near the nearest of it is. World axes, metres, float64 out of
-Mitsuba's float32."""
+"""What a Mitsuba scene is made of, as its outline needs it: triangles with what their radiance is
+looked up by, spheres, disks and cylinders; and how near the nearest of it is. World axes, metres,
+float64 out of Mitsuba's float32."""
 
 import re
 from dataclasses import dataclass
@@ -25,8 +25,8 @@ class Surface:
         return self.light
 
     def round(self):
-        """Centre [3], axis [3] from there to a tube's other end or 0, and radius of a round one; None of a
-        flat one."""
+        """Centre [3], axis [3] from there to a tube's other end or 0, and radius of a round one;
+        None of a flat one."""
         return None
 
     def rims(self):
@@ -34,16 +34,16 @@ class Surface:
         return []
 
     def seams(self):
-        """Start and end [3] of straight lines on which a picture begins: its last column need not go on in
-        the first."""
+        """Start and end [3] of straight lines on which a picture begins: its last column need not
+        go on in the first."""
         return []
 
 
 @dataclass(frozen=True)
 class Mesh(Surface):
-    """vertices: [V, 3]; faces: [F, 3], normals on the side that shines; values: [F, 3, k] by which radiance
-    is looked up at every corner (texture coordinates, colours, radiance of a face), None where it is one for
-    all; light: that one radiance, None where it changes or is not known."""
+    """vertices: [V, 3]; faces: [F, 3], normals on the side that shines; values: [F, 3, k] by which
+    radiance is looked up at every corner (texture coordinates, colours, radiance of a face), None
+    where it is one for all; light: that one radiance, None where it changes or is not known."""
 
     name: str
     vertices: np.ndarray
@@ -65,7 +65,8 @@ class Mesh(Surface):
 
 @dataclass(frozen=True)
 class Ball(Surface):
-    """A sphere: centre [3], radius; seam: half axes [2, 3] of the circle on which its picture begins."""
+    """A sphere: centre [3], radius; seam: half axes [2, 3] of the circle on which its picture
+    begins."""
 
     name: str
     centre: np.ndarray
@@ -108,7 +109,8 @@ class Disk(Surface):
 
 @dataclass(frozen=True)
 class Tube(Surface):
-    """A cylinder without caps: ends of its axis [3], half axes u, v [3] of one length at right angles."""
+    """A cylinder without caps: ends of its axis [3], half axes u, v [3] of one length at right
+    angles."""
 
     name: str
     start: np.ndarray
@@ -133,7 +135,9 @@ class Tube(Surface):
 
     def rims(self):
         """As for Surface."""
-        return [(a, self.u, self.v, b - a) for a, b in ((self.start, self.end), (self.end, self.start))]
+        return [
+            (a, self.u, self.v, b - a) for a, b in ((self.start, self.end), (self.end, self.start))
+        ]
 
     def seams(self):
         """As for Surface."""
@@ -144,8 +148,8 @@ Shape = Mesh | Ball | Disk | Tube
 
 
 def read(mi: Any, shape: Any) -> Shape:
-    """A Mitsuba shape as Mesh, Ball, Disk or Tube. Raises: DomainError for shapes whose outline is not
-    known."""
+    """A Mitsuba shape as Mesh, Ball, Disk or Tube. Raises: DomainError for shapes whose outline is
+    not known."""
     kind = shape.shape_type()
     name = shape.id()
     light = _light(shape)
@@ -193,7 +197,11 @@ def _values(shape, parameters, faces, count):
         if attribute[2] == "face":
             return np.repeat(value.reshape(len(faces), 1, -1), 3, 1)
         return value.reshape(count, -1)[faces]
-    if "vertex_texcoords" in parameters and "Uniform" not in emitter and shape.has_vertex_texcoords():
+    if (
+        "vertex_texcoords" in parameters
+        and "Uniform" not in emitter
+        and shape.has_vertex_texcoords()
+    ):
         return np.array(parameters["vertex_texcoords"], dtype=np.float64).reshape(-1, 2)[faces]
     return None
 
@@ -207,7 +215,9 @@ def _check_even(name, kind, *axes):
     lengths = [float(np.linalg.norm(axis)) for axis in axes]
     even = max(lengths) - min(lengths) <= EVEN * max(lengths)
     square = all(
-        abs(float(a @ b)) <= EVEN * max(lengths) ** 2 for i, a in enumerate(axes) for b in axes[i + 1 :]
+        abs(float(a @ b)) <= EVEN * max(lengths) ** 2
+        for i, a in enumerate(axes)
+        for b in axes[i + 1 :]
     )
     if not (even and square):
         raise DomainError(
@@ -218,8 +228,8 @@ def _check_even(name, kind, *axes):
 
 @dataclass(frozen=True)
 class Bodies:
-    """Triangles corners [N, 3, 3] and distances [N] from them to the surface: 0, or the radius about a point
-    or line."""
+    """Triangles corners [N, 3, 3] and distances [N] from them to the surface: 0, or the radius
+    about a point or line."""
 
     corners: np.ndarray
     radius: np.ndarray

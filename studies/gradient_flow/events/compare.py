@@ -1,7 +1,8 @@
-"""Derivatives of a layer beside differences of the hard sensor, pooled over blocks: cosine and scale.
+"""Derivatives of a layer beside differences of the hard sensor, pooled over blocks: cosine and
+scale.
 
-The hard sensor's counts are means over many places where a pixel may have begun inside its thresholds.
-The same beginnings serve both ends of a step (common random numbers).
+The hard sensor's counts are means over many places where a pixel may have begun inside its
+thresholds. The same beginnings serve both ends of a step (common random numbers).
 """
 
 import itertools
@@ -25,22 +26,23 @@ BLOCKS = 4  # per side of the picture
 RESAMPLES = 400
 
 Maps = Callable[[Tensor, Tensor], Tensor]
-"""What is differentiated: frames [T, H, W] and times [T] to maps [K, H, W], of a layer or of the hard
-sensor."""
+"""What is differentiated: frames [T, H, W] and times [T] to maps [K, H, W], of a layer or of the
+hard sensor."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Derivative of a layer, averaged over a step, and difference of the hard sensor over the step, [K,
-    blocks]."""
+    """Derivative of a layer, averaged over a step, and difference of the hard sensor over the step,
+    [K, blocks]."""
 
     slope: Tensor
     difference: Tensor
 
 
 def offsets(shape: tuple[int, ...], count: int, seed: int = 0) -> Tensor:
-    """[count, *shape] places in [0, 1): evenly spaced over the beginnings, with a random start and in random
-    order for every pixel, so that their mean over beginnings is far less noisy than that of free draws."""
+    """[count, *shape] places in [0, 1): evenly spaced over the beginnings, with a random start and
+    in random order for every pixel, so that their mean over beginnings is far less noisy than that
+    of free draws."""
     generator = Generator().manual_seed(seed)
     first = torch.rand(shape, generator=generator)
     order = torch.rand((count, *shape), generator=generator).argsort(0)
@@ -48,8 +50,9 @@ def offsets(shape: tuple[int, ...], count: int, seed: int = 0) -> Tensor:
 
 
 def distance(place: Tensor, theta_on: Tensor | float, theta_off: Tensor | float) -> Tensor:
-    """How far the level lies above the memorised one at the first frame, for a place in [0, 1): even
-    over -C_off/2 to C_on/2, which is what the memory layer assumes of a pixel without a history."""
+    """How far the level lies above the memorised one at the first frame, for a place in [0, 1):
+    even over -C_off/2 to C_on/2, which is what the memory layer assumes of a pixel without a
+    history."""
     return place * (theta_on + theta_off) / 2 - theta_off / 2
 
 
@@ -57,8 +60,8 @@ def distance(place: Tensor, theta_on: Tensor | float, theta_off: Tensor | float)
 class Judge:
     """Mean over beginnings of something that the hard sensor gives.
 
-    sensor: SensorModel. count: beginnings. seed: of the beginnings and of what the sensor draws itself,
-      the same for every one of them.
+    sensor: SensorModel. count: beginnings. seed: of the beginnings and of what the sensor draws
+      itself, the same for every one of them.
     """
 
     sensor: events.SensorModel
@@ -85,7 +88,8 @@ class Judge:
         return total / self.count
 
     def _begun(self, first, start_s, places):
-        """SensorState of frames [B, H, W] whose memorised levels lie at these places of the thresholds."""
+        """SensorState of frames [B, H, W] whose memorised levels lie at these places of the
+        thresholds."""
         generator = Generator().manual_seed(self.seed)
         level = events.lin_log(first[:1])[0]
         state = events.SensorState()
@@ -144,14 +148,17 @@ def pairs(
 
 
 def pair(ends: Tensor, t_s: Tensor, layer: Maps, truth: Maps) -> Pair:
-    """As ``pairs`` for frames [sections + 1, T, H, W] at the ends of the sections of a step of 2."""
+    """As ``pairs`` for frames [sections + 1, T, H, W] at the ends of the sections of a step of
+    2."""
     difference = blocks(truth(ends[-1], t_s) - truth(ends[0], t_s)) / 2
     return Pair(slope(ends, t_s, layer), difference.double())
 
 
 def slope(ends: Tensor, t_s: Tensor, layer: Maps) -> Tensor:
-    """[K, blocks] derivative of a layer along a step of 2, averaged over it; ends as for ``pair``."""
-    # to second order, the derivative over a section is that at the mean of its ends, along their difference
+    """[K, blocks] derivative of a layer along a step of 2, averaged over it; ends as for
+    ``pair``."""
+    # to second order, the derivative over a section is that at the mean of its ends, along their
+    # difference
     slopes = [
         derivative(layer, (first + second) / 2, second - first, t_s)
         for first, second in itertools.pairwise(ends)
@@ -160,8 +167,8 @@ def slope(ends: Tensor, t_s: Tensor, layer: Maps) -> Tensor:
 
 
 def derivative(layer: Maps, frames: Tensor, tangent: Tensor, t_s: Tensor) -> Tensor:
-    """[K, blocks] derivative of every map, summed over blocks, along a tangent of the frames. Pixels
-    are independent: one backward pass serves all blocks of a map."""
+    """[K, blocks] derivative of every map, summed over blocks, along a tangent of the frames.
+    Pixels are independent: one backward pass serves all blocks of a map."""
     frames = frames.clone().requires_grad_()
     found = []
     for one in (maps := layer(frames, t_s)):
@@ -177,7 +184,9 @@ def row(names: Sequence[object], found: Sequence[Pair], seed: int = 0) -> Row:
     difference = torch.cat([one.difference for one in found], 1)
     # [3, units]
     products = torch.stack([(slope * difference).sum(0), (slope**2).sum(0), (difference**2).sum(0)])
-    cosine = bootstrap(lambda x: _cosine(x.sum(-1)), products, level=0.9, draws=RESAMPLES, seed=seed)
+    cosine = bootstrap(
+        lambda x: _cosine(x.sum(-1)), products, level=0.9, draws=RESAMPLES, seed=seed
+    )
     whole = products.sum(1)
     return Row(
         tuple(str(name) for name in names),

@@ -1,11 +1,11 @@
-"""The event layers beside the hard sensor: every layer with equal thresholds, the physical layer, and
-when events come from few frames.
+"""The event layers beside the hard sensor: every layer with equal thresholds, the physical layer,
+and when events come from few frames.
 
-A camera passes a textured plane behind a thin lens. What a layer gives is pooled over blocks, quarters
-of the time and polarity; one direction each changes the contrast of the scene, the focus of the lens,
-or a component of the camera's pose, by enough to move log levels by about a threshold. The derivative
-of every pooled number along the direction, averaged over the step, is set beside the difference of the
-hard sensor's over the step.
+A camera passes a textured plane behind a thin lens. What a layer gives is pooled over blocks,
+quarters of the time and polarity; one direction each changes the contrast of the scene, the focus
+of the lens, or a component of the camera's pose, by enough to move log levels by about a threshold.
+The derivative of every pooled number along the direction, averaged over the step, is set beside the
+difference of the hard sensor's over the step.
 """
 
 import warnings
@@ -17,7 +17,15 @@ from torch import Tensor
 
 from codesign import events
 from studies.gradient_flow.events import compare
-from studies.gradient_flow.events.case import DIRECTIONS, DURATION_S, FEW, SHIFT_X, Case, Direction, times
+from studies.gradient_flow.events.case import (
+    DIRECTIONS,
+    DURATION_S,
+    FEW,
+    SHIFT_X,
+    Case,
+    Direction,
+    times,
+)
 from studies.gradient_flow.events.compare import Judge
 from studies.gradient_flow.topic import Topic, pointing
 
@@ -129,17 +137,20 @@ def of_field(one, sensor, field):
     for k in range(SECTIONS):
         place = start * (1 + STEP * ((2 * k + 1) / SECTIONS - 1))
         value = torch.tensor(place, dtype=frames.dtype, requires_grad=True)
-        layer, _ = physical_maps(replace(sensor, **{field: float(value.detach())}), **{field: value})
+        layer, _ = physical_maps(
+            replace(sensor, **{field: float(value.detach())}), **{field: value}
+        )
         slope = slope + of_number(layer(frames, t_s), value) * start * STEP / SECTIONS
     low, high = (
-        physical_maps(replace(sensor, **{field: start * (1 + STEP * s)}))[1](frames, t_s) for s in (-1, 1)
+        physical_maps(replace(sensor, **{field: start * (1 + STEP * s)}))[1](frames, t_s)
+        for s in (-1, 1)
     )
     return compare.Pair(slope.double(), compare.blocks(high - low).double() / 2)
 
 
 def of_number(found: Tensor, value: Tensor) -> Tensor:
-    """[K, blocks] derivative of maps [K, H, W] to one number that all pixels share: a backward pass for
-    each."""
+    """[K, blocks] derivative of maps [K, H, W] to one number that all pixels share: a backward pass
+    for each."""
     pooled = compare.blocks(found)
     grads = [torch.autograd.grad(one, value, retain_graph=True)[0] for one in pooled.flatten()]
     return torch.stack(grads).reshape(pooled.shape)
@@ -185,7 +196,9 @@ def stream_change(one: Case, name: str) -> Tensor:
     t_s = times(TRUTH_HZ)
     low, high = (
         judge.mean(
-            one.frames(TRUTH_HZ, direction_of(name), s).float(), t_s, lambda counts: observed(counts, t_s)
+            one.frames(TRUTH_HZ, direction_of(name), s).float(),
+            t_s,
+            lambda counts: observed(counts, t_s),
         )
         for s in (-1.0, 1.0)
     )
@@ -199,7 +212,9 @@ def measure_timing(config, intervals, name):
     found = {loss: [] for loss in LOSSES}
     for one in cases_of(config):
         ends = one.along(intervals / DURATION_S, direction_of(name), TIMED_SECTIONS)
-        slope = compare.slope(ends, t_s, lambda frames, t: observed(*LAYER.finely(frames, t, finest_s)))
+        slope = compare.slope(
+            ends, t_s, lambda frames, t: observed(*LAYER.finely(frames, t, finest_s))
+        )
         change = stream_change(one, name)
         for loss, rows in LOSSES.items():
             found[loss].append(compare.Pair(slope[rows], change[rows]))

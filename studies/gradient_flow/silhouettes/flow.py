@@ -1,5 +1,5 @@
-"""A room with two boxes before a lens: frames, events, flow and loss as a function of nine numbers of
-the camera, the ways to its gradient, and its differences with common random numbers."""
+"""A room with two boxes before a lens: frames, events, flow and loss as a function of nine numbers
+of the camera, the ways to its gradient, and its differences with common random numbers."""
 
 import math
 from collections.abc import Callable
@@ -18,8 +18,8 @@ DURATION_S = 0.05
 BINS = 4
 THETA = 0.15
 MISMATCH = 0.03  # of thresholds, from pixel to pixel
-# metres and radians, then two curvatures per mm and the focus in mm: each moves the image by 0.1 to 0.3
-# px of 48, or changes its blur by about as much
+# metres and radians, then two curvatures per mm and the focus in mm: each moves the image by 0.1 to
+# 0.3 px of 48, or changes its blur by about as much
 STEPS = torch.tensor([*(4e-3,) * 3, *(2e-3,) * 3, 2e-4, 2e-4, 2e-2], dtype=torch.float64)
 GROUPS = {"pose": slice(0, 6), "lens": slice(6, 9)}
 CURVATURES = (0, 2)
@@ -38,7 +38,8 @@ class Case:
         draw = torch.Generator().manual_seed(seed)
         angle = 2 * math.pi * float(torch.rand((), generator=draw))
         shift = torch.tensor(
-            [0.15 * math.cos(angle), 0.15 * math.sin(angle), 0.1, 0.02, -0.03, 0.04], dtype=torch.float64
+            [0.15 * math.cos(angle), 0.15 * math.sin(angle), 0.1, 0.02, -0.03, 0.04],
+            dtype=torch.float64,
         )
         # rolled, so that no edge of the room follows a row of pixels
         start = pose.look_at((0.05, -1.2, 1.0), (0.1, 1.0, 0.75), down=(0.08, 0.0, -1.0))
@@ -48,7 +49,9 @@ class Case:
         shape = (size_px, size_px)
         self.theta = THETA * (1 + MISMATCH * torch.randn(shape, generator=draw))
         coarse = torch.randn(1, 2 * BINS, 5, 5, generator=draw)
-        smooth = torch.nn.functional.interpolate(coarse, size=shape, mode="bicubic", align_corners=True)
+        smooth = torch.nn.functional.interpolate(
+            coarse, size=shape, mode="bicubic", align_corners=True
+        )
         self.weight = smooth.reshape(2, BINS, *shape)
         with torch.no_grad():
             camera = self.camera(torch.zeros(9, dtype=torch.float64), 1, 0)
@@ -60,29 +63,33 @@ class Case:
         optics = self.lens.replace(
             curvature_per_mm=self.lens.curvature_per_mm
             + change.index_put((torch.tensor(CURVATURES),), numbers[6:8]),
-            thickness_mm=self.lens.thickness_mm + change.index_put((torch.tensor([FOCUS]),), numbers[8:]),
+            thickness_mm=self.lens.thickness_mm
+            + change.index_put((torch.tensor([FOCUS]),), numbers[8:]),
         )
-        return render.Camera(optics, self.size_px, self.size_px, WIDTH_MM / self.size_px, samples, seed)
+        return render.Camera(
+            optics, self.size_px, self.size_px, WIDTH_MM / self.size_px, samples, seed
+        )
 
     def frames(
         self, numbers: Tensor, samples: int, seed: int, way: Way = "interior", per_px: float = 2.5
     ) -> Tensor:
-        """Frames [T, H, W] from a path moved, in the camera's own axes, by the twist numbers[:6]."""
+        """Frames [T, H, W] from a path moved, in the camera's own axes, by the twist
+        numbers[:6]."""
         moved = self.path @ pose.se3_exp(numbers[None, :6])
         camera = self.camera(numbers, samples, seed)
         return render.frames(camera, self.scene, moved, gradient=way, per_px=per_px)
 
     def places(self, count: int, seed: int) -> Tensor:
-        """Where pixels stand inside their threshold, [K, H, W] in -1/2..1/2: each goes through K even
-        places, in an order of its own."""
+        """Where pixels stand inside their threshold, [K, H, W] in -1/2..1/2: each goes through K
+        even places, in an order of its own."""
         draw = torch.Generator().manual_seed(seed)
         shape = self.theta.shape
         order = torch.rand(count, *shape, generator=draw).argsort(0)
         return (order + torch.rand(shape, generator=draw)) / count - 0.5
 
     def losses(self, places: Tensor) -> Losses:
-        """Name -> function of frames: a weighted event volume, and the flow's error, of smooth and of
-        hard counts; "hard flow, one place" is that of the first place alone."""
+        """Name -> function of frames: a weighted event volume, and the flow's error, of smooth and
+        of hard counts; "hard flow, one place" is that of the first place alone."""
         return {
             "smooth counts": lambda frames: self.weighted(self.smooth(frames)),
             "smooth flow": lambda frames: self.flow_error(self.smooth(frames)),
@@ -109,14 +116,16 @@ class Case:
         return (volume * self.weight).sum((1, 2)).mean()
 
     def flow_error(self, counts: Tensor) -> Tensor:
-        """Mean square error of the flow, px2, against what is true where the camera stands unmoved."""
+        """Mean square error of the flow, px2, against what is true where the camera stands
+        unmoved."""
         found = flow.estimate_lk(events.from_counts(counts, self.t_s, BINS), "affine").flow_px
         return ((found - self.target) * self.known[:, None]).double().square().mean()
 
     def gradients(
         self, losses: Losses, samples: int, seed: int, way: Way, per_px: float
     ) -> dict[str, Tensor]:
-        """Gradient [9] per step of every number, of every loss: one trace of the frames serves all."""
+        """Gradient [9] per step of every number, of every loss: one trace of the frames serves
+        all."""
         numbers = torch.zeros(9, dtype=torch.float64, requires_grad=True)
         frames = self.frames(numbers, samples, seed, way, per_px)
         found = {}
@@ -145,8 +154,8 @@ LOSSES = ("smooth counts", "smooth flow", "hard counts", "hard flow", "hard flow
 
 
 def estimates(case: Case, samples: int, places: int, seed: int) -> Tensor:
-    """Differences, the interior gradient, the one with the boundary term and a single estimate of it,
-    at one seed of the camera and one draw of places: [4, LOSSES, 9]."""
+    """Differences, the interior gradient, the one with the boundary term and a single estimate of
+    it, at one seed of the camera and one draw of places: [4, LOSSES, 9]."""
     losses = case.losses(case.places(places, seed))
     ways = (
         case.differences(losses, samples, seed),
@@ -158,8 +167,8 @@ def estimates(case: Case, samples: int, places: int, seed: int) -> Tensor:
 
 
 def judged(values: Tensor) -> dict[str, float]:
-    """Relative L2 errors against differences, noises and cosines out of values [cases, seeds, 4, n];
-    cases stand side by side, so that no error cancels another's."""
+    """Relative L2 errors against differences, noises and cosines out of values
+    [cases, seeds, 4, n]; cases stand side by side, so that no error cancels another's."""
     truth, interior, boundary, _ = values.mean(1).transpose(0, 1).flatten(1)
     size = float(truth.norm())
     deviation = values.std(1).transpose(0, 1).flatten(1) / math.sqrt(values.shape[1])
@@ -190,8 +199,8 @@ def measure(config):
 
 
 def asked(row):
-    """5 % and twice the noise of smooth counts; of the mean over places of hard ones a noise below 10 %
-    and a cosine of 0.9. Nothing is asked of one place."""
+    """5 % and twice the noise of smooth counts; of the mean over places of hard ones a noise below
+    10 % and a cosine of 0.9. Nothing is asked of one place."""
     if row.names[0].startswith("smooth"):
         return Asked({}, {"with_boundary": 0.05 + 2 * row.numbers["noise"]})
     return None if row.names[0].endswith("place") else Asked({"cosine": 0.9}, {"noise": 0.10})

@@ -1,5 +1,5 @@
-"""Frames of occluders over a wall, to the camera's pose and to the lens: one scene before one lens, and
-the ways to its gradient beside differences with common random numbers."""
+"""Frames of occluders over a wall, to the camera's pose and to the lens: one scene before one lens,
+and the ways to its gradient beside differences with common random numbers."""
 
 import torch
 
@@ -22,7 +22,8 @@ ROWS = (0, 2, 4), (1, 3, 5)  # curvatures, and thicknesses of which the last is 
 
 
 class Task:
-    """One scene before one lens; a weighted frame as a function of six numbers of the pose or of the lens."""
+    """One scene before one lens; a weighted frame as a function of six numbers of the pose or of
+    the lens."""
 
     def __init__(self, scene, kind):
         self.scene = scene
@@ -33,7 +34,9 @@ class Task:
         }[kind]()
         self.pose = pose.look_at((0.05, -1.2, 1.0), (0.0, 1.0, 0.7))[None]
         coarse = torch.randn(1, 1, 6, 6, generator=torch.Generator().manual_seed(3))
-        self.weight = torch.nn.functional.interpolate(coarse, size=(SIZE_PX, SIZE_PX), mode="bicubic")[0, 0]
+        self.weight = torch.nn.functional.interpolate(
+            coarse, size=(SIZE_PX, SIZE_PX), mode="bicubic"
+        )[0, 0]
 
     def loss(self, numbers, group, samples, seed, way: Way = "interior", per_px=2.5):
         optics = self.lens
@@ -71,8 +74,8 @@ class Task:
 
 
 def measure(config, scene, kind, group):
-    """Relative L2 errors of the ways against differences, scaled so that every number counts by its own
-    step."""
+    """Relative L2 errors of the ways against differences, scaled so that every number counts by its
+    own step."""
     task = Task(silhouette_scenes.build(scene), kind)
 
     def estimates(seed):
@@ -88,7 +91,10 @@ def measure(config, scene, kind, group):
 
 def jobs(quick):
     if quick:
-        return [("cubes", "pinhole", "pose"), *((scene, "traced", "lens") for scene in ("cubes", "poles"))]
+        return [
+            ("cubes", "pinhole", "pose"),
+            *((scene, "traced", "lens") for scene in ("cubes", "poles")),
+        ]
     kinds = {"cubes": LENSES}
     return [
         (scene, kind, group)
