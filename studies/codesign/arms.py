@@ -93,7 +93,7 @@ def read_out(task: "Task", share: Tensor, way: Way, tries: int = 0) -> Tensor:
     there; ``tries`` of it, those of the task for 0. By expected errors, which rank good read-outs
     better than hard ones of so few drives do (0.93 and 0.85, docs/joint_design.md).
     """
-    space, drawn = task.space, task.objective.drawn
+    space = task.space
     free = space.part("read-out")
     if not free or not way.recorded:
         return share
@@ -106,9 +106,7 @@ def read_out(task: "Task", share: Tensor, way: Way, tries: int = 0) -> Tensor:
         chosen = {name: whole.numbers[name] for name in PARTS["read-out"]}
         errors = []
         for looked in way.recorded:
-            frames = {"frames": looked.run["frames"]}
-            other = looked.whole.with_numbers(**chosen)
-            errors.append(drawn.looked(other, looked.samples, recorded=frames).expected)
+            errors.append(looked.again(looked.whole.with_numbers(**chosen)).expected)
         tried.append((float(torch.cat(errors).mean()), moved))
         return tried[-1][0]
 

@@ -144,9 +144,7 @@ class Looks:
         calibration."""
         whole = self.space.made(share)
         looked = self.drawn.looked(whole, self.drawn.draw(LOOKED))
-        single = self.drawn.looked(
-            whole, looked.samples, "sensor", {"frames": looked.run["frames"]}
-        )
+        single = looked.again(whole, "sensor")
         path = self.run.path(f"looks/{name}.safetensors")
         path.parent.mkdir(exist_ok=True)
         conditions = {key: float(value) for key, value in vars(looked.conditions).items()}

@@ -110,11 +110,8 @@ class Objective:
             for name in ON_FRAMES
             if name not in BLOCKS["network"]
         )
-        recorded = {"frames": looked.run["frames"]}
-        if same:
-            recorded["events"] = looked.run["volume"]
-        found = [self.drawn.looked(whole, looked.samples, recorded=recorded) for whole in wholes]
-        return torch.stack([each.expected.mean() for each in found])
+        kept = {"events": looked.run["volume"]} if same else {}
+        return torch.stack([looked.again(whole, **kept).expected.mean() for whole in wholes])
 
     def carried(self, looked: Looked, wholes: Sequence[Whole]) -> Tensor:
         """Mean errors [M] to be expected behind other lenses and of other mounts; nothing is

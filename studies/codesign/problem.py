@@ -1,7 +1,7 @@
 """What a search for a whole design looks at: drives of a robot through worlds, rendered for one
 design; the errors of its velocities, hard ones and those to be expected."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -121,21 +121,28 @@ class Drawn:
         whole: Whole,
         samples: Samples,
         kind: str = "memory",
-        recorded: Mapping[str, Any] | None = None,
     ) -> "Looked":
-        """Drives rendered for a design, or of recorded frames."""
-        if recorded is None:
-            self.rendered += self.base.samples
+        """Drives rendered for a design."""
+        self.rendered += self.base.samples
         batch, twist = self.scenes(whole.T_body_cam[None], samples)
-        run = self.system(whole, kind).begin(batch, recorded)
+        run = self.system(whole, kind).begin(batch)
         return Looked(self, whole, samples, batch, twist, run)
 
     @torch.no_grad()
     def seen(
-        self, cameras: Sequence[Any], mounts: Tensor, batch: Drives, twist: Tensor, field: Any
+        self,
+        cameras: Sequence[Any],
+        mounts: Tensor,
+        batch: Drives,
+        twist: Tensor,
+        field: Any,
+        known: Seen | None = None,
     ) -> tuple[Seen, Tensor]:
         """What flow in the windows is of, behind mounts [M, 4, 4] (``scenes``) and a camera each,
-        and its optics [N, windows, 2] (``window_optics``)."""
+        and its optics [N, windows, 2] (``window_optics``).
+
+        known: of other flow seen alike, in which surfaces are as far, and as hidden, as in this.
+        """
         estimator = self.estimate
         each = batch.T_world_body.shape[1] // len(mounts)
         of_drive = mounts.repeat_interleave(each, 0)
@@ -144,17 +151,23 @@ class Drawn:
         of_mount = torch.tensor([unlike.index(camera) for camera in cameras])
         worlds = len(batch.T_world_body)
         rig = Rig(unlike, of_mount.repeat_interleave(each).repeat(worlds))
-        read, true = estimator.read_beside_truth(
-            field, rig, batch.scene, of_drive, T_world_cam, batch.t_s
-        )
+        given = (field, rig, batch.scene, of_drive, T_world_cam, batch.t_s)
+        if known is None:
+            read, true = estimator.read_beside_truth(*given)
+            covered = torch.cat(
+                [
+                    self.base.own_body.met(mounts[of_mount == number], camera, EVERY_PX)
+                    for number, camera in enumerate(unlike)
+                ]
+            )[of_mount.argsort(stable=True).argsort()]
+            covered = covered.repeat_interleave(each, 0).repeat(worlds, 1)
+        else:
+            covered = known.covered
+            read, true = (
+                estimator.read(*given, depth=lambda *places, depth_m=each.depth_m: depth_m)
+                for each in (known.read, known.surfaces)
+            )
         flow_px = (true.rows @ twist[:, None, :, None])[..., 0]
-        covered = torch.cat(
-            [
-                self.base.own_body.met(mounts[of_mount == number], camera, EVERY_PX)
-                for number, camera in enumerate(unlike)
-            ]
-        )[of_mount.argsort(stable=True).argsort()]
-        covered = covered.repeat_interleave(each, 0).repeat(worlds, 1)
         surfaces = replace(read, depth_m=true.depth_m)
         return Seen(batch.twist, twist, read, surfaces, true.rows, flow_px, covered), rig.optics(
             read
@@ -193,6 +206,16 @@ class Looked:
     batch: Drives
     twist: Tensor
     run: Any
+    known: Seen | None = None
+
+    def again(self, other: Whole, kind: str = "memory", **kept: Any) -> "Looked":
+        """The same frames, and what else is kept of the run, through another sensor and estimator,
+        or in the light of another f-number."""
+        kept["frames"] = self.run["frames"]
+        with torch.no_grad():
+            run = self.drawn.system(other, kind).begin(self.batch, kept)
+        alike = other.camera is self.whole.camera
+        return replace(self, whole=other, run=run, known=self.seen if alike else None)
 
     @cached_property
     def seen(self) -> Seen:
@@ -207,7 +230,7 @@ class Looked:
     @cached_property
     def _seen(self):
         whole = self.whole
-        given = (self.batch, self.twist, self.run["field"])
+        given = (self.batch, self.twist, self.run["field"], self.known)
         return self.drawn.seen([whole.camera], whole.T_body_cam[None], *given)
 
     @cached_property

@@ -47,16 +47,13 @@ def looked(run: Run[Any], space: Space, drawn: Drawn, at: Tensor, count: int) ->
         numbers = space.numbers(share)
         chosen = {space.free[k]: numbers[space.free[k]] for k in free}
 
-        def again(of, one, kind="memory"):
-            recorded = {"frames": one.run["frames"]}
-            return of.looked(whole.with_numbers(**chosen), one.samples, kind, recorded)
-
-        on_few = [again(drawn, one) for one in begun]
+        other = whole.with_numbers(**chosen)
+        on_few = [one.again(other) for one in begun]
         return {
             **chosen,
             "hard": float(torch.cat([each.hard() for each in on_few]).mean()),
             "expected": float(torch.cat([each.expected for each in on_few]).mean()),
-            "elsewhere": float(again(judge, truth, "sensor").hard().mean()),
+            "elsewhere": float(truth.again(other, "sensor").hard().mean()),
         }
 
     return sweep(run, cell, "read_outs", number=range(count))

@@ -135,16 +135,13 @@ def test_a_read_out_is_settled_at_the_bottom_of_what_recorded_frames_tell(space)
     bottom = space.share(theta=0.2, cutoff_hz=300.0, prior_px=4.0)
     free = space.block("sensor") + space.block("network")
 
-    class Known:
-        def looked(self, whole, samples, recorded):
-            away = (space.share(**dict(whole.numbers)) - bottom)[free]
-            return SimpleNamespace(expected=away.square().sum()[None])
+    def again(whole):
+        away = (space.share(**dict(whole.numbers)) - bottom)[free]
+        return SimpleNamespace(expected=away.square().sum()[None])
 
     begun = space.share(theta=0.3, cutoff_hz=150.0, prior_px=6.0)
-    way = Way(
-        recorded=[SimpleNamespace(run={"frames": None}, samples=None, whole=space.made(begun))]
-    )
-    task = Task(SimpleNamespace(drawn=Known(), space=space), begun, 16, 0, 0, 60)
+    way = Way(recorded=[SimpleNamespace(again=again, whole=space.made(begun))])
+    task = Task(SimpleNamespace(space=space), begun, 16, 0, 0, 60)
     found = read_out(task, begun, way)
     held = [k for k in range(len(begun)) if k not in free]
     assert torch.equal(found[held], begun[held])

@@ -368,9 +368,20 @@ def draw_shot_counts(
     shape = (len(interval_s), 2, *pixels)
     if sensor.shot_rate_hz == 0:
         return torch.zeros(shape, dtype=dtype)
-    mean = (sensor.shot_rate_hz / 2) * interval_s.to(generator.device)
-    mean = mean.reshape(-1, *[1] * (len(pixels) + 1)).expand(shape).contiguous()
-    return torch.poisson(mean, generator=generator).to("cpu", dtype)
+    size = 2 * math.prod(pixels)
+    means = (sensor.shot_rate_hz / 2 * interval_s.double()).tolist()
+    counts = [_poisson(mean, size, generator).to("cpu", dtype) for mean in means]
+    return torch.stack(counts).reshape(shape) if counts else torch.zeros(shape, dtype=dtype)
+
+
+def _poisson(mean, size, generator):
+    """[size] Poisson numbers of one mean: their sum is one too, and falls on them evenly."""
+    place: dict[str, Any] = {"generator": generator, "device": generator.device}
+    one = torch.ones((), dtype=torch.float64, device=generator.device)
+    if mean > 1:  # more places than pixels
+        return torch.poisson(one.new_full((size,), mean), generator=generator)
+    events = int(torch.poisson(size * mean * one, generator=generator))
+    return torch.bincount(torch.randint(size, (events,), **place), minlength=size)
 
 
 def _shape(pixels):
