@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         train,
         types,
     )
+    from codesign.report.show import show
     from codesign.system import System
 
 # Torch's OpenMP threads would busy-wait after each operation on the core that drjit's thread pool
@@ -48,6 +49,7 @@ __all__ = [
     "pose",
     "render",
     "report",
+    "show",
     "state",
     "system",
     "train",
@@ -58,6 +60,8 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name == "System":
         return importlib.import_module("codesign.system").System
+    if name == "show":
+        return importlib.import_module("codesign.report.show").show
     if name in __all__ or name in ("place", "task"):  # the latter are former names of mount
         return importlib.import_module(f"codesign.{name}")
     if name == "__version__":

@@ -9,13 +9,10 @@ the one that the README shows (docs/chain.png).
 import sys
 from dataclasses import dataclass
 
-import matplotlib.pyplot as plt
-import numpy as np
 import torch
 
+import codesign
 from codesign import events, flow, lens, pose, render
-from codesign.report.flow_colours import flow_colours
-from codesign.report.lens_layout import draw_layout
 from codesign.system import Batch, System
 from scenes import trajectories, worlds
 from studies.frame.run import Run, StudyConfig, main
@@ -76,41 +73,12 @@ def study(run: Run[Config]):
         f"true motion {moved:.2f} px in {DURATION_S * 1e3:g} ms",
     )
     run.figure(
-        draw(geo, seen),
+        codesign.show(seen),
         "chain",
-        "Lens, first frame, signed events, flow as estimated and as it is.",
+        "Lens, middle frame, signed events, flow as estimated and as it is.",
         dpi=110,
     )
     run.finish("The chain in one picture", "One pass from glass to flow, with the hard sensor.")
-
-
-def draw(geo, seen):
-    """Figure of one pass: what stands at every junction."""
-    figure, axes = plt.subplots(
-        1, 5, figsize=(17, 2.9), layout="constrained", width_ratios=[1.25, 1, 1, 1, 1]
-    )
-    draw_layout(axes[0], geo, [0.0, np.radians(10.0), np.radians(14.0)])
-    axes[0].set_title("lens", fontsize=11)
-    axes[0].axis("off")
-    frame = seen["frames"][0].numpy()
-    counts = seen["volume"].counts[0].sum(1).numpy()
-    estimated = seen["field"].flow_px[0].numpy()
-    true = seen["truth"].flow_px[0].numpy()
-    longest = float(np.quantile(np.hypot(*true), 0.98))
-    pictures = {
-        "frames": np.clip(frame / np.quantile(frame, 0.99), 0, 1) ** (1 / 2.2),
-        "events": counts[0] - counts[1],
-        "flow, estimated": flow_colours(estimated, longest),
-        "flow, true": flow_colours(true, longest),
-    }
-    for axis, (title, picture) in zip(axes[1:], pictures.items(), strict=True):
-        signed = title == "events"
-        colours = {"cmap": "RdBu_r", "vmin": -3, "vmax": 3} if signed else {"cmap": "gray"}
-        axis.imshow(picture, **colours)
-        axis.set_title(title, fontsize=11)
-        axis.set_xticks([])
-        axis.set_yticks([])
-    return figure
 
 
 if __name__ == "__main__":

@@ -1,0 +1,202 @@
+"""One call that draws whatever a stage made: ``codesign.show``.
+
+lens ─▶ cross-section    frames ─▶ grey pictures    events ─▶ red and blue    flow ─▶ colours and their wheel
+"""
+
+import math
+from collections.abc import Iterable
+from contextlib import suppress
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from codesign.errors import CodesignError, DomainError, ShapeError
+from codesign.events import picture
+from codesign.report.flow_colours import flow_colours
+from codesign.report.lens_layout import draw_layout
+from codesign.report.robot_figures import draw_robot, view_lines
+from codesign.types import EventStream, EventVolume, FlowField
+
+MOST = 4  # pictures of a batch or of a film
+FIELDS = (0.0, 0.7, 1.0)  # shares of the half field whose rays are drawn
+QUANTILE = 0.98  # of lengths and counts, that has full colour
+WHEEL = 0.22  # of the picture's width
+HANDLED = (
+    "a lens, a camera, frames [..., H, W], an EventStream, an EventVolume, a FlowField, a Mount (with camera= and body=), "
+    "or what a system's `begin` returns"
+)
+
+
+class Shown(Figure):
+    """A figure that a notebook shows without pyplot."""
+
+    def _repr_png_(self):
+        buffer = BytesIO()
+        self.savefig(buffer, format="png", dpi=110)
+        return buffer.getvalue()
+
+
+def show(
+    x: Any, path: str | Path | None = None, *, camera: Any = None, body: Iterable[Any] = ()
+) -> Shown:
+    """Draw what a stage of the chain made.
+
+    In a notebook the figure shows itself; elsewhere give ``path``, or use ``figure.savefig``.
+
+    Args:
+      x: lens (``GeoLens``) or camera: cross-section with rays to the middle, 0.7 and the corner of
+        the field. Frames [..., H, W], linear light: at most four of them over time, with the
+        screen's gamma. ``EventStream`` and ``EventVolume``: ON red, OFF blue, both purple.
+        ``FlowField``: hue the direction, saturation the length, with a wheel that says how far.
+        ``Mount``, with the camera that it carries and the meshes of its robot. What
+        ``System.begin`` returns: all of the chain in a row.
+      path: file to write, of a kind that matplotlib knows (.png, .svg, .pdf).
+      camera: that a mount carries. body: meshes with vertices_m [V, 3] and faces [F, 3], in body
+        axes.
+    Raises: DomainError for something else.
+
+    >>> import codesign
+    >>> figure = codesign.show(codesign.lens.load("cooke-triplet"))
+    >>> len(figure.axes)
+    1
+    """
+    if isinstance(x, torch.nn.Module) and hasattr(x, "half_range_m"):
+        figure = _mount(x, camera, list(body))
+    elif isinstance(x, EventStream):
+        # events are counted by pixel, whatever their time
+        counts = torch.zeros(2, x.height_px, x.width_px)
+        ones = torch.ones(len(x))
+        counts.index_put_(((x.p < 0).long(), x.y, x.x), ones, accumulate=True)
+        figure = _row([(f"{len(x):,} events", counts[None], _events)])
+    elif isinstance(x, EventVolume):
+        sums = x.counts.detach().sum(2)[:MOST]
+        figure = _row([(f"events {k}" if k else "events", sums[[k]], _events) for k in _each(sums)])
+    elif isinstance(x, FlowField):
+        flows = [_sample(x, k) for k in range(min(MOST, len(x.flow_px)))]
+        full = max(map(_longest, flows))
+        figure = _row(
+            [(f"flow {k}" if k else "flow", (px, full), _flow) for k, px in enumerate(flows)]
+        )
+    elif isinstance(x, Tensor):
+        if x.ndim < 2 or x.dtype.is_complex:
+            raise ShapeError(f"frames have shape {list(x.shape)}; [..., H, W] is needed.")
+        films = x.detach().reshape(-1, *x.shape[-2:])
+        picked = np.unique(np.linspace(0, len(films) - 1, MOST).round().astype(int)).tolist()
+        white = _bright(films)
+        figure = _row([(f"frame {k}", films[k] / white, _frame) for k in picked])
+    elif hasattr(x, "system") and hasattr(x, "keys"):
+        figure = _chain(x)
+    elif hasattr(getattr(x, "lens", x), "to_surfaces"):
+        figure = _row([("", x, _lens)])
+    else:
+        raise DomainError(f"nothing is known of how to draw {type(x).__name__}; give {HANDLED}.")
+    if path is not None:
+        figure.savefig(path, dpi=150)
+    return figure
+
+
+def _each(batch):
+    return range(len(batch))
+
+
+def _sample(field, k):
+    flow = field.flow_px[k].detach()
+    return torch.where(field.valid[k], flow, 0.0).double().numpy()
+
+
+def _bright(films):
+    """Level that becomes white."""
+    return float(torch.quantile(films.flatten()[::7].double(), 0.99).clamp_min(1e-12))
+
+
+def _row(parts):
+    """Figure of (title, what, how to draw it) side by side; a lens gets more room."""
+    wide = [1.5 if draw is _lens else 1.0 for _, _, draw in parts]
+    figure = Shown(figsize=(3.4 * sum(wide) + 0.6, 3.3), layout="constrained")
+    axes = figure.subplots(1, len(parts), squeeze=False, width_ratios=wide)[0]
+    for axis, (title, what, draw) in zip(axes, parts, strict=True):
+        draw(axis, what)
+        axis.set_title(title, fontsize=10)
+        if draw is not _lens:
+            axis.set(xticks=[], yticks=[])
+    return figure
+
+
+def _frame(axis, shares):
+    axis.imshow(np.clip(shares.double().numpy(), 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
+
+
+def _events(axis, counts):
+    some = counts[counts > 0]
+    full = float(torch.quantile(some.flatten()[::7].double(), QUANTILE)) if len(some) else 1.0
+    axis.imshow(picture(counts.clamp_min(0), max(full, 1e-9))[0].numpy())
+
+
+def _longest(flow_px):
+    return max(float(np.quantile(np.hypot(*flow_px), QUANTILE)), 1e-9)
+
+
+def _flow(axis, flow_and_full):
+    flow_px, full = flow_and_full
+    axis.imshow(flow_colours(flow_px, full))
+    across = np.linspace(-1, 1, 61)
+    wheel = np.stack(np.meshgrid(across, across))
+    inside = np.hypot(*wheel) <= 1
+    colours = np.concatenate([flow_colours(wheel, 1.0), inside[..., None]], -1)
+    small = axis.inset_axes([1 - WHEEL, 0, WHEEL, WHEEL])
+    small.imshow(colours)
+    small.set_axis_off()
+    axis.text(
+        0.99 - WHEEL, 0.02, f"rim {full:.2g} px", transform=axis.transAxes, ha="right", size=8
+    )
+
+
+def _lens(axis, x):
+    """Of a lens, or of a camera, whose film's corner is the field."""
+    lens = getattr(x, "lens", x)
+    half_rad = math.radians(lens.half_field_deg or 10.0)
+    if hasattr(x, "film"):
+        across_mm = math.hypot(x.film.sensor_width_px, x.film.sensor_height_px)
+        across_mm *= x.film.pixel_pitch_mm
+        half_rad = math.atan(across_mm / 2 / abs(float(lens.first_order().efl_mm.detach())))
+    draw_layout(axis, lens, [share * half_rad for share in FIELDS])
+
+
+def _mount(mount, camera, body):
+    if camera is None or not body:
+        raise DomainError(
+            "a mount is drawn on its robot: give camera= and body=, meshes such as `bodies.values()` of a pair."
+        )
+    T_body_cam = mount().detach()
+    figure = Shown(figsize=(5, 4.4), layout="constrained")
+    triangles = np.concatenate([np.asarray(m.vertices_m)[np.asarray(m.faces)] for m in body])
+    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    up = normal[:, 2] / np.linalg.norm(normal, axis=1).clip(1e-12)
+    size_m = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
+    lines = view_lines(camera, T_body_cam, 0.7 * size_m)
+    draw_robot(figure.add_subplot(projection="3d"), triangles, 0.55 + 0.25 * up, lines)
+    return figure
+
+
+def _chain(run):
+    """Lens, middle frame, events and flow of the first sample of a pass."""
+    with torch.no_grad():
+        camera = run["camera"]
+        traced = hasattr(getattr(camera, "lens", None), "to_surfaces")
+        parts = [("lens", camera, _lens)] if traced else []
+        frames = run["frames"].detach()
+        films = frames.reshape(-1, *frames.shape[-3:])[0]
+        parts.append(("frame", films[len(films) // 2] / _bright(films), _frame))
+        parts.append(("events", run["volume"].counts[:1].sum(2), _events))
+        flows = {"flow, estimated": run["field"]}
+        with suppress(CodesignError):  # a recording has no truth
+            flows["flow, true"] = run["truth"]
+        fields = {title: _sample(field, 0) for title, field in flows.items()}
+        full = max(_longest(flow_px) for flow_px in fields.values())
+        parts += [(title, (flow_px, full), _flow) for title, flow_px in fields.items()]
+    return _row(parts)

@@ -1,0 +1,80 @@
+"""``codesign.show`` draws what it is given: colours of pixels whose values are known."""
+
+import numpy as np
+import pytest
+import torch
+
+import codesign
+from codesign import lens
+from codesign.errors import DomainError, ShapeError
+from codesign.types import EventStream, EventVolume, FlowField
+
+
+def picture(axis):
+    return np.asarray(axis.images[0].get_array(), dtype=float)
+
+
+def test_flow_to_the_right_is_red_and_what_means_nothing_is_white():
+    flow = torch.zeros(1, 2, 20, 30)
+    flow[:, 0] = 5.0
+    valid = torch.ones(1, 20, 30, dtype=torch.bool)
+    flow[0, :, 4, 7], valid[0, 4, 7] = torch.nan, False
+    axis = codesign.show(FlowField(flow, valid, 0.05)).axes[0]
+    drawn = picture(axis)
+    np.testing.assert_allclose(drawn[10, 10], (1, 0, 0), atol=1e-12)
+    np.testing.assert_allclose(drawn[4, 7], (1, 1, 1), atol=1e-12)
+    assert "5 px" in axis.texts[0].get_text()
+    # of the wheel: up is image-down reversed, a quarter of the hues before red
+    wheel = np.asarray(axis.child_axes[0].images[0].get_array())
+    np.testing.assert_allclose(wheel[30, 60, :3], (1, 0, 0), atol=1e-12)
+    np.testing.assert_allclose(wheel[60, 30, :3], (0.5, 1, 0), atol=1e-12)
+    assert wheel[0, 0, 3] == 0
+
+
+def test_events_are_red_on_and_blue_off_wherever_they_come_from():
+    stream = EventStream(*torch.tensor([[1, 2, 3], [5, 5, 6], [2, 2, 3], [1, 1, -1]]), 8, 9)
+    counts = torch.zeros(1, 2, 3, 8, 9)
+    counts[0, 0, 0, 2, 5] = 2
+    counts[0, 1, 2, 3, 6] = 1
+    volume = EventVolume(counts, torch.arange(3.0), torch.ones(3))
+    for shown in (codesign.show(stream), codesign.show(volume)):
+        drawn = picture(shown.axes[0])
+        assert drawn[2, 5].tolist() == [255, 0, 0]
+        assert drawn[3, 6, 0] == drawn[3, 6, 1] < drawn[3, 6, 2] == 255
+        assert (drawn[0] == 255).all()
+
+
+def test_frames_are_picked_over_time_and_shown_with_a_gamma(tmp_path):
+    frames = torch.arange(1, 8.0)[:, None, None].expand(7, 6, 8) * 10
+    figure = codesign.show(frames, tmp_path / "frames.png")
+    assert [axis.get_title() for axis in figure.axes] == [
+        "frame 0",
+        "frame 2",
+        "frame 4",
+        "frame 6",
+    ]
+    np.testing.assert_allclose(picture(figure.axes[2]), (50 / 70) ** (1 / 2.2), rtol=1e-6)
+    assert (tmp_path / "frames.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_lens_is_drawn_with_rays_to_its_field_and_a_notebook_shows_it():
+    geo = lens.load("cooke-triplet")
+    figure = codesign.show(geo)
+    # the film ends the axis of the drawing
+    ends = max(line.get_xdata().max() for line in figure.axes[0].lines if len(line.get_xdata()) > 2)
+    length = sum(surface.thickness_mm for surface in geo.to_surfaces())
+    assert ends == pytest.approx(length, rel=1e-6)
+    assert figure._repr_png_().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "sentence"),
+    [
+        (3, DomainError, "nothing is known of how to draw int"),
+        (torch.tensor(1.0), ShapeError, "frames have shape"),
+        (codesign.mount.Mount((0, 0, 0.4), (0.1, 0.1, 0.1)), DomainError, "give camera= and body="),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused_in_a_sentence(given, error, sentence):
+    with pytest.raises(error, match=sentence):
+        codesign.show(given)
