@@ -11,7 +11,7 @@ STUDIES := lens-opt lens-report lens-scratch lens-tolerance lens-bench dataset v
 	srm-bench sensor-fit train-flow flow-quality flow-recording \
 	placement codesign speed-error stability gradcheck
 
-.PHONY: help setup test fuzz kill-test test-bits lint core-check try-all doctor clean $(STUDIES)
+.PHONY: help setup docs test fuzz kill-test test-bits lint core-check try-all doctor clean $(STUDIES)
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1|/p' Makefile | awk -F'|' '{printf "%-24s %s\n", $$1, $$2}'
@@ -57,6 +57,9 @@ speed-error: ## time, memory and error of every stage: make speed-error ARGS="--
 stability: ## hard cases: outcome expected and seen
 gradcheck: ## gradients against differences: make gradcheck ARGS="--cases chain joint layers sensors timing silhouettes"
 gradcheck: STUDY := gradient_flow
+
+docs: .venv/with-docs.stamp ## the docs as a site with search and API: open site/index.html
+	@NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet && echo "site/index.html"
 
 test: setup ## all tests, on all cores
 	@$(RUN) -m pytest -n auto --maxprocesses 8 --dist worksteal $(ARGS)

@@ -1,6 +1,9 @@
 """The pages that a newcomer copies from: every block of Python on them runs, top to bottom."""
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -8,6 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = (
     "README.md",
+    "docs/start.md",
     "docs/chain.md",
     "docs/diffraction.md",
     "docs/your_own.md",
@@ -28,3 +32,16 @@ def test_blocks_of_a_page_run_in_one_session(page, tmp_path, monkeypatch, capsys
     names = {"__name__": "page"}
     for block in blocks:
         exec(compile(block, page, "exec"), names)
+
+
+def test_the_site_builds_without_a_warning(tmp_path):
+    """Every link and anchor of the pages leads somewhere, every page has its place, the API reads."""
+    pytest.importorskip("mkdocs", reason="the site needs codesign[docs]")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet"]
+    command += ["--config-file", str(ROOT / "mkdocs.yml"), "--site-dir", str(tmp_path / "site")]
+    quiet = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    built = subprocess.run(command, capture_output=True, text=True, env=quiet, cwd=ROOT)
+    assert built.returncode == 0, built.stdout + built.stderr
+    page = (tmp_path / "site/api/events/index.html").read_text(encoding="utf-8")
+    assert 'id="codesign.events.simulate"' in page
+    assert (tmp_path / "site/search/search_index.json").stat().st_size > 100_000

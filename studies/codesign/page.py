@@ -96,13 +96,17 @@ def race(
         lines.append(line)
     tabulate(run, "Errors in unseen worlds", lines, "arm", prefix="race")
     if found:
-        for arm, name in [*((arm, arm) for arm in found), (best_order(found), "best_order")]:
-            over = found[arm][0]
-            ends = zip(
-                ("median", "low95", "high95"), (over.value, over.low, over.high), strict=True
-            )
-            plain_name = plain("joint_over", name)
-            run.record(**{f"{plain_name}_{end}_{pair}": math.exp(log) for end, log in ends})
+        best = best_order(found)
+        named = [
+            *((arm, plain("joint_over", arm)) for arm in found),
+            (best, "joint_over_best_order"),
+        ]
+        logs = [(name, found[arm][0]) for arm, name in named]
+        if "nested" in found and best != "nested":
+            logs.append(("nested_over_best_order", compared(rows, "nested")[best][0]))
+        for name, over in logs:
+            ends = {"median": over.value, "low95": over.low, "high95": over.high}
+            run.record(**{f"{name}_{end}_{pair}": math.exp(log) for end, log in ends.items()})
         ratios = {
             arm: Interval(*(math.exp(x) for x in (over.value, over.low, over.high)), over.count)
             for arm, (over, _) in found.items()
