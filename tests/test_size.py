@@ -16,7 +16,7 @@ BUDGETS = {
     "codesign/mount": 14_500,
     "codesign/optimise": 3_900,
     "codesign/render": 42_550,
-    "codesign/report": 6_800,
+    "codesign/report": 6_900,
     "codesign/system": 9_300,
     "codesign/train": 5_400,
     "scenes": 15_300,

@@ -15,6 +15,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from codesign.atomic import write_atomic
 from codesign.errors import CodesignError, DomainError, ShapeError
 from codesign.events import picture
 from codesign.report.flow_colours import flow_colours
@@ -35,10 +36,14 @@ HANDLED = (
 class Shown(Figure):
     """A figure that a notebook shows without pyplot."""
 
-    def _repr_png_(self):
+    def image(self, kind: str, dpi: int) -> bytes:
+        """The figure as a file of that kind, such as "png"."""
         buffer = BytesIO()
-        self.savefig(buffer, format="png", dpi=110)
+        self.savefig(buffer, format=kind, dpi=dpi)
         return buffer.getvalue()
+
+    def _repr_png_(self):
+        return self.image("png", 110)
 
 
 def show(
@@ -96,7 +101,7 @@ def show(
     else:
         raise DomainError(f"nothing is known of how to draw {type(x).__name__}; give {HANDLED}.")
     if path is not None:
-        figure.savefig(path, dpi=150)
+        write_atomic(Path(path), figure.image(Path(path).suffix[1:] or "png", 150))
     return figure
 
 
