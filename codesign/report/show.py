@@ -17,10 +17,13 @@ from torch import Tensor
 
 from codesign.atomic import write_atomic
 from codesign.errors import CodesignError, DomainError, ShapeError
-from codesign.events import picture
+from codesign.events import picture, to_counts
+from codesign.mount import Mount
+from codesign.report.chain_figures import draw_image
 from codesign.report.flow_colours import flow_colours
 from codesign.report.lens_layout import draw_layout
 from codesign.report.robot_figures import draw_robot, view_lines
+from codesign.system.run import Pass
 from codesign.types import EventStream, EventVolume, FlowField
 
 MOST = 4  # pictures of a batch or of a film
@@ -70,17 +73,17 @@ def show(
     >>> len(figure.axes)
     1
     """
-    if isinstance(x, torch.nn.Module) and hasattr(x, "half_range_m"):
+    if isinstance(x, Mount):
         figure = _mount(x, camera, list(body))
     elif isinstance(x, EventStream):
-        # events are counted by pixel, whatever their time
-        counts = torch.zeros(2, x.height_px, x.width_px)
-        ones = torch.ones(len(x))
-        counts.index_put_(((x.p < 0).long(), x.y, x.x), ones, accumulate=True)
-        figure = _row([(f"{len(x):,} events", counts[None], _events)])
+        first_us, last_us = x.t_us[[0, -1]].tolist() if len(x) else (0, 0)
+        counts = to_counts(x, [1e-6 * (first_us - 1), 1e-6 * last_us])
+        figure = _row([(f"{len(x):,} events", counts, _events)])
     elif isinstance(x, EventVolume):
         sums = x.counts.detach().sum(2)[:MOST]
-        figure = _row([(f"events {k}" if k else "events", sums[[k]], _events) for k in _each(sums)])
+        figure = _row(
+            [(f"events {k}" if k else "events", sums[[k]], _events) for k in range(len(sums))]
+        )
     elif isinstance(x, FlowField):
         flows = [_sample(x, k) for k in range(min(MOST, len(x.flow_px)))]
         full = max(map(_longest, flows))
@@ -92,9 +95,8 @@ def show(
             raise ShapeError(f"frames have shape {list(x.shape)}; [..., H, W] is needed.")
         films = x.detach().reshape(-1, *x.shape[-2:])
         picked = np.unique(np.linspace(0, len(films) - 1, MOST).round().astype(int)).tolist()
-        white = _bright(films)
-        figure = _row([(f"frame {k}", films[k] / white, _frame) for k in picked])
-    elif hasattr(x, "system") and hasattr(x, "keys"):
+        figure = _row([(f"frame {k}", (films[k], films[picked]), _frame) for k in picked])
+    elif isinstance(x, Pass):
         figure = _chain(x)
     elif hasattr(getattr(x, "lens", x), "to_surfaces"):
         figure = _row([("", x, _lens)])
@@ -105,18 +107,9 @@ def show(
     return figure
 
 
-def _each(batch):
-    return range(len(batch))
-
-
 def _sample(field, k):
     flow = field.flow_px[k].detach()
     return torch.where(field.valid[k], flow, 0.0).double().numpy()
-
-
-def _bright(films):
-    """Level that becomes white."""
-    return float(torch.quantile(films.flatten()[::7].double(), 0.99).clamp_min(1e-12))
 
 
 def _row(parts):
@@ -132,8 +125,8 @@ def _row(parts):
     return figure
 
 
-def _frame(axis, shares):
-    axis.imshow(np.clip(shares.double().numpy(), 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
+def _frame(axis, frame_and_films):
+    draw_image(axis, *frame_and_films)
 
 
 def _events(axis, counts):
@@ -196,7 +189,7 @@ def _chain(run):
         parts = [("lens", camera, _lens)] if traced else []
         frames = run["frames"].detach()
         films = frames.reshape(-1, *frames.shape[-3:])[0]
-        parts.append(("frame", films[len(films) // 2] / _bright(films), _frame))
+        parts.append(("frame", (films[len(films) // 2], films), _frame))
         parts.append(("events", run["volume"].counts[:1].sum(2), _events))
         flows = {"flow, estimated": run["field"]}
         with suppress(CodesignError):  # a recording has no truth
