@@ -54,6 +54,7 @@ class Config(StudyConfig):
         "couplings": 0,
         "read_outs": 0,
     }
+    ANEW: ClassVar = ("processes", "cluster")
     pair: str = "outdoors"
     """Robot and worlds: outdoors, corridor or flight."""
     robot: Path | None = None

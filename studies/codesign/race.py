@@ -100,14 +100,8 @@ def taken_up(path: Path, setting: Mapping[str, Any]) -> tuple[bytes, bytes]:
     lines = path.read_bytes().splitlines(keepends=True)
     judged = []
     for line in lines:
-        try:
-            _, rows = json.loads(line)
-            theirs = [dict(row["setting"]) for row in rows]
-        except (ValueError, TypeError, KeyError) as error:
-            raise FileFormatError(
-                f"'{path}' is no table of answers, or damaged; give answers.jsonl of a run."
-            ) from error
-        for each in theirs:
+        rows = _parsed(path, line)
+        for each in (row["setting"] for row in rows):
             other = [
                 name
                 for name in setting
@@ -122,6 +116,28 @@ def taken_up(path: Path, setting: Mapping[str, Any]) -> tuple[bytes, bytes]:
         ):
             judged.append(line)
     return b"".join(lines), b"".join(judged)
+
+
+def answers(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Setting and rows of a table of judged answers, each with its seed and arm.
+
+    Raises: FileFormatError for what is no such table.
+    """
+    rows = [row for line in path.read_bytes().splitlines() for row in _parsed(path, line)]
+    if not rows or not all("errors" in row for row in rows):
+        raise FileFormatError(f"'{path}' has no judged answers; give answers.jsonl of a run.")
+    return rows[0]["setting"], rows
+
+
+def _parsed(path, line):
+    """Rows of a line, with the seed and the arm that they are of."""
+    try:
+        axes, rows = json.loads(line)
+        return [{**axes, **row, "setting": dict(row["setting"])} for row in rows]
+    except (ValueError, TypeError, KeyError) as error:
+        raise FileFormatError(
+            f"'{path}' is no table of answers, or damaged; give answers.jsonl of a run."
+        ) from error
 
 
 def _alike(one, other):

@@ -23,6 +23,8 @@ class StudyConfig:
 
     QUICK: ClassVar[Mapping[str, Any]] = {}
     """What --quick sets those options to that were not given."""
+    ANEW: ClassVar[tuple[str, ...]] = ()
+    """Options that may change when a run is resumed: how it computes, not what."""
 
     quick: bool = False
     """Smaller and shorter: shows that everything works, not the best result. Options given beside
@@ -98,7 +100,7 @@ def resolved(study: str, kind: type[Config], parse: Callable[[Config], Config]) 
         What is typed and what is a default need not be told apart: the line is read again over
         other defaults.
     Raises: FileFormatError when there is no such run; DomainError when an option typed beside
-      --resume is not that of the stored run: it would have no effect.
+      --resume is not that of the stored run, and none of ANEW: it would have no effect.
     """
     asked = parse(kind())
     if asked.resume is None:
@@ -107,7 +109,10 @@ def resolved(study: str, kind: type[Config], parse: Callable[[Config], Config]) 
     known = dataclasses.replace(stored, resume=asked.resume)
     again = parse(known)
     same = {"out": asked.resume, "device": "auto"}
+    anew = {name: getattr(again, name) for name in kind.ANEW}
     for field in dataclasses.fields(kind):
+        if field.name in anew:
+            continue
         value = getattr(again, field.name)
         earlier = getattr(known, field.name)
         if value not in (earlier, same.get(field.name, earlier)):
@@ -116,7 +121,7 @@ def resolved(study: str, kind: type[Config], parse: Callable[[Config], Config]) 
                 f"{option} is {value}, but the run to resume was started with {earlier}; leave {option} "
                 "out, or start a new run."
             )
-    return known
+    return dataclasses.replace(known, **anew)
 
 
 def _plain(name, value) -> Any:

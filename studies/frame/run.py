@@ -273,6 +273,9 @@ def open_run(
     """
     if config.resume is not None:
         stored = read_config(config.resume / "config.json", study, type(config))
+        stored = dataclasses.replace(
+            stored, **{name: getattr(config, name) for name in config.ANEW}
+        )
         _hold(config.resume, held)
         remove_unfinished(config.resume)
         return Run(study, stored, config.resume, _device(stored.device), True, interruption)
@@ -343,8 +346,9 @@ def _hold(folder, held):
 
 
 def _digest(study, config):
-    """Of what a state belongs to, but for the place of its folder."""
+    """Of what a state belongs to, but for the place of its folder and how it was computed."""
     stored = json.loads(to_json(study, dataclasses.replace(config, out=None, resume=None)))
+    stored = {name: value for name, value in stored.items() if name not in config.ANEW}
     return hashlib.sha256(json.dumps(stored, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -169,6 +169,14 @@ def test_resume_refuses_only_what_differs_from_the_stored_run(out, command):
         assert complaint.count("\n") == 1
 
 
+def test_resume_takes_anew_how_it_is_computed(out, command, monkeypatch):
+    assert command("--out", out)[0] == 0
+    monkeypatch.setattr(Config, "ANEW", ("limit",))
+    assert command("--resume", out, "--limit", 0.25)[0] == 0
+    assert numbers(out)["limit"] == 0.25
+    assert command("--resume", out, "--seed", 1)[0] == 2
+
+
 def test_a_run_that_other_code_goes_on_with_says_so(out, monkeypatch, capsys):
     commits = iter(["a1", "a1", "b2", "b2"])
     monkeypatch.setattr("studies.frame.machine._commit", lambda root: next(commits))
