@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from studies.frame.listing import studies
+
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = (
     "README.md",
@@ -32,6 +34,16 @@ def test_blocks_of_a_page_run_in_one_session(page, tmp_path, monkeypatch, capsys
     names = {"__name__": "page"}
     for block in blocks:
         exec(compile(block, page, "exec"), names)
+
+
+def test_the_readme_is_short_and_names_every_study():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert text.count("\n") <= 100
+    rows = [line for line in text.splitlines() if line.startswith("| ")]
+    cells = [re.sub(r"\]\([^)]*\)", "]", cell) for row in rows for cell in row.split("|")]
+    assert max(len(cell.split()) for cell in cells) <= 20
+    named = set(re.findall(r"`(\w+)", text[text.index("## Studies") : text.index("## Limits")]))
+    assert set(studies()) <= named
 
 
 def test_the_site_builds_without_a_warning(tmp_path):
