@@ -11,7 +11,7 @@ STUDIES := lens-opt lens-report lens-scratch lens-tolerance lens-bench dataset v
 	srm-bench sensor-fit train-flow flow-quality flow-recording \
 	placement codesign speed-error stability gradcheck
 
-.PHONY: help setup docs test fuzz kill-test test-bits lint core-check try-all doctor clean $(STUDIES)
+.PHONY: help setup docs evidence test fuzz kill-test test-bits lint core-check try-all doctor clean $(STUDIES)
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1|/p' Makefile | awk -F'|' '{printf "%-24s %s\n", $$1, $$2}'
@@ -61,13 +61,19 @@ gradcheck: STUDY := gradient_flow
 docs: .venv/with-docs.stamp ## the docs as a site with search and API: open site/index.html
 	@NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet && echo "site/index.html"
 
+evidence: setup ## the figures of README and docs measured again: make evidence ARGS="lens-motion" (all: two hours)
+	@$(RUN) setup/evidence.py $(ARGS)
+
 test: setup ## all tests, on all cores
 	@$(RUN) -m pytest -n auto --maxprocesses 8 --dist worksteal $(ARGS)
 
 fuzz: setup ## mutants of every file format for hours: make fuzz ARGS="--minutes 120 --format .npz"
 	@$(RUN) -m tests.hostile fuzz $(ARGS)
 
-kill-test: setup ## long studies killed at random moments, resumed and compared: make kill-test ARGS="--count 50"
+kill-evidence: setup ## the figures of README and docs measured again: make evidence ARGS="lens-motion" (all: two hours)
+	@$(RUN) setup/evidence.py $(ARGS)
+
+test: setup ## long studies killed at random moments, resumed and compared: make kill-test ARGS="--count 50"
 	@$(RUN) -m tests.hostile kills $(ARGS)
 
 test-bits: setup ## tests that promise equal bits, as other processors and numbers of threads round

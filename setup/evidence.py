@@ -1,0 +1,187 @@
+"""Run what makes the figures of README and docs, keep them in docs/evidence.json, and write them into the pages.
+
+    make evidence                              all parts (about two hours on two cores)
+    make evidence ARGS="lens-motion joint"     named parts
+    make evidence ARGS="--write"               runs nothing: writes the kept figures into the pages
+
+A page names a figure as <!--fig:NAME-->text<!--/-->; the text is what this writes. A part that was
+cut is taken up where it stopped (runs/evidence/PART).
+
+evidence.json: {"schema": 1, "parts": {PART: {"command", "commit", "seconds", "machine", "measured":
+{folder: its tree in git}, "figures": {NAME: text}}}}.
+"""
+
+import argparse
+import json
+import math
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from codesign.atomic import write_atomic  # noqa: E402
+
+KEPT = ROOT / "docs" / "evidence.json"
+RUNS = ROOT / "runs" / "evidence"
+MARK = re.compile(r"(<!--fig:([\w.-]+)-->)(.*?)(<!--/-->)", re.S)
+Metrics = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Part:
+    """command: of a study, without --out. measured: folders whose code its figures are of.
+    figures: name -> its text from metrics.json."""
+
+    command: str
+    measured: tuple[str, ...]
+    figures: Mapping[str, Callable[[Metrics], str]]
+
+
+def ratio(stem: str, pair: str) -> Callable[[Metrics], str]:
+    """A median ratio with its interval."""
+    names = [f"{stem}_{end}_{pair}" for end in ("median", "low95", "high95")]
+    return lambda metrics: "{:.2f} ({:.2f} to {:.2f})".format(*(metrics[name] for name in names))
+
+
+def gains(comparison: str) -> Callable[[Metrics], str]:
+    """The least and the largest gain over settings, in per cent."""
+
+    def text(metrics: Metrics) -> str:
+        found = [
+            100 * (1 - math.exp(value))
+            for name, value in metrics.items()
+            if name.endswith(f"as_it_is_{comparison}")
+        ]
+        return f"{min(found):.0f} to {max(found):.0f} %"
+
+    return text
+
+
+def joint(pair: str, more: str) -> Part:
+    """The race of whole designs on a robot, from its committed answers."""
+    return Part(
+        f"codesign --pair {pair} --grid 2 --slopes 0 --couplings 0 --read-outs 0 --processes 2 "
+        f"--raw docs/joint_race_{pair}.jsonl {more}",
+        ("codesign", "scenes", "studies/codesign"),
+        {
+            f"joint.{pair}.{name}": ratio(stem, pair)
+            for name, stem in {
+                "nested-order": "nested_over_best_order",
+                "joint-order": "joint_over_best_order",
+                "joint-book": "joint_over_book",
+                "joint-default": "joint_over_default",
+            }.items()
+        },
+    )
+
+
+ORDERS = '"lens > mount > read-out" "mount > lens > read-out"'
+PARTS = {
+    "lens-motion": Part(
+        "lens_motion --raw docs/lens_motion.csv",
+        ("codesign/lens", "studies/lens_motion"),
+        {"lens-motion.spots": gains("mtf_along_spots")},
+    ),
+    "joint-outdoors": joint(
+        "outdoors",
+        f'--designs 2 --arms joint {ORDERS} book "alternating 4" CMA-ES default nested',
+    ),
+    "joint-corridor": joint("corridor", f"--designs 64 --arms joint {ORDERS} book nested default"),
+}
+
+
+def kept() -> dict[str, Any]:
+    """What docs/evidence.json has."""
+    return json.loads(KEPT.read_text(encoding="utf-8"))["parts"] if KEPT.exists() else {}
+
+
+def trees(folders: tuple[str, ...]) -> dict[str, str]:
+    """The tree that git has of each folder at the present commit."""
+    said = [
+        subprocess.run(
+            ["git", "rev-parse", f"HEAD:{folder}"], cwd=ROOT, capture_output=True, text=True
+        ).stdout.strip()
+        for folder in folders
+    ]
+    return dict(zip(folders, said, strict=True))
+
+
+def stale(name: str, part: Mapping[str, Any]) -> list[str]:
+    """Folders whose code has changed since a part's figures were measured."""
+    now = trees(tuple(part["measured"]))
+    return [folder for folder, tree in part["measured"].items() if now[folder] != tree]
+
+
+def measured(name: str) -> dict[str, Any]:
+    """Run a part, or go on with it, and give what is kept of it."""
+    part, folder = PARTS[name], RUNS / name
+    words = shlex.split(part.command)
+    command = [sys.executable, "-m", f"studies.{words[0]}"]
+    begun = (folder / "config.json").exists()
+    command += ["--resume", str(folder)] if begun else [*words[1:], "--out", str(folder)]
+    subprocess.run(command, cwd=ROOT, check=True)
+    metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    return {
+        "command": f"python -m studies.{part.command}",
+        "commit": metrics["versions"]["commit"],
+        "seconds": round(metrics.get("seconds", 0)),
+        "machine": f"{metrics['hardware']['cpu']}, {metrics['hardware']['cores']} cores",
+        "measured": trees(part.measured),
+        "figures": {figure: text(metrics) for figure, text in part.figures.items()},
+    }
+
+
+def pages() -> list[Path]:
+    """Those that may name figures."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def written(text: str, figures: Mapping[str, str]) -> str:
+    """A page with its figures as they are kept.
+
+    Raises: KeyError for a figure that no part has.
+
+    >>> written("gains <!--fig:a-->?<!--/--> less", {"a": "16 %"})
+    'gains <!--fig:a-->16 %<!--/--> less'
+    """
+    return MARK.sub(lambda found: found[1] + figures[found[2]] + found[4], text)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Returns the exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}; else all")
+    parser.add_argument("--write", action="store_true", help="run nothing")
+    asked = parser.parse_args(arguments)
+    unknown = [name for name in asked.parts if name not in PARTS]
+    if unknown:
+        print(f"error: {unknown[0]} is no part; choose from {', '.join(PARTS)}.", file=sys.stderr)
+        return 2
+    known = kept()
+    for name in [] if asked.write else asked.parts or PARTS:
+        known[name] = measured(name)
+        text = json.dumps({"schema": 1, "parts": known}, indent=1, ensure_ascii=False)
+        write_atomic(KEPT, f"{text}\n".encode())
+    figures = {name: text for part in known.values() for name, text in part["figures"].items()}
+    for page in pages():
+        before = page.read_text(encoding="utf-8")
+        if (after := written(before, figures)) != before:
+            write_atomic(page, after.encode())
+            print(f"{page.relative_to(ROOT)}: figures written")
+    for name, part in known.items():
+        for folder in stale(name, part):
+            print(f"{name}: {folder} has changed since {part['commit'][:8]}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

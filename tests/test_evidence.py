@@ -1,0 +1,58 @@
+"""Figures in README and docs are those that docs/evidence.json has, and say when they are old."""
+
+import importlib.util
+import math
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+SPEC = importlib.util.spec_from_file_location("evidence", ROOT / "setup" / "evidence.py")
+assert SPEC is not None
+assert SPEC.loader is not None
+evidence = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(evidence)
+
+
+def figures():
+    return {
+        name: text for part in evidence.kept().values() for name, text in part["figures"].items()
+    }
+
+
+def test_pages_have_the_figures_that_are_kept():
+    for page in evidence.pages():
+        text = page.read_text(encoding="utf-8")
+        assert evidence.written(text, figures()) == text, page
+        # a half-written mark would be typed by hand from then on
+        assert len(re.findall("<!--fig:", text)) == len(evidence.MARK.findall(text)), page
+
+
+def test_what_is_kept_is_what_the_parts_make():
+    assert set(evidence.kept()) <= set(evidence.PARTS)
+    for name, part in evidence.kept().items():
+        made = evidence.PARTS[name]
+        assert part["command"] == f"python -m studies.{made.command}"
+        assert set(part["figures"]) == set(made.figures)
+        assert set(part["measured"]) == set(made.measured)
+
+
+def test_texts_of_metrics():
+    metrics = {"a_median_p": 0.714, "a_low95_p": 0.5651, "a_high95_p": 0.92}
+    assert evidence.ratio("a", "p")(metrics) == "0.71 (0.57 to 0.92)"
+    logs = {"x_as_it_is_b_c": math.log(0.84), "y_as_it_is_b_c": math.log(0.72), "y_turned_b_c": 1.0}
+    assert evidence.gains("b_c")(logs) == "16 to 28 %"
+    with pytest.raises(KeyError):
+        evidence.written("<!--fig:nowhere--><!--/-->", {})
+
+
+@pytest.mark.parametrize("name", evidence.kept())
+def test_figures_are_of_this_code(name):
+    git = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True)
+    if git.returncode:
+        pytest.skip("this is no checkout of git")
+    old = evidence.stale(name, evidence.kept()[name])
+    if old:
+        pytest.xfail(f"{', '.join(old)} changed since its figures: make evidence ARGS={name}")
