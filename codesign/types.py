@@ -45,6 +45,11 @@ class EventStream:
     def __len__(self):
         return int(self.t_us.numel())
 
+    def __repr__(self):
+        lasts_ms = 1e-3 * int(self.t_us[-1] - self.t_us[0]) if len(self) else 0.0
+        on = int((self.p > 0).sum())
+        return f"EventStream({len(self):,} events, {on:,} of them ON, in {lasts_ms:.4g} ms, {self.width_px} x {self.height_px} px)"
+
 
 @dataclass(frozen=True)
 class EventVolume:
@@ -60,6 +65,10 @@ class EventVolume:
     counts: Tensor
     centroid_s: Tensor
     collected_s: Tensor
+
+    def __repr__(self):
+        events, lasts_ms = float(self.counts.sum()), 1e3 * float(self.collected_s.sum())
+        return f"EventVolume({list(self.counts.shape)}, {events:,.0f} events in {lasts_ms:.4g} ms)"
 
 
 @dataclass(frozen=True)
@@ -83,6 +92,12 @@ class FlowField:
     confidence: Tensor | None = None
     covariance_px2: Tensor | None = None
     net_share: Tensor | None = None
+
+    def __repr__(self):
+        lengths = self.flow_px.detach().norm(dim=1)[self.valid]
+        median = f"{float(lengths.median()):.3g} px in the median, " if len(lengths) else ""
+        share = float(self.valid.double().mean())
+        return f"FlowField({list(self.flow_px.shape)}, {median}{share:.0%} valid, over {1e3 * self.interval_s:.4g} ms)"
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ A page names a figure as <!--fig:NAME-->text<!--/-->; the text is what this writ
 cut is taken up where it stopped (runs/evidence/PART).
 
 evidence.json: {"schema": 1, "parts": {PART: {"command", "commit", "seconds", "machine", "measured":
-{folder: its tree in git}, "figures": {NAME: text}}}}.
+{folder: its tree in git}, "figures": {NAME: text}, "pictures": [FILE in docs]}}}.
 """
 
 import argparse
@@ -19,7 +19,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -37,11 +37,12 @@ Metrics = Mapping[str, Any]
 @dataclass(frozen=True)
 class Part:
     """command: of a study, without --out. measured: folders whose code its figures are of.
-    figures: name -> its text from metrics.json."""
+    figures: name -> its text from metrics.json. pictures: file in docs -> file of the run."""
 
     command: str
     measured: tuple[str, ...]
-    figures: Mapping[str, Callable[[Metrics], str]]
+    figures: Mapping[str, Callable[[Metrics], str]] = field(default_factory=dict)
+    pictures: Mapping[str, str] = field(default_factory=dict)
 
 
 def ratio(stem: str, pair: str) -> Callable[[Metrics], str]:
@@ -79,11 +80,14 @@ def joint(pair: str, more: str) -> Part:
                 "joint-default": "joint_over_default",
             }.items()
         },
+        {f"joint_race_{pair}.png": "ratios.png", f"joint_designs_{pair}.png": "designs.png"},
     )
 
 
 ORDERS = '"lens > mount > read-out" "mount > lens > read-out"'
 PARTS = {
+    "chain": Part("chain_picture", ("codesign", "scenes"), pictures={"chain.png": "chain.png"}),
+    "hero": Part("hero", ("codesign", "scenes"), pictures={"hero.webp": "hero.webp"}),
     "lens-motion": Part(
         "lens_motion --raw docs/lens_motion.csv",
         ("codesign/lens", "studies/lens_motion"),
@@ -127,6 +131,8 @@ def measured(name: str) -> dict[str, Any]:
     begun = (folder / "config.json").exists()
     command += ["--resume", str(folder)] if begun else [*words[1:], "--out", str(folder)]
     subprocess.run(command, cwd=ROOT, check=True)
+    for picture, made in part.pictures.items():
+        write_atomic(ROOT / "docs" / picture, (folder / made).read_bytes())
     metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
     return {
         "command": f"python -m studies.{part.command}",
@@ -135,6 +141,7 @@ def measured(name: str) -> dict[str, Any]:
         "machine": f"{metrics['hardware']['cpu']}, {metrics['hardware']['cores']} cores",
         "measured": trees(part.measured),
         "figures": {figure: text(metrics) for figure, text in part.figures.items()},
+        "pictures": list(part.pictures),
     }
 
 
@@ -174,6 +181,9 @@ def main(arguments: list[str] | None = None) -> int:
     figures = {name: text for part in known.values() for name, text in part["figures"].items()}
     for page in pages():
         before = page.read_text(encoding="utf-8")
+        if missing := {name for _, name, *_ in MARK.findall(before)} - set(figures):
+            print(f"error: {page.name} names {min(missing)}, not measured yet.", file=sys.stderr)
+            return 2
         if (after := written(before, figures)) != before:
             write_atomic(page, after.encode())
             print(f"{page.relative_to(ROOT)}: figures written")

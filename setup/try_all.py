@@ -41,7 +41,18 @@ NEEDS = re.compile(r"\b(?:give|needs?|pass|with|required:)\b.*?(--[a-z][a-z-]*)"
 # what is no study is made short by what it is given last
 SHORT = {"fuzz": ["--minutes", "1"], "kill-test": ["--count", "1"]}
 KEPT = ROOT / "runs" / "try_all.jsonl"
-ELSEWHERE = ("help", "setup", "docs", "evidence", "test", "test-bits", "lint", "core-check", "clean", "try-all")
+ELSEWHERE = (
+    "help",
+    "setup",
+    "docs",
+    "evidence",
+    "test",
+    "test-bits",
+    "lint",
+    "core-check",
+    "clean",
+    "try-all",
+)
 
 
 def commands() -> dict[str, str]:

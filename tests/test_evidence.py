@@ -37,6 +37,8 @@ def test_what_is_kept_is_what_the_parts_make():
         assert part["command"] == f"python -m studies.{made.command}"
         assert set(part["figures"]) == set(made.figures)
         assert set(part["measured"]) == set(made.measured)
+        assert part["pictures"] == list(made.pictures)
+        assert all((ROOT / "docs" / name).exists() for name in made.pictures)
 
 
 def test_texts_of_metrics():

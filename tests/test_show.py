@@ -5,8 +5,9 @@ import pytest
 import torch
 
 import codesign
-from codesign import lens
+from codesign import lens, render
 from codesign.errors import DomainError, ShapeError
+from codesign.system.result import Result
 from codesign.types import EventStream, EventVolume, FlowField
 
 
@@ -78,3 +79,27 @@ def test_a_lens_is_drawn_with_rays_to_its_field_and_a_notebook_shows_it():
 def test_what_cannot_be_drawn_is_refused_in_a_sentence(given, error, sentence):
     with pytest.raises(error, match=sentence):
         codesign.show(given)
+
+
+def test_results_are_printed_in_a_line_each():
+    stamps = torch.tensor([1_000, 2_000, 6_000])
+    stream = EventStream(stamps, stamps * 0, stamps * 0, torch.tensor([1, -1, 1]), 180, 240)
+    assert repr(stream) == "EventStream(3 events, 2 of them ON, in 5 ms, 240 x 180 px)"
+    counts = torch.zeros(1, 2, 2, 4, 6)
+    counts[0, 0, 1, 2, 3] = 1500
+    volume = EventVolume(counts, torch.tensor([0.01, 0.03]), torch.tensor([0.02, 0.02]))
+    assert repr(volume) == "EventVolume([1, 2, 2, 4, 6], 1,500 events in 40 ms)"
+    flow_px = torch.zeros(1, 2, 4, 4)
+    flow_px[:, 0], flow_px[:, 1] = 3, 4
+    valid = torch.ones(1, 4, 4, dtype=torch.bool)
+    valid[:, :, :1] = False
+    field = FlowField(flow_px, valid, 0.05)
+    assert repr(field) == "FlowField([1, 2, 4, 4], 5 px in the median, 75% valid, over 50 ms)"
+    valid[:] = False
+    assert repr(field) == "FlowField([1, 2, 4, 4], 0% valid, over 50 ms)"
+    camera = render.Camera(lens.Pinhole(4.0), 8, 6, 0.1, samples_per_pixel=4)
+    assert repr(camera).endswith(", 6 x 8 pixels of 0.1 mm, 4 rays each)")
+    assert (
+        repr(Result({"error": torch.tensor(0.25)}, None, None, None, None, None))
+        == "Result(error=0.25)"
+    )

@@ -177,6 +177,13 @@ class Camera:
         """Upright image position in millimetres of pixel coordinates [N, 2]."""
         return (pixels - self.film.middle_px.to(pixels)) * self.film.pixel_pitch_mm
 
+    def __repr__(self):
+        pixels = " x ".join(str(size) for size in self.film.shape)
+        return (
+            f"Camera({self.lens!r}, {pixels} pixels of {self.film.pixel_pitch_mm:g} mm, "
+            f"{self.samples_per_pixel} rays each)"
+        )
+
     def given(self, rays: Rays | None) -> Rays:
         """The same rays, or newly traced ones for None. Raises: ShapeError unless they are as many
         as this camera has."""

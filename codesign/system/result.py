@@ -44,6 +44,13 @@ class Result:
     junctions: dict[str, tuple[Tensor, ...]] | None
     check_passes: float | None = None
 
+    def __repr__(self):
+        told = ", ".join(
+            f"{name}={float(value):.4g}" if value.numel() == 1 else f"{name}{list(value.shape)}"
+            for name, value in self.objectives.items()
+        )
+        return f"Result({told})"
+
     @property
     def loss(self) -> Tensor:
         """The only objective. Raises: DomainError when there are several."""
