@@ -73,7 +73,7 @@ def place_in_words(problem: Problem, share: Tensor) -> str:
     """Position and attitude of a mount."""
     x, y, z, yaw, pitch, roll = problem.ranges.numbers(share).tolist()
     turned = ", ".join(
-        f"{name} {math.degrees(angle):+.0f}°"
+        f"{name} {round(math.degrees(angle)):+d}°".replace("-", "−")
         for name, angle in (("yaw", yaw), ("pitch", pitch), ("roll", roll))
     )
     return f"({x:.2f}, {y:.2f}, {z:.2f}) m, {turned}"
