@@ -78,7 +78,11 @@ def study(run: Run[Config]):
         "Lens, middle frame, signed events, flow as estimated and as it is.",
         dpi=110,
     )
-    run.finish("The chain in one picture", "One pass from glass to flow, with the hard sensor.")
+    run.finish(
+        "The chain in one picture",
+        f"The estimated flow is off by {error:.2f} px where the picture moves by {moved:.2f} px: one pass from glass to "
+        "flow, with the hard sensor.",
+    )
 
 
 if __name__ == "__main__":

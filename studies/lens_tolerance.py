@@ -112,15 +112,19 @@ def study(run: Run[Config]):
         trials, figures=trials.figures[:, :count], nominal=trials.nominal[:count]
     )
     report_linear(run, slopes, first)
+    grown = []
     for k, (name, forecast) in enumerate(forecasts.items()):
         squares = trials.figures[:, count + k * len(FIELDS) :][:, : len(FIELDS)]
-        report_spot(run, name, forecast, trials.amounts, squares)
+        grown.append(
+            f"{report_spot(run, name, forecast, trials.amounts, squares)} (image plane {name})"
+        )
     report_offenders(run, geo, tolerances, slopes, forecasts)
     report_needed(run, geo, fixed, refocus)
     run.record(trials=config.trials, failed_trials=trials.failed, errors=errors)
     run.finish(
         "Tolerances",
-        f"{geo.name}, half field {math.degrees(half_field):.3g} degrees, {config.trials} trials of {errors} "
+        f"Such errors make the RMS spot grow {' or '.join(grown)}: root mean square over the lenses, in the field where it "
+        f"grows most. {geo.name}, half field {math.degrees(half_field):.3g} degrees, {config.trials} trials of {errors} "
         f"errors, of which {trials.failed} failed. Every tolerance is one standard deviation of an "
         "independent normal error.",
     )
@@ -186,7 +190,14 @@ def report_linear(run, slopes, trials):
         figures = {"nominal": trials.nominal[k], **known, "mean shift / deviation": found.bias[k]}
         figures |= {f"{q:.0%}": value for q, value in zip(QUANTILES, quantiles[:, k], strict=True)}
         rows.append(
-            {"figure": name, **{title: f"{float(value):.6g}" for title, value in figures.items()}}
+            # what is 0 by symmetry is shown as 0, not as its rounding
+            {
+                "figure": name,
+                **{
+                    title: f"{round(float(value), 12) + 0.0:.6g}"
+                    for title, value in figures.items()
+                },
+            }
         )
     run.card(
         "Linear figures",
@@ -218,7 +229,8 @@ def report_linear(run, slopes, trials):
 
 
 def report_spot(run, name, forecast, amounts, squares):
-    """Table, figure and metrics of the spot, with the image plane fixed or refocused."""
+    """Table, figure and metrics of the spot, with the image plane fixed or refocused; returns from
+    what to what it grows in the field where it grows most."""
     good = squares.isfinite().all(1)
     squares = squares[good]
     predicted = forecast.at(amounts[good])
@@ -294,6 +306,8 @@ def report_spot(run, name, forecast, amounts, squares):
         f"spot_{name}",
         "Distribution of the RMS spot: trials, and draws of the quadratic forecast.",
     )
+    most = int((mean / forecast.nominal).argmax())
+    return f"from {float(nominal_um[most]):.2f} to {1e3 * float(mean[most].sqrt()):.2f} µm"
 
 
 def report_offenders(run, geo, tolerances, slopes, forecasts):

@@ -1,6 +1,7 @@
 """What may enter an event layer: frames, thresholds, times. Everything else is refused with a
 sentence."""
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,6 +22,7 @@ REAL = (
     torch.int32,
     torch.int16,
 )
+PICTURE = 256  # values from which on the scale of frames can be judged
 MOST_VALUES = 2**32  # that are made in one call: 16 GB in single precision
 
 
@@ -41,6 +43,25 @@ def check_frames(
     least = 0.0 if non_negative else None
     remedy = "intensities are 0 or more: subtract the black level first" if non_negative else ""
     return check(frames, axes, name, FLOATS, least=least, finite=True, remedy=remedy)
+
+
+def on_unit_scale(frames: Tensor) -> bool:
+    """Whether linear frames seem to be on 0 to 1, on which the sensor sees nothing but black: the
+    brightest is above 0 and at most 1. Others are mostly told by the first frame alone."""
+    if frames.numel() < PICTURE or float(frames[:1].detach().max()) > 1:
+        return False
+    return 0 < float(frames.detach().max()) <= 1
+
+
+def warn_of_scale(frames: Tensor, log_input: bool) -> None:
+    """Warn of linear frames that seem to be on 0 to 1."""
+    if not log_input and on_unit_scale(frames):
+        warnings.warn(
+            "no frame is brighter than 1; frames are linear light on the scale 0 to 255, on which these are "
+            "black and make hardly an event: multiply by 255 if they are on 0 to 1.",
+            UserWarning,
+            stacklevel=2,
+        )
 
 
 def check_per_pixel(

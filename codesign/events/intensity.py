@@ -9,7 +9,7 @@ from torch import Tensor
 
 from codesign import backend
 from codesign.checks import check_flag
-from codesign.events.entry import check_frames
+from codesign.events.entry import check_frames, warn_of_scale
 from codesign.exclusive import exclusive
 
 JOINT = 20.0  # intensity on the 0-255 scale where the linear part meets the logarithm
@@ -115,4 +115,5 @@ def log_levels(frames: Tensor, log_input: bool, minimum: int) -> Tensor:
     """Check frames and bring them to log intensity; ``log_input`` says that they already are."""
     front_end = FrontEnd(log_input)
     check_frames(frames, minimum, non_negative=not log_input)
+    warn_of_scale(frames, log_input)
     return front_end.level(frames)

@@ -29,7 +29,8 @@ ENDINGS = (".svg", ".png", ".pdf")
 
 def degrees(angle_rad: float) -> str:
     """An angle as it stands in a title."""
-    return f"{math.degrees(angle_rad):.3g}°"
+    # neither −0 nor what rounding leaves of it
+    return f"{round(math.degrees(angle_rad), 6) + 0.0:.3g}°"
 
 
 def coloured(fields_rad: Sequence[float]) -> Iterator[tuple[float, str]]:

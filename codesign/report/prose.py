@@ -37,6 +37,11 @@ def plain(text: str) -> str:
     return text
 
 
+def counted(count: int, noun: str) -> str:
+    """Counts in a sentence: "1 start", "3 starts". noun: one that takes an s."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def _block(block):
     lines = [line.strip() for line in block.splitlines()]
     if all(line.startswith("- ") for line in lines):

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from codesign.checks import check, check_kind
 from codesign.errors import DomainError
+from codesign.events.entry import on_unit_scale
 from codesign.types import EventVolume, FlowField, Rays
 
 LAYOUT = {
@@ -22,7 +23,6 @@ LAYOUT = {
     },
 }
 OPTIONAL = ("confidence", "covariance_px2")
-PICTURE = 256  # values from which on the scale of frames can be judged
 LONGEST_S = 2.0  # a window of flow that lasts longer is in milliseconds
 
 
@@ -66,7 +66,7 @@ def look_at(by: str, value: Any) -> None:
             f"{by} counts down to {low:.3g}; numbers of events are 0 or more, ON first: a signed change belongs into "
             "two channels, change.relu() and (-change).relu()."
         )
-    if tensor is value and low >= 0 and 0 < high <= 1 and tensor.numel() >= PICTURE:
+    if tensor is value and low >= 0 and on_unit_scale(value):
         warn(
             f"{by} between {low:.3g} and {high:.3g}; the scale is 0 to 255, on which these are black: multiply "
             "by 255 if they are on 0 to 1."

@@ -7,6 +7,7 @@ import torch
 
 from codesign.flow.contrast import count_image, stream_tracks
 from codesign.report.flow_colours import flow_colours
+from codesign.report.prose import counted
 from studies.frame.show import pictures as show_pictures
 
 SHARPER = 1.02  # times the truth's FWL: estimates are sharper than a truth that is right by less
@@ -73,7 +74,26 @@ def show(run, packets, rows, names, film):
         run.section("Video", film.sentence)
         run.video(film.path.name, film.caption)
     source = "a synthetic recording" if synthetic else f"`{run.config.recording}`"
-    run.finish("Event flow on a recording", f"{len(packets)} packets of {source}.")
+    run.finish(
+        "Event flow on a recording",
+        f"{answer(best, main)} Means of {counted(len(packets), 'packet')} of {source}.",
+    )
+
+
+def answer(name, means):
+    """How well an estimator works on a recording, by its mean figures."""
+    said = []
+    if "aee_px" in means:
+        share = means["aee_px"] / max(means["zero_aee_px"], 1e-9)
+        said.append(
+            f"errs by {means['aee_px']:.2f} px where events are, {share:.2f} times what zero flow does"
+        )
+    if "fwl" in means:
+        sharper = f"{means['fwl_above_1_share']:.0%} of the packets (FWL {means['fwl']:.2f})"
+        said.append(f"sharpens the events of {sharper}, warped along it")
+    return (
+        f"The flow of '{name}' {', and '.join(said) or 'cannot be judged: no packet has events'}."
+    )
 
 
 def _key(name):

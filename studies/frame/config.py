@@ -30,7 +30,8 @@ class StudyConfig:
     """Smaller and shorter: shows that everything works, not the best result. Options given beside
     it count."""
     out: Path | None = None
-    """Folder for the results; runs/<study>/<time> when left out."""
+    """Folder for the results, taken from where the command is run; runs/<study>/<time> there when
+    left out."""
     seed: int = 0
     """Seed of everything random in the run."""
     device: Literal["auto", "cpu", "cuda"] = "auto"

@@ -52,6 +52,7 @@ FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 NO_ROOM = "No usable temporary directory"  # of Python's, on a full disk
 RESERVED = ("versions", "hardware")
 VERSION = 2  # of the frame's part of state.npz
+QUICK = "A quick run, which decides nothing."
 TIMES = "times"  # of the frame itself, among the numbers of state.npz
 
 
@@ -223,7 +224,13 @@ class Run(Generic[Config]):
         return path
 
     def finish(self, title: str, lead: str):
-        """Write metrics.json and report.html. Returns the path of the page."""
+        """Write metrics.json and report.html. Returns the path of the page.
+
+        lead: answers the study's question in its first sentence; a quick run says before it that it
+          decides nothing.
+        """
+        if self.config.quick:
+            lead = f"{QUICK} {lead}"
         self.record()
         configuration = json.loads(to_json(self.study, self.config))
         facts = {

@@ -77,11 +77,15 @@ def study(run: Run[Config]) -> None:
     ]
     first_order(run, geo, light, half_deg, at_m)
     seidel(run, geo, math.radians(half_deg), light[0], at_m)
-    pictures(run, geo, fields, light, quick, at_m)
+    radii = pictures(run, geo, fields, light, quick, at_m)
     sharpness(run, geo, fields, light, quick, at_m)
     depth(run, geo, fields, light[0], distances)
     run.record(half_field_deg=half_deg, seconds=time.perf_counter() - start)
-    run.finish(f"Lens report: {geo.name}", " ".join(notes))
+    spots = [
+        f"{radius:.1f} µm at {degrees(field)}" for field, radius in zip(fields, radii, strict=True)
+    ]
+    said = f"At f/{run.metrics['fno']:.3g} the lens makes RMS spots of {', '.join(spots)}."
+    run.finish(f"Lens report: {geo.name}", " ".join([said, *notes]))
 
 
 def half_field(geo, wanted_deg, wavelength_um, at_m=math.inf):
@@ -199,7 +203,7 @@ def seidel(run, geo, half_rad, wavelength_um, at_m):
 
 
 def pictures(run, geo, fields, light, quick, at_m):
-    """Layout, spots, fans, field errors."""
+    """Layout, spots, fans, field errors; returns the RMS spots, µm."""
     run.section("Layout")
     run.figure(
         lens_figures.lens_layout(geo, fields, at_m=at_m),
@@ -230,6 +234,7 @@ def pictures(run, geo, fields, light, quick, at_m):
         "Field curvature of thin bundles, distortion against f tan, and lateral colour of the chief ray.",
     )
     rows = []
+    radii = []
     for field in fields:
         positions, weight = analysis.polychromatic_spot(geo, field, light, 32, True, at_m=at_m)
         shift = analysis.focus_shift_mm(geo, [field], light[0], at_m=at_m)[0]
@@ -241,6 +246,7 @@ def pictures(run, geo, fields, light, quick, at_m):
         record_at(
             run, field, rms_spot_um=radius, distortion_percent=distortion, passed_share=passed
         )
+        radii.append(radius)
         foci = (f"{float(s):.4f}" for s in shift)
         rows.append((degrees(field), f"{radius:.2f}", f"{distortion:.3f}", *foci, f"{passed:.3f}"))
     run.table(
@@ -249,6 +255,7 @@ def pictures(run, geo, fields, light, quick, at_m):
         + ("share that passes",),
         rows,
     )
+    return radii
 
 
 def record_at(run, field, **figures):

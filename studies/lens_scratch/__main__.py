@@ -22,6 +22,7 @@ from codesign import lens
 from codesign.errors import DomainError
 from codesign.lens.design.constraints import active
 from codesign.report import lens_figures
+from codesign.report.prose import counted
 from studies.frame.compare import share
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.show import table
@@ -120,9 +121,18 @@ def show(run, published, found):
     run.table("Seeds", *table(rows))
     run.finish(
         "A lens from plane plates",
-        "Three glasses in a given order, a stop, a focal length and limits; no start design, no drawing "
+        f"{answer(run)} Three glasses in a given order, a stop, a focal length and limits; no start design, no drawing "
         "from known lenses.",
     )
+
+
+def answer(run):
+    """Whether the published lens is reached, and from how many starts."""
+    of = [
+        f"{run.metrics[f'{method}_seeds_succeeded']} of {counted(run.metrics[f'{method}_seeds'], 'start')} ({method})"
+        for method in run.config.methods
+    ]
+    return f"{ALLOWED:g} times the spot of {YARDSTICK} or less is reached from {', '.join(of)}."
 
 
 def layouts(published, found):

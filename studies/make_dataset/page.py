@@ -8,6 +8,7 @@ import torch
 
 from codesign.events import picture, to_counts
 from codesign.report.flow_colours import flow_colours
+from codesign.report.prose import counted
 from codesign.types import EventStream
 from studies.frame.show import pictures, table
 from studies.make_dataset.store import h5
@@ -93,7 +94,7 @@ def show(run, names, spent, wall_s, frames_made):
     run.record(
         **{f"session_{part.replace(' ', '_')}_s": seconds for part, seconds in spent.items()}
     )
-    run.card("Frames", f"{frames}", f"in {len(names)} sequences")
+    run.card("Frames", f"{frames}", f"in {counted(len(names), 'sequence')}")
     run.card(
         "Events",
         f"{events / 1e6:.2f} million",
@@ -120,7 +121,8 @@ def show(run, names, spent, wall_s, frames_made):
     run.text("`manifest.json` holds the SHA-256 of every file; `docs/datasets.md` the layout.")
     run.finish(
         "Data set",
-        f"{len(names)} sequences, {frames} frames and {events} events, {disk_mb:.0f} MB.",
+        f"{counted(len(names), 'sequence')} with {counted(frames, 'frame')}, their flow, depth and poses, and {events} events, "
+        f"{disk_mb:.0f} MB, are complete in this folder.",
     )
 
 

@@ -3,6 +3,7 @@ that is the robot itself, whether the mount keeps what is required, and what mot
 to."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from codesign.mount import (
     VELOCITIES,
     Body,
     OwnBody,
+    Sight,
     Surroundings,
     judge,
     sight,
@@ -23,6 +25,7 @@ from codesign.mount import (
     sight_units,
     yaw_pitch_roll_rad,
 )
+from codesign.mount.requirements import Verdict
 from codesign.report.mount_sphere import mount_sphere
 from scenes.robots import pair as robot_pair
 from scenes.robots.pair import RobotPair
@@ -49,9 +52,11 @@ def look(run: Run[Any], pair: RobotPair, camera: render.Camera) -> None:
         "Left: the robot in its own axes (m) and its camera's view; right: the frame (gamma 2.2, 255 is white), the windows "
         "that are read outlined.",
     )
-    run.text("Requirements: " + "; ".join(map(str, judge(pair.requirements(), pose, camera))) + ".")
+    verdicts = judge(pair.requirements(), pose, camera)
+    run.text("Requirements: " + "; ".join(map(str, verdicts)) + ".")
     around = surroundings(pair, pose)
-    if what_it_tells(run, pair, camera, pose, "default"):
+    told = what_it_tells(run, pair, camera, pose, "default")
+    if told:
         names = [VELOCITIES[axis] for axis in around.axes]
         table = sight_table(camera, around)
         for attitude in ATTITUDES:
@@ -77,8 +82,21 @@ def look(run: Run[Any], pair: RobotPair, camera: render.Camera) -> None:
             ],
             "Blind to: worse than 0.1 m/s or 0.1 rad/s. Weakest motion: shares of the units in which it is hardest to see.",
         )
-    run.finish(
-        "A robot and its camera", f"What the camera of '{pair.name}' sees from its default mount."
+    run.finish("A robot and its camera", answer(pair, own_share, verdicts, told))
+
+
+def answer(
+    pair: RobotPair, own_share: float, verdicts: Sequence[Verdict], told: Sight | None
+) -> str:
+    """What a mount is blind to, sees of its robot and keeps, in one sentence."""
+    blind = "stands too low to tell any motion"
+    if told:
+        blind = f"is blind to {', '.join(told.blind()) or 'no motion'} over flat ground"
+    missed = [each.name for each in verdicts if not each.kept]
+    keeps = f"misses what is required: {', '.join(missed)}" if missed else "keeps all requirements"
+    return (
+        f"From its default mount the camera of '{pair.name}' {blind}; its own body fills {own_share:.1%} of the view, and "
+        f"the mount {keeps}."
     )
 
 
@@ -106,13 +124,13 @@ def what_it_tells(
     camera: render.Camera,
     pose: Tensor,
     marked: str,
-) -> bool:
-    """Show what a mount [4, 4] is blind to over flat ground, and all other directions there; False
+) -> Sight | None:
+    """Show what a mount [4, 4] is blind to over flat ground, and all other directions there; None
     where it is too low."""
     around = surroundings(pair, pose)
     height = float(pose[2, 3] + around.T_world_body[2, 3])
     if height <= LEAST_HEIGHT_M:
-        return False
+        return None
     told = sight(around.information(camera, pose)[0], sight_units(around), around.axes)
     run.text(
         f"{height:.2f} m over flat ground the motion that shows least from there is {told.weakest_named()} (in units of "
@@ -126,4 +144,4 @@ def what_it_tells(
         "What the place allows: the error that flow over flat ground lets expect, over all directions the camera may look in "
         "(27 points of 5 px/s).",
     )
-    return True
+    return told

@@ -13,16 +13,18 @@ from torch import Tensor
 from codesign.mount.pose import NAMES
 from studies.frame.compare import median_ratio, ratio_of_means
 from studies.placement.problem import Problem
-from studies.placement.race import GRADIENT, Race
+from studies.placement.race import DEFAULT, GRADIENT, Race
 
 RESAMPLED = 4000
 INTERVAL = 0.9
+# of fewer paired units all may be ahead by chance at that level: 2 / 2^4 > 1 - INTERVAL > 2 / 2^5
+LEAST_UNITS = 5
 
 
 @dataclass(frozen=True)
 class Paired:
     """Ratio of errors, ours over theirs, over paired starts: median and interval of resampled
-    starts; how many below 1."""
+    starts, which is shown of LEAST_UNITS or more; how many below 1."""
 
     median: float
     low: float
@@ -33,7 +35,8 @@ class Paired:
     def __str__(self):
         if self.count == 1:
             return f"{self.median:.2f}, one start"
-        return f"{self.median:.2f} ({self.low:.2f} to {self.high:.2f}), ahead {self.ahead} of {self.count}"
+        interval = f" ({self.low:.2f} to {self.high:.2f})" if self.count >= LEAST_UNITS else ""
+        return f"{self.median:.2f}{interval}, ahead {self.ahead} of {self.count}"
 
 
 def paired(ours: Tensor, theirs: Tensor) -> Paired:
@@ -76,7 +79,7 @@ class Outcome:
     @cached_property
     def errors(self) -> dict[str, Tensor]:
         """Mean errors of the starts and of what each search ends with, [starts]."""
-        names = dict.fromkeys(name for _, name in self.judged if name != "default")
+        names = dict.fromkeys(name for _, name in self.judged if name != DEFAULT)
         return {
             name: torch.stack([self.judged[number, name].mean() for number in range(self.starts)])
             for name in names
@@ -93,22 +96,37 @@ class Outcome:
         }
 
     @cached_property
-    def best(self) -> int | None:
-        """Number of the descent that training samples choose; None: they choose the pair's own
-        mount."""
+    def best(self) -> tuple[int, str]:
+        """Start and search of the answer that training samples choose, whoever found it;
+        (0, DEFAULT): they choose the pair's own mount."""
         return self.race.chosen(self.starts)
+
+    @property
+    def found_by(self) -> str:
+        """The search that found the answer, in words."""
+        name = self.best[1]
+        return {
+            DEFAULT: "the robot's own design",
+            GRADIENT: "the gradient",
+            "random": "random search",
+        }.get(name, name)
+
+    @property
+    def groups(self) -> int:
+        """Unseen worlds, or groups of drives through the one world, that intervals resample."""
+        return len(self.unseen.numbers)
 
     @property
     def answered(self) -> Tensor:
         """Errors [N] of the answer."""
-        return self.judged[(0, "default") if self.best is None else (self.best, GRADIENT)]
+        return self.judged[self.best]
 
     @property
     def share(self) -> Tensor:
         """The mount [6] that is the answer."""
-        return (
-            self.race.problem.start if self.best is None else self.race.answer(self.best, GRADIENT)
-        )
+        if self.best[1] == DEFAULT:
+            return self.race.problem.start
+        return self.race.answer(*self.best)
 
     @property
     def pose(self) -> Tensor:
@@ -123,13 +141,13 @@ class Outcome:
     @property
     def default_error(self) -> float:
         """Mean error of the pair's own mount."""
-        return float(self.judged[0, "default"].mean())
+        return float(self.judged[0, DEFAULT].mean())
 
     @property
     def over_default(self) -> tuple[float, float, float]:
         """Ratio of the answer's error to that of the pair's own mount, and its interval over
         worlds."""
-        return over_worlds(self.answered, self.judged[0, "default"], len(self.unseen.numbers))
+        return over_worlds(self.answered, self.judged[0, DEFAULT], self.groups)
 
     def metrics(self) -> dict[str, float | int]:
         """By name."""
@@ -138,18 +156,19 @@ class Outcome:
             "default_error": self.default_error,
             "samples_per_search": self.race.samples(0, GRADIENT),
             "samples_judged": self.unseen.samples,
-            "chosen_start": -1 if self.best is None else self.best,
+            "chosen_start": -1 if self.best[1] == DEFAULT else self.best[0],
+            "chosen_is_gradient": int(self.best[1] == GRADIENT),
             "seeds": self.starts,
             "over_default": ratio,
         }
-        if len(self.unseen.numbers) > 1:
+        if self.groups >= LEAST_UNITS:
             found |= {"over_default_low90": low, "over_default_high90": high}
         for name, values in self.errors.items():
             found[f"{_label(name)}_median_error"] = float(values.quantile(0.5))
         for name, beside in self.rivals.items():
             over = f"over_{_label(name)}"
             found |= {f"{over}_median": beside.median, f"{over}_ahead": beside.ahead}
-            if beside.count > 1:
+            if beside.count >= LEAST_UNITS:
                 found |= {f"{over}_low90": beside.low, f"{over}_high90": beside.high}
         return found
 
@@ -163,12 +182,12 @@ class Outcome:
             share, samples = problem.start, 0
             if name == "start":
                 share = race.trail(number, GRADIENT).share[0]
-            elif name != "default":
+            elif name != DEFAULT:
                 share, samples = race.answer(number, name), race.samples(number, name)
             numbers = [f"{value:.5f}" for value in problem.ranges.numbers(share).tolist()]
             told = [
                 f"{float(errors.mean()):.5f}",
-                f"{standard_error(errors, len(self.unseen.numbers)):.5f}",
+                f"{standard_error(errors, self.groups):.5f}",
             ]
             seed = race.run.config.seed + number
             writer.writerow([problem.pair.name, seed, name, *numbers, samples, *told])

@@ -8,15 +8,16 @@ from torch import Tensor
 
 from codesign.atomic import write_atomic
 from codesign.mount import VelocityErrors, judge
+from codesign.report.prose import counted
 from codesign.system import HandOver, load_hand_over, save_hand_over
 from scenes.robots import pair as robot_pair
 from studies.frame.run import Run
 from studies.placement import figures
 from studies.placement.controls import controls
 from studies.placement.look import what_it_tells
-from studies.placement.outcome import INTERVAL, Outcome
+from studies.placement.outcome import INTERVAL, LEAST_UNITS, Outcome
 from studies.placement.problem import Problem
-from studies.placement.race import GRADIENT
+from studies.placement.race import DEFAULT, GRADIENT
 
 
 def report(run: Run[Any], outcome: Outcome) -> None:
@@ -24,13 +25,15 @@ def report(run: Run[Any], outcome: Outcome) -> None:
     write_atomic(run.path("race.csv"), outcome.table().encode())
     run.record(**outcome.metrics())
     run.card(
-        "error of the answer", f"{outcome.error:.3f}", f"default mount: {outcome.default_error:.3f}"
+        "error of the answer",
+        f"{outcome.error:.3f}",
+        f"found by {outcome.found_by}; default mount: {outcome.default_error:.3f}",
     )
     for name, beside in outcome.rivals.items():
         run.card(
             f"gradient over {name}",
             f"{beside.median:.2f}",
-            f"ahead {beside.ahead} of {beside.count} starts",
+            f"ahead {beside.ahead} of {counted(beside.count, 'start')}",
         )
     searches(run, outcome)
     seen(run, outcome)
@@ -42,27 +45,27 @@ def report(run: Run[Any], outcome: Outcome) -> None:
 
 def answer(outcome: Outcome) -> str:
     """In one sentence."""
-    name, worlds = outcome.race.problem.pair.name, len(outcome.unseen.numbers)
+    name = outcome.race.problem.pair.name
     where = place_in_words(outcome.race.problem, outcome.share)
     beside = f"{outcome.error:.3f} against {outcome.default_error:.3f} on {outcome.unseen.samples} unseen samples with single events."
-    if outcome.best is None:
-        none = (
-            f"none of {outcome.starts} descents ends"
-            if outcome.starts > 1
-            else "the one descent does not end"
-        )
-        return f"The camera of '{name}' stays at its default mount, {where}: on training drives {none} at a better place (error {outcome.default_error:.3f} on unseen samples with single events)."
+    if outcome.best[1] == DEFAULT:
+        places = outcome.starts * (1 + len(outcome.rivals))
+        none = f"none of {places} places found is" if places > 1 else "the one place found is not"
+        return f"The camera of '{name}' stays at its default mount, {where}: on training drives {none} better (error {outcome.default_error:.3f} on unseen samples with single events)."
     if outcome.error >= outcome.default_error:
-        return f"The place found for the camera of '{name}', {where}, is no better than its default mount: {beside}"
+        return f"The place found for the camera of '{name}' by {outcome.found_by}, {where}, is no better than its default mount: {beside}"
     ratio, low, high = outcome.over_default
-    resampled = "groups of drives" if outcome.unseen.pair.one_world else "worlds"
+    unit, of = ("group", " of drives") if outcome.unseen.pair.one_world else ("world", "")
+    sure = outcome.groups >= LEAST_UNITS
     interval = (
-        f" ({low:.2f} to {high:.2f}, {INTERVAL:.0%} of resampled {resampled})" if worlds > 1 else ""
+        f" ({low:.2f} to {high:.2f}, {INTERVAL:.0%} of resampled {unit}s{of})"
+        if sure
+        else f" (of {counted(outcome.groups, unit)}, too few to decide)"
     )
-    sits = "belongs at" if high < 1 else "may be better off at"
+    sits = "belongs at" if sure and high < 1 else "may be better off at"
     return (
-        f"The camera of '{name}' {sits} {where}: its error there is {ratio:.2f}{interval} times that at its default mount, "
-        f"{beside}"
+        f"The camera of '{name}' {sits} {where}, found by {outcome.found_by}: its error there is {ratio:.2f}{interval} times "
+        f"that at its default mount, {beside}"
     )
 
 
@@ -70,7 +73,7 @@ def place_in_words(problem: Problem, share: Tensor) -> str:
     """Position and attitude of a mount."""
     x, y, z, yaw, pitch, roll = problem.ranges.numbers(share).tolist()
     turned = ", ".join(
-        f"{name} {math.degrees(angle):+.0f}°"
+        f"{name} {round(math.degrees(angle)):+d}°".replace("-", "−")
         for name, angle in (("yaw", yaw), ("pitch", pitch), ("roll", roll))
     )
     return f"({x:.2f}, {y:.2f}, {z:.2f}) m, {turned}"
@@ -81,12 +84,13 @@ def searches(run: Run[Any], outcome: Outcome) -> None:
     race = outcome.race
     samples = race.samples(0, GRADIENT)
     begun = f"{outcome.starts} mounts" if outcome.starts > 1 else "mount"
+    resampled = f" In brackets: {INTERVAL:.0%} of resampled starts."
     told = "drives through the one world" if outcome.unseen.pair.one_world else "worlds and drives"
     run.section(
         "Searches at equal renders",
         f"Every search began at the same {begun} and rendered {samples} samples; "
         "errors are means of q / (1 + q), q the squared error of the velocities that count in units of 0.05 m/s plus a "
-        f"tenth of the speed, and 0.15 rad/s, with single events in {told} that no search saw. In brackets: {INTERVAL:.0%} of resampled starts.",
+        f"tenth of the speed, and 0.15 rad/s, with single events in {told} that no search saw.{resampled if outcome.starts >= LEAST_UNITS else ''}",
     )
     rows: list[list[Any]] = []
     for name, values in outcome.errors.items():
@@ -151,6 +155,7 @@ def handed(run: Run[Any], outcome: Outcome) -> VelocityErrors:
     path = run.path("mount.yaml")
     notes = {
         "pair": problem.pair.name,
+        "found_by": outcome.found_by,
         "error_unseen": outcome.error,
         "error_unseen_default": outcome.default_error,
     }

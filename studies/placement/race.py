@@ -17,6 +17,8 @@ from studies.placement.problem import Problem
 from studies.placement.searches import SEARCHES, Trail, descend
 
 GRADIENT = "gradient"
+# the pair's own mount
+DEFAULT = "default"
 # of the cube: the gradient's differences of geometry
 STEP = 0.12
 # that choose among answers
@@ -172,9 +174,9 @@ class Race:
     def judge(self, unseen: Problem, starts: list[Tensor]) -> dict[tuple[int, str], Tensor]:
         """Bounded errors [N] of starts and answers, on the same unseen samples with single events.
 
-        Key: (start, search); the pair's own design is (0, "default"), the starts (number, "start").
+        Key: (start, search); the pair's own design is (0, DEFAULT), the starts (number, "start").
         """
-        wanted = {(0, "default"): unseen.start}
+        wanted = {(0, DEFAULT): unseen.start}
         for number, start in enumerate(starts):
             wanted[number, "start"] = start
             for name in (GRADIENT, *self.run.config.searches):
@@ -192,16 +194,21 @@ class Race:
                 bar.advance(error=float(self.tensors[key].mean()))
         return found
 
-    def chosen(self, count: int) -> int | None:
-        """Number of the descent whose answer errs least on training samples, None where the pair's
-        own mount errs less than all of them: what is judged on unseen samples has not been chosen
-        by them."""
-        if "chosen" not in self.tensors:
+    def chosen(self, count: int) -> tuple[int, str]:
+        """Start and search of the answer that errs least on training samples that no search saw,
+        (0, DEFAULT) where the pair's own mount errs less than all of them: what is judged on unseen
+        samples has not been chosen by them."""
+        names = (GRADIENT, *self.run.config.searches)
+        answers = [(number, name) for number in range(count) for name in names]
+        if "final_errors" not in self.tensors:
             problem = self.problem
+            mounts = [problem.start, *(self.answer(*each) for each in answers)]
             draws = [problem.draw(-1 - k) for k in range(FINAL_DRAWS)]
-            mounts = [problem.start, *(self.answer(number, GRADIENT) for number in range(count))]
-            errors = [sum(problem.bounded(share, draw) for draw in draws) for share in mounts]
-            self.tensors["chosen"] = torch.tensor(errors).argmin() - 1
+            errors = []
+            with self.run.progress(len(mounts), "choosing on training drives") as bar:
+                for share in mounts:
+                    errors.append(sum(problem.bounded(share, draw) for draw in draws) / FINAL_DRAWS)
+                    bar.advance(error=errors[-1])
+            self.tensors["final_errors"] = torch.tensor(errors, dtype=torch.float64)
             self.save()
-        number = int(self.tensors["chosen"])
-        return None if number < 0 else number
+        return [(0, DEFAULT), *answers][int(self.tensors["final_errors"].argmin())]

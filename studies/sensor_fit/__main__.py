@@ -140,8 +140,9 @@ def show(run, recording, sensor, simulated, figures):
         "interval.",
     )
     best = figures["fitted"]
+    truer = best["correlation"] > figures["ideal"]["correlation"]
     lead = (
-        f"On the half that was not fitted, signed counts correlate by **{best['correlation']:.3f}** "
+        f"The fitted sensor is {'truer' if truer else 'no truer'} than an ideal one. On the half that was not fitted, signed counts correlate by **{best['correlation']:.3f}** "
         f"(ideal sensor {figures['ideal']['correlation']:.3f}); ON and OFF events number "
         f"{best['ratio_on']:.2f} and {best['ratio_off']:.2f} times the recorded ones "
         f"({figures['ideal']['ratio_on']:.2f} and {figures['ideal']['ratio_off']:.2f})."

@@ -201,8 +201,17 @@ def show(run, job, scores):
     cpu = (progress.data_s + progress.training_s) / 60
     run.finish(
         f"Training of {config.network}",
-        f"{cpu:.1f} processor minutes, seed {config.seed}, loss {config.loss}.",
+        f"{answer(scores)} {cpu:.1f} processor minutes, seed {config.seed}, loss {config.loss}.",
     )
+
+
+def answer(scores):
+    """How the network fares on sets never trained on."""
+    said = [
+        f"{ours.ratio:.2f} on {name.replace('_', ' ')} (closed form {closed.ratio:.2f})"
+        for name, (ours, closed) in scores.items()
+    ]
+    return f"The network's error or blur over that of zero flow: {', '.join(said)}."
 
 
 def curves(progress):

@@ -151,8 +151,10 @@ def write_page(view, state, sensor, clock, written):
         f"{state.events:,} events from {frames} frames of `{view.source.path.name}`, "
         f"{seconds(view.duration_s)}."
     )
-    warned = " **The video is too slow for its motion, see below.**" if slow else ""
-    run.finish("Video to events", lead + warned)
+    verdict = "**The video is too slow for its motion, see below.**"
+    if not slow:
+        verdict = "The video is fast enough for its motion." if state.events else "Nothing moved."
+    run.finish("Video to events", f"{verdict} {lead}")
 
 
 def warnings(view, state, sensor, slow):

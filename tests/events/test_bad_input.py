@@ -301,6 +301,28 @@ def test_a_state_that_a_simpler_sensor_began(more, words):
     assert state.time_s == pytest.approx(0.04)
 
 
+# what upsample makes, the sensor warns of
+@pytest.mark.parametrize("take", TAKE_FRAMES[:9] + TAKE_FRAMES[10:])
+def test_frames_on_0_to_1_are_warned_of(take):
+    """They make no event: on 0 to 255 all light up to 1 is within ln(20)/20 = 0.15 of black, less
+    than a threshold. Black frames, frames of a chain that begins black, and all others are taken in
+    silence."""
+    flat = torch.linspace(0, 1, 320).reshape(5, 8, 8)
+    with pytest.warns(UserWarning, match="scale 0 to 255"):
+        take(flat)
+    for frames in (0 * flat, 255 * flat, torch.cat((0 * flat[:3], 255 * flat[:2]))):
+        take(frames)
+
+
+def test_frames_on_0_to_1_make_no_event():
+    flat = torch.rand(5, 8, 8, generator=torch.Generator().manual_seed(0))
+    with pytest.warns(UserWarning, match="multiply by 255"):
+        assert not len(events.simulate(flat, T_S, SensorModel(theta_on=0.2, theta_off=0.2)))
+    assert len(events.simulate(255 * flat, T_S, SensorModel(theta_on=0.2, theta_off=0.2))) > 100
+    # levels of a logarithm may be as small
+    events.simulate(flat, T_S, SENSOR, log_input=True)
+
+
 @pytest.mark.parametrize("name", [name for name in events.LAYERS if name != "physical"])
 def test_what_a_layer_leaves_out_of_its_sensor_is_named(name):
     with pytest.warns(

@@ -272,7 +272,7 @@ class Settled(nn.Module):
     >>> import torch
     >>> from codesign import events
     >>> settled = events.Settled(events.layer("memory"), lead_s=0.01)
-    >>> frames = torch.rand(1, 5, 8, 8, generator=torch.Generator().manual_seed(0))
+    >>> frames = 255 * torch.rand(1, 5, 8, 8, generator=torch.Generator().manual_seed(0))
     >>> float(settled.volume(frames, torch.linspace(0, 0.04, 5), 3).collected_s.sum().round(decimals=3))
     0.03
     """

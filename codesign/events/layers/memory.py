@@ -9,7 +9,7 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
 from codesign.checks import FLOATS, check, check_choice, check_kind
-from codesign.events.entry import check_frames, check_level, check_per_pixel
+from codesign.events.entry import check_frames, check_level, check_per_pixel, warn_of_scale
 from codesign.events.intensity import FrontEnd, kernel_levels, log_levels
 from codesign.events.layers import memory_kernel as kernel
 
@@ -85,6 +85,7 @@ def memory(
     check(frames, "T>=2 ..." if state is None else "T ...", "frames", FLOATS)
     theta_on = check_per_pixel(theta_on, "theta_on", frames)
     theta_off = check_per_pixel(theta_off, "theta_off", frames)
+    warn_of_scale(frames, log_input)
     if state is not None:
         check_kind(state, Tensor, "the state", "pass what the call before returned")
     if state is not None and state.shape == frames.shape[1:]:

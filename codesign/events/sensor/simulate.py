@@ -16,6 +16,7 @@ from codesign.events.entry import (
     check_later,
     check_per_pixel,
     check_times,
+    warn_of_scale,
 )
 from codesign.events.intensity import FrontEnd, kernel_levels, log_levels
 from codesign.events.kernels import Lanes
@@ -165,6 +166,7 @@ def _open(frames, t_s, sensor, generator, state, front_end):
     check_generator(generator)
     frames = frames.detach()
     if fresh:
+        warn_of_scale(frames, front_end.log_input)
         check_frames(frames[:1], 1, non_negative=not front_end.log_input)
         if sensor.timing == "v2e":
             level = v2e.levels(frames[:1], front_end)

@@ -24,6 +24,7 @@ from codesign.events.entry import (
     check_state,
     check_times,
     shown,
+    warn_of_scale,
 )
 from codesign.events.intensity import lin_log
 from codesign.events.layers.memory import memory
@@ -297,6 +298,7 @@ def _checked(frames, t_s, state):
             f"frames have shape {list(frames.shape)}; [T, H, W] or [T, B, H, W] of at least 2 x 2 pixels is "
             "needed."
         )
+    warn_of_scale(frames, False)
     times_s = check_times(t_s, len(frames))
     if state is None:
         return frames, times_s
