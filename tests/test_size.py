@@ -8,7 +8,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 UNCOUNTED = (ast.expr_context, ast.operator, ast.unaryop, ast.cmpop, ast.boolop)
 BUDGETS = {
-    "codesign": 9_600,
+    "codesign": 9_700,
     "codesign/events": 47_100,
     "codesign/flow": 42_500,
     "codesign/grad": 3_300,
@@ -42,7 +42,7 @@ BUDGETS = {
     "studies/stability": 4_700,
     "studies/train_flow": 5_000,
     "studies/video_to_events": 4_300,
-    "tests": 12_050,
+    "tests": 12_450,
     "tests/data": 1_000,
     "tests/events": 33_200,
     "tests/flow": 29_350,
