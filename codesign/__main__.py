@@ -1,16 +1,18 @@
 """`codesign`, or `python -m codesign`: list and run the studies, look after the installation."""
 
 import argparse
+import os
 import runpy
 import sys
 
 import codesign
+from codesign import shipped
 from codesign.interrupt import written_out
 
 EXAMPLES = """
 for example:
   codesign list                    every study with its question
-  codesign run lens_opt --quick    the same as python -m studies.lens_opt --quick
+  codesign run lens_opt --quick    the same as python -m studies.lens_opt --quick in a checkout
   make lens-opt                    set everything up and optimise a lens for event flow
 """
 
@@ -55,6 +57,7 @@ def _main(arguments):
         from codesign.doctor import main as run_doctor  # imports drjit, which the rest does without
 
         return run_doctor(chosen.device)
+    shipped.on_path()
     from studies.frame import listing
 
     if chosen.command == "list":
@@ -67,6 +70,8 @@ def _run(name, options, refusal):
     if refusal:
         print(f"error: {refusal}", file=sys.stderr)
         return 2
+    # what a study starts by `python -m studies.…` imports nothing of the folder it runs in
+    os.environ["PYTHONSAFEPATH"] = "1"
     sys.argv = [f"studies.{name}", *options]
     runpy.run_module(f"studies.{name}", run_name="__main__", alter_sys=True)
     return 0

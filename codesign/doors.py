@@ -21,14 +21,15 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, NoReturn, ParamSpec, TypeVar
 
+from codesign import shipped
 from codesign.errors import CodesignError, DomainError, ShapeError, shown
 
 P = ParamSpec("P")
 T = TypeVar("T")
 HOME = str(Path(__file__).parent) + os.sep
-# packages that have doors, which are beside each other wherever they are installed
+# packages that have doors
 PACKAGES = ("codesign.", "scenes.")
-OURS = tuple(str(Path(__file__).parents[1] / package[:-1]) + os.sep for package in PACKAGES)
+OURS = (HOME, str(shipped.FOLDER / "scenes") + os.sep)
 LIBRARIES = (
     sysconfig.get_path("stdlib"),
     sysconfig.get_path("purelib"),

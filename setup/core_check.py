@@ -10,7 +10,9 @@ import torch
 import codesign
 from codesign import events, flow, lens, pose, render
 from codesign.errors import MissingPackageError
-from scenes import textures, trajectories, worlds
+
+codesign.shipped.on_path()
+from scenes import textures, trajectories, worlds  # noqa: E402
 
 for package in (
     "h5py",

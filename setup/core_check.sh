@@ -10,7 +10,7 @@ setup/make_venv.sh "$place/venv" "${1:-}"
 python=$place/venv/bin/python
 # a copy: building in place would leave a folder build/ and take in what an earlier build left there
 mkdir "$place/source"
-tar -c --exclude=__pycache__ pyproject.toml README.md LICENSE codesign scenes studies | tar -x -C "$place/source"
+tar -c --exclude=__pycache__ pyproject.toml setup.py README.md LICENSE codesign scenes studies | tar -x -C "$place/source"
 "$python" -m pip install --disable-pip-version-check --quiet "$place/source" --constraint constraints.txt
 cp setup/core_check.py "$place"
 cd "$place" # where no checkout is found

@@ -4,10 +4,12 @@ import importlib
 import pickle
 import subprocess
 import sys
+import tomllib
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+import yaml
 
 import codesign
 from codesign import mount
@@ -99,3 +101,12 @@ def test_a_mount_pickled_under_its_former_name_is_read():
     former = written.replace(b"ccodesign.mount.pose\n", b"ccodesign.place.mount\n")
     assert former != written
     assert isinstance(pickle.loads(former), mount.Mount)
+
+
+def test_the_citation_is_whole_and_names_this_version():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    # what the format 1.2.0 requires
+    assert {"cff-version", "message", "title", "authors"} <= cited.keys()
+    assert cited["cff-version"] == "1.2.0"
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert (cited["version"], cited["license"]) == (project["version"], project["license"])

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
 
+from codesign import shipped
 from codesign.errors import DomainError, FileFormatError
 from codesign.reading import building, read_json
 
@@ -83,7 +84,7 @@ def read_config(path: Path, study: str, kind: type[Config]) -> Config:
 
 def resume_command(study: str, folder: Path) -> str:
     """The line that goes on with the run in ``folder``, fit to be pasted into a shell."""
-    return f"python -m studies.{study} --resume {shlex.quote(str(folder))}"
+    return f"{shipped.command(study)} --resume {shlex.quote(str(folder))}"
 
 
 def configured(kind: type[Config], quick: bool, **given: Any) -> Config:

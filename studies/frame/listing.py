@@ -62,7 +62,7 @@ def show(columns: int | None = None) -> str:
     files = studies()
     width = max(map(len, files)) + 4
     lines = [
-        "codesign run NAME [OPTIONS], or python -m studies.NAME [OPTIONS]; --help explains them."
+        "codesign run NAME [OPTIONS] (in a checkout also python -m studies.NAME); --help explains."
     ]
     for group, names in by_group().items():
         lines += ["", group]
@@ -90,12 +90,10 @@ def refusal(name: str) -> str:
     if name and (
         FOLDER.joinpath(*name.split(".")).with_suffix(".py").is_file() or (FOLDER / name).is_dir()
     ):
-        return (
-            f"studies.{name} is a part of the studies and no study; 'python -m studies' lists them."
-        )
+        return f"studies.{name} is a part of the studies and no study; 'codesign list' lists them."
     near = difflib.get_close_matches(name.replace("-", "_"), files, n=1)
     hint = f"did you mean {near[0]}? " if near else ""
-    return f"there is no study '{name}'; {hint}'python -m studies' lists them."
+    return f"there is no study '{name}'; {hint}'codesign list' lists them."
 
 
 def refuse_parts(command: list[str]):

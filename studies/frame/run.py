@@ -35,7 +35,7 @@ import torch
 import tyro
 from rich.console import Console
 
-from codesign import backend, state
+from codesign import backend, shipped, state
 from codesign.atomic import remove_unfinished, write_atomic
 from codesign.errors import CodesignError, DomainError, FileFormatError, NonFiniteError
 from codesign.interrupt import Interruption, written_out
@@ -313,7 +313,7 @@ def main(
         return tyro.cli(
             kind,
             default=default,
-            prog=f"python -m studies.{name}",
+            prog=shipped.command(name),
             description=sys.modules[study.__module__].__doc__,
             args=arguments,
         )

@@ -6,7 +6,7 @@ from typing import Any
 
 from torch import nn
 
-from codesign import events, flow
+from codesign import events, flow, shipped
 from codesign.errors import DomainError
 from studies.lens_opt.task import SENSOR
 
@@ -43,7 +43,7 @@ def estimator(name: str, train: bool, objective: str, weights: int, seed: int) -
         if not train:
             raise DomainError(
                 f"--flow {name} starts with random weights, whose flow means nothing; add --train-network, or give "
-                "the file of a trained network (python -m studies.train_flow makes one)."
+                f"the file of a trained network ({shipped.command('train_flow')} makes one)."
             )
         return WEIGHTS[name].with_weights(weights, seed=seed)
     if name != "refiner" and not Path(name).is_file():

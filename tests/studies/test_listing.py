@@ -94,7 +94,7 @@ def test_run_starts_the_module_and_hands_over_its_options():
     [
         ("lens_op", "there is no study 'lens_op'; did you mean lens_opt?"),
         ("lens-opt", "there is no study 'lens-opt'; did you mean lens_opt?"),
-        ("xylophone", "there is no study 'xylophone'; 'python -m studies' lists them."),
+        ("xylophone", "there is no study 'xylophone'; 'codesign list' lists them."),
         ("lens_opt.page", "studies.lens_opt.page is a part of the studies and no study"),
         ("frame.config", "studies.frame.config is a part of the studies and no study"),
     ],

@@ -10,6 +10,7 @@ import torch
 from numpy.polynomial import chebyshev
 from torch import Tensor
 
+from codesign import shipped
 from codesign.checks import check_whole
 from codesign.errors import DomainError, FileFormatError
 from codesign.events.formats.hdf5 import Hdf5Events
@@ -280,7 +281,7 @@ def _places(folder):
     if not path.is_file():
         raise FileFormatError(
             f"{folder} is no data set: it has no manifest.json, so it was not finished; "
-            f"finish it with: python -m studies.make_dataset --resume {shlex.quote(str(folder))}"
+            f"finish it with: {shipped.command('make_dataset')} --resume {shlex.quote(str(folder))}"
         )
     manifest = read_json(path)
     with reading(path, "it is no manifest of a data set; make the data set anew"):

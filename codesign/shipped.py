@@ -1,0 +1,31 @@
+"""The scenes and studies that come with codesign. In a checkout they are top-level packages; a
+wheel carries them inside codesign, where they shadow nobody's own."""
+
+import os
+import sys
+from pathlib import Path
+
+_INSIDE = Path(__file__).with_name("_shipped")
+FOLDER = _INSIDE if _INSIDE.is_dir() else Path(__file__).parents[1]
+
+
+def on_path() -> None:
+    """Let `import scenes` and `import studies` find those that come with codesign, before any
+    others of these names, here and in processes that are started from here. `codesign run` does it
+    for every study; a program that uses scenes out of a wheel calls it first.
+
+    >>> import codesign
+    >>> codesign.shipped.on_path()
+    >>> from scenes import worlds
+    """
+    folder = str(FOLDER)
+    sys.path[:] = [folder, *(place for place in sys.path if place != folder)]
+    inherited = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    others = [place for place in inherited if place not in ("", folder)]
+    os.environ["PYTHONPATH"] = os.pathsep.join([folder, *others])
+
+
+def command(study: str) -> str:
+    """What starts a study from a shell: `python -m studies.NAME` in a checkout, `codesign run NAME`
+    out of a wheel."""
+    return f"codesign run {study}" if FOLDER == _INSIDE else f"python -m studies.{study}"
