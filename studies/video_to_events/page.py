@@ -17,7 +17,7 @@ from studies.video_to_events.input import Light
 from studies.video_to_events.state import LARGE, WORRYING, EventLog
 
 SHARE_OF_DURATION = 0.2  # a sensor whose reactions take more of the input hides what happens in it
-MOST_ON_PAGE_MB = 25.0  # larger videos lie beside the page
+MOST_ON_PAGE_MB = 0.4  # larger videos lie beside the page, which stays below 2 MB
 PREVIEW_FPS = 30.0  # pictures per second of the videos
 FULL_SCALE = 2.0  # events per pixel and picture that give full colour
 POINTS = 20_000  # events drawn in space and time
@@ -238,7 +238,7 @@ def pictures(view):
         f"Events in space and time: {len(few):,} of {view.log.count:,}, drawn at random. Orange brighter, "
         "blue darker."
     )
-    run.figure(figure, "space_time", caption)
+    run.figure(figure, "space_time", caption, dpi=90)
     if config.preview:
         covers = (
             f"{view.slowdown:.4g} times slower than the scene, each picture covers "
@@ -257,7 +257,7 @@ def video(view, name, made, caption):
     if size_mb <= MOST_ON_PAGE_MB:
         view.run.video(path.name, caption)
     else:
-        view.run.text(f"{caption} `{path.name}`, {size_mb:.0f} MB, lies beside this page.")
+        view.run.text(f"{caption} `{path.name}`, {size_mb:.1f} MB, lies beside this page.")
     view.run.say(f"Written: {path}")
 
 
