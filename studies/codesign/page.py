@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 
+from codesign.report.prose import counted
 from studies.codesign.design import Space
 from studies.codesign.gallery import handed, side_by_side
 from studies.codesign.landscape import Landscape
@@ -27,7 +28,7 @@ def lead(run: Run[Any], space: Space, rows: Sequence[Row], judge: Judge) -> str:
     found = compared(rows)
     race(run, plain(space.pair.name), found, rows)
     shown(run, space, found, rows, judge)
-    return answer(run, space.pair.name, found)
+    return answer(run, space.pair.name, found, rows)
 
 
 def best_order(found: Mapping[str, tuple[Interval, float]]) -> str:
@@ -37,23 +38,31 @@ def best_order(found: Mapping[str, tuple[Interval, float]]) -> str:
     return max(rivals, key=lambda arm: rivals[arm][0].value)
 
 
-def answer(run: Run[Any], pair: str, found: Mapping[str, tuple[Interval, float]]) -> str:
-    """In one sentence."""
+def answer(
+    run: Run[Any], pair: str, found: Mapping[str, tuple[Interval, float]], rows: Sequence[Row]
+) -> str:
+    """What joint design, and nested where it ran, make of the best order of the blocks."""
     size = run.config
     where = f"'{pair}', {size.light:g} of daylight" + (
         f", {size.speed:g} of the speed" if size.speed != 1 else ""
     )
     where += "".join(f", {each}" for each in size.hold)
-    name = best_order(found)
-    over, p = found[name]
-    ratio = f"{math.exp(over.value):.2f} ({math.exp(over.low):.2f} to {math.exp(over.high):.2f})"
     if size.seeds < ENOUGH:
-        return f"This run of {size.seeds} starts decides nothing; it shows that everything works ({where})."
-    verdict = {"wins": "beats", "loses": "loses to", "ties": "ties with"}[over.outcome]
-    return (
-        f"Joint design {verdict} the best order of its blocks, {name}, in {where}: its error is {ratio} times that one's in unseen "
-        f"worlds (median over starts, 95 % of resampled starts and worlds; p = {p:.3g} after Holm)."
-    )
+        return f"{counted(size.seeds, 'start')} shows that everything works, and decides nothing ({where})."
+    name = best_order(found)
+    said = [f"In {where}, against the best order of single blocks ({name}):"]
+    ways = {"joint": "One descent along all numbers"}
+    if "nested" in found and name != "nested":
+        ways["nested"] = "Lens and mount together, with sensor and estimator solved at every step,"
+    for arm, way in ways.items():
+        over, p = compared(rows, arm)[name]
+        verdict = {"wins": "wins", "loses": "loses", "ties": "is undecided"}[over.outcome]
+        ends = [math.exp(value) for value in (over.value, over.low, over.high)]
+        said.append(
+            f"{way} {verdict}: {ends[0]:.2f} ({ends[1]:.2f} to {ends[2]:.2f}) times its error in unseen worlds (p = {p:.2g} "
+            "after Holm)."
+        )
+    return " ".join(said)
 
 
 def race(
