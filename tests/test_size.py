@@ -42,7 +42,7 @@ BUDGETS = {
     "studies/stability": 4_700,
     "studies/train_flow": 5_000,
     "studies/video_to_events": 4_300,
-    "tests": 12_450,
+    "tests": 12_800,
     "tests/data": 1_000,
     "tests/events": 33_200,
     "tests/flow": 29_350,
