@@ -13,6 +13,10 @@ from codesign.events.formats.aedat import read_frames
 from codesign.types import EventStream
 
 PLACE = Path("shared") / "data" / "davis346_newton_cradle" / "demo-01.npz"
+PUBLISHED = (
+    "The one of docs/sensor_fit.md is published as data/demo/samples/demo-01.aedat4 of "
+    "github.com/KugaMaxx/cuke-emlb."
+)
 ENTRIES = ("t", "x", "y", "p", "frames", "exposure")
 
 
@@ -55,8 +59,8 @@ def load(path):
     path = Path(path)
     if not path.is_file():
         raise FileFormatError(
-            f"the recording is not there ('{path}'); name an .aedat4 or .npz file with frames and events by "
-            "--recording."
+            f"the recording is not there ('{path}'); give the path of an .aedat4 or .npz file with frames and "
+            f"events by --recording. {PUBLISHED}"
         )
     frames, exposure_us, stream = (
         _read_aedat4(path) if path.suffix == ".aedat4" else _read_npz(path)

@@ -173,6 +173,7 @@ def test_a_slider_has_no_error_against_its_rotation(tmp_path):
     ("options", "sentence"),
     [
         (["--recording", "absent"], "nothing lies at absent"),
+        (["--recording", "absent"], "DSEC at dsec.ifi.uzh.ch"),
         (["--estimator", "nothing"], "nothing"),
         (["--width-px", "60"], "give both"),
         (["--window-ms", "-1"], "number > 0"),

@@ -187,7 +187,10 @@ def test_the_study_records_what_the_files_say(tmp_path, capsys):
         )
         == 2
     )
-    assert "the recording is not there" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "the recording is not there" in said
+    assert "demo-01.aedat4 of github.com/KugaMaxx/cuke-emlb" in said
+    assert "by --recording" in said
     path = tmp_path / "made.npz"
     stream = write_recording(path)
     assert (

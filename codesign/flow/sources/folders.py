@@ -28,6 +28,10 @@ SIDE_FILES = {
     "timestamps.txt",
     "forward_timestamps.txt",
 }
+PUBLISHED = (
+    "Recordings are published as DSEC at dsec.ifi.uzh.ch, MVSEC at daniilidis-group.github.io/mvsec, and with "
+    "events.txt at rpg.ifi.uzh.ch/davis_data.html."
+)
 FLOW_WORDS = re.compile(r"(flow|truth|^gt|_gt|gt_|^of_|_of$)", re.IGNORECASE)
 # of an archive: what deflate can reach; what is unpacked at most
 MOST_RATIO = 1040
@@ -44,8 +48,8 @@ def opened(path: str | Path) -> Iterator[Path]:
     path = check_path(path, "the path of the recording")
     if not path.exists():
         raise FileFormatError(
-            f"nothing lies at {path}; give a folder with events.txt, an event file, or a zip archive of "
-            "either."
+            f"nothing lies at {path}; give the path of a folder with events.txt, an event file, or a zip archive "
+            f"of either. {PUBLISHED}"
         )
     if path.suffix.lower() != ".zip":
         yield path
