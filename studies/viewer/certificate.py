@@ -17,9 +17,9 @@ LADDER = (1e-1, 3e-2, 1e-2)
 DIRECTIONS = 2
 
 
-def certificate(setting: Setting, way: str = "interior") -> list[Row]:
-    """Rows for the pose of the camera (m and rad in its own axes), its focus (1/m) and the
-    threshold, over the middle of the film.
+def certificate(setting: Setting) -> list[Row]:
+    """Rows for the pose of the camera (m and rad in its own axes), the threshold and, of a lens
+    that can be moved, the focus (1/m), over the middle of the film.
 
     The loss is the mean square of the flow of smooth counts, which have no noise: hard counts have
     no derivative to compare with.
@@ -31,18 +31,25 @@ def certificate(setting: Setting, way: str = "interior") -> list[Row]:
     T_world_cam = drive.batch.T_world_body[0] @ whole.T_body_cam
     gain = whole.space.costs.gain(whole.numbers["fno"])
 
+    held = drive.camera(whole).with_film(film)
+    bins = min(robot_pair.BINS, len(drive.batch.t_s) - 1)
+
     def loss(p: dict[str, Tensor]) -> Tensor:
-        design = replace(whole.design, focus_per_m=p["focus"])
-        camera = drive.space.pair.camera(design).with_film(film)
+        camera = held
+        if "focus" in p:
+            design = replace(whole.design, focus_per_m=p["focus"])
+            camera = drive.space.pair.camera(design).with_film(film)
         poses = T_world_cam @ pose.se3_exp(p["pose"])
-        frames = render.frames(camera, drive.batch.scene[0], poses, way)
+        frames = render.frames(camera, drive.batch.scene[0], poses)
         counts = events.soft_counts(gain * frames[0].double(), p["threshold"], p["threshold"])
-        volume = events.from_counts(counts, drive.batch.t_s, robot_pair.BINS)
+        volume = events.from_counts(counts, drive.batch.t_s, bins)
         return whole.flow(volume).flow_px.square().mean()
 
     point = {
         "pose": torch.zeros(6, dtype=torch.float64),
-        "focus": torch.tensor(whole.numbers["focus_per_m"], dtype=torch.float64),
         "threshold": torch.tensor(whole.numbers["theta"], dtype=torch.float64),
     }
-    return certify(loss, point, scales=SCALES, ladder=LADDER, directions=DIRECTIONS)
+    if "focus_per_m" in drive.space.free:
+        point["focus"] = torch.tensor(whole.numbers["focus_per_m"], dtype=torch.float64)
+    scales = {name: SCALES[name] for name in point}
+    return certify(loss, point, scales=scales, ladder=LADDER, directions=DIRECTIONS)

@@ -143,7 +143,12 @@ class Window:
         colours = picture if picture.ndim == 3 else np.stack([picture] * 3, -1)
         if name == "frame":
             self.server.scene.add_camera_frustum(
-                "/robot/camera/view", self.setting.view_rad(), 1.0, scale=VIEW_M, image=colours
+                "/robot/camera/view",
+                self.setting.view_rad(),
+                1.0,
+                scale=VIEW_M,
+                thickness=0.003,
+                image=colours,
             )
         self.pictures[name].image = colours.repeat(ENLARGED, 0).repeat(ENLARGED, 1)
 
