@@ -10,12 +10,10 @@ import contextlib
 import statistics
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-import codesign
 from codesign.checks import check_whole
 from codesign.errors import DomainError
 from scenes.robots.pairs import PAIRS
@@ -71,13 +69,7 @@ def study(run: Run[Config]) -> None:
         window.server.stop()
     setting = window.setting
     run.record(**{name: setting.whole.numbers[name] for name in drive.names})
-    run.figure(codesign.show(setting.run), "last", "What was shown last, its first window.")
     run.text(setting.words() + ".")
-    run.table(
-        "Certificates of the gradient, as asked for last",
-        ("gradient of", "verdict", "error", "noise"),
-        [(row.name, row.verdict, row.relative_error, row.noise_floor) for row in window.rows],
-    )
     run.finish("The viewer's last setting", str(setting.whole))
 
 
@@ -94,20 +86,14 @@ def chosen(size: Config) -> Whole:
     return space.made(space.start)
 
 
-def moves(window: Window, name: str) -> Iterator[float]:
-    """Values of a slider, from its middle towards its upper end."""
-    slider = window.sliders[name]
-    return (slider.min + (0.5 + 0.3 * k / MOVES) * (slider.max - slider.min) for k in range(MOVES))
-
-
 def measured(run: Run[Any], window: Window) -> None:
     """Processor and wall time of an update by every slider: medians, the first left out."""
     rows = []
     with run.progress(len(window.sliders), "sliders") as bar:
         for name, slider in window.sliders.items():
             updates = []
-            for value in moves(window, name):
-                slider.value = value
+            for k in range(MOVES):
+                slider.value = slider.min + (0.5 + 0.3 * k / MOVES) * (slider.max - slider.min)
                 began = time.perf_counter(), time.process_time()
                 spent = window.update()
                 wall_s, cpu_s = time.perf_counter() - began[0], time.process_time() - began[1]

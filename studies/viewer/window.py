@@ -1,7 +1,9 @@
 """The viewer's window in a browser: a scene, pictures and sliders, served by viser."""
 
+import logging
 import threading
 import time
+from typing import Any
 
 import numpy as np
 import torch
@@ -9,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from codesign.errors import CodesignError, DomainError
-from codesign.grad import Row
 from codesign.optional import optional
 from studies.viewer.certificate import certificate
 from studies.viewer.state import SLIDERS, Setting
@@ -19,7 +20,7 @@ trimesh = optional("trimesh", "viewer", "the viewer")
 
 HOST = "127.0.0.1"  # this machine alone
 STEPS = 200  # of a slider
-ENLARGED = 3  # pixels of a picture, a side
+ENLARGED = 2  # pixels of a picture, a side
 VIEW_M = 0.25  # size of the camera's cone
 RAY_COLOUR = (220, 60, 40)
 
@@ -33,9 +34,11 @@ class Window:
 
     def __init__(self, setting: Setting, port: int = 8080) -> None:
         self.setting = setting
-        self.rows: list[Row] = []
+        self._shown: dict[str, Any] = {}
         self._changed = threading.Event()
         self._asked = threading.Event()
+        # browsers open connections that they never use, each a traceback
+        logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
         self.server = viser.ViserServer(HOST, port, verbose=False)
         self.port: int = self.server.get_port()
         if port not in (0, self.port):
@@ -113,43 +116,44 @@ class Window:
             return {}
 
     def show(self) -> dict[str, float]:
-        """Put the setting into the window, the camera first, then picture after picture."""
+        """Put what the setting has anew into the window, picture after picture."""
         steps = {
-            "camera": self._camera,
-            "frames": lambda: self._picture("frame", self.setting.frame()),
+            "frames": self._camera_and_frame,
             "volume": lambda: self._picture("events", self.setting.events()),
             "field": lambda: self._picture("flow", self.setting.flow()),
             "estimate": self._words,
         }
-        spent = {"drawing": 0.0}
+        spent = dict.fromkeys((*steps, "drawing"), 0.0)
         for stage, draw in steps.items():
             began = time.process_time()
             with torch.no_grad():
-                self.setting.run[stage]
+                found = self.setting.run[stage]
             made = time.process_time()
-            draw()
+            if found is not self._shown.get(stage):
+                draw()
+            self._shown[stage] = found
             spent[stage] = made - began
             spent["drawing"] += time.process_time() - made
         return spent
 
-    def _camera(self):
+    def _camera_and_frame(self):
         scene, setting = self.server.scene, self.setting
+        frame = np.stack([setting.frame()] * 3, -1)
         self.camera.wxyz, self.camera.position = _placed(setting.whole.T_body_cam)
         scene.add_line_segments(
             "/robot/camera/rays", np.float32(setting.rays()), RAY_COLOUR, thickness=0.002
         )
+        scene.add_camera_frustum(
+            "/robot/camera/view",
+            setting.view_rad(),
+            1.0,
+            scale=VIEW_M,
+            thickness=0.003,
+            image=frame,
+        )
+        self._picture("frame", frame)
 
-    def _picture(self, name, picture):
-        colours = picture if picture.ndim == 3 else np.stack([picture] * 3, -1)
-        if name == "frame":
-            self.server.scene.add_camera_frustum(
-                "/robot/camera/view",
-                self.setting.view_rad(),
-                1.0,
-                scale=VIEW_M,
-                thickness=0.003,
-                image=colours,
-            )
+    def _picture(self, name, colours):
         self.pictures[name].image = colours.repeat(ENLARGED, 0).repeat(ENLARGED, 1)
 
     def _words(self):
@@ -159,13 +163,13 @@ class Window:
         """Certify the gradient at the setting that is shown, and show the verdicts."""
         self.verdict.content = "Certifying: this takes a while."
         try:
-            self.rows = certificate(self.setting)
+            rows = certificate(self.setting)
         except CodesignError as error:
             self.verdict.content = f"error: {error}"
             return
         lines = [
             f"| {row.name} | **{row.verdict}** | {row.relative_error:.1e} | {row.noise_floor:.0e} |"
-            for row in self.rows
+            for row in rows
         ]
         heads = "| gradient of | verdict | error | noise |\n|---|---|---|---|\n"
         self.verdict.content = f"At {self.setting.whole}:\n\n{heads}" + "\n".join(lines)
