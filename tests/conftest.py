@@ -33,7 +33,7 @@ EXTRAS = {
     "trimesh",
     "collada",
 }
-EXTRAS |= {"yourdfpy", "lxml", "tensorboard", "cma", "optuna", "onnx", "onnxscript"}
+EXTRAS |= {"yourdfpy", "lxml", "tensorboard", "cma", "optuna", "onnx", "onnxscript", "viser"}
 ABSENT = {name for name in EXTRAS if importlib.util.find_spec(name) is None}
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = next(

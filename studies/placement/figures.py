@@ -97,8 +97,8 @@ def draw_seen(
     """Frame, single events and flow of a drive, into three axes. run: of the chain that saw it."""
     _draw_frame(axes[0], drives, camera, T_body_cam)
     counts, flow = run["volume"].counts.sum(2), run["field"].flow_px
-    axes[1].imshow(_tiled(events.picture(counts).numpy()))
-    axes[2].imshow(flow_colours(_tiled(flow.movedim(1, -1).numpy()).transpose(2, 0, 1)))
+    axes[1].imshow(tiled(events.picture(counts).numpy()))
+    axes[2].imshow(flow_colours(tiled(flow.movedim(1, -1).numpy()).transpose(2, 0, 1)))
     for axis, title in zip(axes, ("frame", "events", "flow"), strict=True):
         axis.set(xticks=[], yticks=[], title=title if titled else "")
 
@@ -110,7 +110,7 @@ def fastest(problem: Problem, seed: int = 0) -> Samples:
     return Samples(numbers, (int(drives.twist[:, :3].norm(dim=1).argmax()),), seed)
 
 
-def _tiled(windows: np.ndarray) -> np.ndarray:
+def tiled(windows: np.ndarray) -> np.ndarray:
     """Windows [9, H, W, C] in rows of three."""
     side = math.isqrt(len(windows))
     rows = [np.concatenate(list(windows[side * k : side * (k + 1)]), 1) for k in range(side)]
