@@ -88,6 +88,34 @@ ORDERS = '"lens > mount > read-out" "mount > lens > read-out"'
 PARTS = {
     "chain": Part("chain_picture", ("codesign", "scenes"), pictures={"chain.png": "chain.png"}),
     "hero": Part("hero", ("codesign", "scenes"), pictures={"hero.webp": "hero.webp"}),
+    "gallery-lens": Part(
+        "lens_opt --quick",
+        ("codesign", "studies/lens_opt"),
+        pictures={
+            f"gallery/lens_{name}.png": f"{made}.png"
+            for name, made in {
+                "frames_and_events": "frames_and_events",
+                "designs": "design_curves",
+                "layout": "lens_layout",
+            }.items()
+        },
+    ),
+    "gallery-events": Part(
+        "spike_esim --quick",
+        ("codesign/events", "studies/spike_esim"),
+        pictures={
+            f"gallery/events_{name}.png": f"unseen_motion_{name}.png"
+            for name in ("rates", "patches", "pictures")
+        },
+    ),
+    "gallery-flow": Part(
+        "train_flow --quick",
+        ("codesign/flow", "codesign/train", "studies/train_flow"),
+        pictures={
+            "gallery/flow_training.png": "curves.png",
+            "gallery/flow_fields.png": "flows.png",
+        },
+    ),
     "lens-motion": Part(
         "lens_motion --raw docs/lens_motion.csv",
         ("codesign/lens", "studies/lens_motion"),
@@ -132,6 +160,7 @@ def measured(name: str) -> dict[str, Any]:
     command += ["--resume", str(folder)] if begun else [*words[1:], "--out", str(folder)]
     subprocess.run(command, cwd=ROOT, check=True)
     for picture, made in part.pictures.items():
+        (ROOT / "docs" / picture).parent.mkdir(exist_ok=True)
         write_atomic(ROOT / "docs" / picture, (folder / made).read_bytes())
     metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
     return {
