@@ -32,6 +32,7 @@ MITSUBA = {
     "codesign.render": "makes pictures with it",
     "scenes": "describe worlds to it",
     "studies.speed_error.frames": "compares with its sensors",
+    "studies.stability.render_cases": "mirrors shapes by its transforms",
 }
 
 

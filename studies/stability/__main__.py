@@ -1,76 +1,79 @@
-"""Hard cases: what theory expects of values and gradients, and what is seen.
+"""Hard cases of every stage: what theory says of value, gradient and single precision, and what is
+seen.
 
-Flat and black scenes, rays that are lost, poses that do not move, images without events, flows too
-small to see, thresholds at both ends of their range, one pixel, strong surfaces, far objects; and
-gradients of random lenses whose coincidences (equal neighbours, flats, zeros) leave a surface
-without effect but not without a derivative. A miss is listed and shown, not hidden, and does not
-make the study fail.
+Nothing to see, everything lost, no turn, half a turn, one event, thresholds and coordinates at both
+ends of their range, 1e5 frames, NaN: each is tried at the ends of its numbers and at random ones
+between, and a cell of the matrix is the worst of them. Beside it, gradients of random lenses whose
+coincidences (equal neighbours, flats, zeros) leave a surface without effect but not without a
+derivative. A miss is listed and explained, not hidden, and does not make the study fail.
 """
 
 import sys
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 
-from codesign.errors import CodesignError
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.show import table
-from studies.frame.sweep import metrics, select, sweep
-from studies.stability.cases import CASES, Check
+from studies.frame.sweep import metrics, sweep
+from studies.stability.case import Case, judge, trials, worst
+from studies.stability.cases import CASES
+from studies.stability.matrix import matrix
 from studies.stability.systems import errors_of_systems
 
 ALLOWED = 1e-6  # relative error of a gradient
+Rows = list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"tries": 0, "systems": 10}
+    tries: int = 10
+    """Random numbers that a case is tried at, beside the ends of its spans."""
     systems: int = 100
     """Random lenses whose gradients are compared with differences."""
 
 
-def judge(case: Callable[[], Iterable[Check]]) -> list[dict[str, object]]:
-    """Rows of a case's checks; one that stops with an error has failed, with what it said."""
-    rows: list[dict[str, object]] = []
-    try:
-        for check in case():
-            figures = {"off_by": check.off, "allowed": check.allowed, "passed": check.passed}
-            rows.append(
-                {
-                    "what": check.what,
-                    "expected": _text(check.expected),
-                    "seen": _text(check.seen),
-                    **figures,
-                }
-            )
-    except (CodesignError, RuntimeError, ArithmeticError, ValueError) as error:
-        said = f"stopped: {' '.join(str(error).split())[:160]}"
-        rows.append({"what": "an outcome", "seen": said, "passed": False})
-    return rows
-
-
-def _text(value):
-    """A number, or the ends of several."""
-    value = torch.as_tensor(value, dtype=torch.float64).detach()
-    ends = dict.fromkeys((float(value.min()), float(value.max())))
-    return " to ".join(f"{end:.6g}" for end in ends)
+def cells(case: Case, tries: int, seed: int) -> Rows:
+    """A row for each of the case's cells: the worst of its trials."""
+    rows = zip(*[judge(case, numbers) for numbers in trials(case, tries, seed)], strict=True)
+    return [{"stage": case.stage, **worst(of_kind)} for of_kind in rows]
 
 
 def study(run: Run[Config]) -> None:
-    rows = sweep(run, judge, "hard cases", case=CASES)
-    missed = [name for name in CASES if not all(row["passed"] for row in select(rows, case=name))]
-    run.record(cases_total=len(CASES), cases_passed=len(CASES) - len(missed))
-    run.record(
-        **metrics(
-            [{k: v for k, v in row.items() if k != "allowed"} for row in rows], "case", "what"
-        )
+    given = {"tries": run.config.tries, "seed": run.config.seed}
+    rows = sweep(run, cells, "cells", given=given, case=CASES)
+    missed = [row for row in rows if not row["passed"]]
+    explained = [row for row in missed if CASES[row["case"]].known]
+    seen = len(rows) - len(missed)
+    run.record(cells_total=len(rows), cells_passed=seen, cells_explained=len(explained))
+    errors = [{k: row[k] for k in ("case", "kind", "off", "passed")} for row in rows]
+    run.record(**metrics(errors, "case", "kind"))
+    run.card("As theory says", f"{seen} of {len(rows)} cells", f"{len(CASES)} hard cases")
+    run.card("Missed", str(len(missed)), f"{len(explained)} of them explained below")
+    run.section("Cases by stages")
+    run.figure(
+        matrix(rows, CASES),
+        "matrix",
+        "Each stage has three columns: value (v), gradient (g), single beside double precision (s). "
+        "Green: as theory says. Red: missed. Grey: does not apply.",
     )
-    run.card("Cases passed", f"{len(CASES) - len(missed)} of {len(CASES)}", ", ".join(missed))
-    run.section("Cases")
-    run.table("Expected and seen", *table(rows))
-    missed += random_systems(run)
-    lead = f"**Missed:** {', '.join(missed)}." if missed else "All cases end as theory says."
-    run.finish("Hard cases", f"What happens at the edges, in value and in gradient. {lead}")
+    if missed:
+        run.section("What was missed, and why")
+        run.text("\n".join(f"- {_told(row)}" for row in missed))
+    run.section("All cells")
+    run.table(
+        "Expected and seen",
+        *table([_shown(row) for row in rows]),
+        "The worst of all trials. Errors are over the largest number expected, or over the natural unit.",
+    )
+    wrong = random_systems(run)
+    lead = f"**{seen} of {len(rows)} cells are as theory says**" + (
+        f"; missed: {', '.join(dict.fromkeys(row['case'] for row in missed))}." if missed else "."
+    )
+    lead += f" Wrong in random lenses: {', '.join(wrong)}." if wrong else ""
+    run.finish("Hard cases", lead)
 
 
 def random_systems(run: Run[Config]) -> list[str]:
@@ -80,13 +83,13 @@ def random_systems(run: Run[Config]) -> list[str]:
         errors = errors_of_systems(
             count, torch.Generator().manual_seed(0), alone_every=10, advance=progress.advance
         )
-    worst = max(errors.values())
-    run.record(gradient_systems=count, gradient_relative_error=worst)
+    largest = max(errors.values())
+    run.record(gradient_systems=count, gradient_relative_error=largest)
     run.record(**{f"gradient_relative_error_{name}": error for name, error in errors.items()})
     run.card(
-        "Gradients of random lenses", f"{worst:.1e}", f"worst relative error of {count} lenses"
+        "Gradients of random lenses", f"{largest:.1e}", f"worst relative error of {count} lenses"
     )
-    run.section("Gradients")
+    run.section("Gradients of random lenses")
     run.table(
         "Worst relative error of a gradient",
         ("numbers", "error", "pass"),
@@ -96,6 +99,21 @@ def random_systems(run: Run[Config]) -> list[str]:
         "precision. In every tenth, each kind of number asks for a gradient alone.",
     )
     return [f"gradient to {name}" for name, error in errors.items() if not error <= ALLOWED]
+
+
+def _shown(row):
+    case = CASES[row["case"]]
+    shown = {"case": case.name, "stage": case.stage, "cell": row["kind"], "theory": case.theory}
+    off = None if row["off"] is None else f"{row['off']:.1e}"
+    errors = {"off": off, "allowed": f"{row['allowed']:.1e}", "pass": row["passed"]}
+    return shown | {name: row[name] for name in ("expected", "seen")} | errors
+
+
+def _told(row):
+    case = CASES[row["case"]]
+    outcome = f"Expected {row['expected']}, seen {row['seen']}"
+    why = case.known or "Not explained yet."
+    return f"**{case.label}, {row['kind']}.** Theory: {case.theory}. {outcome}. {why}"
 
 
 if __name__ == "__main__":

@@ -158,9 +158,12 @@ def play_adjoint(
         known = moves & (engaged != NONE)
         loop.put(target, (pull - now_pull) * slope, engaged + offset, known)
         grad_start = grad_start - dr.select(moves & ~known, now_pull, 0)
+        moved_centre = centre + (rise - fall)
         if wants_thetas:
-            grad_on = grad_on - seed_on * rise / loop.theta_on
-            grad_off = grad_off - seed_off * fall / loop.theta_off
+            # as it is rounded: what rounding leaves of ``rise`` would add up over many small steps
+            moved = dr.abs(moved_centre - centre)
+            grad_on = grad_on - seed_on * moved / loop.theta_on
+            grad_off = grad_off - seed_off * moved / loop.theta_off
             # anchor: how the upper edge moves with the width: 0 where it stands at a level, 1 where
             # the lower one does, 1/2 at the start
             grad_width = (
@@ -173,7 +176,7 @@ def play_adjoint(
         slope = dr.select(moves, now_slope(), slope)
         engaged = dr.select(moves, index, engaged)
         return (
-            centre + (rise - fall),
+            moved_centre,
             pull,
             slope,
             engaged,

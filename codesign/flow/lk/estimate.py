@@ -160,9 +160,9 @@ def field(
     net, share = _net(way, volume.counts)
     interval_s = float(volume.collected_s.sum())
     covariance = share * covariance
-    return FlowField(
-        net * flow, _seen(volume.counts), interval_s, confidence, covariance, way.net.detach()
-    )
+    seen = _seen(volume.counts)
+    confidence = torch.where(seen, confidence, 0)  # 1 - 1 rounds to 2e-16
+    return FlowField(net * flow, seen, interval_s, confidence, covariance, way.net.detach())
 
 
 def _net(way, counts):
