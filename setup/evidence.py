@@ -84,6 +84,11 @@ def joint(pair: str, more: str) -> Part:
     )
 
 
+def share_of(passed: str, total: str) -> Callable[[Metrics], str]:
+    """How many of how many."""
+    return lambda metrics: f"{metrics[passed]} of {metrics[total]}"
+
+
 ORDERS = '"lens > mount > read-out" "mount > lens > read-out"'
 PARTS = {
     "chain": Part("chain_picture", ("codesign", "scenes"), pictures={"chain.png": "chain.png"}),
@@ -115,6 +120,12 @@ PARTS = {
             "gallery/flow_training.png": "curves.png",
             "gallery/flow_fields.png": "flows.png",
         },
+    ),
+    "stability": Part(
+        "stability",
+        ("codesign", "studies/stability"),
+        {"stability.cells": share_of("cells_passed", "cells_total")},
+        {"stability.png": "matrix.png"},
     ),
     "lens-motion": Part(
         "lens_motion --raw docs/lens_motion.csv",
