@@ -4,7 +4,6 @@ network: functions of named parameters, with their required figures. The tests c
 
 import math
 from dataclasses import replace
-from statistics import median
 
 import torch
 
@@ -15,7 +14,7 @@ from codesign.grad.modules import by_group
 from codesign.mount import Mount
 from codesign.system import Batch, System
 from scenes import textures, trajectories, worlds
-from studies.gradient_flow.topic import Asked, Row, Topic
+from studies.gradient_flow.topic import Asked, Topic, of_certificate
 from studies.lens_opt.task import PITCH_MM, SENSOR, TRAINING, draw_case, make_task, make_worlds
 
 FINE = tuple(10.0**-k for k in (3, 4, 5, 6))
@@ -401,33 +400,27 @@ JUNCTIONS = {
 HARD = "final loss, hard events"
 
 
-def shown(label: str, row: CertificateRow) -> Row:
-    """A row of a certificate as one of the study's."""
-    numbers = {
-        name: getattr(row, name)
-        for name in ("relative_error", "cosine", "signed_bias", "noise_floor")
-    }
-    return Row((label, row.name), {**numbers, "plateau_step": median(row.step_plateau)})
-
-
 def measure_junction(config, label):
     rows = (
         hard_rows(config.seed, config.hard_cases)
         if label == HARD
         else JUNCTIONS[label][1](config.seed)
     )
-    return [shown(label, row) for row in rows]
+    return [of_certificate((label, row.name), row) for row in rows]
 
 
 def measure_joint(config):
     system = make_system(10_000, config.seed)
     batch = draw_batch(4, 1000 + config.seed)
-    return [shown("one graph", row) for row in joint_rows(system, batch, 4 if config.quick else 12)]
+    return [
+        of_certificate(("one graph", row.name), row)
+        for row in joint_rows(system, batch, 4 if config.quick else 12)
+    ]
 
 
 TEXT = (
-    "Relative error is |autograd - difference| / |difference| over the group; the noise floor is the "
-    "disagreement of neighbouring step sizes, in the same unit."
+    "Relative error is |autograd - difference| / |difference| over the group; signal to noise is one over "
+    "the noise of the differences, in the same unit."
 )
 CHAIN = Topic(
     "Along the chain",

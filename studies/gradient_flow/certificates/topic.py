@@ -1,0 +1,89 @@
+"""Every junction and every group on five scenes: the rows, their three states, and the sentence
+that says what they come to."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from studies.gradient_flow.certificates import behind, picture, scenes
+from studies.gradient_flow.topic import (
+    NOT_JUDGEABLE,
+    RIGHT,
+    STATES,
+    WRONG,
+    Asked,
+    Row,
+    Topic,
+    of_certificate,
+)
+
+PARTS = ("picture", "events", "spikes", "flow")
+BEHIND = {
+    "events": behind.certify_events,
+    "spikes": behind.certify_spikes,
+    "flow": behind.certify_flow,
+}
+
+
+def measure(config: Any, scene: str, part: str) -> Iterator[Row]:
+    """Rows of a scene: of the picture and all that follows from it, or of a stage behind it."""
+    if part == "picture":
+        few = config.directions or None
+        found = picture.certify_picture(scene, config.film_samples, config.draws, few)
+    else:
+        found = BEHIND[part](scene, 4 if config.quick else 12)
+    for junction, row in found:
+        yield of_certificate((scene, junction, row.name), row, STATES[row.verdict])
+
+
+def headline(rows: Sequence[Row], quick: bool = False) -> str:
+    """One sentence: how many gradients are right, wrong, and not to be judged."""
+    count = Counter(row.state for row in rows)
+    judged = count[RIGHT] + count[WRONG]
+    share = f"{picture.TOLERANCE:.0%}".replace("%", " %")
+    if not judged:
+        said = "no gradient could be judged"
+    elif count[WRONG]:
+        worst = max((row for row in rows if row.state == WRONG), key=_error)
+        said = (
+            f"{count[WRONG]} of {judged} gradients that can be judged are wrong by more than {share}, "
+            f"the worst by {_error(worst):.2g} of its length ({', '.join(worst.names)})"
+        )
+    else:
+        said = f"every gradient that can be judged is right within {share}"
+    tail = f"{count[NOT_JUDGEABLE]} of {len(rows)} cannot be judged at this noise"
+    start = "quick form: " if quick else ""
+    return f"{start}{said}; {tail}."
+
+
+def _error(row):
+    return row.numbers["relative_error"]
+
+
+TEXT = f"""
+Each row compares a gradient by autograd with differences of the same loss, at the same random
+numbers. Relative error is |autograd - difference| / |difference| (L2); signed bias is the length of
+the gradient along the differences, less 1; noise is in the same unit, and signal to noise is one
+over it. The plateau is the step at which the differences were taken, in unit steps: before the film
+a unit moves the picture by about a tenth of a pixel, behind it it is the length of the parameter.
+
+- **right**: no error above {picture.TOLERANCE:.0%} was seen at three standard deviations of the
+noise, and one of 10 % is excluded.
+- **wrong**: the error is above {picture.TOLERANCE:.0%} by more than three standard deviations of the
+noise.
+- **not judgeable**: the noise is above the signal that would tell, so the differences say neither;
+more samples or draws (`--film-samples`, `--draws`) lower it.
+
+Scenes with silhouettes (occluders, robot in view, dark room) take the gradient with the boundary
+term; their noise is that of film samples. True flow is compared away from silhouettes, where it
+jumps. Stages behind the frames are certified in float64 on the frames of the scene, with the smooth
+form of each: hard events are the case `layers`, dead times the case `sensors`.
+"""
+TOPIC = Topic(
+    "Every junction on five scenes",
+    TEXT,
+    ("scene", "junction", "group"),
+    lambda quick: [(scene, part) for scene in scenes.BUILDERS for part in PARTS],
+    measure,
+    lambda row: None if row.state == NOT_JUDGEABLE else Asked({}, {}),
+)
