@@ -90,7 +90,9 @@ def study(run: Run[Config]) -> None:
         if getattr(config, name) < least:
             raise DomainError(f"{name} = {getattr(config, name)} must be at least {least}.")
     if config.quick:
-        run.say("quick form: few samples and directions, so that more cannot be judged.")
+        run.say(
+            "quick form: few samples and directions; frames with silhouettes are left to the full form."
+        )
     done = []
     try:
         for name in config.cases:

@@ -25,7 +25,7 @@ LEARNT = {
 WEIGHTS = 10_000
 SAMPLES = 64  # per pixel of the frames
 FINER = 8  # steps of the spiking neurons per frame interval
-# counts have a kink wherever a level stands still, so steps are small
+GRAIN = 0.01  # of the frames
 LADDER = (1e-4, 1e-5, 1e-6)
 
 
@@ -125,5 +125,8 @@ def _lengths(params):
 
 @cache
 def _frames(name) -> Tensor:
+    """Frames of a scene, with grain: no level stands still, where counts have a kink."""
     with torch.no_grad():
-        return picture.frames(name, scenes.point(), SAMPLES, 0, "interior")
+        image = picture.frames(name, scenes.point(), SAMPLES, 0, "interior")
+    draw = torch.Generator().manual_seed(6)
+    return image * (1 + GRAIN * torch.randn(image.shape, generator=draw, dtype=image.dtype))

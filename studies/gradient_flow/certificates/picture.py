@@ -5,9 +5,9 @@ Every draw has its own film samples, and its gradient is compared with its own d
 what the draws disagree about, and what a doubled step changes.
 """
 
+import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from functools import cache
 
 import torch
 from scipy import stats
@@ -29,25 +29,29 @@ Line = tuple[str, Tensor]  # a group, and a direction in it, in steps
 Losses = Callable[[Numbers, int, Way], Tensor]  # of a draw, its gradient by a way
 
 
-def certify_picture(
+def certify_seen(
     name: str, samples: int, draws: int, directions: int | None
 ) -> Iterator[tuple[str, Row]]:
-    """(junction, row) of every group of ``scenes.point``, for a scene by its name.
+    """(junction, row) of frames and final loss to every group of ``scenes.point``, for a scene by
+    its name.
 
     Args:
       samples: per pixel. draws: of film samples. directions: at random in every group that has
         more numbers; None: every number.
     """
-    chosen = list(lines(name, directions))
 
-    def seen(numbers, draw, way):
+    def losses(numbers, draw, way):
         return _seen(name, numbers, samples, draw, way)
 
-    def truth(numbers, draw, way):
-        return _truth(name, numbers)
+    chosen = list(lines(name, directions))
+    yield from _rows(("frames", "final loss"), losses, chosen, draws, scenes.scene(name).way)
 
-    yield from _rows(("frames", "final loss"), seen, chosen, draws, scenes.scene(name).way)
-    yield from _rows(("true flow",), truth, chosen, 1, "interior")
+
+def certify_truth(name: str, directions: int | None) -> Iterator[tuple[str, Row]]:
+    """As ``certify_seen`` for the true flow, which has no film samples."""
+    chosen = list(lines(name, directions))
+    losses = functools.partial(_truth, name)
+    yield from _rows(("true flow",), losses, chosen, 1, "interior")
 
 
 def lines(name: str, directions: int | None) -> Iterator[Line]:
@@ -81,7 +85,7 @@ def smooth_weight(*shape: int) -> Tensor:
     return fine.double().reshape(*shape, *size)
 
 
-@cache
+@functools.cache
 def target(name: str) -> tuple[Tensor, Tensor]:
     """True flow [1, 2, H, W] of a scene as it stands, and [1, 1, H, W] where it is known and no
     silhouette is near."""
@@ -103,7 +107,7 @@ def true_flow(name: str, numbers: Numbers) -> tuple[Tensor, Tensor]:
 def closed_form(counts: Tensor) -> Tensor:
     """Estimated flow [1, 2, H, W] of counts [FRAMES - 1, 2, H, W]."""
     volume = events.from_counts(counts, T_S, BINS)
-    return flow.estimate_lk(volume, "affine").flow_px
+    return flow.estimate_lk(volume, "affine", levels_px=(2.0, 1.0), steps=2).flow_px
 
 
 def _seen(name, numbers, samples, draw, way):
@@ -116,7 +120,7 @@ def _seen(name, numbers, samples, draw, way):
     return torch.stack([(smooth_weight(FRAMES) * image).mean() / 100, error])
 
 
-def _truth(name, numbers):
+def _truth(name, numbers, draw, way):
     found, _ = true_flow(name, numbers)
     return (smooth_weight(1, 2) * target(name)[1] * found).mean()[None]
 
@@ -127,7 +131,7 @@ def _rows(junctions, losses: Losses, chosen: Sequence[Line], draws: int, way: Wa
     differences = torch.stack([torch.stack(each) for each in found])
     twice = torch.stack([_difference(losses, line, 0, 2) for line in chosen])
     for k, junction in enumerate(junctions):
-        bent = (twice - differences[0])[:, k].abs() / 3
+        bent = (twice - differences[0])[:, k].abs()
         for row in judged(chosen, slopes[..., k], differences[..., k], bent):
             yield junction, row
 

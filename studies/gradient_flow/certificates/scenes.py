@@ -45,7 +45,7 @@ class Scene:
 
     on_object: whether the camera stands on the object, which carries it along. step: of
       differences, in unit steps: small where textures have texels, as large as bending allows where
-      silhouettes make noise.
+      silhouettes make noise. near: share of a step of translations, before something near.
     """
 
     world: render.moving.Scene
@@ -55,6 +55,7 @@ class Scene:
     way: Way = "interior"
     on_object: bool = False
     step: float = 1.0
+    near: float = 1.0
 
     def at(self, numbers: Numbers) -> tuple[render.MovingScene, Tensor]:
         """The moving scene and the camera's path [FRAMES, 4, 4], changed by twists: numbers' "pose
@@ -88,12 +89,13 @@ def point() -> dict[str, Tensor]:
 
 def steps(name: str) -> dict[str, Tensor]:
     """Steps of ``point``'s numbers in the scene of that name, in the shape of each."""
-    twists = dict(zip(POSE, TWIST_UNITS.split(1), strict=True))
+    before = scene(name)
+    twist = TWIST_UNITS * torch.tensor([before.near] * 3 + [1.0] * 3, dtype=torch.float64)
+    twists = dict(zip(POSE, twist.split(1), strict=True))
     kinds = {kind: torch.tensor(unit).double() for kind, unit in LENS_UNITS.items()}
     kinds["index_offset"] = kinds["index_offset"] * optics().glass
-    units = {**kinds, **twists, OBJECT: TWIST_UNITS}
-    size = scene(name).step
-    return {key: size * units[key].expand(value.shape) for key, value in point().items()}
+    units = {**kinds, **twists, OBJECT: twist}
+    return {key: before.step * units[key].expand(value.shape) for key, value in point().items()}
 
 
 def camera(numbers: Numbers, samples: int, seed: int) -> render.Camera:
@@ -115,18 +117,20 @@ def _room():
 def _occluders():
     ball = pose.se3_exp(torch.tensor([0.0, 1.7, 1.3, 0, 0, 0], dtype=torch.float64))
     start = pose.look_at(*START)
-    return Scene(silhouettes.build("cubes"), silhouettes.ball(), ball, start, "boundary", step=2.0)
+    return Scene(silhouettes.build("cubes"), silhouettes.ball(), ball, start, "boundary")
 
 
 def _robot():
     stand = pose.se3_exp(torch.tensor([0.05, -1.2, 1.0, 0.0, 0.0, 0.1], dtype=torch.float64))
     mounted = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, -0.15))
-    return Scene(silhouettes.room(), silhouettes.robot(), stand, mounted, "boundary", True, 2.0)
+    return Scene(
+        silhouettes.room(), silhouettes.robot(), stand, mounted, "boundary", True, near=0.2
+    )
 
 
 def _dark():
     start = pose.look_at(*worlds.VIEWS["dark-room"])
-    return Scene(_behind(), worlds.dark_room(), _eye(), start, "boundary", step=2.0)
+    return Scene(_behind(), worlds.dark_room(), _eye(), start, "boundary")
 
 
 def _behind():
@@ -138,6 +142,11 @@ def _eye():
     return torch.eye(4, dtype=torch.float64)
 
 
+SILHOUETTES = (
+    "occluders",
+    "robot in view",
+    "dark room",
+)  # scenes whose gradient has a boundary term
 BUILDERS: dict[str, Callable[[], Scene]] = {
     "smooth plane": _plane,
     "textured room": _room,
