@@ -35,27 +35,23 @@ def certify_seen(
     """(junction, row) of frames and final loss to every group of ``scenes.point``, for a scene by
     its name.
 
-    Args:
-      samples: per pixel. draws: of film samples. directions: at random in every group that has
-        more numbers; None: every number.
+    Args: samples per pixel; draws of film samples; directions as for ``lines``.
     """
-
-    def losses(numbers, draw, way):
-        return _seen(name, numbers, samples, draw, way)
-
-    chosen = list(lines(name, directions))
-    yield from _rows(("frames", "final loss"), losses, chosen, draws, scenes.scene(name).way)
+    losses = functools.partial(_seen, name, samples)
+    way = scenes.scene(name).way
+    yield from _rows(("frames", "final loss"), losses, lines(name, directions), draws, way)
 
 
 def certify_truth(name: str, directions: int | None) -> Iterator[tuple[str, Row]]:
     """As ``certify_seen`` for the true flow, which has no film samples."""
-    chosen = list(lines(name, directions))
     losses = functools.partial(_truth, name)
-    yield from _rows(("true flow",), losses, chosen, 1, "interior")
+    yield from _rows(("true flow",), losses, lines(name, directions), 1, "interior")
 
 
-def lines(name: str, directions: int | None) -> Iterator[Line]:
-    """Steps to take in a scene: along single numbers, or in random directions."""
+def lines(name: str, directions: int | None) -> list[Line]:
+    """Steps to take in a scene: along every number (None), or in random directions in groups that
+    have more."""
+    found = []
     draw = torch.Generator().manual_seed(1)
     for group, unit in scenes.steps(name).items():
         few = directions is not None and directions < unit.numel()
@@ -67,7 +63,8 @@ def lines(name: str, directions: int | None) -> Iterator[Line]:
             line = way.reshape(unit.shape) * unit
             # air has no index to change
             if bool(line.any()):
-                yield group, line
+                found.append((group, line))
+    return found
 
 
 def frames(name: str, numbers: Numbers, samples: int, draw: int, way: Way) -> Tensor:
@@ -110,7 +107,7 @@ def closed_form(counts: Tensor) -> Tensor:
     return flow.estimate_lk(volume, "affine", levels_px=(2.0, 1.0), steps=2).flow_px
 
 
-def _seen(name, numbers, samples, draw, way):
+def _seen(name, samples, numbers, draw, way):
     """A weighted mean of the frames, and the squared error of the closed-form flow of their smooth
     counts, px2."""
     image = frames(name, numbers, samples, draw, way)

@@ -106,7 +106,7 @@ def camera(numbers: Numbers, samples: int, seed: int) -> render.Camera:
 
 def _plane():
     wall = worlds.smooth_plane(0, pose.look_at((0, 0, 0), (0, -1, 0)), finest_period_m=0.3)
-    return Scene(_behind(), wall, _eye(), pose.look_at((0.1, -2, 0.05), (0, 0, 0)), step=0.2)
+    return Scene(_behind(), wall, _eye(), pose.look_at((0.1, -2, 0.05), (0, 0, 0)), step=0.02)
 
 
 def _room():
