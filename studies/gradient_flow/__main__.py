@@ -1,13 +1,13 @@
 """Are the gradients right, from the lens to the loss? Against central differences with common
 random numbers, by case.
 
-chain, joint: junction by junction, and the whole graph with lens, mount, thresholds and network.
-  layers,
-sensors, timing: the event layers against differences of hard counts. silhouettes,
-  silhouettes_chain:
-where objects hide one another.
+scenes: every junction and every group on five scenes, each right, wrong or not judgeable; its
+count is the first line of the page. chain, joint: more precisely, junction by junction, and the
+whole graph with lens, mount, thresholds and network. layers, sensors, timing: the event layers
+against differences of hard counts. silhouettes, silhouettes_chain: where objects hide one another.
 """
 
+import json
 import sys
 from dataclasses import dataclass
 from typing import ClassVar
@@ -19,11 +19,13 @@ from codesign.report import chain_figures
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.sweep import sweep
 from studies.gradient_flow import chain
+from studies.gradient_flow.certificates import topic as certificates
 from studies.gradient_flow.events import topics
 from studies.gradient_flow.silhouettes import flow, frames
-from studies.gradient_flow.topic import Row, Topic, label
+from studies.gradient_flow.topic import NOT_JUDGEABLE, Row, Topic, label
 
 CASES: dict[str, Topic] = {
+    "scenes": certificates.TOPIC,
     "chain": chain.CHAIN,
     "joint": chain.JOINT,
     "layers": topics.LAYERS,
@@ -36,9 +38,26 @@ CASES: dict[str, Topic] = {
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
-    QUICK: ClassVar = {"hard_cases": 2, "scenes": 1, "samples": 512, "seeds": 2}
-    cases: tuple[str, ...] = ("chain", "joint")
-    """What to measure: chain, joint, layers, sensors, timing, silhouettes, silhouettes_chain."""
+    QUICK: ClassVar = {
+        "cases": ("scenes",),
+        "film_samples": 32,
+        "draws": 4,
+        "directions": 1,
+        "hard_cases": 2,
+        "scenes": 1,
+        "samples": 512,
+        "seeds": 2,
+    }
+    cases: tuple[str, ...] = ("scenes", "chain", "joint")
+    """What to measure: scenes, chain, joint, layers, sensors, timing, silhouettes,
+    silhouettes_chain."""
+    film_samples: int = 128
+    """Samples per pixel of the frames of the five scenes."""
+    draws: int = 16
+    """Draws of these samples, over which gradients and differences are averaged."""
+    directions: int = 2
+    """Random directions of a lens tensor or of an object's pose (scenes); 0: every number by
+    itself."""
     hard_cases: int = 32
     """Motions and textures averaged for the straight-through layer against the hard loss
     (chain)."""
@@ -59,33 +78,67 @@ def study(run: Run[Config]) -> None:
         raise DomainError(
             f"--cases is {' '.join(config.cases)!r}; choose among {', '.join(CASES)}."
         )
-    for name, least in (("hard_cases", 1), ("scenes", 1), ("samples", 64), ("seeds", 2)):
+    for name, least in (
+        ("film_samples", 1),
+        ("draws", 2),
+        ("directions", 0),
+        ("hard_cases", 1),
+        ("scenes", 1),
+        ("samples", 64),
+        ("seeds", 2),
+    ):
         if getattr(config, name) < least:
             raise DomainError(f"{name} = {getattr(config, name)} must be at least {least}.")
-    missed = []
-    for name in config.cases:
-        missed += show(run, name, measured(run, name))
-    run.finish(
-        "Gradients beside differences",
-        f"**Below what is asked:** {'; '.join(missed)}." if missed else "All that is asked is met.",
+    if config.quick:
+        run.say(
+            "quick form: few samples and directions; frames with silhouettes are left to the full form."
+        )
+    done = []
+    try:
+        for name in config.cases:
+            done.append(name)
+            measured(run, name)
+    except KeyboardInterrupt:
+        report(run, done, interrupted=True)
+        raise
+    report(run, done)
+
+
+def report(run: Run[Config], cases: list[str], interrupted: bool = False) -> None:
+    """The page of what is measured so far."""
+    rows = {name: found for name in cases if (found := stored(run, name))}
+    missed = [short for name, found in rows.items() for short in show(run, name, found)]
+    lead = []
+    if "scenes" in rows:
+        lead.append(certificates.headline(rows["scenes"], run.config.quick))
+    if interrupted:
+        lead.append("**Interrupted**: the rows below are those that were done.")
+    lead.append(
+        f"**Below what is asked:** {'; '.join(missed)}." if missed else "All that is asked is met."
     )
+    run.say(lead[0])
+    run.finish("Gradients beside differences", "\n\n".join(lead))
 
 
-def measured(run: Run[Config], name: str) -> list[Row]:
-    """The rows of a case, job by job."""
+def measured(run: Run[Config], name: str) -> None:
+    """Measure the rows of a case, job by job."""
     topic = CASES[name]
 
     def cell(job):
         rows = list(topic.measure(run.config, *job))
         for row in rows:
             run.record(**row.metrics(name))
-        return [{"names": list(row.names), **row.numbers} for row in rows]
+        return [{"names": list(row.names), "state": row.state, **row.numbers} for row in rows]
 
-    rows = sweep(run, cell, name, job={label(job): job for job in topic.jobs(run.config.quick)})
-    return [
-        Row(tuple(row["names"]), {k: v for k, v in row.items() if k not in ("job", "names")})
-        for row in rows
-    ]
+    sweep(run, cell, name, job={label(job): job for job in topic.jobs(run.config.quick)})
+
+
+def stored(run: Run[Config], name: str) -> list[Row]:
+    """The rows of a case that are in the run's folder."""
+    path = run.path(f"{name}.jsonl")
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    found = [row for line in lines for row in json.loads(line)[1]]
+    return [Row(tuple(row.pop("names")), state=row.pop("state"), numbers=row) for row in found]
 
 
 def show(run: Run[Config], name: str, rows: list[Row]) -> list[str]:
@@ -97,10 +150,14 @@ def show(run: Run[Config], name: str, rows: list[Row]) -> list[str]:
     run.card(topic.title, f"{judged - len(short)} of {judged}", "rows that reach what is asked")
     run.section(topic.title, topic.text)
     numbers = list(rows[0].numbers)
+    states = ("state",) if rows[0].state else ()
     run.table(
         topic.title,
-        (*topic.columns, *(key.replace("_", " ") for key in numbers)),
-        [(*row.names, *(row.numbers[key] for key in numbers)) for row in rows],
+        (*topic.columns, *states, *(key.replace("_", " ") for key in numbers)),
+        [
+            (*row.names, *(row.state for _ in states), *(row.numbers[key] for key in numbers))
+            for row in rows
+        ],
         caption="Below what is asked: " + "; ".join(" ".join(row.names) for row in short)
         if short
         else "",
@@ -109,13 +166,12 @@ def show(run: Run[Config], name: str, rows: list[Row]) -> list[str]:
         lines, columns = (list(dict.fromkeys(row.names[k] for row in rows)) for k in (0, 1))
         errors = np.full((len(lines), len(columns)), np.nan)
         for row in rows:
-            errors[lines.index(row.names[0]), columns.index(row.names[1])] = row.numbers[
-                "relative_error"
-            ]
+            if row.state != NOT_JUDGEABLE:
+                at = lines.index(row.names[0]), columns.index(row.names[1])
+                errors[at] = np.fmax(errors[at], row.numbers["relative_error"])
         figure = chain_figures.heat_map(errors, lines, columns, "relative error")
-        run.figure(
-            figure, f"heat_map_{name}", f"{topic.title}: relative error against differences."
-        )
+        caption = f"{topic.title}: largest relative error of what can be judged."
+        run.figure(figure, f"heat_map_{name}", caption)
     return [f"{name}: {len(short)} of {judged} rows"] if short else []
 
 

@@ -1,10 +1,7 @@
-"""Gradients along the chain, junction by junction, and of one graph with lens, mount, thresholds
-and
-network: functions of named parameters, with their required figures. The tests certify them too."""
+"""Gradients of what the five scenes do not show: lens rays by themselves, the straight-through layer
+beside the hard loss, and one graph with lens, mount, thresholds and network."""
 
-import math
 from dataclasses import replace
-from statistics import median
 
 import torch
 
@@ -14,9 +11,9 @@ from codesign.grad import certify
 from codesign.grad.modules import by_group
 from codesign.mount import Mount
 from codesign.system import Batch, System
-from scenes import textures, trajectories, worlds
-from studies.gradient_flow.topic import Asked, Row, Topic
-from studies.lens_opt.task import PITCH_MM, SENSOR, TRAINING, draw_case, make_task, make_worlds
+from scenes import trajectories, worlds
+from studies.gradient_flow.topic import Asked, Topic, of_certificate
+from studies.lens_opt.task import SENSOR, TRAINING, draw_case, make_task, make_worlds
 
 FINE = tuple(10.0**-k for k in (3, 4, 5, 6))
 CURVES = [0, 2, 3]  # the three curvatures of the final loss: front crown, both sides of the flint
@@ -49,118 +46,6 @@ def rays_rows():
     return certify(fn, params, scales=scales, ladder=FINE, tolerance=1e-6)
 
 
-def _camera_rows(loss, size_px, samples, seed, curvature, **options):
-    """Rows of loss(camera, twist) with respect to curvatures, thicknesses and pose. curvature: its
-    step unit."""
-    geo = lens.load("cooke-triplet").scaled(0.22).freeze()
-    params = {
-        "curvature": geo.curvature_per_mm,
-        "thickness": geo.thickness_mm,
-        "pose": torch.zeros(6, dtype=torch.float64),
-    }
-
-    def fn(p):
-        optics = geo.replace(curvature_per_mm=p["curvature"], thickness_mm=p["thickness"])
-        camera = render.Camera(optics, size_px, size_px, PITCH_MM * 192 / size_px, samples, seed)
-        return loss(camera, pose.se3_exp(p["pose"]))
-
-    scales = {"curvature": curvature, "thickness": 0.1, "pose": POSE_UNIT}
-    return certify(fn, params, scales=scales, **options)
-
-
-def _frame_rows(scene, start, seed, samples, **options):
-    """Of a small sequence of frames."""
-    motion = trajectories.translation(start, (0.4, 0.1, 0.2), trajectories.times(3, 100.0))
-    # a smooth weight: the loss of a stage downstream never sees single pixels
-    weight = torch.nn.functional.avg_pool2d(normal(3, 48, 48, seed=seed), 5, 1, 2)
-
-    def loss(camera, twist):
-        image = render.frames(camera, scene, motion @ twist).double()
-        return (weight * image).mean() + 0.01 * (image / 100).square().mean()
-
-    return _camera_rows(loss, 48, samples, seed, 0.002, **options)
-
-
-def plane_rows(seed):
-    """Frames of the analytic plane, everything in float64."""
-    plane = worlds.smooth_plane(seed, pose.look_at((0, 0, 0), (0, -1, 0)))
-    start = pose.look_at((0.1, -2, 0.05), (0, 0, 0))
-    return _frame_rows(
-        plane, start, seed, 8, ladder=(0.1, 0.03, 0.01, 0.003, 0.001), tolerance=1e-5
-    )
-
-
-def room_rows(seed):
-    """Frames of the photo-textured room without objects, so that no silhouette moves; scene in
-    float32."""
-    start = pose.look_at((0.3, -0.8, 1.2), (0.1, 2.0, 1.0))
-    scene = worlds.room(objects=False)
-    return _frame_rows(scene, start, seed, 16, ladder=(0.03, 0.02, 0.014, 0.01), tolerance=0.01)
-
-
-def truth_rows():
-    """Ground-truth flow through the lens, with respect to lens and the first pose."""
-    wall = worlds.smooth_plane(0, pose.look_at((0, 0, 0), (0, -1, 0)))
-    first = pose.look_at((0, -2, 0), (0.1, 0, 0))
-    later = pose.look_at((0.03, -1.95, 0.02), (0.12, 0, 0))
-    weight = normal(1, 2, 24, 24, seed=1)
-
-    def loss(camera, twist):
-        found, _ = render.true_flow(camera, wall, torch.stack([first @ twist, later]))
-        return (weight * found).mean()
-
-    return _camera_rows(loss, 24, 1, 0, 0.01, ladder=(1e-1, 1e-2, 1e-3, 1e-4), tolerance=1e-5)
-
-
-def _moving_frames(seed, contrast=0.6):
-    """A small band-limited sequence in float64, as a function of contrast and shift per frame:
-    fn(p) -> frames [8, 24, 24]; and the point where it is asked."""
-    frequency, amplitude, phase = (
-        part[..., None, None, None] for part in textures.waves(seed, 12, 6.0, 24.0, contrast)
-    )
-    pixel = torch.arange(24, dtype=torch.float64)
-    steps = torch.arange(8, dtype=torch.float64)[:, None, None]
-
-    def frames(p):
-        at_x = pixel - p["shift"][0] * steps
-        at_y = pixel[:, None] - p["shift"][1] * steps
-        waves = (2 * math.pi * (frequency[:, 0] * at_x + frequency[:, 1] * at_y) + phase).cos()
-        return 80 * (p["contrast"] * (amplitude * waves).sum(0)).exp()
-
-    point = {"contrast": torch.ones(1), "shift": torch.tensor([0.4, -0.2])}
-    return frames, {name: value.double() for name, value in point.items()}
-
-
-def count_rows(seed):
-    """Smooth event counts with respect to contrast, motion and threshold. Small steps: counts have
-    a kink where the level stands still."""
-    frames, params = _moving_frames(seed)
-    weight = torch.rand(
-        7, 2, 24, 24, generator=torch.Generator().manual_seed(2), dtype=torch.float64
-    )
-    params = {**params, "theta": torch.tensor([0.2], dtype=torch.float64)}
-    return certify(
-        lambda p: (weight * events.soft_counts(frames(p), p["theta"], p["theta"])).mean(),
-        params,
-        scales={"theta": 0.1, "shift": 0.1},
-        ladder=(1e-4, 1e-5, 1e-6),
-        tolerance=1e-5,
-    )
-
-
-def flow_rows(seed):
-    """Mean estimated flow and its square, with respect to contrast and motion."""
-    frames, params = _moving_frames(seed)
-    t_s = torch.linspace(0, 0.05, 8, dtype=torch.float64)
-
-    def fn(p):
-        volume = events.from_counts(events.soft_counts(frames(p), 0.2, 0.2), t_s, 4)
-        found = flow.estimate_lk(volume, "constant", levels_px=(2.0, 1.0), steps=2).flow_px
-        return found.mean() + 0.1 * found.square().mean()
-
-    return certify(fn, params, scales={"shift": 0.1}, ladder=(1e-3, 1e-4, 1e-5), tolerance=1e-5)
-
-
 def _final(task, case_list, layer, samples, sensor=SENSOR):
     """Mean log angular flow error over cases, as a function of three curvatures and the camera
     pose."""
@@ -187,43 +72,6 @@ def _final(task, case_list, layer, samples, sensor=SENSOR):
         "pose": torch.zeros(6, dtype=torch.float64),
     }
     return fn, params, {"curvature": unit, "pose": POSE_UNIT}
-
-
-def loss_rows(seed):
-    """The final loss with the smooth counts layer, whole chain, scene in float32.
-
-    Without noise the smooth layer lets the closed-form flow come within hundredths of a pixel, and
-    the gradient is that of rounding; shot noise of 40 Hz gives an error that the optics can change.
-    Band-limited textures, since texel borders are kinks.
-    """
-    task = make_task("cooke-triplet", seed, 1.0)
-    walls = [
-        worlds.wall(
-            textures.speckle(k, size_px=1024, finest_px=32.0, coarsest_px=128.0), texel_m=0.002
-        )
-        for k in (5, 6)
-    ]
-    cases = [draw_case(walls, 61 + i) for i in range(4)]
-    noisy = events.SensorModel(theta_on=0.2, theta_off=0.2, theta_sigma=0.03, shot_rate_hz=40.0)
-    fn, params, scales = _final(task, cases, "counts", 16, noisy)
-    return certify(fn, params, scales=scales, ladder=(0.014, 0.01, 0.007, 0.005), tolerance=0.05)
-
-
-def plane_loss_rows():
-    """Endpoint error of the closed form on smooth counts of the analytic plane, whole chain in
-    float64."""
-    plane = worlds.smooth_plane(3, pose.look_at((0, 0, 0), (0, -1, 0)))
-    t_s = torch.linspace(0, 0.05, 8, dtype=torch.float64)
-    path = trajectories.translation(pose.look_at((0.1, -2, 0.05), (0, 0, 0)), (0.4, 0.1, 0.2), t_s)
-
-    def loss(camera, twist):
-        moved = path @ twist
-        counts = events.soft_counts(render.frames(camera, plane, moved), 0.2, 0.2)
-        field = flow.estimate_lk(events.from_counts(counts, t_s, bins=5))
-        return flow.metrics.aee(field.flow_px, *render.true_flow(camera, plane, moved[[0, -1]]))
-
-    ladder = (3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5)
-    return _camera_rows(loss, 24, 8, 0, 0.002, ladder=ladder, tolerance=1e-6)
 
 
 def hard_rows(seed, count, moved=("curvature", "pose")):
@@ -381,65 +229,40 @@ def joint_rows(system: System, batch: Batch, directions: int) -> list[Certificat
 
 # ---- the cases of the study
 
-# label: what is asked, and what makes the rows
-JUNCTIONS = {
-    "lens rays, float64": (Asked({}, {"relative_error": 1e-6}), lambda seed: rays_rows()),
-    "frames, plane, float64": (Asked({}, {"relative_error": 1e-5}), lambda seed: plane_rows(seed)),
-    "frames, room, float32": (Asked({}, {"relative_error": 0.01}), lambda seed: room_rows(seed)),
-    "true flow, float64": (Asked({}, {"relative_error": 1e-5}), lambda seed: truth_rows()),
-    "event counts, smooth": (Asked({}, {"relative_error": 1e-5}), lambda seed: count_rows(seed)),
-    "flow estimate, float64": (Asked({}, {"relative_error": 1e-5}), lambda seed: flow_rows(seed)),
-    "final loss, plane, float64": (
-        Asked({}, {"relative_error": 1e-6}),
-        lambda seed: plane_loss_rows(),
-    ),
-    "final loss, smooth events": (
-        Asked({"cosine": 0.99}, {"relative_error": 0.05}),
-        lambda seed: loss_rows(seed),
-    ),
-}
 HARD = "final loss, hard events"
-
-
-def shown(label: str, row: CertificateRow) -> Row:
-    """A row of a certificate as one of the study's."""
-    numbers = {
-        name: getattr(row, name)
-        for name in ("relative_error", "cosine", "signed_bias", "noise_floor")
-    }
-    return Row((label, row.name), {**numbers, "plateau_step": median(row.step_plateau)})
+RAYS = "lens rays, float64"
+HARD = "final loss, hard events"
+ASKED = {RAYS: Asked({}, {"relative_error": 1e-6}), HARD: Asked({"cosine": 0.9}, {})}
 
 
 def measure_junction(config, label):
-    rows = (
-        hard_rows(config.seed, config.hard_cases)
-        if label == HARD
-        else JUNCTIONS[label][1](config.seed)
-    )
-    return [shown(label, row) for row in rows]
+    rows = rays_rows() if label == RAYS else hard_rows(config.seed, config.hard_cases)
+    return [of_certificate((label, row.name), row) for row in rows]
 
 
 def measure_joint(config):
     system = make_system(10_000, config.seed)
     batch = draw_batch(4, 1000 + config.seed)
-    return [shown("one graph", row) for row in joint_rows(system, batch, 4 if config.quick else 12)]
+    return [
+        of_certificate(("one graph", row.name), row)
+        for row in joint_rows(system, batch, 4 if config.quick else 12)
+    ]
 
 
 TEXT = (
-    "Relative error is |autograd - difference| / |difference| over the group; the noise floor is the "
-    "disagreement of neighbouring step sizes, in the same unit."
+    "Relative error is |autograd - difference| / |difference| over the group; signal to noise is one over "
+    "the noise of the differences, in the same unit."
 )
 CHAIN = Topic(
     "Along the chain",
-    TEXT
-    + " Lens rays in float64, frames (textured room, no silhouettes) with respect to lens and pose, "
-    "event counts, flow, and the final loss with respect to three curvatures and all six pose components, "
-    "once with the smooth event layer and once with the straight-through layer against differences of the "
-    "hard loss.",
+    TEXT + " Lens rays in float64, and the final loss with respect to three curvatures and "
+    "all six pose components with the straight-through layer, against differences of the hard loss.",
     ("junction", "parameters"),
-    lambda quick: [(label,) for label in (*JUNCTIONS, HARD)],
+    lambda quick: [(label,) for label in ASKED],
     measure_junction,
-    lambda row: Asked({"cosine": 0.9}, {}) if row.names[0] == HARD else JUNCTIONS[row.names[0]][0],
+    lambda row: (
+        Asked({"cosine": 0.9}, {}) if row.names[0] == HARD else Asked({}, {"relative_error": 1e-6})
+    ),
 )
 JOINT = Topic(
     "Lens, mount, thresholds and network in one graph",

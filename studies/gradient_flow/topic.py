@@ -4,17 +4,24 @@ behind the last."""
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from statistics import median
+
+from codesign.grad import Row as CertificateRow
 
 Job = tuple[str | float, ...]  # plain values, which tell it from other jobs
+RIGHT, WRONG, NOT_JUDGEABLE = "right", "wrong", "not judgeable"
+STATES = {"pass": RIGHT, "fail": WRONG, "noise": NOT_JUDGEABLE}
+LEAST_NOISE = 1e-16
 
 
 @dataclass(frozen=True)
 class Row:
     """A line of a table. names: what tells it from the others. numbers: figures by name, such as
-    cosine and scale."""
+    cosine and scale. state: of STATES, where a certificate judges it."""
 
     names: tuple[str, ...]
     numbers: dict[str, float]
+    state: str = ""
 
     def metrics(self, prefix: str = "") -> dict[str, float]:
         """Figures by the names that they have in metrics.json: cosine_memory_contrast_240fps."""
@@ -25,6 +32,19 @@ class Row:
         return {f"{key}_{name}": value for key, value in self.numbers.items()}
 
 
+def of_certificate(names: tuple[str, ...], row: CertificateRow, state: str = "") -> Row:
+    """A row of a certificate as one of the study's; the plateau is the step of its differences, in
+    the middle of them."""
+    numbers = {
+        "relative_error": row.relative_error,
+        "cosine": row.cosine,
+        "signed_bias": row.signed_bias,
+        "signal_to_noise": 1 / max(row.noise_floor, LEAST_NOISE),
+        "plateau_step": median(row.step_plateau),
+    }
+    return Row(names, numbers, state)
+
+
 @dataclass(frozen=True)
 class Asked:
     """What a row's numbers have to reach: at least, at most, by name."""
@@ -33,8 +53,8 @@ class Asked:
     most: dict[str, float]
 
     def missed(self, row: Row) -> bool:
-        """Whether a number falls short; NaN does."""
-        return not (
+        """Whether the row is wrong, or a number falls short; NaN does."""
+        return row.state == WRONG or not (
             all(row.numbers[name] >= value for name, value in self.least.items())
             and all(row.numbers[name] <= value for name, value in self.most.items())
         )

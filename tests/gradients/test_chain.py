@@ -1,20 +1,14 @@
 """Gradients along the whole chain, certified with the cases that
 ``studies.gradient_flow --cases chain`` reports."""
 
-import pytest
-
 from studies.gradient_flow import chain
 
-JUNCTIONS = [label for label in chain.JUNCTIONS if not label.startswith("final loss")]
 
-
-@pytest.mark.parametrize("label", JUNCTIONS)
-def test_junction_gradients_agree_with_differences(label):
-    asked, rows = chain.JUNCTIONS[label]
-    for row in rows(0):
-        assert row.relative_error <= asked.most["relative_error"], row
+def test_ray_gradients_agree_with_differences():
+    for row in chain.rays_rows():
+        assert row.relative_error <= 1e-6, row
         # otherwise the differences could not have judged
-        assert row.noise_floor <= asked.most["relative_error"], row
+        assert row.noise_floor <= 1e-6, row
 
 
 def test_straight_through_gradient_of_the_lens_points_where_the_hard_loss_falls():

@@ -37,6 +37,9 @@ def test_the_study_goes_on_where_it_was_cut(tmp_path, monkeypatch):
     monkeypatch.setitem(study.CASES, "layers", dataclasses.replace(topic, measure=measure))
     options = ["--quick", "--cases", "layers"]
     assert main(study.study, study.Config, [*options, "--out", str(tmp_path / "run")]) == 130
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert "Interrupted" in page
+    assert [f"<td>{job[0]}</td>" in page for job in ran] == [True, False]
     assert main(study.study, study.Config, ["--resume", str(tmp_path / "run")]) == 0
     jobs = topic.jobs(True)
     assert ran == [*jobs[:2], *jobs[1:]]
