@@ -51,7 +51,7 @@ class Config(StudyConfig):
     cases: tuple[str, ...] = ("scenes", "chain", "joint")
     """What to measure: scenes, chain, joint, layers, sensors, timing, silhouettes,
     silhouettes_chain."""
-    film_samples: int = 128
+    film_samples: int = 256
     """Samples per pixel of the frames of the five scenes."""
     draws: int = 16
     """Draws of these samples, over which gradients and differences are averaged."""

@@ -59,7 +59,7 @@ def headline(rows: Sequence[Row], quick: bool = False) -> str:
             f"{share}, the worst by {_error(worst):.2g} of its length ({', '.join(worst.names)})"
         )
     else:
-        said = f"every gradient that can be judged is right within {share}"
+        said = f"every gradient that can be judged is right within {share} or its own noise"
     tail = f"{count[NOT_JUDGEABLE]} of {len(rows)} cannot be judged at this noise"
     start = "quick form: " if quick else ""
     return f"{start}{said}; {tail}."
