@@ -51,7 +51,7 @@ class Config(StudyConfig):
     cases: tuple[str, ...] = ("scenes", "chain", "joint")
     """What to measure: scenes, chain, joint, layers, sensors, timing, silhouettes,
     silhouettes_chain."""
-    film_samples: int = 128
+    film_samples: int = 256
     """Samples per pixel of the frames of the five scenes."""
     draws: int = 16
     """Draws of these samples, over which gradients and differences are averaged."""
@@ -110,7 +110,7 @@ def report(run: Run[Config], cases: list[str], interrupted: bool = False) -> Non
     missed = [short for name, found in rows.items() for short in show(run, name, found)]
     lead = []
     if "scenes" in rows:
-        lead.append(certificates.headline(rows["scenes"], run.config.quick))
+        lead.append(certificates.headline(rows["scenes"]))
     if interrupted:
         lead.append("**Interrupted**: the rows below are those that were done.")
     lead.append(

@@ -112,10 +112,11 @@ def test_the_headline_counts_the_rows():
         ]
 
     assert topic.headline(rows(right=37, not_judgeable=3)) == (
-        "every gradient that can be judged is right within 1 %; 3 of 40 cannot be judged at this noise."
+        "every gradient that can be judged is right within 1 % or its own noise; 3 of 40 cannot be "
+        "judged at this noise."
     )
-    assert topic.headline(rows(right=5, wrong=1), quick=True) == (
-        "quick form: 1 of 6 gradients that can be judged are wrong by more than 1 %, the worst by 0.04 "
+    assert topic.headline(rows(right=5, wrong=1)) == (
+        "1 of 6 gradients that can be judged are wrong by more than 1 %, the worst by 0.04 "
         "of its length (room, frames, pose x); 0 of 6 cannot be judged at this noise."
     )
 

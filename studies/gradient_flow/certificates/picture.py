@@ -124,11 +124,11 @@ def _truth(name, numbers, draw, way):
 
 def _rows(junctions, losses: Losses, chosen: Sequence[Line], draws: int, way: Way):
     slopes = torch.stack([_slopes(losses, chosen, draw, way) for draw in range(draws)])
-    found = [[_difference(losses, line, draw, 1) for line in chosen] for draw in range(draws)]
-    differences = torch.stack([torch.stack(each) for each in found])
-    twice = torch.stack([_difference(losses, line, 0, 2) for line in chosen])
+    differences = _differences(losses, chosen, draws, 1)
+    some = max(1, draws // 4)
+    bending = _differences(losses, chosen, some, 2) - differences[:some]
     for k, junction in enumerate(junctions):
-        bent = (twice - differences[0])[:, k].abs()
+        bent = bending[..., k].mean(0).abs()
         for row in judged(chosen, slopes[..., k], differences[..., k], bent):
             yield junction, row
 
@@ -147,15 +147,20 @@ def _slopes(losses, chosen, draw, way):
 
 
 @torch.no_grad()
-def _difference(losses, line, draw, step):
-    """[losses] central differences over a number of steps, per step."""
-    group, way = line
+def _differences(losses, chosen, draws, step):
+    """[draws, lines, losses] central differences over a number of steps, per step."""
     start = scenes.point()
-    ahead, behind = (
-        losses({**start, group: start[group] + sign * step * way}, draw, "interior")
-        for sign in (1, -1)
-    )
-    return (ahead - behind) / (2 * step)
+
+    def at(draw, group, way):
+        return losses({**start, group: start[group] + way}, draw, "interior")
+
+    found = [
+        torch.stack(
+            [(at(k, group, step * way) - at(k, group, -step * way)) for group, way in chosen]
+        )
+        for k in range(draws)
+    ]
+    return torch.stack(found) / (2 * step)
 
 
 def judged(chosen: Sequence[Line], slopes: Tensor, differences: Tensor, bent: Tensor) -> list[Row]:

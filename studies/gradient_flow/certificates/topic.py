@@ -45,7 +45,7 @@ def measure(config: Any, scene: str, part: str) -> Iterator[Row]:
         yield of_certificate((scene, junction, row.name), row, STATES[row.verdict])
 
 
-def headline(rows: Sequence[Row], quick: bool = False) -> str:
+def headline(rows: Sequence[Row]) -> str:
     """One sentence: how many gradients are right, wrong, and not to be judged."""
     count = Counter(row.state for row in rows)
     judged = count[RIGHT] + count[WRONG]
@@ -59,10 +59,9 @@ def headline(rows: Sequence[Row], quick: bool = False) -> str:
             f"{share}, the worst by {_error(worst):.2g} of its length ({', '.join(worst.names)})"
         )
     else:
-        said = f"every gradient that can be judged is right within {share}"
+        said = f"every gradient that can be judged is right within {share} or its own noise"
     tail = f"{count[NOT_JUDGEABLE]} of {len(rows)} cannot be judged at this noise"
-    start = "quick form: " if quick else ""
-    return f"{start}{said}; {tail}."
+    return f"{said[0].upper()}{said[1:]}; {tail}."
 
 
 def _error(row):
