@@ -112,7 +112,7 @@ def test_the_headline_counts_the_rows():
         ]
 
     assert topic.headline(rows(right=37, not_judgeable=3)) == (
-        "every gradient that can be judged is right within 1 % or its own noise; 3 of 40 cannot be "
+        "Every gradient that can be judged is right within 1 % or its own noise; 3 of 40 cannot be "
         "judged at this noise."
     )
     assert topic.headline(rows(right=5, wrong=1)) == (
