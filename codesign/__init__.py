@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         errors,
         events,
         exclusive,
+        fidelity,
         flow,
         grad,
         lens,
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
         train,
         types,
     )
+    from codesign.fidelity.select import select
     from codesign.report.show import show
     from codesign.system import System
 
@@ -41,6 +43,7 @@ __all__ = [
     "errors",
     "events",
     "exclusive",
+    "fidelity",
     "flow",
     "grad",
     "lens",
@@ -49,6 +52,7 @@ __all__ = [
     "pose",
     "render",
     "report",
+    "select",
     "show",
     "state",
     "system",
@@ -60,6 +64,8 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name == "System":
         return importlib.import_module("codesign.system").System
+    if name == "select":
+        return importlib.import_module("codesign.fidelity").select
     if name == "show":
         return importlib.import_module("codesign.report.show").show
     if name in __all__ or name in ("place", "task"):  # the latter are former names of mount

@@ -5,7 +5,9 @@ from typing import ClassVar, Literal
 
 from studies.frame.config import StudyConfig
 
-Name = Literal["levels", "lens", "render", "psf", "light", "events", "spiking", "flow", "placement"]
+Name = Literal[
+    "levels", "select", "lens", "render", "psf", "light", "events", "spiking", "flow", "placement"
+]
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,11 @@ import sys
 from codesign.errors import DomainError
 from studies.frame.run import Run, main
 from studies.frame.show import asked
-from studies.speed_error import Config, chain, events, frames, lens, levels
+from studies.speed_error import Config, chain, events, frames, lens, levels, select
 
 STAGES = {
     "levels": levels.stage,
+    "select": select.stage,
     "lens": lens.stage,
     "render": frames.render_stage,
     "psf": frames.psf_stage,
