@@ -29,7 +29,7 @@ if TYPE_CHECKING:
         train,
         types,
     )
-    from codesign.fidelity.select import select
+    from codesign.fidelity.search import select
     from codesign.report.show import show
     from codesign.system import System
 

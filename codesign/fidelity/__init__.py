@@ -4,7 +4,7 @@ tolerance."""
 from codesign.doors import explain
 from codesign.fidelity.choice import Choice
 from codesign.fidelity.levels import Fidelity, levels_of
-from codesign.fidelity.select import select
+from codesign.fidelity.search import select
 from codesign.fidelity.survey import Survey, survey
 from codesign.fidelity.task import Task
 

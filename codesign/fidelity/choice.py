@@ -6,10 +6,10 @@ from typing import Any
 
 from torch import Tensor
 
-from codesign.fidelity.levels import STAGES, Fidelity, levels_in, system_of
+from codesign.fidelity.levels import STAGES, Fidelity, batch_of, levels_in, system_of
 from codesign.fidelity.survey import Survey
 from codesign.fidelity.task import Task
-from codesign.system import System
+from codesign.system import Batch, System
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,10 @@ class Choice:
         own = {"objectives": objectives, "gradient": self.gradient}
         return system_of(self.scene, self.task, self.fidelity, **{**own, **parts})
 
+    def batch(self) -> Batch:
+        """The drives of the task at the frame times that were chosen."""
+        return batch_of(self.task, self.fidelity)
+
     def reasons(self) -> dict[str, str]:
         """Stage -> why its level, in a few words."""
         return {stage: self._reason(stage) for stage in STAGES}
@@ -52,15 +56,13 @@ class Choice:
             return "there is no other"
         if (stage, level) not in levels_in(self.fidelity):
             return "does not count"
-        if level != levels[-1]:
-            best = levels[-1]
-            dearer = self.survey.cpu_s(replace(self.fidelity, **{stage: best}))
-            times = dearer / self.survey.cpu_s(self.fidelity)
-            off = self.survey.changed(stage, level)
-            return f"{best} would change {name} by {off:.2g} {unit}, {times:.1f}x the time"
-        others = {other: self.survey.changed(stage, other) for other in levels[:-1]}
-        near = min(others, key=lambda other: others[other])
-        return f"{near}, the nearest, would change {name} by {others[near]:.2g} {unit}"
+        changes = {other: self.survey.changed(stage, other) for other in levels}
+        other, off = levels[-1], changes[level]
+        if level == other:
+            other, off = min(list(changes.items())[:-1], key=lambda item: item[1])
+        tried = replace(self.fidelity, **{stage: other})
+        times = self.survey.cpu_s(tried) / self.survey.cpu_s(self.fidelity)
+        return f"{other} would change {name} by {off:.2g} {unit}, {times:.2g}x the time"
 
     def __str__(self) -> str:
         task, wide = self.task, max(map(len, STAGES))

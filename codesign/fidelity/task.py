@@ -53,7 +53,7 @@ class Task:
     unit: str = "px"
     gradient: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_kind(self.camera, Camera, "the task's camera")
         check_kind(self.sensor, SensorModel, "the task's sensor")
         times = len(check_times(self.t_s))

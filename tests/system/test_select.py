@@ -1,19 +1,18 @@
 """What ``codesign.select`` chooses, beside every combination tried by hand and beside optics."""
 
 import itertools
-import sys
 from dataclasses import replace
 
 import pytest
 import torch
+from codesign.fidelity.survey import PARTS, change, outcome
 
 import codesign
 from codesign import events, lens, pose, render
 from codesign.errors import DomainError
-from codesign.fidelity import Fidelity, Survey, Task, levels_of
+from codesign.fidelity import Fidelity, Survey, Task, levels_of, search
 from codesign.fidelity.levels import batch_of, finer
-from codesign.fidelity.select import cheapest
-from codesign.fidelity.survey import PARTS, change, outcome
+from codesign.fidelity.search import cheapest
 
 T_S = torch.linspace(0, 0.05, 9, dtype=torch.float64)
 PLANE = render.TexturedPlane([[2.0, 1.5], [1.2, -2.4], [3.0, 0.4]], [0.3] * 3, [0.0, 1.0, 2.0])
@@ -130,15 +129,14 @@ def test_what_is_chosen_stays_within_the_tolerance_of_the_finest_and_repeats():
 
 def test_a_survey_that_promises_too_much_is_found_out_by_the_finer_run(monkeypatch):
     wanted = task(lens.ThinLens(8.0, 5.0).focus_at(0.12))
-    room = sys.modules["codesign.fidelity.select"]  # the function has its name
-    real = room.survey
+    real = search.survey
 
     def blind(*given):
         known = real(*given)
         return replace(known, rows=[{**row, "change": 0.0} for row in known.rows])
 
     only = {**FEW, "camera": ("pinhole", "thin"), "samples": (16,)}
-    monkeypatch.setattr(room, "survey", blind)
+    monkeypatch.setattr(search, "survey", blind)
     assert codesign.select(PLANE, wanted, 0.06, levels=only).fidelity.camera == "thin"
 
 

@@ -54,14 +54,14 @@ def select(
     >>> plane = render.TexturedPlane([[1.0, 0.5], [0.4, -0.8]], [0.3, 0.3], [0.0, 1.0])
     >>> still = pose.look_at((0, -0.1, 4), (0, 0, 0)).repeat(5, 1, 1)
     >>> task = Task(camera, events.SensorModel(), still, torch.linspace(0, 0.1, 5))
-    >>> print(codesign.select(plane, task, tolerance=0.1).fidelity)  # nothing moves
-    pinhole camera, 1 samples, 3 frames, sigmoid events, 3 bins, constant flow
+    >>> few = {"events": ("memory", "hard"), "bins": (4, 6), "flow": ("affine",)}
+    >>> choice = codesign.select(plane, task, tolerance=0.1, levels=few)  # nothing moves
+    >>> choice.change, choice.predicted
+    (0.0, 0.0)
     """
     check_positive(tolerance, "select: tolerance", remedy="give it in the unit of what is judged")
     known = survey(scene, task.cropped(), levels_of(task, levels), seed)
-    pick = cheapest(known, task, tolerance)
-    while (found := _finer_changes(scene, task, pick, known, seed)) > tolerance:
-        pick = _moved_up(scene, task, pick, known, tolerance, found, seed)
+    pick, found = verified(scene, task, cheapest(known, task, tolerance), known, tolerance, seed)
     return Choice(
         pick, found, known.predicted(pick), tolerance, known, scene, task, _way(scene, task)
     )
@@ -80,38 +80,35 @@ def cheapest(known: Survey, task: Task, tolerance: float) -> Fidelity:
     return min(alike, key=lambda pick: off[pick])
 
 
-def _finer_changes(scene, task, pick, known, seed):
-    above = finer(pick, known.levels)
-    return _change_between(scene, task, pick, above, seed)
+def verified(
+    scene: Any, task: Task, pick: Fidelity, known: Survey, tolerance: float, seed: int = 0
+) -> tuple[Fidelity, float]:
+    """The combination, moved up until one that is finer in every stage changes what is judged on
+    the whole film by no more than the tolerance; and that change.
 
-
-def _change_between(scene, task, one, other, seed):
-    if one == other:
-        return 0.0
-    first, second = (outcome(scene, task, each, seed).judged for each in (one, other))
-    return change(first, second)
-
-
-def _moved_up(scene, task, pick, known, tolerance, found, seed):
-    """The combination with the next level in the stage where a finer one changes most.
-
-    Raises: DomainError when no stage can move up.
+    Raises: DomainError when no stage can move up, naming the combination.
     """
-    above, allowed = finer(pick, known.levels), pickable(task, known.levels)
-    changes = {}
-    for stage in STAGES:
-        if getattr(pick, stage) != allowed[stage][-1]:
-            tried = replace(pick, **{stage: getattr(above, stage)})
-            changes[stage] = _change_between(scene, task, pick, tried, seed)
-    if not changes:
-        raise DomainError(
-            f"no combination keeps {task.name} within {tolerance:g} {task.unit}; the best found, "
-            f"{pick}, is off by {found:.2g} {task.unit}: give that tolerance, or a finer task "
-            "(samples, times)."
-        )
-    stage = max(changes, key=lambda stage: changes[stage])
-    at = allowed[stage].index(getattr(pick, stage))
-    return replace(pick, **{stage: allowed[stage][at + 1]})
+    allowed = pickable(task, known.levels)
+    while True:
+        made = outcome(scene, task, pick, seed).judged
+        above = finer(pick, known.levels)
+        found = change(made, outcome(scene, task, above, seed).judged)
+        if found <= tolerance:
+            return pick, found
+        changes = {}  # of a finer level in one stage alone
+        for stage in STAGES:
+            if getattr(pick, stage) != allowed[stage][-1]:
+                tried = replace(pick, **{stage: getattr(above, stage)})
+                changes[stage] = change(made, outcome(scene, task, tried, seed).judged)
+        if not changes:
+            raise DomainError(
+                f"no combination keeps {task.name} within {tolerance:g} {task.unit}; the best found, "
+                f"{pick}, is off by {found:.2g} {task.unit}: give that tolerance, or a finer task "
+                "(samples, times)."
+            )
+        stage = max(changes, key=lambda each: changes[each])
+        at = allowed[stage].index(getattr(pick, stage))
+        pick = replace(pick, **{stage: allowed[stage][at + 1]})
 
 
 def _way(scene, task):
@@ -119,6 +116,10 @@ def _way(scene, task):
     if not task.gradient:
         return "interior"
     camera = task.cropped().camera.with_samples(len(task.camera.colours))
-    poses = task.T_world_body if task.mount is None else task.T_world_body @ task.mount().detach()
+    poses = (
+        task.T_world_body
+        if task.mount is None
+        else task.T_world_body @ task.mount()[..., None, :, :]
+    )
     views = views_of(scene, poses.detach().requires_grad_(), camera.rays())
     return cheapest_gradient(camera, views)
