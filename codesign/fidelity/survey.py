@@ -49,7 +49,7 @@ TURNS = 3  # of which the quickest counts: the first compiles, and others use th
 @dataclass(frozen=True)
 class Outcome:
     """One combination on a scene. judged: [draws, N, ...] of the sensor's noise. cpu_s: processor
-    seconds of each of PARTS. frames: as rendered."""
+    seconds of each of PARTS that was run. frames: as rendered."""
 
     judged: Tensor
     cpu_s: dict[str, float]
@@ -87,14 +87,14 @@ def outcome(
       turns: times that it is run; the least seconds count.
     """
     layer, batch = events_at(task, fidelity), batch_of(task, fidelity)
-    judged, seconds = [], dict.fromkeys(PARTS, math.inf)
+    judged, seconds = [], {}
     for draw in range(max(turns, DRAWS if is_noisy(task.sensor) else 1)):
         system = system_of(scene, task, fidelity, events=_Drawn(layer, seed + draw))
         run = system.begin(batch, {} if frames is None else {"frames": frames})
-        for part in PARTS:
+        for part in PARTS[frames is not None :]:
             begun = time.process_time()
             value = run.objective(task.name) if part == "judged" else run[part]
-            seconds[part] = min(seconds[part], time.process_time() - begun)
+            seconds[part] = min(seconds.get(part, math.inf), time.process_time() - begun)
         judged.append(value)
         if draw + 1 >= turns:
             frames = run["frames"]  # further draws are of the noise alone
@@ -129,13 +129,14 @@ class Survey:
     """rows: stage, level, change (of what is judged, against the reference) and cpu_s (of the chain
     with this level, all else finest). reference: seconds of every part of the finest chain. ratios:
     (stage, level) -> seconds of every part over the reference's. refused: (stage, level) ->
-    sentence, of levels that this scene does not allow."""
+    sentence, of levels that this scene does not allow. judged: of the finest chain."""
 
     levels: Levels
     rows: list[dict[str, Any]]
     reference: dict[str, float]
     ratios: dict[tuple[str, Any], dict[str, float]]
     refused: dict[tuple[str, Any], str]
+    judged: Tensor
 
     def changed(self, stage: str, level: Any) -> float:
         """What one level changes."""
@@ -146,6 +147,11 @@ class Survey:
     def predicted(self, fidelity: Fidelity) -> float:
         """Sum of what the levels of a combination change."""
         return sum(self.changed(*level) for level in levels_in(fidelity))
+
+    def likely(self, fidelity: Fidelity) -> float:
+        """Root of the sum of squares: what a combination changes where its levels do so
+        independently."""
+        return math.hypot(*(self.changed(*level) for level in levels_in(fidelity)))
 
     def cpu_s(self, fidelity: Fidelity) -> float:
         """Processor seconds of a combination."""
@@ -183,4 +189,4 @@ def survey(scene: Any, task: Task, levels: Levels, seed: int = 0) -> Survey:
         ratios[stage, level] = {part: cpu_s[part] / best.cpu_s[part] for part in PARTS}
         off = change(new.judged, best.judged)
         rows.append({"stage": stage, "level": level, "change": off, "cpu_s": sum(cpu_s.values())})
-    return Survey(known, rows, best.cpu_s, ratios, refused)
+    return Survey(known, rows, best.cpu_s, ratios, refused, best.judged)

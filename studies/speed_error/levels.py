@@ -7,13 +7,13 @@ from functools import partial
 from typing import Any
 
 import torch
-from codesign.fidelity.survey import change, outcome
 from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.fidelity import Fidelity, Survey, Task, levels_of, survey
 from codesign.fidelity.levels import STAGES, Levels, batch_of, system_of
 from codesign.fidelity.search import cheapest as cheapest_combination
+from codesign.fidelity.survey import change, outcome
 from scenes import worlds
 from studies.frame.bench import Timing, turns
 from studies.frame.compare import median_ratio

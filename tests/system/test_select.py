@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from codesign.fidelity.survey import PARTS, change, outcome
 
 import codesign
 from codesign import events, lens, pose, render
@@ -13,6 +12,7 @@ from codesign.errors import DomainError
 from codesign.fidelity import Fidelity, Survey, Task, levels_of, search
 from codesign.fidelity.levels import batch_of, finer
 from codesign.fidelity.search import cheapest
+from codesign.fidelity.survey import PARTS, change, outcome
 
 T_S = torch.linspace(0, 0.05, 9, dtype=torch.float64)
 PLANE = render.TexturedPlane([[2.0, 1.5], [1.2, -2.4], [3.0, 0.4]], [0.3] * 3, [0.0, 1.0, 2.0])
@@ -77,7 +77,14 @@ def made_up():
     pairs = [(stage, level) for stage, found in levels.items() for level in found]
     rows = [{"stage": s, "level": v, "change": changes.get(v, 0.0), "cpu_s": 1.0} for s, v in pairs]
     ratios = {(s, v): {**dict.fromkeys(PARTS, 1.0), "frames": speeds.get(v, 1.0)} for s, v in pairs}
-    return Survey(levels, rows, dict(zip(PARTS, (8.0, 0.1, 0.1, 0.0), strict=True)), ratios, {})
+    return Survey(
+        levels,
+        rows,
+        dict(zip(PARTS, (8.0, 0.1, 0.1, 0.0), strict=True)),
+        ratios,
+        {},
+        torch.zeros(1),
+    )
 
 
 @pytest.mark.parametrize(
