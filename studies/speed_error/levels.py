@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.fidelity import Fidelity, Survey, Task, levels_of, survey
-from codesign.fidelity.levels import STAGES, Levels, batch_of, system_of
+from codesign.fidelity import Fidelity, Task, levels_of, survey
+from codesign.fidelity.levels import Levels, batch_of, system_of
 from codesign.fidelity.search import cheapest as cheapest_combination
 from codesign.fidelity.survey import change, outcome
 from scenes import worlds
@@ -94,20 +94,26 @@ def stage(run: Run[Config]) -> list[Asked]:
         found = select(rows, stage=name)
         caption = f"Error: {measure.what}; {measure.tolerated:g} is tolerated."
         tabulate(run, name.capitalize(), found, "stage", "level", caption=caption)
-    known = survey(world, task, levels, run.config.seed)
-    chains = sweep(run, lambda: of_chains(world, task, known, run.config.repeats), "chains")
+    chains = sweep(run, lambda: of_chains(world, task, levels, run.config), "chains")
     tabulate(run, "Whole chains", chains, "levels", prefix="chain")
-    lines = {name: _line(select(known.rows, stage=name)) for name in STAGES}
-    lines["all of them"] = _line(chains)
-    chart = Panel(lines, "processor time of the chain, ms", "change of the flow, px", "xy")
-    caption = "Whole chains with one stage cheaper, and those that are chosen for all stages."
+    lines = {"found": ("cpu_s", "change"), "forecast": ("forecast_s", "forecast")}
+    series = {name: _front(chains, *columns) for name, columns in lines.items()}
+    chart = Panel(series, "processor time of the chain, ms", "change of the flow, px", "xy")
+    caption = "Whole chains that no other of them is both faster and nearer to the finest than."
     run.figure(panels(chart, width=7), "speed_error_chain", caption)
     return []
 
 
-def _line(rows):
-    rows = sorted(rows, key=lambda row: row["cpu_s"])
-    return [1e3 * row["cpu_s"] for row in rows], [max(row["change"], LEAST_PX) for row in rows]
+def _front(rows, seconds, change_px):
+    """Milliseconds and changes of the rows that no quicker one equals."""
+    front = []
+    for row in sorted(rows, key=lambda row: row[seconds]):
+        if not front or row[change_px] < front[-1][change_px]:
+            front.append(row)
+    return (
+        [1e3 * row[seconds] for row in front],
+        [max(row[change_px], LEAST_PX) for row in front],
+    )
 
 
 def of_stage(
@@ -159,13 +165,14 @@ def verdicts(
     return rows
 
 
-def of_chains(world: Any, task: Task, known: Survey, rounds: int) -> list[dict[str, Any]]:
+def of_chains(world: Any, task: Task, levels: Levels, config: Config) -> list[dict[str, Any]]:
     """Rows of the combinations that are chosen for TOLERANCES_PX, and of the finest, timed in
     turns; forecasts of the survey beside what was found."""
+    known = survey(world, task, levels, config.seed)
     finest = Fidelity(**{name: found[-1] for name, found in known.levels.items()})
     picks = [cheapest_combination(known, task, tolerance) for tolerance in TOLERANCES_PX]
     tried = list(dict.fromkeys([*picks, finest]))
-    timed = turns({each: once(world, task, each) for each in tried}, rounds)
+    timed = turns({each: once(world, task, each) for each in tried}, config.repeats)
     reference = outcome(world, task, finest).judged
     return [
         {

@@ -125,6 +125,8 @@ def test_what_is_chosen_stays_within_the_tolerance_of_the_finest_and_repeats():
     finest = Fidelity("thin", 16, 9, "hard", 4, "affine")
     off = [outcome(PLANE, wanted, each).judged for each in (found.fidelity, finest)]
     assert change(*off) <= 0.2
+    frames = outcome(PLANE, wanted, finest).frames
+    assert "frames" not in outcome(PLANE, wanted, finest, frames=frames).cpu_s  # not timed
     again = codesign.select(PLANE, wanted, 0.2, levels=FEW)
     changes = [[row["change"] for row in each.survey.rows] for each in (found, again)]
     assert changes[0] == changes[1]
