@@ -73,7 +73,7 @@ class Choice:
         return "\n".join(
             [
                 *lines,
-                f"{self.speedup:.1f}x faster than the finest; one finer changes {task.name} by "
+                f"about {self.speedup:.2g}x faster than the finest; one finer changes {task.name} by "
                 f"{self.change:.2g} {task.unit} ({self.tolerance:g} tolerated).",
             ]
         )
