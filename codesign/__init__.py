@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         errors,
         events,
         exclusive,
+        fidelity,
         flow,
         grad,
         lens,
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
         train,
         types,
     )
+    from codesign.fidelity.search import select
     from codesign.report.show import show
     from codesign.system import System
 
@@ -42,6 +44,7 @@ __all__ = [
     "errors",
     "events",
     "exclusive",
+    "fidelity",
     "flow",
     "grad",
     "lens",
@@ -50,6 +53,7 @@ __all__ = [
     "pose",
     "render",
     "report",
+    "select",
     "shipped",
     "show",
     "state",
@@ -62,6 +66,8 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name == "System":
         return importlib.import_module("codesign.system").System
+    if name == "select":
+        return importlib.import_module("codesign.fidelity").select
     if name == "show":
         return importlib.import_module("codesign.report.show").show
     if name in __all__ or name in ("place", "task"):  # the latter are former names of mount

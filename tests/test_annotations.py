@@ -16,6 +16,7 @@ WHOLE = (
     "atomic",
     "backend",
     "errors",
+    "fidelity",
     "flow",
     "grad",
     "lens",

@@ -19,6 +19,7 @@ FLOORS = (
     {"mount"},
     {"place", "task"},
     {"system"},
+    {"fidelity"},
     {"report"},
     {"optimise"},
     {"train"},

@@ -15,6 +15,7 @@ PAGES = (
     "README.md",
     "docs/start.md",
     "docs/chain.md",
+    "docs/select.md",
     "docs/diffraction.md",
     "docs/your_own.md",
     "docs/mounts.md",

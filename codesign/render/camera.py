@@ -108,6 +108,13 @@ class Camera:
         """The same lens and film with other samples."""
         return self._with(seed=check_seed(seed, "camera: seed"))
 
+    def with_samples(self, samples_per_pixel: int) -> "Camera":
+        """The same lens and film with other numbers of rays per pixel; each colour needs its equal
+        share."""
+        film, colours = self.film, {"spectrum": self.spectrum, "falloff": self.falloff}
+        size = film.width_px, film.height_px, film.pixel_pitch_mm
+        return Camera(self.lens, *size, samples_per_pixel, self.seed, film, aim=self.aim, **colours)
+
     def in_one_colour(self) -> "Camera":
         """The same camera for light of the d line, without falloff."""
         return self._with(spectrum=None, falloff=False)

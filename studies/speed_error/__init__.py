@@ -5,17 +5,19 @@ from typing import ClassVar, Literal
 
 from studies.frame.config import StudyConfig
 
-Name = Literal["levels", "lens", "render", "psf", "light", "events", "spiking", "flow", "placement"]
+Name = Literal[
+    "chain", "select", "lens", "render", "psf", "light", "events", "spiking", "flow", "placement"
+]
 
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
     QUICK: ClassVar = {"repeats": 3, "rounds": 1}
-    stages: tuple[Name, ...] = ("levels",)
-    """What is measured: levels (every stage's cheaper and finer ways on one small scene); lens (ray
-    tracing beside optiland), render, psf (frames by point spread functions), light
-    (emissive, baked, path), events, spiking (beside snnTorch and norse), flow (estimators),
-    placement (a step of it)."""
+    stages: tuple[Name, ...] = ("chain",)
+    """What is measured: chain (every stage's cheaper and finer levels, and whole chains of them, on
+    one small scene); select (what codesign.select picks on six scenes); lens (ray tracing beside
+    optiland), render, psf (frames by point spread functions), light (emissive, baked, path),
+    events, spiking (beside snnTorch and norse), flow (estimators), placement (a step of it)."""
     repeats: int = 7
     """Timed repeats of each thing; at least 3."""
     rounds: int = 2

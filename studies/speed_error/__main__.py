@@ -14,10 +14,11 @@ import sys
 from codesign.errors import DomainError
 from studies.frame.run import Run, main
 from studies.frame.show import asked
-from studies.speed_error import Config, chain, events, frames, lens, levels
+from studies.speed_error import Config, chain, events, frames, lens, levels, select
 
 STAGES = {
-    "levels": levels.stage,
+    "chain": levels.stage,
+    "select": select.stage,
     "lens": lens.stage,
     "render": frames.render_stage,
     "psf": frames.psf_stage,
@@ -42,7 +43,11 @@ def study(run: Run[Config]) -> None:
         run.say(name)
         run.section(name.capitalize(), stage.__doc__ or "")
         figures += stage(run)
-    lead = asked(run, figures) if figures else "Time against error of every level."
+    lead = (
+        asked(run, figures)
+        if figures
+        else "Time against error of every level and of the whole chain."
+    )
     run.finish("Speed and error", lead)
 
 

@@ -1,217 +1,187 @@
-"""Stage "levels": every stage's cheaper and finer levels on one small scene, a camera that passes a
-textured wall, and the cheapest that is good enough."""
+"""Stage "chain": time and error of every level of every stage, and of the whole chain, before a
+textured wall."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import cached_property, partial
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from codesign import events, flow, lens, pose, render
 from codesign.errors import DomainError
-from scenes import textures, trajectories, worlds
-from studies.frame.bench import measure
+from codesign.fidelity import Fidelity, Task, levels_of, survey
+from codesign.fidelity.levels import Levels, batch_of, system_of
+from codesign.fidelity.search import cheapest as cheapest_combination
+from codesign.fidelity.survey import change, outcome
+from scenes import worlds
+from studies.frame.bench import Timing, turns
+from studies.frame.compare import median_ratio
 from studies.frame.run import Run
 from studies.frame.show import Asked, Panel, panels, tabulate
-from studies.frame.sweep import metrics, plain, select, sweep
+from studies.frame.sweep import select, sweep
 from studies.speed_error import Config
+from studies.speed_error.select import Case, once, triplet
 
-DURATION_S = 0.1
-THETA = 0.2
-PITCH_MM = 0.15
-DISTANCE_M = 2.0
-VELOCITY_M_S = (0.4, 0.25, 0.5)
-RATES_HZ = (60, 240, 1000)
-FINEST_HZ = 4000
-SENSOR = events.SensorModel(THETA, THETA)
-
-
-@dataclass(frozen=True)
-class Part:
-    """A stage of the chain: ways to compute it from cheap to fine, the error of what one returns,
-    what that error measures, and how much of it is tolerated."""
-
-    levels: Mapping[str, Callable[[], Any]]
-    error: Callable[[Any], float]
-    measure: str
-    tolerance: float
+WALL = Case(
+    partial(worlds.smooth_plane, 0, finest_period_m=0.03, coarsest_period_m=0.3),
+    partial(triplet, 50.0),
+    0.15,
+    ((0.0, -0.01, 2.0), (0.0, 0.0, 0.0)),
+    (0.4, 0.25, 0.5, 0.0, 0.0, 0.0),
+)
+TOLERANCES_PX = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12, 0.08)  # of the whole chain
+LEAST_PX = 1e-3  # what is drawn of a change that is 0
+MADE = {"frames": "frames", "events": "volume"}  # at the junctions that stages start from
 
 
 @dataclass(frozen=True)
-class Setup:
-    """Size of the common scene and the seed of its texture and samples."""
+class Measure:
+    """Where a stage is timed and judged: what it makes, the junction that it starts from, what
+    about it is judged, and how much of that is tolerated."""
 
-    size_px: int
-    seed: int
+    made: str
+    begins_at: str
+    off: Callable[[Any, Any], float]
+    what: str
+    tolerated: float
 
-    @cached_property
-    def lens(self):
-        return lens.load("cooke-triplet", torch.float32).freeze()
 
-    @cached_property
-    def waves(self):
-        return textures.waves(self.seed, finest_period_m=0.03, coarsest_period_m=0.3)
+def off_frames(found: Tensor, finest: Tensor) -> float:
+    """RMS difference over RMS contrast."""
+    off = (found.double() - finest.double()).square().mean().sqrt()
+    return float(off / finest.double().std())
 
-    @cached_property
-    def wall(self):
-        """A Mitsuba wall whose bitmap holds the analytic texture at 2.5 mm per texel."""
-        texel_m = 0.0025
-        half_m = 1.5
-        at = (
-            torch.arange(round(2 * half_m / texel_m), dtype=torch.float64) + 0.5
-        ) * texel_m - half_m
-        frequency, amplitude, phase = self.waves
-        total = torch.zeros(at.numel(), at.numel(), dtype=torch.float64)
-        for (fx, fy), a, shift in zip(
-            frequency.tolist(), amplitude.tolist(), phase.tolist(), strict=True
-        ):
-            total += a * (2 * torch.pi * (fx * at[None] + fy * at[:, None]) + shift).cos()
-        # the first row of a bitmap is the top
-        return worlds.wall(100 * total.exp().flip(0).numpy(), texel_m, half_m)
 
-    def plane(self, dtype):
-        """The same texture in closed form, in the plane of the wall."""
-        stand = torch.eye(4, dtype=torch.float64)
-        stand[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
-        return render.TexturedPlane(*self.waves, T_world_plane=stand, dtype=dtype)
+def off_counts(found: Any, finest: Any) -> float:
+    """Wrong counts of the pixels over the whole window, per true one."""
+    counts, truth = (volume.counts.double().sum(2) for volume in (found, finest))
+    return float((counts - truth).abs().sum() / truth.sum())
 
-    def path(self, rate_hz):
-        """Times and poses over the interval at a frame rate."""
-        t_s = torch.linspace(0, DURATION_S, round(DURATION_S * rate_hz) + 1, dtype=torch.float64)
-        start = pose.look_at((0.0, -DISTANCE_M, 0.0), (0.0, 0.0, 0.0))
-        return t_s, trajectories.translation(start, VELOCITY_M_S, t_s)
 
-    def camera(self, optics, samples):
-        return render.Camera(optics, self.size_px, self.size_px, PITCH_MM, samples, self.seed)
+def off_flow(found: Any, finest: Any) -> float:
+    """Root mean square change, px."""
+    return change(found.flow_px[None], finest.flow_px[None])
 
-    @torch.no_grad()
-    def frames(self, rate_hz=60, optics=None, samples=8, world=None):
-        """[T, H, W] frames at a rate, traced lens and wall unless others are given."""
-        camera = self.camera(optics or self.lens, samples)
-        return render.frames(camera, world or self.wall, self.path(rate_hz)[1])
 
-    @cached_property
-    def stream(self):
-        """Hard events of the physical sensor at the finest rate."""
-        return events.simulate(self.frames(FINEST_HZ), self.path(FINEST_HZ)[0], SENSOR)
-
-    @cached_property
-    def true_flow(self):
-        """[1, 2, H, W] px over the whole interval, through the traced lens."""
-        ends = self.path(60)[1][[0, -1]]
-        return render.true_flow(
-            self.camera(lens.load("cooke-triplet").freeze(), 1), self.wall, ends
-        )[0]
-
-    def volume(self, bins):
-        return events.from_stream(self.stream, 0, round(DURATION_S * 1e6), bins)
+IMAGE = Measure("frames", "", off_frames, "RMS difference of frames over contrast", 0.05)
+EVENTS = Measure("volume", "frames", off_counts, "wrong counts per true one", 0.1)
+FLOW = Measure("field", "events", off_flow, "RMS change of the flow, px", 0.3)
+MEASURES = {
+    "camera": IMAGE,
+    "samples": replace(IMAGE, tolerated=0.01),
+    "frames": replace(EVENTS, begins_at=""),
+    "events": EVENTS,
+    "bins": replace(FLOW, begins_at="frames"),
+    "flow": FLOW,
+}
 
 
 def stage(run: Run[Config]) -> list[Asked]:
-    """Every level of every stage, and the cheapest whose error is tolerated."""
-    found = parts(Setup(32 if run.config.quick else 64, run.config.seed))
-
-    def cell(part):
-        rows = []
-        for name, work in part.levels.items():
-            timing = measure(work, run.config.repeats, warm=1)
-            error = part.error(work())
-            rows.append({"level": name, "cpu_s": timing.cpu, "wall_s": timing.wall, "error": error})
-        return rows
-
-    rows = sweep(run, cell, "levels", part=found)
-    for name, part in found.items():
-        levels = select(rows, part=name)
-        best, enough = cheapest(levels, part.tolerance)
-        run.record(**metrics([{**best, "within_tolerance": int(enough)}], "part", prefix="chosen"))
-        verdict = "is the cheapest level within" if enough else "comes closest; none is within"
-        figures = f"({best['error']:.2g}, {1e3 * best['cpu_s']:.3g} CPU-ms)"
-        tabulate(run, name.capitalize(), levels, "part", "level")
-        run.text(f"**{best['level']}** {verdict} an error of {part.tolerance:g} {figures}.")
-        floor = min([part.tolerance, *(row["error"] for row in levels if row["error"] > 0)]) / 5
-        points = {
-            row["level"]: ([1e3 * row["cpu_s"]], [max(row["error"], floor)]) for row in levels
-        }
-        chart = Panel(points, "processor time, ms (median)", "error", "xy", [part.tolerance])
-        caption = f"Error: {part.measure}. Dashed: the tolerance. A level without error stands at the bottom."
-        run.figure(panels(chart, width=7), f"speed_error_{plain(name)}", caption)
+    """Every level of every stage, all else finest: its own processor time and its error where it
+    ends. Then whole chains, those that are chosen for tolerances from coarse to fine: time and
+    change of the flow against the finest chain. All times are medians of turns; ratios are medians
+    of pairs with 95 % intervals, and a level is undecided against the quickest that is tolerated
+    where that interval holds 1."""
+    world, task = WALL.scene(), WALL.task(run.config.seed)
+    levels = {
+        name: found[:2] + found[-1:] if run.config.quick else found
+        for name, found in levels_of(task).items()
+    }
+    cell = partial(of_stage, world, task, levels, rounds=run.config.repeats)
+    rows = sweep(run, cell, "levels", stage=list(levels))
+    for name, measure in MEASURES.items():
+        found = select(rows, stage=name)
+        caption = f"Error: {measure.what}; {measure.tolerated:g} is tolerated."
+        tabulate(run, name.capitalize(), found, "stage", "level", caption=caption)
+    chains = sweep(run, lambda: of_chains(world, task, levels, run.config), "chains")
+    tabulate(run, "Whole chains", chains, "levels", prefix="chain")
+    lines = {"found": ("cpu_s", "change"), "forecast": ("forecast_s", "forecast")}
+    series = {name: _front(chains, *columns) for name, columns in lines.items()}
+    chart = Panel(series, "processor time of the chain, ms", "change of the flow, px", "xy")
+    caption = "Whole chains that no other of them is both faster and nearer to the finest than."
+    run.figure(panels(chart, width=7), "speed_error_chain", caption)
     return []
 
 
-def cheapest(levels: list[dict[str, Any]], tolerance: float) -> tuple[dict[str, Any], bool]:
-    """The level of least processor time whose error is within ``tolerance``; where none is, the one
-    of least error.
+def _front(rows, seconds, change_px):
+    """Milliseconds and changes of the rows that no quicker one equals."""
+    front = []
+    for row in sorted(rows, key=lambda row: row[seconds]):
+        if not front or row[change_px] < front[-1][change_px]:
+            front.append(row)
+    return (
+        [1e3 * row[seconds] for row in front],
+        [max(row[change_px], LEAST_PX) for row in front],
+    )
 
-    Returns: the level, and whether it is within the tolerance. Raises: DomainError when there is no
-      level.
+
+def of_stage(
+    world: Any, task: Task, levels: Levels, stage: str, rounds: int
+) -> list[dict[str, Any]]:
+    """Rows of the levels of one stage, timed in turns."""
+    measure = MEASURES[stage]
+    finest = Fidelity(**{name: found[-1] for name, found in levels.items()})
+    run = system_of(world, task, finest).begin(batch_of(task, finest))
+    with torch.no_grad():
+        given = {name: run[MADE[name]] for name in (measure.begins_at,) if name}
+
+    @torch.no_grad()
+    def work(level):
+        tried = replace(finest, **{stage: level})
+        return system_of(world, task, tried).begin(batch_of(task, tried), given)[measure.made]
+
+    timed = turns({level: partial(work, level) for level in levels[stage]}, rounds)
+    best = work(levels[stage][-1])
+    errors = {level: measure.off(work(level), best) for level in timed}
+    return verdicts(timed, errors, measure.tolerated)
+
+
+def verdicts(
+    timed: Mapping[Any, Timing], errors: Mapping[Any, float], tolerated: float
+) -> list[dict[str, Any]]:
+    """Rows of levels that were timed in turns: error, median time, its ratio to that of the
+    quickest level that is tolerated (of the one of least error, where none is), and the verdict.
+
+    Raises: DomainError when there is no level.
     """
-    if not levels:
+    if not timed:
         raise DomainError("there is no level to choose from; give at least one.")
-    enough = [level for level in levels if level["error"] <= tolerance]
-    if enough:
-        return min(enough, key=lambda level: level["cpu_s"]), True
-    return min(levels, key=lambda level: level["error"]), False
+    enough = [level for level in timed if errors[level] <= tolerated]
+    best = (
+        min(enough, key=lambda level: timed[level].cpu)
+        if enough
+        else min(timed, key=lambda level: errors[level])
+    )
+    ratios = {level: median_ratio(timed[level].cpu_s, timed[best].cpu_s) for level in timed}
+    alike = [level for level in enough if ratios[level].low <= 1 <= ratios[level].high]
+    rows = []
+    for level, timing in timed.items():
+        verdict = "not tolerated" if level not in enough else "dearer"
+        if level in alike:
+            verdict = "cheapest" if alike == [best] else "undecided"
+        found = {"cpu_ms": 1e3 * timing.cpu, "ratio": f"{ratios[level]:.2f}", "verdict": verdict}
+        rows.append({"level": str(level), "error": errors[level], **found})
+    return rows
 
 
-def parts(setup: Setup) -> dict[str, Part]:
-    """All stages of the chain with their levels."""
-    optics = {
-        "pinhole": lens.Pinhole(setup.lens.first_order().efl_mm.detach()),
-        "thin lens": setup.lens.thin(),
-        "traced": setup.lens,
-    }
-    scenes = {
-        "Mitsuba bitmap, float32": setup.wall,
-        "analytic, float32": setup.plane(torch.float32),
-        "analytic, float64": setup.plane(torch.float64),
-    }
-    layers = {
-        "sigmoid": lambda frames: events.soft(frames, THETA),
-        "soft counts": lambda frames: events.soft_counts(frames, THETA, THETA),
-        "memory": lambda frames: events.memory(frames, THETA, THETA)[0],
-    }
-    through = {name: partial(setup.frames, optics=o, samples=16) for name, o in optics.items()}
-    sampled = {f"{n} samples": partial(setup.frames, samples=n) for n in (1, 2, 4, 8, 16, 32, 64)}
-    seen = {name: partial(setup.frames, world=world) for name, world in scenes.items()}
-    counted = {
-        f"{name}, {rate} fps": lambda layer=layer, rate=rate: layer(setup.frames(rate)).sum(0)
-        for name, layer in layers.items()
-        for rate in RATES_HZ
-    }
-    binned = {f"{n} bins": lambda n=n: flow.estimate_lk(setup.volume(n)) for n in range(2, 10)}
-    models = {
-        f"{model}, {len(blurs)} levels": partial(
-            flow.estimate_lk, setup.volume(5), model, levels_px=blurs
-        )
-        for model in ("constant", "affine", "quadratic")
-        for blurs in ((1.0,), (2.0, 1.0), (4.0, 2.0, 1.0))
-    }
-    truth = events.to_counts(setup.stream, setup.path(60)[0][[0, -1]])[0]
-    of_frames = "RMS difference over contrast, from "
-    of_flow = "endpoint error from hard events, px"
-
-    def wrong(found):
-        return float((found - truth).abs().sum() / truth.sum())
-
-    def endpoint(field):
-        return float(flow.metrics.aee(field.flow_px.double(), setup.true_flow))
-
-    return {
-        "lens": Part(through, _off(through["traced"]()), f"{of_frames}the traced lens", 0.05),
-        "sampling": Part(sampled, _off(setup.frames(samples=256)), f"{of_frames}256 samples", 0.01),
-        "scene": Part(
-            seen, _off(seen["analytic, float64"]()), f"{of_frames}analytic float64", 0.01
-        ),
-        "events": Part(
-            counted, wrong, f"wrong counts per true one, hard events at {FINEST_HZ} fps", 0.1
-        ),
-        "time bins": Part(binned, endpoint, f"affine, {of_flow}", 0.5),
-        "flow": Part(models, endpoint, f"5 bins, {of_flow}", 0.5),
-    }
-
-
-def _off(truth):
-    """RMS difference from ``truth`` over its RMS contrast."""
-    truth = truth.double()
-    return lambda found: float((found.double() - truth).square().mean().sqrt() / truth.std())
+def of_chains(world: Any, task: Task, levels: Levels, config: Config) -> list[dict[str, Any]]:
+    """Rows of the combinations that are chosen for TOLERANCES_PX, and of the finest, timed in
+    turns; forecasts of the survey beside what was found."""
+    known = survey(world, task, levels, config.seed)
+    finest = Fidelity(**{name: found[-1] for name, found in known.levels.items()})
+    picks = [cheapest_combination(known, task, tolerance) for tolerance in TOLERANCES_PX]
+    tried = list(dict.fromkeys([*picks, finest]))
+    timed = turns({each: once(world, task, each) for each in tried}, config.repeats)
+    reference = outcome(world, task, finest).judged
+    return [
+        {
+            "levels": str(each),
+            "change": change(outcome(world, task, each).judged, reference),
+            "forecast": known.predicted(each),
+            "cpu_s": timed[each].cpu,
+            "forecast_s": known.cpu_s(each),
+            "faster": f"{median_ratio(timed[finest].cpu_s, timed[each].cpu_s):.2f}",
+        }
+        for each in tried
+    ]

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from codesign.errors import DomainError
-from studies.speed_error import chain, events
-from studies.speed_error.levels import cheapest
+from studies.frame.bench import Timing
+from studies.speed_error import chain, events, levels
 from studies.stability.systems import (
     KINDS,
     differences,
@@ -14,35 +14,38 @@ from studies.stability.systems import (
     worst_error,
 )
 
-LEVELS = [
-    {"level": "pinhole", "cpu_s": 1.0, "error": 0.2},
-    {"level": "thin", "cpu_s": 3.0, "error": 0.05},
-    {"level": "quick and good", "cpu_s": 2.0, "error": 0.04},
-    {"level": "traced", "cpu_s": 9.0, "error": 0.0},
-]
+# level -> processor seconds of five turns, and its error
+TURNS = {
+    "pinhole": ((8.7, 8.2, 9.4, 8.1, 8.8), 0.02),
+    "thin": ((8.3, 8.6, 8.2, 8.5, 8.4), 0.01),
+    "traced": ((17.0, 16.0, 18.0, 17.5, 16.5), 0.0),
+    "coarse": ((1.0, 1.0, 1.0, 1.0, 1.0), 0.2),
+}
 
 
 @pytest.mark.parametrize(
-    ("tolerance", "name"),
+    ("tolerance", "expected"),
     [
-        (0.5, "pinhole"),
-        (0.2, "pinhole"),
-        (0.1, "quick and good"),
-        (0.04, "quick and good"),
-        (0.01, "traced"),
-        (0.0, "traced"),
+        (0.5, ["dearer", "dearer", "dearer", "cheapest"]),
+        (0.05, ["undecided", "undecided", "dearer", "not tolerated"]),
+        (0.01, ["not tolerated", "cheapest", "dearer", "not tolerated"]),
     ],
 )
-def test_the_cheapest_level_within_the_tolerance_is_chosen(tolerance, name):
-    best, enough = cheapest(LEVELS, tolerance)
-    assert (best["level"], enough) == (name, True)
+def test_levels_whose_times_differ_from_turn_to_turn_are_undecided(tolerance, expected):
+    """The pinhole is the quicker in two of five turns; the traced lens takes twice as long in
+    each."""
+    timed = {name: Timing(cpu_s, cpu_s) for name, (cpu_s, _) in TURNS.items()}
+    errors = {name: error for name, (_, error) in TURNS.items()}
+    rows = levels.verdicts(timed, errors, tolerance)
+    assert [row["verdict"] for row in rows] == expected
 
 
-def test_where_none_is_good_enough_the_best_is_named_as_such():
-    best, enough = cheapest(LEVELS[:3], 0.01)
-    assert (best["level"], enough) == ("quick and good", False)
+def test_where_none_is_good_enough_all_are_told_so():
+    timed = {"thin": Timing((1.0, 1.0), (1.0, 1.0))}
+    (row,) = levels.verdicts(timed, {"thin": 0.1}, 0.01)
+    assert row["verdict"] == "not tolerated"
     with pytest.raises(DomainError, match="no level"):
-        cheapest([], 0.1)
+        levels.verdicts({}, {}, 0.1)
 
 
 def test_gradients_of_random_lenses_with_coincidences_agree_with_differences():
