@@ -70,10 +70,7 @@ test: setup ## all tests, on all cores
 fuzz: setup ## mutants of every file format for hours: make fuzz ARGS="--minutes 120 --format .npz"
 	@$(RUN) -m tests.hostile fuzz $(ARGS)
 
-kill-evidence: setup ## the figures of README and docs measured again: make evidence ARGS="lens-motion" (all: two hours)
-	@$(RUN) setup/evidence.py $(ARGS)
-
-test: setup ## long studies killed at random moments, resumed and compared: make kill-test ARGS="--count 50"
+kill-test: setup ## long studies killed at random moments, resumed and compared: make kill-test ARGS="--count 50"
 	@$(RUN) -m tests.hostile kills $(ARGS)
 
 test-bits: setup ## tests that promise equal bits, as other processors and numbers of threads round
