@@ -54,9 +54,11 @@ def test_no_verdict_is_worse_than_in_the_table():
     rows = measured()
     assert worsened(rows) == []
     assert verdicts(rows).keys() == committed().keys()
-    # float64 and no silhouette: nothing but rounding, and the noise, which is three times bending
+    # float64 and no silhouette: nothing but rounding, and three times the bending; the final loss has
+    # kinks where a level stands still
     for row in rows:
-        assert row.numbers["relative_error"] <= 1e-4 + 1 / row.numbers["signal_to_noise"], row
+        if row.names[1] != "final loss":
+            assert row.numbers["relative_error"] <= 1e-4 + 1 / row.numbers["signal_to_noise"], row
 
 
 def test_a_threshold_gradient_that_is_3_per_cent_too_long_is_found(monkeypatch):
@@ -88,18 +90,19 @@ def test_frames_whose_gradient_is_3_per_cent_too_short_are_found(monkeypatch):
     ]
 
 
-@pytest.mark.parametrize(("error", "state"), [(0.0, "pass"), (0.1, "fail")])
-def test_the_judge_of_draws_knows_its_own_noise(error, state):
-    """600 groups of one number, 4 draws, noise of 1 % each; Student's factor makes the chance of a
-    wrong verdict that of three standard deviations, 0.3 %: at most 8 of 600 but once in 10,000."""
+@pytest.mark.parametrize(("error", "state", "never"), [(0, "pass", "fail"), (0.2, "fail", "pass")])
+def test_the_judge_of_draws_knows_its_own_noise(error, state, never):
+    """600 groups of one number, 4 draws, noise of 1 % each: of right gradients 2 x 1.5e-4 are
+    called wrong, 0.2 of 600, and more than two once in a thousand times; a wrong one lies 40
+    standard errors away."""
     generator = torch.Generator().manual_seed(0)
     noise = 0.01 * torch.randn(4, 600, generator=generator, dtype=torch.float64)
     chosen = [(str(k), torch.ones(1)) for k in range(600)]
-    differences = torch.ones(4, 600, dtype=torch.float64)
-    rows = picture.judged(chosen, 1 + error + noise, differences, torch.zeros(600).double())
-    count = sum(row.verdict == state for row in rows)
-    assert count >= 500
-    assert sum(row.verdict == {"pass": "fail", "fail": "pass"}[state] for row in rows) <= 8
+    rows = picture.judged(
+        chosen, 1 + error + noise, torch.ones_like(noise), torch.zeros(600, dtype=torch.float64)
+    )
+    assert sum(row.verdict == state for row in rows) >= 500
+    assert sum(row.verdict == never for row in rows) <= 2
 
 
 def test_the_headline_counts_the_rows():
