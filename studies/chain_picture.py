@@ -3,7 +3,7 @@
     lens ──rays──▶ frames ──▶ events ──▶ flow
 
 A traced lens on a drifting, turning robot looks into a room with crates and a ball. The picture is
-the one that the README shows (docs/chain.png).
+the one at the head of docs/chain.md.
 """
 
 import sys

@@ -168,7 +168,7 @@ def figure_at(films: Mapping[str, Film], k: int) -> Any:
             draw_layout(axes[0], film.whole.camera.lens, FIELDS_RAD, rays=3)
             axes[0].get_legend().remove()
         axes[0].set_axis_off()
-        axes[0].set_title(f"{title}:\nerror {film.error:.2f}", fontsize=11, color=colour)
+        axes[0].set_title(f"{title}:\nvelocity error {film.error:.2f}", fontsize=11, color=colour)
         draw_pair(axes[1], film.whole.space.pair, film.whole.camera, film.whole.T_body_cam)
         axes[1].set_axis_off()
         draw_image(axes[2], film.frames[k], film.frames)
@@ -187,7 +187,7 @@ def _draw_velocity(axis, film, k, colour):
     axis.plot(since_s, forward, color="black", linewidth=1)
     axis.plot(since_s[: k + 1], film.velocity[: k + 1, 0].numpy(), "o", ms=3, color=colour)
     axis.set(xlim=(-STEP_S, since_s[-1] + STEP_S), ylim=(0, 2 * forward.max()), xticks=[0, 0.5, 1])
-    axis.set_title("forward speed, m/s", fontsize=9)
+    axis.set_title("forward speed, m/s, over time, s", fontsize=9)
     axis.tick_params(labelsize=7)
 
 

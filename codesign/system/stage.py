@@ -138,7 +138,7 @@ class Stage:
             if required and parameter.kind in _NAMED and parameter.name not in OFFERED:
                 raise DomainError(
                     f"stage '{self.name}' asks for '{parameter.name}', which a system does not have; it has "
-                    f"{', '.join(OFFERED)}. Bind other arguments beforehand (functools.partial)."
+                    f"{', '.join(OFFERED)}. Arguments go by name: rename it, or bind it beforehand (functools.partial)."
                 )
         return tuple(p.name for p in parameters if p.kind in _NAMED and p.name in OFFERED)
 

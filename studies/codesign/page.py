@@ -192,7 +192,11 @@ def looked(run: Run[Any], space: Space, gates: Landscape) -> None:
         landscape_spread=gates.spread,
         landscape_designs=len(gates.designs),
         **{f"calibration_{name}": value for name, value in vars(gates.calibration).items()},
-        **{f"inside_{plain(name)}": float(gates.inside(name)) for name in space.free},
+        **{
+            f"inside_{plain(name)}": float(gates.inside(name))
+            for name in space.free
+            if run.config.grid > 2
+        },
     )
     told = ""
     if gates.rank is not None and gates.slope is not None:
@@ -211,6 +215,8 @@ def looked(run: Run[Any], space: Space, gates: Landscape) -> None:
         if walls
         else " The best lies off all bounds."
     )
+    if run.config.grid < 3:  # the ends alone
+        at_walls = ""
     run.text(
         f"The ninetieth percentile of {len(gates.designs)} designs is {gates.spread:.2f} times the tenth: {enough}.{at_walls}{told}"
     )

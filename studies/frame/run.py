@@ -307,7 +307,7 @@ def main(
       by SIGTERM (both with the line to go on).
     Raises: SystemExit from the command line itself (0 for --help, 2 for a wrong option).
     """
-    name = _name(kind)
+    name = _name(study)
 
     def parse(default):
         return tyro.cli(
@@ -359,8 +359,8 @@ def _digest(study, config):
     return hashlib.sha256(json.dumps(stored, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _name(kind):
-    path = Path(inspect.getfile(kind))
+def _name(study):
+    path = Path(inspect.getfile(study))
     return path.parent.name if path.stem.startswith("__") else path.stem
 
 

@@ -3,6 +3,7 @@
 import importlib
 import inspect
 import json
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ from studies.train_flow import peers  # noqa: F401  which networks files know
 # the last window in so many of a data set is judged on: whole stretches, since neighbours look
 # alike
 HELD_OUT = 10
+LOOKED_AT = 20  # windows that are asked whether they hold events
 # share of the windows on which a network that refines begins from another flow than its own
 FOREIGN = 0.2
 POOL = 64  # batches shown in turn before windows come again
@@ -246,6 +248,7 @@ def sources(config, shape):
         config.seed,
         config.window_ms * 1e-3,
     )
+    _warn_of_empty(config, whole)
     held = max(1, len(whole) // HELD_OUT)
     if len(whole) <= held:
         raise DomainError(
@@ -255,6 +258,18 @@ def sources(config, shape):
     return [(1.0, Part(whole, 0, len(whole) - held))], {
         "held_out": Part(whole, len(whole) - held, len(whole))
     }
+
+
+def _warn_of_empty(config, whole):
+    """Warn where most of the windows that are looked at hold no event."""
+    looked = range(0, len(whole), max(1, len(whole) // LOOKED_AT))
+    empty = sum(not bool(whole.batch([k]).volume.counts.any()) for k in looked)
+    if 2 * empty > len(looked):
+        warnings.warn(
+            f"{empty} of {len(looked)} windows of '{config.data}' that were looked at hold no event where they are cut; is "
+            "the size of the sensor known (flow_recordings.md)? Larger --height-px and --width-px cut more.",
+            stacklevel=2,
+        )
 
 
 def check_names(option, names, table):

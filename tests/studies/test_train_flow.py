@@ -4,6 +4,7 @@ processes, raced, and refused."""
 import json
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -144,6 +145,8 @@ def test_the_last_tenth_of_a_data_set_is_judged_on_alone(tmp_path, monkeypatch):
     options = f"--data {tmp_path} --window-frames 2 --steps 14 --validate-every 100"
     assert train(tmp_path / "run", options) == 0
     assert opened == [(tmp_path, 2, 2, (16, 16), 0, 0.02)]
+    assert asked[:30] == [[k] for k in range(30)], "whether they hold events"
+    del asked[:30]
     probe, *steps = asked[:15]
     assert probe == [0, 13, 26]
     seen = [index for batch in steps for index in batch]
@@ -151,6 +154,20 @@ def test_the_last_tenth_of_a_data_set_is_judged_on_alone(tmp_path, monkeypatch):
     assert max(seen) == 26
     assert asked[15] == [27, 28, 29]
     assert metrics_of(tmp_path / "run")["held_out_windows"] == 3
+
+
+@pytest.mark.parametrize("empty", [15, 16])
+def test_windows_that_are_mostly_empty_are_warned_of(empty, recwarn):
+    class Cut(list):
+        def batch(self, indices):
+            counts = torch.tensor([self[k] for k in indices])
+            return SimpleNamespace(volume=SimpleNamespace(counts=counts))
+
+    whole = Cut([0] * empty + [3] * (30 - empty))
+    train_flow_setup._warn_of_empty(SimpleNamespace(data="mine"), whole)
+    said = [str(each.message) for each in recwarn]
+    assert bool(said) == (empty == 16)
+    assert all("16 of 30 windows of 'mine'" in each for each in said)
 
 
 SHARED = """
