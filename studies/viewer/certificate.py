@@ -38,7 +38,7 @@ def certificate(setting: Setting) -> list[Row]:
         camera = held
         if "focus" in p:
             design = replace(whole.design, focus_per_m=p["focus"])
-            camera = drive.space.pair.camera(design).with_film(film)
+            camera = held.with_lens(drive.space.pair.camera(design).lens)
         poses = T_world_cam @ pose.se3_exp(p["pose"])
         frames = render.frames(camera, drive.batch.scene[0], poses)
         counts = events.soft_counts(gain * frames[0].double(), p["threshold"], p["threshold"])
