@@ -22,7 +22,8 @@ def certificate(setting: Setting) -> list[Row]:
     that can be moved, the focus (1/m), over the middle of the film.
 
     The loss is the mean square of the flow of smooth counts, which have no noise: hard counts have
-    no derivative to compare with.
+    no derivative to compare with. Where texels are finer than pixels its slope changes within the
+    steps, which the noise floor does not see (docs/viewer.md).
     """
     drive, whole = setting.drive, setting.whole
     one = min(AROUND_PX, drive.film.sensor_width_px)
