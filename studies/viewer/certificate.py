@@ -22,7 +22,8 @@ def certificate(setting: Setting) -> list[Row]:
     that can be moved, the focus (1/m), over the middle of the film.
 
     The loss is the mean square of the flow of smooth counts, which have no noise: hard counts have
-    no derivative to compare with.
+    no derivative to compare with. Where texels are finer than pixels its slope changes within the
+    steps, which the noise floor does not see (docs/viewer.md).
     """
     drive, whole = setting.drive, setting.whole
     one = min(AROUND_PX, drive.film.sensor_width_px)
@@ -38,7 +39,7 @@ def certificate(setting: Setting) -> list[Row]:
         camera = held
         if "focus" in p:
             design = replace(whole.design, focus_per_m=p["focus"])
-            camera = drive.space.pair.camera(design).with_film(film)
+            camera = held.with_lens(drive.space.pair.camera(design).lens)
         poses = T_world_cam @ pose.se3_exp(p["pose"])
         frames = render.frames(camera, drive.batch.scene[0], poses)
         counts = events.soft_counts(gain * frames[0].double(), p["threshold"], p["threshold"])

@@ -103,6 +103,18 @@ def test_the_loss_that_is_certified_has_the_slope_of_the_threshold(setting, monk
     assert [row.verdict for row in certificate(setting)] == ["pass"]
 
 
+def test_the_lens_that_is_certified_has_the_rays_of_the_setting(setting, monkeypatch):
+    taken = []
+    monkeypatch.setattr(
+        "studies.viewer.certificate.certify", lambda loss, point, **_: taken.append((loss, point))
+    )
+    certificate(setting)
+    loss, point = taken[0]
+    as_it_is = {name: value for name, value in point.items() if name != "focus"}
+    assert len(as_it_is) < len(point)
+    assert float(loss(point)) == pytest.approx(float(loss(as_it_is)), rel=1e-5)
+
+
 def test_designs_that_runs_handed_over_are_opened_as_they_are(tmp_path):
     space = Space.of("corridor", None, light=0.5)
     whole = space.made(space.share(z_m=0.5, fno=2.5, theta=0.3))
