@@ -52,6 +52,7 @@ FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 NO_ROOM = "No usable temporary directory"  # of Python's, on a full disk
 RESERVED = ("versions", "hardware")
 VERSION = 2  # of the frame's part of state.npz
+STUDIES = Path(__file__).parents[1]
 QUICK = "A quick run, which decides nothing."
 TIMES = "times"  # of the frame itself, among the numbers of state.npz
 
@@ -307,7 +308,7 @@ def main(
       by SIGTERM (both with the line to go on).
     Raises: SystemExit from the command line itself (0 for --help, 2 for a wrong option).
     """
-    name = _name(study)
+    name = _name(kind)
 
     def parse(default):
         return tyro.cli(
@@ -359,9 +360,10 @@ def _digest(study, config):
     return hashlib.sha256(json.dumps(stored, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _name(study):
-    path = Path(inspect.getfile(study))
-    return path.parent.name if path.stem.startswith("__") else path.stem
+def _name(kind):
+    path = Path(inspect.getfile(kind))
+    shared = path.parent != STUDIES and (path.parent / "__main__.py").exists()
+    return path.parent.name if shared else path.stem
 
 
 def _device(wanted):

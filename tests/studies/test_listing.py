@@ -11,6 +11,7 @@ import pytest
 
 from studies.frame import listing
 from studies.frame.config import StudyConfig, configured, to_json
+from studies.frame.run import _name
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = list(listing.studies())
@@ -126,3 +127,11 @@ def test_quick_sets_options_of_the_study(name):
         "what --quick sets are options, at other values than usual"
     )
     to_json(name, quick)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_run_has_the_name_of_its_study(name):
+    module = importlib.import_module(
+        f"studies.{name}" + ".__main__" * (ROOT / "studies" / name).is_dir()
+    )
+    assert _name(module.Config) == name
