@@ -29,7 +29,7 @@ BUDGETS = {
     "studies/flow_quality": 5_300,
     "studies/flow_recording": 3_200,
     "studies/frame": 7_950,
-    "studies/gradient_flow": 10_050,
+    "studies/gradient_flow": 10_100,
     "studies/lens_motion": 4_000,
     "studies/lens_opt": 6_400,
     "studies/lens_report": 2_300,
