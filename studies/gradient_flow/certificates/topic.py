@@ -76,7 +76,7 @@ plateau is the step at which differences were taken, in unit steps: before the f
 picture by about a tenth of a pixel, behind it it is the length of the parameter.
 
 - **right**: no error above 1 % was seen at three standard deviations of the noise, and one of 10 % is excluded.
-- **wrong**: the error is above 1 % by more than three standard deviations of the noise.
+- **wrong**: the error is above 1 % by more than the noise can make, at odds that hundreds of rows allow.
 - **not judgeable**: the noise is above the signal that would tell, so the differences say neither; more samples or draws (`--film-samples`, `--draws`) lower it.
 
 Scenes with silhouettes (occluders, robot in view, dark room) take the gradient with the boundary
