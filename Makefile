@@ -61,7 +61,7 @@ gradcheck: STUDY := gradient_flow
 docs: .venv/with-docs.stamp ## the docs as a site with search and API: open site/index.html
 	@NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet && echo "site/index.html"
 
-evidence: setup ## the figures of README and docs measured again: make evidence ARGS="lens-motion" (all: two hours)
+evidence: setup ## the figures of README and docs whose code has changed, measured again: make evidence ARGS="lens-motion"
 	@$(RUN) setup/evidence.py $(ARGS)
 
 test: setup ## all tests, on all cores

@@ -1,11 +1,11 @@
 """Run what makes the figures of README and docs, keep them in docs/evidence.json, and write them into the pages.
 
-    make evidence                              all parts (about two hours on two cores)
-    make evidence ARGS="lens-motion joint"     named parts
+    make evidence                              parts whose code has changed since (all: an hour on two cores)
+    make evidence ARGS="lens-motion hero"      named parts
     make evidence ARGS="--write"               runs nothing: writes the kept figures into the pages
 
 A page names a figure as <!--fig:NAME-->text<!--/-->; the text is what this writes. A part that was
-cut is taken up where it stopped (runs/evidence/PART).
+cut is taken up where it stopped (runs/evidence/PART); one that was finished begins anew.
 
 evidence.json: {"schema": 1, "parts": {PART: {"command", "commit", "seconds", "machine", "measured":
 {folder: its tree in git}, "figures": {NAME: text}, "pictures": [FILE in docs]}}}.
@@ -16,6 +16,7 @@ import json
 import math
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
@@ -156,8 +157,8 @@ def trees(folders: tuple[str, ...]) -> dict[str, str]:
     return dict(zip(folders, said, strict=True))
 
 
-def stale(name: str, part: Mapping[str, Any]) -> list[str]:
-    """Folders whose code has changed since a part's figures were measured."""
+def stale(part: Mapping[str, Any]) -> list[str]:
+    """Folders whose code has changed since the figures of what is kept of a part."""
     now = trees(tuple(part["measured"]))
     return [folder for folder, tree in part["measured"].items() if now[folder] != tree]
 
@@ -167,6 +168,8 @@ def measured(name: str) -> dict[str, Any]:
     part, folder = PARTS[name], RUNS / name
     words = shlex.split(part.command)
     command = [sys.executable, "-m", f"studies.{words[0]}"]
+    if (folder / "report.html").exists():
+        shutil.rmtree(folder)
     begun = (folder / "config.json").exists()
     command += ["--resume", str(folder)] if begun else [*words[1:], "--out", str(folder)]
     subprocess.run(command, cwd=ROOT, check=True)
@@ -206,7 +209,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}; else all")
+    parser.add_argument(
+        "parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}; else those that are old"
+    )
     parser.add_argument("--write", action="store_true", help="run nothing")
     asked = parser.parse_args(arguments)
     unknown = [name for name in asked.parts if name not in PARTS]
@@ -214,7 +219,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {unknown[0]} is no part; choose from {', '.join(PARTS)}.", file=sys.stderr)
         return 2
     known = kept()
-    for name in [] if asked.write else asked.parts or PARTS:
+    old = [name for name in PARTS if name not in known or stale(known[name])]
+    for name in [] if asked.write else asked.parts or old:
         known[name] = measured(name)
         text = json.dumps({"schema": 1, "parts": known}, indent=1, ensure_ascii=False)
         write_atomic(KEPT, f"{text}\n".encode())
@@ -228,7 +234,7 @@ def main(arguments: list[str] | None = None) -> int:
             write_atomic(page, after.encode())
             print(f"{page.relative_to(ROOT)}: figures written")
     for name, part in known.items():
-        for folder in stale(name, part):
+        for folder in stale(part):
             print(f"{name}: {folder} has changed since {part['commit'][:8]}")
     return 0
 

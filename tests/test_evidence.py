@@ -55,6 +55,6 @@ def test_figures_are_of_this_code(name):
     git = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True)
     if git.returncode:
         pytest.skip("this is no checkout of git")
-    old = evidence.stale(name, evidence.kept()[name])
+    old = evidence.stale(evidence.kept()[name])
     if old:
         pytest.xfail(f"{', '.join(old)} changed since its figures: make evidence ARGS={name}")

@@ -15,7 +15,7 @@ from codesign.lens.analysis import polychromatic_spot, spot_radius_mm
 from codesign.lens.design import edge_thickness_mm
 from studies.frame.compare import log_ratio
 from studies.frame.config import configured
-from studies.frame.run import main
+from studies.frame.run import QUICK, main
 from studies.lens_opt import __main__ as lens_opt
 from studies.lens_opt import rivals
 from studies.lens_opt.page import verdict
@@ -188,7 +188,7 @@ def test_a_run_killed_while_it_judges_goes_on_there_and_ends_with_the_same_figur
     first = json.loads((folder / "metrics.json").read_text())
     said = capsys.readouterr().out.splitlines()[-1]
     lead = (folder / "report.html").read_text().split('<div class="lead">')[1]
-    assert html.unescape(lead).startswith(f"<p><strong>{said}</strong></p>")
+    assert html.unescape(lead).startswith(f"<p>{QUICK} <strong>{said}</strong></p>")
     monkeypatch.setattr(rivals, "refocus", None)  # the rivals are stored: nobody makes them again
     monkeypatch.setattr(rivals, "shrink_spots", None)
     (folder / "report.html").unlink()
