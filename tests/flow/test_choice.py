@@ -11,6 +11,7 @@ import torch
 from codesign import flow
 from codesign.flow.metrics import aee, zero_flow_error
 from scenes.windows.sets import HARSH
+from tests.flow.test_lk import mean_error, moving
 
 SEED = 4242  # of no study
 
@@ -88,3 +89,10 @@ def test_gradient_is_that_of_the_closed_form_that_was_chosen():
         difference = (value(counts + step * way) - value(counts - step * way)) / (2 * step)
     # what is believed changes with the counts and has no gradient: 25 nats of some thousands
     assert float((grad * way).sum()) == pytest.approx(float(difference), rel=0.02)
+
+
+@pytest.mark.parametrize("bins", [2, 3, 4])
+def test_few_bins_tell_a_motion_too(bins):
+    """A turn needs two pairs of bins, so of three no turn is looked for; the way is 1.5 px."""
+    volume, truth = moving(3, shift=(1.2, -0.9), bins=bins)
+    assert mean_error(flow.estimate(volume), truth) < 0.05 * 1.5

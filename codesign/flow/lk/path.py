@@ -117,7 +117,7 @@ def _mirror(signed, weight):
     sizes = sizes[:, :, None] * sizes[:, None]
     at = torch.arange(bins, device=signed.device)
     # place of the turn: two pairs of bins at least
-    twice = torch.arange(3, 2 * bins - 4, device=signed.device)
+    twice = torch.arange(3, max(3, 2 * bins - 4), device=signed.device)
     if not len(twice):
         return torch.ones_like(products[:, 0])
     pairs = (at[:, None] + at == twice[:, None, None]) & (at[:, None] != at)
