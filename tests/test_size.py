@@ -47,7 +47,7 @@ BUDGETS = {
     "tests": 13_500,
     "tests/data": 1_000,
     "tests/events": 33_350,
-    "tests/flow": 29_350,
+    "tests/flow": 29_450,
     "tests/gradients": 3_500,
     "tests/hard_cases": 2_500,
     "tests/hostile": 19_100,

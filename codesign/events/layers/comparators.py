@@ -377,7 +377,7 @@ def layer(name: str = "memory", sensor: SensorModel | None = None, **options: An
     if name not in LAYERS:
         near = difflib.get_close_matches(str(name), LAYERS, n=1)
         raise DomainError(
-            f"there is no event layer {name!r}{f', did you mean {near[0]!r}?' if near else ''}; event layers "
+            f"there is no event layer {name!r}{f', did you mean {near[0]!r}?' if near else ';'} event layers "
             f"are {', '.join(map(repr, LAYERS))}."
         )
     own = () if name == "physical" else tuple(field.name for field in fields(COMPARATORS[name]))
