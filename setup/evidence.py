@@ -138,7 +138,9 @@ PARTS = {
         "outdoors",
         f'--designs 2 --arms joint {ORDERS} book "alternating 4" CMA-ES default nested',
     ),
-    "joint-corridor": joint("corridor", f"--designs 64 --arms joint {ORDERS} book nested default"),
+    "joint-corridor": joint(
+        "corridor", f"--seeds 20 --designs 64 --arms joint {ORDERS} book nested default"
+    ),
 }
 
 
