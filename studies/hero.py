@@ -130,9 +130,8 @@ def filmed(drawn: Drawn, whole: Whole, error: float, config: Config) -> Film:
     looked = drawn.looked(
         whole, Samples((config.world,), tuple(range(config.pictures)), config.seed), "sensor"
     )
-    camera = render.Camera(
-        whole.camera.lens, *robot_pair.SENSOR_PX, robot_pair.PITCH_MM, config.rays, falloff=True
-    )
+    sensor = render.Film(*robot_pair.SENSOR_PX, *robot_pair.SENSOR_PX, robot_pair.PITCH_MM)
+    camera = whole.camera.with_film(sensor).with_samples(config.rays)
     stage = events.HardSensor(whole.sensor, robot_pair.BINS, robot_pair.LEAD_S)
     exposed = Exposed(stage, whole.space.costs.gain(whole.numbers["fno"]), None, 1)
     batch = looked.batch

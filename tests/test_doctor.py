@@ -1,29 +1,14 @@
 """The doctor and the renderer check, in processes of their own: a bad LLVM may abort the process,
 and must not."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from codesign import backend, doctor
+from tests.processes import python
 
 LLVM_15 = Path("/usr/lib/x86_64-linux-gnu/libLLVM-15.so")
-
-
-def python(*arguments, **environment):
-    """Run Python with ``arguments`` and extra environment variables; returns the finished
-    process."""
-    return subprocess.run(
-        [sys.executable, *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-        env={**os.environ, **environment},
-    )
 
 
 @pytest.fixture(params=["absent", "llvm 15"])

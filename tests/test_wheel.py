@@ -1,33 +1,16 @@
 """The wheel as setuptools builds it, without a network: what it puts beside other people's packages,
 and that it works where there is no checkout."""
 
-import os
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+from tests.processes import ROOT, python
+
 SOURCES = ("codesign", "scenes", "studies", "pyproject.toml", "setup.py", "README.md", "LICENSE")
 BUILD = "from setuptools.build_meta import build_wheel; build_wheel('.')"
 DATA = {".txt", ".npz", ".safetensors", ".jinja", ".urdf", ".csv", ".typed"}
-
-
-def python(*arguments, cwd, path=None):
-    """Run Python in ``cwd`` with ``path`` alone to import from besides the installed packages."""
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    environment |= {"PYTHONPATH": str(path)} if path else {}
-    return subprocess.run(
-        [sys.executable, *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-        cwd=cwd,
-        env=environment,
-    )
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +19,7 @@ def wheel(tmp_path_factory):
     source = tmp_path_factory.mktemp("source")
     for name in SOURCES:
         (source / name).symlink_to(ROOT / name)
-    built = python("-c", BUILD, cwd=source)
+    built = python("-c", BUILD, cwd=source, PYTHONPATH="")
     assert built.returncode == 0, built.stderr
     [path] = source.glob("*.whl")
     return path
@@ -66,9 +49,9 @@ def test_it_hides_nobodys_packages_and_finds_its_own(installed, tmp_path):
     for name in ("scenes", "studies"):
         (tmp_path / f"{name}.py").write_text("whose = 'mine'")
     own = "import codesign, scenes, studies; print(scenes.whose, studies.whose)"
-    assert python("-c", own, cwd=tmp_path, path=installed).stdout == "mine mine\n"
+    assert python("-c", own, cwd=tmp_path, PYTHONPATH=str(installed)).stdout == "mine mine\n"
     shipped = "import codesign; codesign.shipped.on_path(); import scenes; print(scenes.__file__)"
-    found = python("-c", shipped, cwd=tmp_path, path=installed).stdout.strip()
+    found = python("-c", shipped, cwd=tmp_path, PYTHONPATH=str(installed)).stdout.strip()
     assert Path(found) == installed / "codesign" / "_shipped" / "scenes" / "__init__.py"
 
 
@@ -79,7 +62,7 @@ def test_a_study_and_what_it_starts_run_out_of_it(installed, tmp_path):
         "try: main(['run', 'lens_report', '--help'])\n"
         "except SystemExit: subprocess.run([sys.executable, '-m', 'studies'], check=True)"
     )
-    done = python("-c", script, cwd=tmp_path, path=installed)
+    done = python("-c", script, cwd=tmp_path, PYTHONPATH=str(installed))
     assert done.returncode == 0, done.stderr
     assert "usage: codesign run lens_report" in done.stdout
-    assert done.stdout.count(python("-m", "studies", cwd=ROOT).stdout) == 1
+    assert done.stdout.count(python("-m", "studies", PYTHONPATH="").stdout) == 1

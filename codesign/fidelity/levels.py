@@ -49,6 +49,11 @@ class Fidelity:
     bins: int
     flow: str
 
+    @staticmethod
+    def finest(levels: "Levels") -> "Fidelity":
+        """The last level of every stage, the reference."""
+        return Fidelity(**{stage: found[-1] for stage, found in levels.items()})
+
     def __str__(self) -> str:
         return (
             f"{self.camera} camera, {self.samples} samples, {self.frames} frames, {self.events} "
@@ -116,12 +121,12 @@ def pickable(task: Task, levels: Levels) -> Levels:
 
 def finer(fidelity: Fidelity, levels: Levels) -> Fidelity:
     """Numbers one level finer, named levels at their finest."""
-    above = {stage: found[-1] for stage, found in levels.items()}
+    above = {}
     for stage, level in levels_in(fidelity):
         if stage in NUMBERS:
             at = levels[stage].index(level)
             above[stage] = levels[stage][min(at + 1, len(levels[stage]) - 1)]
-    return Fidelity(**above)
+    return replace(Fidelity.finest(levels), **above)
 
 
 def camera_at(camera: Camera, fidelity: Fidelity) -> Camera:

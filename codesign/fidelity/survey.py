@@ -172,7 +172,7 @@ def survey(scene: Any, task: Task, levels: Levels, seed: int = 0) -> Survey:
 
     Raises: DomainError where the finest chain itself cannot be run.
     """
-    finest = Fidelity(**{stage: found[-1] for stage, found in levels.items()})
+    finest = Fidelity.finest(levels)
     best = outcome(scene, task, finest, seed, turns=TURNS)
     rows, ratios, refused = [], {}, {}
     known: Levels = dict.fromkeys(levels, ())

@@ -121,7 +121,7 @@ def of_stage(
 ) -> list[dict[str, Any]]:
     """Rows of the levels of one stage, timed in turns."""
     measure = MEASURES[stage]
-    finest = Fidelity(**{name: found[-1] for name, found in levels.items()})
+    finest = Fidelity.finest(levels)
     run = system_of(world, task, finest).begin(batch_of(task, finest))
     with torch.no_grad():
         given = {name: run[MADE[name]] for name in (measure.begins_at,) if name}
@@ -169,7 +169,7 @@ def of_chains(world: Any, task: Task, levels: Levels, config: Config) -> list[di
     """Rows of the combinations that are chosen for TOLERANCES_PX, and of the finest, timed in
     turns; forecasts of the survey beside what was found."""
     known = survey(world, task, levels, config.seed)
-    finest = Fidelity(**{name: found[-1] for name, found in known.levels.items()})
+    finest = Fidelity.finest(known.levels)
     picks = [cheapest_combination(known, task, tolerance) for tolerance in TOLERANCES_PX]
     tried = list(dict.fromkeys([*picks, finest]))
     timed = turns({each: once(world, task, each) for each in tried}, config.repeats)

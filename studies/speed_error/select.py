@@ -161,12 +161,12 @@ def stage(run: Run[Config]) -> list[Asked]:
 def judged(scene: Case, rounds: int) -> dict[str, Any]:
     """Figures of one scene."""
     world, task = scene.scene(), scene.task(0)
-    truth = render.true_flow(task.camera, world, task.T_world_body[:, [0, -1]])[0]
-    size_px = float(truth.nan_to_num().square().sum(-3).mean().sqrt())
+    truth, valid = render.true_flow(task.camera, world, task.T_world_body[:, [0, -1]])
+    size_px = float(truth.square().sum(-3)[valid].mean().sqrt())
     tolerance = TOLERATED * size_px
     found = codesign.select(world, task, tolerance, levels=GRID)
     pick, levels = found.fidelity, found.survey.levels
-    finest = Fidelity(**{name: each[-1] for name, each in levels.items()})
+    finest = Fidelity.finest(levels)
     best = min(
         (row for row in tried_all(world, task, levels) if row["change"] <= tolerance),
         key=lambda row: row["cpu_s"],
@@ -210,7 +210,7 @@ def tried_all(world: Any, task: Task, levels: Levels) -> Iterator[dict[str, Any]
     """Every combination of levels that may be chosen, with what it changes of the flow and its
     seconds; frames are rendered once for all that follows them."""
     allowed = pickable(task, levels)
-    finest = Fidelity(**{name: each[-1] for name, each in levels.items()})
+    finest = Fidelity.finest(levels)
     reference = outcome(world, task, finest).judged
     later = ("events", "bins", "flow")
     for rendered in itertools.product(*(allowed[name] for name in ("camera", "samples", "frames"))):

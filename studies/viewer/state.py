@@ -86,9 +86,7 @@ class Drive:
 
     def camera(self, whole: Whole) -> render.Camera:
         """The film behind a design's lens."""
-        lens, falloff = whole.camera.lens, whole.camera.falloff
-        size = (self.film.width_px, self.film.height_px, self.film.pixel_pitch_mm)
-        return render.Camera(lens, *size, self.rays_per_px, 0, self.film, falloff=falloff)
+        return whole.camera.with_film(self.film).with_samples(self.rays_per_px)
 
     @cached_property
     def system(self) -> System:

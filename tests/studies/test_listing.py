@@ -3,30 +3,15 @@ wrong name."""
 
 import dataclasses
 import importlib
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
 from studies.frame import listing
 from studies.frame.config import StudyConfig, configured, to_json
 from studies.frame.run import _name
+from tests.processes import ROOT, python
 
-ROOT = Path(__file__).resolve().parents[2]
 NAMES = list(listing.studies())
-
-
-def python(*arguments, cwd=ROOT):
-    """Run Python with ``arguments``; returns the finished process."""
-    return subprocess.run(
-        [sys.executable, *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-        cwd=cwd,
-    )
 
 
 def test_every_folder_and_file_that_runs_is_listed_once():

@@ -142,11 +142,8 @@ def _eye():
     return torch.eye(4, dtype=torch.float64)
 
 
-SILHOUETTES = (
-    "occluders",
-    "robot in view",
-    "dark room",
-)  # scenes whose gradient has a boundary term
+# scenes whose gradient has a boundary term
+SILHOUETTES = ("occluders", "robot in view", "dark room")
 BUILDERS: dict[str, Callable[[], Scene]] = {
     "smooth plane": _plane,
     "textured room": _room,
