@@ -141,7 +141,12 @@ def study(run: Run[Config]) -> None:
     judge = Judge(space, size.judged_worlds, size.judged_drives)
     rows = raced(run, judge, setting) if size.seeds else []
     said = page.lead(run, space, rows, judge)
-    best = best_joint(drawn, rows) if rows and (size.couplings or size.read_outs) else gates.best
+    best = gates.best
+    if rows and (size.couplings or size.read_outs):
+        shares = [
+            torch.tensor(row["share"], dtype=torch.float64) for row in rows if row["arm"] == "joint"
+        ]
+        best = couplings.best_of(drawn, shares)
     if rows and size.couplings:
         around(run, drawn, best, rows)
     page.looked(run, space, gates)
@@ -156,24 +161,17 @@ def study(run: Run[Config]) -> None:
     run.finish("Lens, mount, sensor and estimator together", said)
 
 
-def best_joint(drawn: Drawn, rows: Sequence[Row]) -> torch.Tensor:
-    """Shares [V] of the joint answer of which least error is expected on one fresh draw."""
-    fresh = drawn.draw(couplings.FIRST - 1)
-    shares = [
-        torch.tensor(row["share"], dtype=torch.float64) for row in rows if row["arm"] == "joint"
-    ]
-    return min(
-        shares,
-        key=lambda share: float(drawn.looked(drawn.space.made(share), fresh).expected.mean()),
-    )
-
-
 def around(run: Run[Config], drawn: Drawn, at: torch.Tensor, rows: Sequence[Row]) -> None:
     """Couplings around a joint answer, and what the orders would leave by them."""
     at = at.clamp(couplings.STEP, 1 - couplings.STEP)
     starts = [start(drawn.space, seed) for seed in dict.fromkeys(row["seed"] for row in rows)]
     measured = {arm: math.exp(-over.value) for arm, (over, _) in compared(rows).items()}
-    pulls = couplings.curvatures(run, drawn, at, run.config.couplings)
+    pulls = sweep(
+        run,
+        lambda draw: couplings.curvatures(drawn, at, draw),
+        "couplings",
+        draw=range(run.config.couplings),
+    )
     couplings.show(run, drawn.space, pulls, at, starts, measured)
 
 
@@ -214,14 +212,6 @@ def checked(size: Config) -> None:
         )
     if size.family != THIN:
         lens.family(size.family)
-    if not 0 < size.light <= 1:
-        raise DomainError(
-            f"--light is {size.light:g}; a share of daylight above 0 and at most 1 is needed."
-        )
-    if not 0 < size.speed <= 1:
-        raise DomainError(
-            f"--speed is {size.speed:g}; a share of the drives' speed above 0 and at most 1 is needed."
-        )
     if size.seeds < 0:
         raise DomainError(f"--seeds is {size.seeds}; 0 or more are needed.")
     if size.worlds > MOST_WORLDS or size.designs < 2:

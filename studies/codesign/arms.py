@@ -7,13 +7,12 @@ from dataclasses import dataclass, field
 from itertools import permutations
 
 import torch
-from scipy.optimize import minimize
 from torch import Tensor
 
 from codesign.mount.requirements import first_missed
 from scenes.robots import pair as robot_pair
 from scenes.robots.costs import FASTEST
-from studies.codesign.design import BLOCKS, PARTS, Space
+from studies.codesign.design import BLOCKS, Space
 from studies.codesign.objective import Objective
 from studies.codesign.problem import Looked
 from studies.placement.searches import SEARCHES
@@ -22,7 +21,6 @@ FIRST_LENGTH, LAST_LENGTH = 0.15, 0.03  # of steps in the cube
 MOMENTUM = 0.7
 END = 0.25  # of the way, whose mean is the answer
 RECORDED = 3  # rounds of drives on which sensor and estimator are settled
-SIMPLEX = 0.15  # of the cube, in which that begins
 NESTED = 8  # designs of sensor and estimator tried at every step
 BOOK_STEPS = 40  # of focal length, from the longest on
 GEOMETRY = ("lens", "mount")
@@ -86,39 +84,11 @@ def descend(
 
 
 def read_out(task: "Task", share: Tensor, way: Way, tries: int = 0) -> Tensor:
-    """Shares [V] with the sensor and the estimator that let expect least error on the drives
-    recorded last.
-
-    Nothing is rendered: a simplex (Nelder and Mead) from what they are now, on frames that are
-    there; ``tries`` of it, those of the task for 0. By expected errors, which rank good read-outs
-    better than hard ones of so few drives do (0.93 and 0.85, docs/joint_design.md).
-    """
-    space = task.space
-    free = space.part("read-out")
-    if not free or not way.recorded:
+    """Shares [V] with sensor and estimator settled on the drives recorded last
+    (``Objective.settled``); ``tries`` of them, those of the task for 0."""
+    if not task.space.part("read-out") or not way.recorded:
         return share
-    tried = []
-
-    def error(numbers):
-        moved = share.clone()
-        moved[free] = torch.from_numpy(numbers).clamp(0, 1)
-        whole = space.made(moved)
-        chosen = {name: whole.numbers[name] for name in PARTS["read-out"]}
-        errors = []
-        for looked in way.recorded:
-            errors.append(looked.again(looked.whole.with_numbers(**chosen)).expected)
-        tried.append((float(torch.cat(errors).mean()), moved))
-        return tried[-1][0]
-
-    begun = share[free]
-    # towards the middle, so that none leaves the bounds
-    corners = begun + torch.diag(torch.where(begun < 0.5, SIMPLEX, -SIMPLEX))
-    options = {
-        "maxfev": tries or task.settling,
-        "initial_simplex": torch.cat([begun[None], corners]).numpy(),
-    }
-    minimize(error, begun.numpy(), method="Nelder-Mead", options=options)
-    return min(tried, key=lambda one: one[0])[1]
+    return task.objective.settled(share, way.recorded, tries or task.settling)
 
 
 @dataclass(frozen=True)
@@ -143,9 +113,7 @@ class Task:
 
     def look(self, share: Tensor, way: Way) -> None:
         """Render a draw at shares, for what is solved on recorded frames."""
-        drawn = self.objective.drawn
-        looked = drawn.looked(self.space.made(share), drawn.draw(self.first + len(way.shares)))
-        way.add(share, float(looked.expected.mean()), looked)
+        way.add(share, *self.objective.look(share, self.first + len(way.shares)))
 
     def descend(self, start, blocks, steps, way, **how) -> Tensor:
         """Steps in some blocks, draws numbered on from those on the way."""

@@ -1,55 +1,131 @@
-"""How strongly the blocks of a design pull at each other, and what designing them one after the
-other would leave there:
-second differences of the errors to be expected around one design."""
+"""How strongly the blocks of a design pull at each other, and what the arms would leave there:
+second differences of the errors to be expected around one design, and a race in the valley that
+they make."""
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from studies.codesign.arms import ARMS, Task, read_out
 from studies.codesign.design import PARTS, Space
 from studies.codesign.problem import Drawn
 from studies.frame.run import Run
 from studies.frame.show import tabulate
-from studies.frame.sweep import Row, sweep
+from studies.frame.sweep import Row
 
 STEP = 0.12  # of the cube, to either side
 FIRST = 5_500_000  # number of the first draw, beyond those of any race
 NULLS = 200  # draws of noise
 FLATTEST = 0.02  # of the largest curvature, below which none is taken
+DESCENTS = [name for name in ARMS if " > " in name or name.split()[0] in ("alternating", "nested")]
 
 
-def curvatures(run: Run[Any], drawn: Drawn, at: Tensor, draws: int) -> list[Row]:
-    """Rows of every draw and pair of numbers around shares [V], a STEP off the bounds: the mixed
-    second difference of the mean expected error, and that error itself."""
+def best_of(drawn: Drawn, shares: Sequence[Tensor]) -> Tensor:
+    """Of shares [V] those of which least error is expected on one fresh draw."""
+    fresh = drawn.draw(FIRST - 1)
+    return min(
+        shares,
+        key=lambda share: float(drawn.looked(drawn.space.made(share), fresh).expected.mean()),
+    )
+
+
+def curvatures(drawn: Drawn, at: Tensor, draw: int) -> list[Row]:
+    """Rows of every pair of numbers around shares [V], a STEP off the bounds, on one draw: the
+    mixed second difference of the mean expected error, and that error itself."""
     names = drawn.space.free
+    samples = drawn.draw(FIRST + draw)
 
-    def error(draw, *moves):
+    def error(*moves):
         share = at.clone()
         for place, step in moves:
             share[place] += step
-        looked = drawn.looked(drawn.space.made(share), drawn.draw(FIRST + draw))
-        return float(looked.expected.mean())
+        return float(drawn.looked(drawn.space.made(share), samples).expected.mean())
 
-    def cell(draw):
-        here = error(draw)
-        rows = []
-        for a in range(len(names)):
-            ends = sum(error(draw, (a, step)) for step in (-STEP, STEP))
-            rows.append(
-                {"one": names[a], "other": names[a], "curvature": (ends - 2 * here) / STEP**2}
-            )
-        for a, b in combinations(range(len(names)), 2):
-            mixed = sum(
-                i * j * error(draw, (a, i * STEP), (b, j * STEP)) for i in (-1, 1) for j in (-1, 1)
-            )
-            rows.append({"one": names[a], "other": names[b], "curvature": mixed / (4 * STEP**2)})
-        return [{**row, "error": here} for row in rows]
+    here = error()
+    rows = []
+    for a in range(len(names)):
+        ends = sum(error((a, step)) for step in (-STEP, STEP))
+        rows.append({"one": names[a], "other": names[a], "curvature": (ends - 2 * here) / STEP**2})
+    for a, b in combinations(range(len(names)), 2):
+        mixed = sum(i * j * error((a, i * STEP), (b, j * STEP)) for i in (-1, 1) for j in (-1, 1))
+        rows.append({"one": names[a], "other": names[b], "curvature": mixed / (4 * STEP**2)})
+    return [{**row, "error": here} for row in rows]
 
-    return sweep(run, cell, "couplings", draw=range(draws))
+
+@dataclass(frozen=True)
+class Valley:
+    """The second-order model of the errors around a design, which arms descend as they do the true
+    ones; every slope is exact there and every draw the same.
+
+    curvature: [V, V], positive definite. bottom: [V] shares, and the error there. Errors stay below
+    1, as true ones do.
+    """
+
+    space: Space
+    curvature: Tensor
+    bottom: Tensor
+    error: float
+
+    @property
+    def drawn(self) -> "Valley":
+        """Itself, whose draws are their numbers."""
+        return self
+
+    def draw(self, number: int) -> int:
+        """That draw."""
+        return number
+
+    def over(self, share: Tensor) -> float:
+        """Error at shares [V]."""
+        away = share - self.bottom
+        height = float(away @ self.curvature @ away) / 2
+        room = 1 - self.error
+        return self.error + height * room / (height + room)
+
+    def __call__(
+        self, share: Tensor, samples: int, free: Sequence[int]
+    ) -> tuple[float, Tensor, None]:
+        """Error, its slope [V] along the free numbers (its direction; arms take no more of it)."""
+        slope = torch.zeros_like(share)
+        slope[list(free)] = (self.curvature @ (share - self.bottom))[list(free)]
+        return self.over(share), slope, None
+
+    def look(self, share: Tensor, draw: int) -> tuple[float, None]:
+        """Error at shares [V]."""
+        return self.over(share), None
+
+    def settled(self, share: Tensor, recorded: Any = None, tries: int = 0) -> Tensor:
+        """Shares [V] with the read-out at its bottom."""
+        return self.lowest(share, "read-out")
+
+    def lowest(self, share: Tensor, part: str) -> Tensor:
+        """Shares [V] with a part at its bottom, the others as they are; within the bounds."""
+        mine = self.space.part(part)
+        rest = [k for k in range(len(share)) if k not in mine]
+        away = share - self.bottom
+        found = share.clone()
+        pulled = self.curvature[mine][:, rest] @ away[rest]
+        found[mine] = self.bottom[mine] - torch.linalg.solve(self.curvature[mine][:, mine], pulled)
+        return found.clamp(0, 1)
+
+    def one_pass(self, start: Tensor, order: Sequence[str]) -> float:
+        """Error where parts are brought to their bottoms in an order, and the read-out once
+        more."""
+        share = start
+        for part in (*order, "read-out"):
+            share = self.lowest(share, part)
+        return self.over(share)
+
+    def raced(self, start: Tensor, arm: str, steps: int) -> float:
+        """Error of an arm's answer here."""
+        task = Task(self, start, steps, 0, 0)
+        answer, way = ARMS[arm](task)
+        return self.over(read_out(task, answer, way))
 
 
 def hessian(space: Space, rows: Sequence[Row]) -> tuple[Tensor, Tensor, float]:
@@ -98,28 +174,21 @@ def coupled(space: Space, curvature: Tensor) -> dict[str, float]:
     return found
 
 
-def left_by(
-    space: Space,
-    curvature: Tensor,
-    error: float,
-    at: Tensor,
-    starts: Sequence[Tensor],
-    order: Sequence[str],
-) -> float:
-    """Error of one pass over the parts in an order and, as in the race, over the read-out once
-    more, each brought to its bottom, over that of the joint bottom: median over the starts, by the
-    second-order model."""
-    ratios = []
-    for start in starts:
-        away = start - at
-        for part in (*order, "read-out"):
-            mine = space.part(part)
-            rest = [k for k in range(len(away)) if k not in mine]
-            away[mine] = -torch.linalg.solve(
-                curvature[mine][:, mine], curvature[mine][:, rest] @ away[rest]
-            )
-        ratios.append(1 + float(away @ curvature @ away) / 2 / error)
-    return float(torch.tensor(ratios).quantile(0.5))
+def foretold(valley: Valley, starts: Sequence[Tensor], steps: int, arm: str) -> dict[str, float]:
+    """Error of an arm over that of the joint one, median over the starts: ``at_budget`` after so
+    many steps, and for an order ``at_the_bottom``, where every part is brought to its own."""
+    joint = [valley.raced(start, "joint", steps) for start in starts]
+    mine = [valley.raced(start, arm, steps) for start in starts]
+    found = {"at_budget": _median(a / b for a, b in zip(mine, joint, strict=True))}
+    order = arm.split(" > ")
+    if len(order) == len(PARTS):
+        bottoms = (valley.one_pass(start, order) for start in starts)
+        found["at_the_bottom"] = _median(error / valley.error for error in bottoms)
+    return found
+
+
+def _median(values):
+    return float(torch.tensor(list(values), dtype=torch.float64).quantile(0.5))
 
 
 def show(
@@ -150,16 +219,18 @@ def show(
         for name, value in coupled(space, curvature).items()
     ]
     tabulate(run, "Canonical couplings", lines, "parts", prefix="parts")
-    lines = []
-    for arm, ratio in measured.items():
-        order = arm.split(" > ")
-        if len(order) == len(PARTS):
-            predicted = left_by(space, curvature, error, at, starts, order)
-            lines.append({"order": arm, "predicted": predicted, "measured": ratio})
+    valley = Valley(space, curvature, at, error)
+    lines = [
+        {"arm": arm, **foretold(valley, starts, run.config.steps, arm), "measured": ratio}
+        for arm, ratio in measured.items()
+        if arm in DESCENTS
+    ]
     if lines:
-        tabulate(
-            run, "Error of an order over the joint one", lines, "order", prefix="order_over_joint"
+        run.text(
+            "The same arms raced in the valley that these differences make, from the same starts and with exact slopes: after "
+            "as many steps as here, and with every part brought to its bottom."
         )
+        tabulate(run, "Error of an arm over the joint one", lines, "arm", prefix="arm_over_joint")
     steepness = curvature.diagonal().sqrt() / math.sqrt(2 * error)
     each = [
         {"number": name, "per_share": float(value)}

@@ -121,7 +121,12 @@ class Space:
         held: Mapping[str, float] = MappingProxyType({}),
     ) -> "Space":
         """By names: of one of the three pairs or of an own robot's page (.yaml), behind a thin lens
-        for None, in a share of daylight, at a share of the drives' speed."""
+        for None, in a share of daylight, at a share of the drives' speed.
+
+        Raises: DomainError for shares outside 0 to 1, and what Space refuses."""
+        for name, share in (("light", light), ("speed", speed)):
+            if not 0 < share <= 1:
+                raise DomainError(f"{name} is {share:g}; a share above 0 and at most 1 is needed.")
         found = PAIRS[pair]() if pair in PAIRS else own_pair(pair)
         if speed != 1:
             found = robot_pair.slowed(found, speed)

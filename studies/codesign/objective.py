@@ -10,16 +10,18 @@ these numbers a step.
 from collections.abc import Sequence
 
 import torch
+from scipy.optimize import minimize
 from torch import Tensor
 
 from codesign import mount
 from codesign.mount import PrecisionTrend
-from studies.codesign.design import BLOCKS, Whole
+from studies.codesign.design import BLOCKS, PARTS, Whole
 from studies.codesign.problem import Drawn, Looked, Seen
 from studies.placement.problem import Samples, of_bodies
 
 STEP = 0.12  # of the cube, to either side
 PENALTY_STEP = 0.01
+SIMPLEX = 0.15  # of the cube, in which sensor and estimator begin to be settled
 GEOMETRY = BLOCKS["lens"] + BLOCKS["mount"]
 # geometry knows the blur of an f-number, recorded frames its light
 ON_FRAMES = ("fno", *BLOCKS["sensor"], *BLOCKS["network"])
@@ -70,6 +72,41 @@ class Objective:
                 share, moved, PENALTY_STEP, looked.whole, self._penalties
             )
         return value + penalty, slope, looked
+
+    def look(self, share: Tensor, draw: int) -> tuple[float, Looked]:
+        """Error to be expected of shares [V] on a draw, and what was rendered."""
+        looked = self.drawn.looked(self.space.made(share), self.drawn.draw(draw))
+        return float(looked.expected.mean()), looked
+
+    def settled(self, share: Tensor, recorded: Sequence[Looked], tries: int) -> Tensor:
+        """Shares [V] with the sensor and the estimator that let expect least error on recorded
+        drives.
+
+        Nothing is rendered: a simplex (Nelder and Mead) of so many tries from what they are now, on
+        frames that are there. By expected errors, which rank good read-outs better than hard ones
+        of so few drives do (0.93 and 0.85, docs/joint_design.md).
+        """
+        free = self.space.part("read-out")
+        tried = []
+
+        def error(numbers):
+            moved = share.clone()
+            moved[free] = torch.from_numpy(numbers).clamp(0, 1)
+            whole = self.space.made(moved)
+            chosen = {name: whole.numbers[name] for name in PARTS["read-out"]}
+            errors = []
+            for looked in recorded:
+                errors.append(looked.again(looked.whole.with_numbers(**chosen)).expected)
+            tried.append((float(torch.cat(errors).mean()), moved))
+            return tried[-1][0]
+
+        begun = share[free]
+        # towards the middle, so that none leaves the bounds
+        corners = begun + torch.diag(torch.where(begun < 0.5, SIMPLEX, -SIMPLEX))
+        simplex = torch.cat([begun[None], corners]).numpy()
+        options = {"maxfev": tries, "initial_simplex": simplex}
+        minimize(error, begun.numpy(), method="Nelder-Mead", options=options)
+        return min(tried, key=lambda one: one[0])[1]
 
     def forget(self) -> None:
         """All numbers that act on recorded frames take their turn in the next call."""

@@ -17,7 +17,8 @@ GROUPS = {
     "events": ("video_to_events", "sensor_fit", "spike_esim"),
     "flow": ("train_flow", "flow_quality", "flow_recording"),
     "whole chain": (
-        *("lens_opt", "lens_opt_seeds", "lens_motion", "placement", "codesign", "velocity_head"),
+        *("lens_opt", "lens_opt_seeds", "lens_motion", "placement"),
+        *("codesign", "joint_map", "joint_levers", "velocity_head"),
         *("gradient_flow", "speed_error", "stability", "chain_picture", "hero", "viewer"),
     ),
 }

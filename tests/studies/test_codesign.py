@@ -3,7 +3,7 @@ valley, and the whole of it, resumed."""
 
 import json
 import math
-from contextlib import nullcontext
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -15,7 +15,7 @@ from scenes.robots.costs import Costs
 from scenes.robots.pairs import PAIRS
 from studies.codesign import __main__ as codesign
 from studies.codesign import couplings, slopes
-from studies.codesign.arms import ARMS, Task, Way, chosen_by_the_book, read_out
+from studies.codesign.arms import Task, Way, chosen_by_the_book, read_out
 from studies.codesign.design import Space
 from studies.codesign.objective import Objective
 from studies.codesign.problem import Drawn
@@ -87,46 +87,26 @@ def test_a_swaying_mast_is_an_error_that_is_expected(drawn, space):
     assert errors["shaken"][1] > errors["still"][1] + 0.1
 
 
-class Valley:
-    """An objective whose error is known, in place of a rendered one: lens and mount pull at each
-    other."""
-
-    def __init__(self, space):
-        self.space = space
-        self.drawn = SimpleNamespace(
-            draw=lambda number: SimpleNamespace(seed=number, numbers=(0,), which=(0,)),
-            requirements=[],
-            rendered=0,
-        )
-
-    def error(self, share):
-        away = share - 0.5
-        return away.square().sum() + 1.6 * away[0] * away[4]
-
-    def __call__(self, share, samples, free):
-        at = share.clone().requires_grad_()
-        error = self.error(at)
-        (slope,) = torch.autograd.grad(error, at)
-        held = [k for k in range(len(share)) if k not in free]
-        slope[held] = 0.0
-        return float(error.detach()), slope, None
-
-
 def test_joint_descent_reaches_the_bottom_of_a_valley_that_one_pass_over_the_blocks_does_not(
-    space, monkeypatch
+    space,
 ):
-    monkeypatch.setattr("studies.codesign.arms.read_out", lambda task, share, *rest: share)
-    begun = torch.full((len(space.free),), 0.5, dtype=F)
+    size = len(space.free)
+    curvature = 2 * torch.eye(size, dtype=F)
+    curvature[0, 4] = curvature[4, 0] = 1.6
+    valley = couplings.Valley(space, curvature, torch.full((size,), 0.5, dtype=F), 0.0)
+    begun = valley.bottom.clone()
     begun[0], begun[4] = 0.1, 0.9
-    valley = Valley(space)
-    ends = {
-        name: ARMS[name](Task(valley, begun, 48, 0, 0))[0]
-        for name in ("joint", "lens > mount > read-out")
-    }
-    errors = {name: float(valley.error(share)) for name, share in ends.items()}
-    assert errors["joint"] < 2e-3
+    joint, one_pass, alternating = (
+        valley.raced(begun, arm, 48)
+        for arm in ("joint", "lens > mount > read-out", "alternating 8")
+    )
+    assert joint < 2e-3
     # minimising along the lens, then along the mount leaves (1 - 0.64) 0.64 of the squared start
-    assert errors["lens > mount > read-out"] > 5 * errors["joint"]
+    assert one_pass == pytest.approx(0.36 * 0.64 * 0.16, abs=0.015)
+    assert joint < alternating < one_pass
+    told = couplings.foretold(replace(valley, error=0.1), [begun], 48, "lens > mount > read-out")
+    assert told["at_budget"] > 1.2
+    assert couplings.foretold(valley, [begun], 48, "alternating 8").keys() == {"at_budget"}
 
 
 def test_a_read_out_is_settled_at_the_bottom_of_what_recorded_frames_tell(space):
@@ -141,14 +121,14 @@ def test_a_read_out_is_settled_at_the_bottom_of_what_recorded_frames_tell(space)
 
     begun = space.share(theta=0.3, cutoff_hz=150.0, prior_px=6.0)
     way = Way(recorded=[SimpleNamespace(again=again, whole=space.made(begun))])
-    task = Task(SimpleNamespace(space=space), begun, 16, 0, 0, 60)
-    found = read_out(task, begun, way)
+    known = Objective(SimpleNamespace(space=space))
+    found = read_out(Task(known, begun, 16, 0, 0, 60), begun, way)
     held = [k for k in range(len(begun)) if k not in free]
     assert torch.equal(found[held], begun[held])
     assert (found - bottom)[free].abs().max() < 0.02
 
 
-def test_couplings_of_a_known_valley_are_its_own(space, tmp_path):
+def test_couplings_of_a_known_valley_are_its_own(space):
     """A quadratic valley in which lens and mount pull at each other: its curvature, its canonical
     coupling, and what one pass leaves, all in closed form."""
     size = len(space.free)
@@ -166,12 +146,11 @@ def test_couplings_of_a_known_valley_are_its_own(space, tmp_path):
         draw=lambda number: number,
         looked=looked,
     )
-    run = SimpleNamespace(
-        path=lambda name: tmp_path / name,
-        state_unread=False,
-        progress=lambda *_, **__: nullcontext(SimpleNamespace(advance=lambda: None)),
-    )
-    rows = couplings.curvatures(run, known, bottom, 2)
+    rows = [
+        {"draw": draw, **row}
+        for draw in range(2)
+        for row in couplings.curvatures(known, bottom, draw)
+    ]
     found, spread, error = couplings.hessian(space, rows)
     assert torch.allclose(found, true, atol=1e-9)
     assert float(spread.max()) < 1e-9
@@ -191,8 +170,10 @@ def test_couplings_of_a_known_valley_are_its_own(space, tmp_path):
     # the lens goes to -0.8 x 0.3, then the mount to 0.64 x 0.3
     lens_away, mount_away = -0.8 * 0.3, 0.64 * 0.3
     left = (lens_away**2 + mount_away**2 + 1.6 * lens_away * mount_away) / 2
-    over = couplings.left_by(space, found, error, bottom, [begun], ("lens", "mount", "read-out"))
-    assert over == pytest.approx(1 + left / 0.1)
+    valley = couplings.Valley(space, found, bottom, error)
+    # heights over the bottom are bounded, as errors are
+    bounded = left * 0.9 / (left + 0.9)
+    assert valley.one_pass(begun, ("lens", "mount")) == pytest.approx(0.1 + bounded)
 
 
 def test_starts_keep_what_is_required(space):
@@ -238,14 +219,14 @@ def test_the_comparison_is_of_pairs():
     ("wrong", "said"),
     [
         (["--pair", "moon"], "choose from outdoors"),
-        (["--light", "0"], "share of daylight"),
+        (["--light", "0"], "light is 0"),
         (["--steps", "10"], "multiple of 16"),
         (["--arms", "book"], "needs joint"),
         (["--arms", "joint", "luck"], "choose from joint"),
         (["--per-draw", "7", "--worlds", "3"], "spread evenly"),
         (["--family", "fisheye-9"], "no lens family"),
         (["--free", "colour"], "no number 'colour'"),
-        (["--speed", "2"], "share of the drives' speed"),
+        (["--speed", "2"], "speed is 2"),
         (["--hold", "fno"], "such as fno=4"),
         (["--hold", "fno=40"], "give a value within 1.2 to 8"),
         (["--arms", "joint"], "another one"),

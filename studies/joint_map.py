@@ -1,0 +1,183 @@
+"""Where does designing lens, mount, sensor and estimator in one descent beat one after the other?
+
+Cells of light, f-number and speed are raced each by itself (studies.codesign): joint, and the
+orders of lens and mount before the read-out. Beside the measured ratio of a cell stands what the
+same arms leave in the valley that second differences around its best joint answer make: what the
+couplings alone would let expect.
+"""
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, ClassVar
+
+import matplotlib.pyplot as plt
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from studies.codesign import couplings
+from studies.codesign.cells import CellsConfig, answers, pulls_of, setting, space_of
+from studies.codesign.landscape import ranked
+from studies.codesign.race import compared, start
+from studies.frame.compare import Interval, bootstrap
+from studies.frame.run import Run, main
+from studies.frame.show import tabulate
+from studies.frame.sweep import Row, select
+
+ORDERS = ("lens > mount > read-out", "mount > lens > read-out")
+ENOUGH = 6  # cells, below which nothing is said of the prediction
+
+
+@dataclass(frozen=True)
+class Config(CellsConfig):
+    QUICK: ClassVar = {
+        "lights": (1.0,),
+        "fnos": (4.0,),
+        "speeds": (1.0, 0.3),
+        "seeds": 1,
+        "worlds": 2,
+        "per_draw": 2,
+        "judged_worlds": 2,
+        "settling": 6,
+        "couplings": 0,
+    }
+    lights: tuple[float, ...] = (1.0, 0.1)
+    """Shares of daylight."""
+    fnos: tuple[float, ...] = (0.0, 2.0, 8.0)
+    """f-numbers at which the lens is held; 0: it is designed."""
+    speeds: tuple[float, ...] = (1.0, 0.3)
+    """Shares of the drives' speed."""
+    couplings: int = 1
+    """Draws of twelve drives by which second differences are measured in each cell; 0: none."""
+
+
+def study(run: Run[Config]) -> None:
+    config = run.config
+    cells = {
+        f"{light:g} of daylight, {f'f/{fno:g}' if fno else 'f free'}, {speed:g} of the speed": setting(
+            config, light, speed, {"fno": fno} if fno else {}
+        )
+        for speed, light, fno in product(config.speeds, config.lights, config.fnos)
+    }
+    rows = answers(run, cells, ("joint", *ORDERS))
+    pulls = pulls_of(run, cells, rows, config.couplings) if config.couplings else []
+    lines, ratios = [], {}
+    for cell, given in cells.items():
+        mine = select(rows, regime=cell)
+        found = compared(mine)
+        order = max(ORDERS, key=lambda arm: found[arm][0].value)
+        over = found[order][0]
+        ratios[cell] = over
+        errors = {arm: _median(mine, arm) for arm in ("joint", order)}
+        line = {
+            "cell": cell,
+            "best order": order,
+            "joint": errors["joint"],
+            "order": errors[order],
+            **{name: _ratio(getattr(over, name)) for name in ("value", "low", "high")},
+            "rank": ranked([row["expected"] for row in mine], [_error(row) for row in mine]),
+        }
+        if pulls:
+            line |= _foretold(config, given, select(pulls, regime=cell), order)
+        lines.append(line)
+    run.section(
+        "Cells",
+        "Medians over starts of errors in unseen worlds; the joint error over that of the better order, with 95 % of "
+        "resampled starts and worlds. Foretold: the same in the valley of second differences, at this budget and at the "
+        "bottom. Rank: of the answers' expected errors against hard ones (Spearman).",
+    )
+    titles = {
+        "cell": "cell",
+        "best order": "better order",
+        "joint": "joint",
+        "order": "order",
+        "value": "joint over order",
+        "low": "low",
+        "high": "high",
+        "at_budget": "foretold",
+        "at_the_bottom": "at the bottom",
+        "rank": "rank",
+    }
+    tabulate(run, "Joint over the better order", lines, "cell", prefix="cell", **titles)
+    foretold = [line["at_budget"] for line in lines if line.get("at_budget")]
+    run.figure(
+        drawn(ratios, foretold if len(foretold) == len(lines) else []),
+        "map",
+        "Joint error over that of the better order in each cell (dots, 95 %), and what its couplings let expect (crosses).",
+    )
+    run.finish("A map of joint design", _answer(run, lines, foretold))
+
+
+def _foretold(config: Config, given: Mapping[str, Any], pulls: Sequence[Row], order: str) -> Row:
+    """Joint error over that of an order in the valley, as the measured ratio is; nothing where
+    there is no valley."""
+    space = space_of(given)
+    raw, _, error = couplings.hessian(space, pulls)
+    curvature = couplings.bowl(raw)
+    if curvature is None:
+        return {}
+    at = torch.tensor(pulls[0]["at"], dtype=torch.float64)
+    valley = couplings.Valley(space, curvature, at, error)
+    starts = [start(space, seed) for seed in range(config.seed, config.seed + config.seeds)]
+    told = couplings.foretold(valley, starts, config.steps, order)
+    return {name: 1 / value for name, value in told.items()}
+
+
+def _error(row):
+    return sum(row["errors"]) / len(row["errors"])
+
+
+def _median(rows, arm):
+    errors = [_error(row) for row in select(rows, arm=arm)]
+    return float(torch.tensor(errors, dtype=torch.float64).quantile(0.5))
+
+
+def _ratio(log):
+    return float(torch.tensor(log, dtype=torch.float64).exp())
+
+
+def _answer(run: Run[Config], lines: Sequence[Row], foretold: Sequence[float]) -> str:
+    """The map in one sentence, and the rank of what was foretold."""
+    won = sum(line["high"] < 1 for line in lines)
+    lost = sum(line["low"] > 1 for line in lines)
+    run.record(cells=len(lines), cells_won=won, cells_lost=lost)
+    said = (
+        f"Of {len(lines)} cells one joint descent beats the better order of single blocks in {won}, loses in {lost}, and is "
+        f"undecided in {len(lines) - won - lost}."
+    )
+    if len(lines) < ENOUGH or run.config.quick:
+        return f"{said} So few cells or starts decide nothing."
+    if len(foretold) < len(lines):
+        return f"{said} Couplings were not measured in all of them."
+
+    def rank(measured: Tensor, told: Tensor) -> Tensor:
+        one, other = (each.argsort(-1).argsort(-1).double() for each in (measured, told))
+        one, other = (each - each.mean(-1, keepdim=True) for each in (one, other))
+        return (one * other).sum(-1) / (one.norm(dim=-1) * other.norm(dim=-1))
+
+    found: Interval = bootstrap(rank, [line["value"] for line in lines], foretold)
+    run.record(**found.metrics("rank_of_foretold"))
+    return f"{said} What couplings foretold ranks the cells by {found:.2f} (Spearman)."
+
+
+def drawn(ratios: Mapping[str, Interval], foretold: Sequence[float]) -> Figure:
+    """Dots with whiskers for log ratios of each cell, crosses for ratios that were foretold."""
+    figure, axis = plt.subplots(figsize=(7, 1 + 0.35 * len(ratios)), layout="constrained")
+    for at, over in enumerate(ratios.values()):
+        middle, low, high = (_ratio(x) for x in (over.value, over.low, over.high))
+        axis.plot([low, high], [at, at], color="#1b6ca8")
+        axis.plot(middle, at, "o", color="#1b6ca8")
+    axis.plot(foretold, range(len(foretold)), "x", color="#c44e17")
+    axis.axvline(1, color="0.5", linewidth=1)
+    axis.set_yticks(range(len(ratios)), list(ratios), fontsize=8)
+    axis.set(xlabel="joint / better order", xscale="log")
+    axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.xaxis.set_minor_formatter(lambda value, _: f"{value:g}")
+    axis.invert_yaxis()
+    return figure
+
+
+if __name__ == "__main__":
+    sys.exit(main(study, Config))

@@ -1,0 +1,161 @@
+"""The map of joint design and the shares of its parts: known valleys, known errors, one small
+race."""
+
+import json
+import math
+from itertools import product
+
+import pytest
+import torch
+
+from studies import joint_levers, joint_map
+from studies.codesign import cells, couplings
+from studies.codesign.design import BLOCKS
+from studies.codesign.race import start
+from studies.frame.run import main
+
+F = torch.float64
+SMALL = [
+    "--worlds",
+    "1",
+    "--per-draw",
+    "1",
+    "--judged-worlds",
+    "2",
+    "--judged-drives",
+    "1",
+    "--steps",
+    "2",
+    "--settling",
+    "5",
+]
+
+
+def raced(study, *given):
+    return main(study.study, study.Config, list(given))
+
+
+def test_a_map_says_which_cells_are_won_and_what_their_valleys_foretell(tmp_path, monkeypatch):
+    """Errors that are known: joint .8 of the better order in daylight and 1.25 of it in the dark;
+    a valley in which the lens and the mount pull at each other by day and not by night."""
+    asked = {}
+
+    def answers(run, regimes, arms):
+        asked.update(regimes)
+        rows = []
+        for cell, seed, arm in product(regimes, range(run.config.seeds), arms):
+            joint = 0.2 if cell.startswith("1 ") else 0.3125
+            error = {"joint": joint, arms[1]: 0.25}.get(arm, 0.5)
+            rows.append(
+                {"regime": cell, "seed": seed, "arm": arm, "errors": [error] * 3, "expected": error}
+            )
+        return rows
+
+    def pulls(run, regimes, rows, draws):
+        found = []
+        for cell, given in regimes.items():
+            space = cells.space_of(given)
+            pull = 0.8 if cell.startswith("1 ") else 0.0
+            a, b = space.block("lens")[0], space.block("mount")[0]
+            for one, other in product(range(len(space.free)), repeat=2):
+                if one <= other:
+                    value = float(one == other) + pull * ((one, other) == (a, b))
+                    names = {"one": space.free[one], "other": space.free[other]}
+                    found.append(
+                        {"regime": cell, "draw": 0, **names, "curvature": value, "error": 0.1}
+                        | {"at": [0.5] * len(space.free)}
+                    )
+        return found
+
+    monkeypatch.setattr(joint_map, "answers", answers)
+    monkeypatch.setattr(joint_map, "pulls_of", pulls)
+    out = ["--out", str(tmp_path / "map"), "--fnos", "0", "--speeds", "1", "0.5", "0.3"]
+    assert raced(joint_map, *out) == 0
+    numbers = json.loads((tmp_path / "map" / "metrics.json").read_text())
+    assert (numbers["cells"], numbers["cells_won"], numbers["cells_lost"]) == (6, 3, 3)
+    day, night = ("cell_1_of_daylight_f_free_1", "cell_0_1_of_daylight_f_free_1")
+    assert numbers[f"{day}_of_the_speed_value"] == pytest.approx(0.8)
+    assert numbers[f"{night}_of_the_speed_value"] == pytest.approx(1.25)
+    # one pass over parts that stand alone ends at the bottom
+    assert numbers[f"{night}_of_the_speed_at_the_bottom"] == pytest.approx(1.0)
+    given = asked["1 of daylight, f free, 1 of the speed"]
+    space = cells.space_of(given)
+    b = space.block("mount")[0]
+    left = []
+    for seed in range(6):
+        away = float(start(space, seed)[b] - 0.5)
+        # the lens goes to -.8 of the mount's place, the mount to .64 of its own
+        lens, mount = max(-0.8 * away, -0.5), 0.64 * away
+        height = (lens**2 + mount**2 + 1.6 * lens * mount) / 2
+        left.append(1 + height * 0.9 / (height + 0.9) / 0.1)
+    expected = 1 / float(torch.tensor(left, dtype=F).quantile(0.5))
+    assert numbers[f"{day}_of_the_speed_at_the_bottom"] == pytest.approx(expected)
+    assert numbers["rank_of_foretold"] > 0.8
+    assert "in 3, loses in 3, and is undecided in 0" in (tmp_path / "map/report.html").read_text()
+
+
+def test_parts_that_act_by_themselves_have_their_own_factors(tmp_path, monkeypatch):
+    """Every part multiplies the error by a factor, whatever else is designed: its Shapley value."""
+    factors = {"lens": 0.5, "mount": 0.9, "sensor": 0.7, "network": 1.1}
+
+    def answers(run, regimes, arms):
+        rows = []
+        for parts in joint_levers.SUBSETS:
+            cell = joint_levers.told(parts)
+            assert set(regimes[cell]["free"]) <= {n for part in parts for n in BLOCKS[part]}
+            error = 0.4 * math.prod(factors[part] for part in parts)
+            rows += [
+                {"regime": cell, "seed": seed, "arm": "joint", "errors": [error] * 3}
+                for seed in range(run.config.seeds)
+            ]
+        return rows
+
+    monkeypatch.setattr(joint_levers, "answers", answers)
+    monkeypatch.setattr(joint_levers, "judged_errors", lambda *_: {"errors": [0.4, 0.4, 0.4]})
+    assert raced(joint_levers, "--out", str(tmp_path / "levers")) == 0
+    numbers = json.loads((tmp_path / "levers" / "metrics.json").read_text())
+    for part, factor in factors.items():
+        assert numbers[f"share_{joint_levers.NAMES[part]}"] == pytest.approx(factor)
+    assert "The lens brings most" in (tmp_path / "levers" / "report.html").read_text()
+
+
+def test_cells_are_raced_judged_and_taken_up_again(tmp_path):
+    given = ["--seeds", "1", "--fnos", "4", "--lights", "0.5", "--speeds", "1", "--couplings", "0"]
+    assert raced(joint_map, *SMALL, *given, "--out", str(tmp_path / "map")) == 0
+    table = tmp_path / "map" / "answers.jsonl"
+    rows = [json.loads(line) for line in table.read_text().splitlines()]
+    assert [axes["arm"] for axes, _ in rows] == ["joint", *joint_map.ORDERS]
+    assert all(found["fno"] == 4.0 for _, (found,) in rows if "fno" in found)
+    assert all(len(found["errors"]) == 2 and found["drives"] == 2 for _, (found,) in rows)
+    before = table.read_bytes()
+    assert raced(joint_map, "--resume", str(tmp_path / "map")) == 0
+    assert table.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["--pair", "moon"], "choose from"),
+        (["--seeds", "0"], "--seeds is 0"),
+        (["--speeds", "2"], "speed is 2"),
+        (["--fnos", "40"], "held at 40"),
+    ],
+)
+def test_a_cell_that_cannot_be_is_refused(tmp_path, given, said, capsys):
+    assert raced(joint_map, *given, "--out", str(tmp_path / "map")) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_the_best_answer_of_a_cell_is_that_of_which_least_is_expected():
+    class Known:
+        space = type("S", (), {"made": staticmethod(lambda share: share)})
+
+        def draw(self, number):
+            return number
+
+        def looked(self, share, samples):
+            return type("L", (), {"expected": (share - 0.3).square().sum()[None]})
+
+    shares = [torch.full((2,), value, dtype=F) for value in (0.9, 0.35, 0.0)]
+    assert couplings.best_of(Known(), shares) is shares[1]
+    assert cells.setting(joint_map.Config())["calibration"] == []
