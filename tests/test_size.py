@@ -25,7 +25,7 @@ BUDGETS = {
     "scenes/trajectories": 3_100,
     "scenes/windows": 8_700,
     "setup": 2_500,
-    "studies": 9_700,
+    "studies": 10_700,
     "studies/codesign": 14_100,
     "studies/flow_quality": 5_450,
     "studies/flow_recording": 3_300,
@@ -56,7 +56,7 @@ BUDGETS = {
     "tests/optimise": 3_500,
     "tests/render": 30_900,
     "tests/scenes": 21_600,
-    "tests/studies": 33_150,
+    "tests/studies": 33_700,
     "tests/system": 6_950,
     "tests/train": 4_500,
 }

@@ -18,7 +18,7 @@ GROUPS = {
     "flow": ("train_flow", "flow_quality", "flow_recording"),
     "whole chain": (
         *("lens_opt", "lens_opt_seeds", "lens_motion", "placement"),
-        *("codesign", "joint_map", "joint_levers", "velocity_head"),
+        *("codesign", "joint_map", "joint_levers", "joint_controls", "velocity_head"),
         *("gradient_flow", "speed_error", "stability", "chain_picture", "hero", "viewer"),
     ),
 }
