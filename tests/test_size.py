@@ -56,7 +56,7 @@ BUDGETS = {
     "tests/optimise": 3_500,
     "tests/render": 30_900,
     "tests/scenes": 21_600,
-    "tests/studies": 33_700,
+    "tests/studies": 33_750,
     "tests/system": 6_950,
     "tests/train": 4_500,
 }
