@@ -30,7 +30,7 @@ BUDGETS = {
     "studies/flow_quality": 5_450,
     "studies/flow_recording": 3_300,
     "studies/frame": 8_050,
-    "studies/gradient_flow": 10_200,
+    "studies/gradient_flow": 8_850,
     "studies/lens_motion": 4_000,
     "studies/lens_opt": 6_400,
     "studies/lens_report": 2_350,
@@ -56,7 +56,7 @@ BUDGETS = {
     "tests/optimise": 3_500,
     "tests/render": 30_900,
     "tests/scenes": 21_600,
-    "tests/studies": 32_500,
+    "tests/studies": 31_950,
     "tests/system": 6_950,
     "tests/train": 4_500,
 }
