@@ -211,15 +211,15 @@ def faded_to(texture: np.ndarray, level: float, margin: float = 0.12) -> np.ndar
 
 def check_texture(values, name):
     """Radiances [H, W] as float32. Raises: DomainError unless all are finite and at least 0, and
-    for whole numbers of 8 or 16 bits, which may be light or be coded by the sRGB gamma (``picture``
-    is told which)."""
+    for whole numbers of any width, which may be light or be coded by the sRGB gamma (``picture`` is
+    told which)."""
     values = np.asarray(values)
-    if values.dtype.kind == "u":
+    if values.dtype.kind in "ui":
         raise DomainError(
             f"texture {name}: an array of {values.dtype} may hold pixels coded as in a PNG, or radiance; say which: "
             "textures.picture(array, encoding='srgb') or encoding='linear'."
         )
-    if values.dtype.kind not in "bif":
+    if values.dtype.kind not in "bf":
         raise DomainError(
             f"texture {name}: it holds no numbers; give radiances of at least 0, [H, W]."
         )
@@ -247,8 +247,8 @@ def picture(
 
     Args:
       encoding: of an array: None or "linear" takes it as radiance 0..255, "srgb" as pixels [H, W]
-        or [H, W, 3], whole numbers or 0..1, coded as those of a PNG. Whole numbers of 8 or 16 bits
-        are refused without it.
+        or [H, W, 3], coded as those of a PNG: uint8, uint16 or 0..1. Whole numbers of any width are
+        refused without it, and as "srgb" of another width, whose white is not known.
     """
     if encoding not in (None, "linear", "srgb"):
         raise DomainError(f"encoding = {encoding!r} is not known; give 'linear' or 'srgb'.")
@@ -257,16 +257,17 @@ def picture(
             raise DomainError(f"encoding is of arrays, and '{source}' says its own; leave it out.")
     elif encoding == "srgb":
         pixels = np.asarray(source)
-        if pixels.dtype.kind not in "uf" or pixels.ndim not in (2, 3) or not pixels.size:
+        known = pixels.dtype.kind == "f" or pixels.dtype in (np.uint8, np.uint16)
+        if not known or pixels.ndim not in (2, 3) or not pixels.size:
             raise DomainError(
                 f"an array coded by sRGB has pixels [H, W] or [H, W, 3], uint8, uint16 or 0..1, not {pixels.dtype} "
-                f"{pixels.shape}."
+                f"{pixels.shape}; numbers of 0 to 255 become so by .astype(np.uint8)."
             )
         return _radiance(linear(pixels), "given as an array")
     else:
         values = np.asarray(source)
         return check_texture(
-            values.astype(float) if encoding and values.dtype.kind == "u" else values,
+            values.astype(float) if encoding and values.dtype.kind in "ui" else values,
             "given as an array",
         )
     if str(source).startswith("speckle-") and str(source)[8:].isdigit():

@@ -22,6 +22,10 @@ PAGES = (
     "docs/placement.md",
     "docs/worlds.md",
     "docs/robots_and_worlds.md",
+    "docs/flow_needs.md",
+    "docs/lens_files.md",
+    "docs/lens_design.md",
+    *(f"docs/{name}.md" for name in ("flow", "events", "flow_closed_form", "srm", "silhouettes")),
 )
 
 

@@ -51,19 +51,6 @@ def test_gradcheck(scale, generator):
     assert torch.autograd.gradcheck(se3_exp, twist, atol=1e-8)
 
 
-def test_the_derivative_at_zero_is_the_generators():
-    zero = torch.zeros(6, dtype=D, requires_grad=True)
-    transform = se3_exp(zero)
-    rows = [
-        torch.autograd.grad(entry, zero, retain_graph=True)[0] for entry in transform.reshape(-1)
-    ]
-    jacobian = torch.stack(rows).reshape(4, 4, 6)
-    for k in range(6):
-        torch.testing.assert_close(
-            jacobian[:, :, k], wedge(torch.eye(6, dtype=D)[k]), rtol=0, atol=1e-14
-        )
-
-
 def test_inverse_and_apply(generator):
     transform = se3_exp(torch.randn(4, 2, 6, dtype=D, generator=generator))
     points = torch.randn(4, 2, 7, 3, dtype=D, generator=generator)

@@ -1,5 +1,8 @@
 """``codesign.show`` draws what it is given: colours of pixels whose values are known."""
 
+import re
+
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
@@ -103,3 +106,24 @@ def test_results_are_printed_in_a_line_each():
         repr(Result({"error": torch.tensor(0.25)}, None, None, None, None, None))
         == "Result(error=0.25)"
     )
+
+
+@pytest.mark.parametrize("width_in", [2, 3.5, 7.16])
+def test_a_figure_of_a_paper_has_its_width(width_in, tmp_path):
+    """150 pixels to the inch of a .png, 72 points to that of a .pdf; the height follows."""
+    frames = torch.rand(3, 12, 16, generator=torch.Generator().manual_seed(0))
+    usual = codesign.show(frames).get_size_inches()
+    width, height = codesign.show(frames, tmp_path / "a.png", width_in=width_in).get_size_inches()
+    assert (width, width / height) == pytest.approx((width_in, usual[0] / usual[1]), rel=1e-12)
+    drawn = plt.imread(tmp_path / "a.png")
+    assert drawn.shape[1] == pytest.approx(150 * width_in, abs=1)
+    codesign.show(lens.load("cooke-triplet"), tmp_path / "a.pdf", width_in=width_in)
+    box = re.search(rb"MediaBox \[ 0 0 ([0-9.]+) ", (tmp_path / "a.pdf").read_bytes())
+    assert box is not None
+    assert float(box[1]) == pytest.approx(72 * width_in, abs=0.01)
+
+
+@pytest.mark.parametrize("width_in", [0, -3, float("nan"), "3in", 1000])
+def test_a_width_that_no_paper_has_is_refused(width_in):
+    with pytest.raises(DomainError, match=r"width_in must be .* in inches"):
+        codesign.show(torch.ones(4, 4), width_in=width_in)

@@ -56,12 +56,17 @@ def on_unit_scale(frames: Tensor) -> bool:
 def warn_of_scale(frames: Tensor, log_input: bool) -> None:
     """Warn of linear frames that seem to be on 0 to 1."""
     if not log_input and on_unit_scale(frames):
-        warnings.warn(
-            "no frame is brighter than 1; frames are linear light on the scale 0 to 255, on which these are "
-            "black and make hardly an event: multiply by 255 if they are on 0 to 1.",
-            UserWarning,
-            stacklevel=2,
-        )
+        warn_of_black()
+
+
+def warn_of_black() -> None:
+    """The warning itself, where the brightest of all frames is known."""
+    warnings.warn(
+        "no frame is brighter than 1; frames are linear light on the scale 0 to 255, on which these are "
+        "black and make hardly an event: multiply by 255 if they are on 0 to 1.",
+        UserWarning,
+        stacklevel=3,
+    )
 
 
 def check_per_pixel(

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from codesign.atomic import write_atomic
+from codesign.checks import check_number
 from codesign.errors import CodesignError, DomainError, ShapeError
 from codesign.events import picture, to_counts
 from codesign.mount import Mount
@@ -50,7 +51,12 @@ class Shown(Figure):
 
 
 def show(
-    x: Any, path: str | Path | None = None, *, camera: Any = None, body: Iterable[Any] = ()
+    x: Any,
+    path: str | Path | None = None,
+    *,
+    camera: Any = None,
+    body: Iterable[Any] = (),
+    width_in: float | None = None,
 ) -> Shown:
     """Draw what a stage of the chain made.
 
@@ -66,7 +72,9 @@ def show(
       path: file to write, of a kind that matplotlib knows (.png, .svg, .pdf).
       camera: that a mount carries. body: meshes with vertices_m [V, 3] and faces [F, 3], in body
         axes.
-    Raises: DomainError for something else.
+      width_in: width of the figure, inches, 1 to 100, such as that of a column of a paper: the
+        height follows, letters keep their size in points. None: 3.4 for each picture.
+    Raises: DomainError for something else, or another width.
 
     >>> import codesign
     >>> figure = codesign.show(codesign.lens.load("cooke-triplet"))
@@ -102,6 +110,9 @@ def show(
         figure = _row([("", x, _lens)])
     else:
         raise DomainError(f"nothing is known of how to draw {type(x).__name__}; give {HANDLED}.")
+    if width_in is not None:
+        width_in = check_number(width_in, "width_in", 1.0, 100.0, remedy="give it in inches")
+        figure.set_size_inches(width_in, figure.get_figheight() * width_in / figure.get_figwidth())
     if path is not None:
         write_atomic(Path(path), figure.image(Path(path).suffix[1:] or "png", 150))
     return figure

@@ -8,8 +8,9 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from codesign.errors import CodesignError, DomainError
+from codesign.errors import CodesignError, DomainError, ShapeError
 from codesign.system.contents import hidden_tensors, tensors_in
+from codesign.types import EventVolume
 
 OFFERED = (
     "batch",
@@ -165,7 +166,7 @@ class Stage:
         """Run the stage on its input, with what it asks for out of ``has``.
 
         Raises: DomainError naming both sides where torch cannot join weights and input of different
-          dtypes or devices.
+          dtypes or devices; ShapeError where a network is of other bins than the volume.
         """
         named = {name: has[name] for name in self.asked}
         if inputs and not self.by_position:
@@ -177,7 +178,21 @@ class Stage:
             if not isinstance(error, CodesignError):
                 # counts, flow: the first of a kind
                 self._check_kinds(tensors_in((inputs, named))[:1], error)
+                if self.name == "flow" and isinstance(inputs[0], EventVolume):
+                    self._check_bins(inputs[0].counts.shape[2], error)
             raise
+
+    def _check_bins(self, bins: int, error: RuntimeError) -> None:
+        """Raise where a network's first convolution takes other channels than the volume has."""
+        layers = [each for module in modules_of(self.call) for each in module.modules()]
+        taken = next((each.in_channels for each in layers if hasattr(each, "in_channels")), None)
+        if taken not in (None, bins, 2 * bins):
+            remedy = f"bins={taken // 2}" if taken % 2 == 0 else "bins="
+            raise ShapeError(
+                f"stage 'flow' ({label(self.call)}) begins with a convolution of {taken} channels, and the volume "
+                f"has {bins} bins of two polarities, {2 * bins} channels: give {remedy}, or a network of as many "
+                "channels."
+            ) from error
 
     def _check_kinds(self, given: list[Tensor], error: RuntimeError) -> None:
         weights = [p for module in modules_of(self.call) for p in module.parameters()]

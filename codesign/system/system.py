@@ -1,8 +1,10 @@
 """The system: lens -> rays -> frames -> events -> flow -> objectives, as one torch Module."""
 
 import difflib
+import functools
+import inspect
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar, cast
 
 from torch import Tensor, nn
 
@@ -16,7 +18,32 @@ from codesign.system.stage import Stage, event_call, label, modules_of, registra
 
 BINS = 5  # time bins where neither the estimator nor the user says
 PARTS = ("camera", "mount", "trajectory", "render", "events", "flow", "estimate")
+OTHER_NAMES = {
+    "network": "flow",
+    "estimator": "flow",
+    "sensor": "events",
+    "layer": "events",
+    "poses": "trajectory",
+    "losses": "objectives",
+}
 _ALSO = ("lens", "objectives", "named_objectives", "gradient", "scene", "bins", "training")
+
+
+Init = TypeVar("Init", bound=Callable[..., None])
+
+
+def _by_known_names(init: Init) -> Init:
+    """Refuse other names before Python does, whose sentence knows no nearest one."""
+    known = tuple(inspect.signature(init).parameters)[1:]
+
+    @functools.wraps(init)
+    def checked(self: Any, *unnamed: Any, **parts: Any) -> None:
+        unknown = [name for name in parts if name not in known]
+        if unknown:
+            raise _unknown(unknown[0], known)
+        init(self, *unnamed, **parts)
+
+    return cast(Init, checked)
 
 
 class System(nn.Module):
@@ -44,8 +71,8 @@ class System(nn.Module):
       scene: for batches without one. bins: time bins of the volume; by default those the flow stage
         was built for (its ``config``), or 5.
     Samples: N counts trajectories times windows of the film, trajectory by trajectory.
-    Raises: DomainError when a stage asks for what a system does not have, or estimator and bins do
-      not fit.
+    Raises: DomainError for a part that a system does not have, naming the nearest; when a stage
+      asks for what it does not have, or estimator and bins do not fit.
 
     >>> import torch
     >>> from codesign import System, events, flow, lens, render
@@ -63,6 +90,7 @@ class System(nn.Module):
     flow: Any
     estimate: Any
 
+    @_by_known_names
     def __init__(
         self,
         *,
@@ -200,8 +228,9 @@ class System(nn.Module):
 
 
 def _unknown(name: str, known: tuple[str, ...]) -> DomainError:
-    near = difflib.get_close_matches(name, known, n=1)
-    meant = f", did you mean '{near[0]}'?" if near else ";"
+    meant = {each: each for each in known} | OTHER_NAMES
+    near = difflib.get_close_matches(name, meant, n=1)
+    meant = f", did you mean '{meant[near[0]]}'?" if near else ";"
     return DomainError(f"a system has no part '{name}'{meant} it has {', '.join(known)}.")
 
 

@@ -46,25 +46,28 @@ def check_pair(
     check_mount(robot_pair.mount_at(pair.ranges, pair.design.mount()), requirements, camera)
     if pair.depth == "ground" and pair.low.z_m - pair.housing_radius_m <= pair.ground_z_m:
         raise DomainError(
-            f"pair '{pair.name}': the camera may sit as low as {pair.low.z_m:g} m in body axes, its housing has a radius of "
-            f"{pair.housing_radius_m:g} m, and the ground, from which depth is known, lies at {pair.ground_z_m + 0.0:.3g} m; raise "
-            "the box."
+            f"pair '{pair.name}': the camera may sit as low as {pair.low.z_m:g} m in body axes, "
+            f"its housing has a radius of {pair.housing_radius_m:g} m, and the ground, from which "
+            f"depth is known, lies at {pair.ground_z_m + 0.0:.3g} m; raise the box."
         )
     for number in numbers:
         poses, twist = pair.drive(number, DRIVES)
         if not float(twist.abs().max()) > STILL:
             raise DomainError(
-                f"pair '{pair.name}': drives {number} never move, so there are no events; give a motion that does."
+                f"pair '{pair.name}': drives {number} never move, so there are no events; give a "
+                "motion that does."
             )
         middle = poses[:, robot_pair.FRAMES // 2] @ pair.design.mount()
         world = pair.world(number)
         share = _textured(render.frames(camera, world, middle))
         if share < LEAST_TEXTURE:
             raise DomainError(
-                f"pair '{pair.name}': world {number} has no texture where the camera looks: {share:.0%} of blocks of "
-                f"{BLOCK_PX} x {BLOCK_PX} pixels vary by more than the sensor's threshold, {LEAST_TEXTURE:.0%} are the "
-                "least; paint its surfaces with pictures of radiance 0 to 255, turn the start to where there are some, see "
-                "whether so long, wide or wrongly focused a lens blurs them, or whether world and motion are in other units or places."
+                f"pair '{pair.name}': world {number} has no texture where the camera looks: "
+                f"{share:.0%} of blocks of {BLOCK_PX} x {BLOCK_PX} pixels vary by more than the "
+                f"sensor's threshold, {LEAST_TEXTURE:.0%} are the least; paint its surfaces with "
+                "pictures of radiance 0 to 255, turn the start to where there are some, see "
+                "whether so long, wide or wrongly focused a lens blurs them, or whether world and "
+                "motion are in other units or places."
             )
         ends = poses[:, [1, -1]] @ pair.design.mount()
         flow_px, valid = render.true_flow(camera, world, ends)
@@ -72,15 +75,16 @@ def check_pair(
         moved_px = float(length_px.median())
         if moved_px < LEAST_MOVED_PX:
             raise DomainError(
-                f"pair '{pair.name}': in drives {number} the picture moves by {moved_px:.2g} pixels in "
-                f"{1e3 * robot_pair.DURATION_S:g} ms, {LEAST_MOVED_PX:g} are the least; drive faster, or see whether the motion "
-                "is in metres and seconds."
+                f"pair '{pair.name}': in drives {number} the picture moves by {moved_px:.2g} "
+                f"pixels in {1e3 * robot_pair.DURATION_S:g} ms, {LEAST_MOVED_PX:g} are the least; "
+                "drive faster, or see whether the motion is in metres and seconds."
             )
         followed = float((length_px <= robot_pair.WINDOW_PX).double().mean())
         if not followed >= LEAST_FOLLOWED:  # no surface, no number
             raise DomainError(
-                f"pair '{pair.name}': in drives {number} {followed:.0%} of the surfaces seen move by less than the width of a window "
-                f"({robot_pair.WINDOW_PX} pixels in {1e3 * robot_pair.DURATION_S:g} ms), {LEAST_FOLLOWED:.0%} are the least; drive "
+                f"pair '{pair.name}': in drives {number} {followed:.0%} of the surfaces seen move "
+                f"by less than the width of a window ({robot_pair.WINDOW_PX} pixels in "
+                f"{1e3 * robot_pair.DURATION_S:g} ms), {LEAST_FOLLOWED:.0%} are the least; drive "
                 "more slowly, or take a shorter lens."
             )
 
@@ -96,8 +100,9 @@ def _check_width(pair, camera):
     width_mm = float(torch.as_tensor(widths).max())
     if width_mm > housing_mm:
         raise DomainError(
-            f"pair '{pair.name}': its lens is {width_mm:.3g} mm wide, wider than the camera's housing, {housing_mm:g} mm; stop it "
-            "down, take a shorter one, or give a larger housing (require.clearance.radius_m)."
+            f"pair '{pair.name}': its lens is {width_mm:.3g} mm wide, wider than the camera's "
+            f"housing, {housing_mm:g} mm; stop it down, take a shorter one, or give a larger "
+            "housing (require.clearance.radius_m)."
         )
 
 

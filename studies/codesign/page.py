@@ -59,8 +59,8 @@ def answer(
         verdict = {"wins": "wins", "loses": "loses", "ties": "is undecided"}[over.outcome]
         ends = [math.exp(value) for value in (over.value, over.low, over.high)]
         said.append(
-            f"{way} {verdict}: {ends[0]:.2f} ({ends[1]:.2f} to {ends[2]:.2f}) times its error in unseen worlds (p = {p:.2g} "
-            "after Holm)."
+            f"{way} {verdict}: {ends[0]:.2f} ({ends[1]:.2f} to {ends[2]:.2f}) times its error in "
+            f"unseen worlds (p = {p:.2g} after Holm)."
         )
     return " ".join(said)
 
@@ -71,10 +71,11 @@ def race(
     """The arms beside one another."""
     run.section(
         "The race",
-        "Every arm began at the same designs and rendered as many drives. Errors are means of q / (1 + q), q the squared error "
-        "of the velocities that count in units of 0.05 m/s plus a tenth of the speed, and 0.15 rad/s, by single events in worlds "
-        "that no arm saw. Sensor and estimator on recorded frames cost nothing. Velocities are by least squares, with head: by the "
-        "delivered velocity head on the same flow.",
+        "Every arm began at the same designs and rendered as many drives. Errors are means of q / "
+        "(1 + q), q the squared error of the velocities that count in units of 0.05 m/s plus a "
+        "tenth of the speed, and 0.15 rad/s, by single events in worlds that no arm saw. Sensor "
+        "and estimator on recorded frames cost nothing. Velocities are by least squares, with "
+        "head: by the delivered velocity head on the same flow.",
     )
     by_head = compared(rows, of="head_errors")
     lines = []
@@ -105,26 +106,43 @@ def race(
         lines.append(line)
     tabulate(run, "Errors in unseen worlds", lines, "arm", prefix="race")
     if found:
+        every = every_ratio(rows)
         best = best_order(found)
-        named = [
-            *((arm, plain("joint_over", arm)) for arm in found),
-            (best, "joint_over_best_order"),
-        ]
-        logs = [(name, found[arm][0]) for arm, name in named]
-        if "nested" in found and best != "nested":
-            logs.append(("nested_over_best_order", compared(rows, "nested")[best][0]))
-        for name, over in logs:
-            ends = {"median": over.value, "low95": over.low, "high95": over.high}
-            run.record(**{f"{name}_{end}_{pair}": math.exp(log) for end, log in ends.items()})
-        ratios = {
-            arm: Interval(*(math.exp(x) for x in (over.value, over.low, over.high)), over.count)
-            for arm, (over, _) in found.items()
-        }
-        caption = "Error of the joint design over that of each arm: median over starts, 95 % of resampled starts and worlds."
+        named = {plain(arm, "over", other): ratio for (arm, other), ratio in every.items()}
+        for arm in ("joint", "nested"):
+            if (arm, best) in every:
+                named[f"{arm}_over_best_order"] = every[arm, best]
+        for name, ratio in named.items():
+            ends = {"median": ratio.value, "low95": ratio.low, "high95": ratio.high}
+            run.record(**{f"{name}_{end}_{pair}": value for end, value in ends.items()})
+        arms = ["joint", *found]
+        run.table(
+            "Error of each arm over that of every other",
+            ("arm", *(f"over {other}" for other in arms)),
+            [
+                (arm, *("" if arm == other else f"{every[arm, other]:.2f}" for other in arms))
+                for arm in arms
+            ],
+            "Medians over starts, 95 % of resampled starts and worlds.",
+        )
+        ratios = {arm: every["joint", arm] for arm in found}
+        caption = (
+            "Error of the joint design over that of each arm: median over starts, 95 % of "
+            "resampled starts and worlds."
+        )
         run.figure(bars(ratios, "joint / arm", log=True, level=1.0), "ratios", caption)
         trails(run, rows)
         best = max(ratios, key=lambda arm: ratios[arm].value)
         run.card(f"joint over {best}", f"{ratios[best].value:.2f}", f"{ratios[best]:.2f}")
+
+
+def every_ratio(rows: Sequence[Row]) -> dict[tuple[str, str], Interval]:
+    """(arm, other) -> the ratio of their errors over paired starts and worlds."""
+    return {
+        (arm, other): Interval(*map(math.exp, (over.value, over.low, over.high)), over.count)
+        for arm in dict.fromkeys(row["arm"] for row in rows)
+        for other, (over, _) in compared(rows, arm).items()
+    }
 
 
 def trails(run: Run[Any], rows: Sequence[Row]) -> None:
@@ -144,8 +162,8 @@ def trails(run: Run[Any], rows: Sequence[Row]) -> None:
             series, "drives rendered", "error expected, with penalty", log="y", bands=bands
         )
         caption = (
-            "Errors to be expected of what each arm looks at, on its own drives, with the penalty of what is required: median over "
-            "starts, and the middle half."
+            "Errors to be expected of what each arm looks at, on its own drives, with the penalty "
+            "of what is required: median over starts, and the middle half."
         )
         run.figure(panels(chart, width=8.0), "trails", caption)
 
@@ -172,9 +190,9 @@ def shown(
             designs[row["arm"]] = title, whole
     run.section(
         "Designs side by side",
-        f"Answers from start {seed}, whose joint design expected the median error on its own drives, with their errors in unseen "
-        "worlds: lens, robot and view, "
-        "and an unseen drive as frame, single events and flow.",
+        f"Answers from start {seed}, whose joint design expected the median error on its own "
+        "drives, with their errors in unseen worlds: lens, robot and view, and an unseen drive as "
+        "frame, single events and flow.",
     )
     run.figure(
         side_by_side(judge, dict(designs[arm] for arm in arms)), "designs", "Whole designs.", 110
@@ -205,8 +223,9 @@ def looked(run: Run[Any], space: Space, gates: Landscape) -> None:
             slope_of_hard_over_expected_near_the_best=gates.slope,
         )
         told = (
-            f" Expected errors rank {len(gates.judged)} designs near the best, to which nothing was fitted, by {gates.rank:.2f} "
-            f"(Spearman); hard ones rise by {gates.slope:.2f} where they rise by 1."
+            f" Expected errors rank {len(gates.judged)} designs near the best, to which nothing "
+            f"was fitted, by {gates.rank:.2f} (Spearman); hard ones rise by {gates.slope:.2f} "
+            "where they rise by 1."
         )
     enough = "enough to design" if gates.spread >= SPREAD else "too little to design"
     walls = [name for name in space.free if not gates.inside(name)]
@@ -218,7 +237,8 @@ def looked(run: Run[Any], space: Space, gates: Landscape) -> None:
     if run.config.grid < 3:  # the ends alone
         at_walls = ""
     run.text(
-        f"The ninetieth percentile of {len(gates.designs)} designs is {gates.spread:.2f} times the tenth: {enough}.{at_walls}{told}"
+        f"The ninetieth percentile of {len(gates.designs)} designs is {gates.spread:.2f} times the "
+        f"tenth: {enough}.{at_walls}{told}"
     )
     charts = []
     for name in space.free:

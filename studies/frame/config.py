@@ -6,7 +6,7 @@ import math
 import shlex
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
@@ -124,6 +124,25 @@ def resolved(study: str, kind: type[Config], parse: Callable[[Config], Config]) 
                 "out, or start a new run."
             )
     return dataclasses.replace(known, **anew)
+
+
+def check_paths(kind: type[StudyConfig], arguments: Sequence[str]) -> None:
+    """Refuse empty paths of a command line, which would stand for the present folder.
+
+    Raises: DomainError naming the option.
+    """
+    hints = typing.get_type_hints(kind)
+    option = ""
+    for word in arguments:
+        name, _, value = word.partition("=")
+        if word.startswith("--"):
+            option = name
+        hint = hints.get(option.removeprefix("--").replace("-", "_"))
+        empty = not value if word.startswith(f"{option}=") else not word
+        if empty and Path in (hint, *typing.get_args(hint)):
+            raise DomainError(
+                f"the path of {option} is empty; give one, or leave {option} out ('.' is the present folder)."
+            )
 
 
 def _plain(name, value) -> Any:

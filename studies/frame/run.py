@@ -43,7 +43,15 @@ from codesign.reading import read_json
 from codesign.report import page, prose
 from studies.frame import folder as folders
 from studies.frame import machine
-from studies.frame.config import Config, StudyConfig, read_config, resolved, resume_command, to_json
+from studies.frame.config import (
+    Config,
+    StudyConfig,
+    check_paths,
+    read_config,
+    resolved,
+    resume_command,
+    to_json,
+)
 from studies.frame.progress import Pace, StepProgress
 
 __all__ = ["Run", "StudyConfig", "main", "open_run"]
@@ -329,6 +337,7 @@ def main(
     interruption = Interruption()
     try:
         with written_out(), interruption:
+            check_paths(kind, sys.argv[1:] if arguments is None else arguments)
             config = resolved(name, kind, parse)
             with contextlib.ExitStack() as held:
                 run = open_run(name, config, interruption, held)

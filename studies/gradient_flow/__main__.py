@@ -4,7 +4,7 @@ random numbers, by case.
 scenes: every junction and every group on five scenes, each right, wrong or not judgeable; its
 count is the first line of the page. chain, joint: more precisely, junction by junction, and the
 whole graph with lens, mount, thresholds and network. layers, sensors, timing: the event layers
-against differences of hard counts. silhouettes, silhouettes_chain: where objects hide one another.
+against differences of hard counts. silhouettes: where objects hide one another.
 """
 
 import json
@@ -18,10 +18,9 @@ from codesign.errors import DomainError
 from codesign.report import chain_figures
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.sweep import sweep
-from studies.gradient_flow import chain
+from studies.gradient_flow import chain, silhouettes
 from studies.gradient_flow.certificates import topic as certificates
 from studies.gradient_flow.events import topics
-from studies.gradient_flow.silhouettes import flow, frames
 from studies.gradient_flow.topic import NOT_JUDGEABLE, Row, Topic, label
 
 CASES: dict[str, Topic] = {
@@ -31,8 +30,7 @@ CASES: dict[str, Topic] = {
     "layers": topics.LAYERS,
     "sensors": topics.SENSORS,
     "timing": topics.TIMING,
-    "silhouettes": frames.TOPIC,
-    "silhouettes_chain": flow.TOPIC,
+    "silhouettes": silhouettes.TOPIC,
 }
 
 
@@ -49,8 +47,7 @@ class Config(StudyConfig):
         "seeds": 2,
     }
     cases: tuple[str, ...] = ("scenes", "chain", "joint")
-    """What to measure: scenes, chain, joint, layers, sensors, timing, silhouettes,
-    silhouettes_chain."""
+    """What to measure: scenes, chain, joint, layers, sensors, timing, silhouettes."""
     film_samples: int = 256
     """Samples per pixel of the frames of the five scenes."""
     draws: int = 16
@@ -62,13 +59,11 @@ class Config(StudyConfig):
     """Motions and textures averaged for the straight-through layer against the hard loss
     (chain)."""
     scenes: int = 2
-    """Textures and paths over which cosine and scale are taken together (event layers,
-    silhouettes_chain)."""
+    """Textures and paths over which cosine and scale are taken together (event layers)."""
     samples: int = 1024
-    """Samples per pixel of differences and precise gradients at silhouettes; a quarter of them
-    along the chain."""
+    """Samples per pixel of differences and precise gradients at silhouettes."""
     seeds: int = 4
-    """Seeds of these; twice as many along the chain."""
+    """Seeds of these."""
 
 
 def study(run: Run[Config]) -> None:

@@ -231,7 +231,6 @@ def joint_rows(system: System, batch: Batch, directions: int) -> list[Certificat
 
 HARD = "final loss, hard events"
 RAYS = "lens rays, float64"
-HARD = "final loss, hard events"
 ASKED = {RAYS: Asked({}, {"relative_error": 1e-6}), HARD: Asked({"cosine": 0.9}, {})}
 
 

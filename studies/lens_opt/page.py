@@ -88,8 +88,8 @@ def write(run, course, lenses, junctions):
     if "after_spots" in lenses:
         pair = log_ratio(errors["after_spots"], errors["spots"])
         run.text(
-            f"{config.after_steps} steps of the flow objective from the spot designer's lens change its flow error "
-            f"by {pair.percent()}: by its interval, it {pair.outcome}."
+            f"{config.after_steps} steps of the flow objective from the spot designer's lens "
+            f"change its flow error by {pair.percent()}: by its interval, it {pair.outcome}."
         )
     _by_window(run, course.found, names, rivals)
     _settings(run, course)
@@ -109,10 +109,11 @@ def write(run, course, lenses, junctions):
     pace = f" at {m['seconds_per_step']:.2f} s" if "seconds_per_step" in m else ""
     run.finish(
         "Lens optimisation for event flow",
-        f"**{said}**\n\nAsked: what does an event-flow objective buy a lens designer over the best spot-size designer? "
-        f"{config.lens}, curvatures detuned by seed {config.seed} and refocused, objective {config.objective}, events "
-        f"{config.events}, flow {config.flow}{trained}: {m['steps']} steps{pace}. Changes are of the geometric mean "
-        "flow error, case by case, with 95 % intervals of Student's t.",
+        f"**{said}**\n\nAsked: what does an event-flow objective buy a lens designer over the best "
+        f"spot-size designer? {config.lens}, curvatures detuned by seed {config.seed} and "
+        f"refocused, objective {config.objective}, events {config.events}, flow "
+        f"{config.flow}{trained}: {m['steps']} steps{pace}. Changes are of the geometric mean flow "
+        "error, case by case, with 95 % intervals of Student's t.",
     )
     run.say(said)
 
@@ -133,10 +134,11 @@ def _who_wins(run, names, pairs, rivals):
         )
     run.section(
         "Who wins",
-        "Hard events from the physical sensor, textures and motions never optimised on, the same cases for every "
-        f"lens. A change below 0 says that the {design} errs less than the lens of the row; where the interval holds "
-        "0, the two tie. All lenses have the same free variables, focal length, f-number and floors of thickness; the "
-        "published lens is a yardstick that no design here knows.",
+        "Hard events from the physical sensor, textures and motions never optimised on, the same "
+        f"cases for every lens. A change below 0 says that the {design} errs less than the lens of "
+        "the row; where the interval holds 0, the two tie. All lenses have the same free "
+        "variables, focal length, f-number and floors of thickness; the published lens is a "
+        "yardstick that no design here knows.",
     )
     rows = []
     for name, title in names.items():
@@ -198,11 +200,13 @@ def _settings(run, course):
     config = run.config
     run.section(
         "The rivals at their best",
-        f"Refocusing moves the film alone. The spot designer minimises the weighted mean square spot of the wall in the "
-        f"camera's own light by damped least squares, from {config.spot_starts} starts. Both choose among the settings "
-        f"below by the geometric mean flow error on {config.developed} development cases, of other textures than those "
-        "optimised on and those judged on. The other gradient objective runs from the same start, for as many steps, "
-        "with a clip and a step size of its own, the best of a few on development cases.",
+        "Refocusing moves the film alone. The spot designer minimises the weighted mean square "
+        "spot of the wall in the camera's own light by damped least squares, from "
+        f"{config.spot_starts} starts. Both choose among the settings below by the geometric mean "
+        f"flow error on {config.developed} development cases, of other textures than those "
+        "optimised on and those judged on. The other gradient objective runs from the same start, "
+        "for as many steps, with a clip and a step size of its own, the best of a few on "
+        "development cases.",
     )
     for name, rows in course.choices.items():
         columns = {
@@ -240,7 +244,8 @@ def _seen_by_the_sensor(run, job, shown):
             rows.setdefault(title, {}).update({f"field {h:g}": frame, f"events {h:g}": count})
     run.section(
         "What the sensor sees",
-        "One training scene: first frame and signed event counts over the whole interval, at the three windows.",
+        "One training scene: first frame and signed event counts over the whole interval, at the "
+        "three windows.",
     )
     run.figure(
         pictures(rows, signed=[f"events {h:g}" for h in FIELDS]),
@@ -262,8 +267,8 @@ def _fading_events(run, frames, t_s):
         return
     run.video(
         "events_decay.mp4",
-        f"{len(stream)} events of frame differences (events_naive.csv), fading over 15 ms; the three windows above one "
-        "another.",
+        f"{len(stream)} events of frame differences (events_naive.csv), fading over 15 ms; the "
+        "three windows above one another.",
     )
 
 
@@ -298,7 +303,8 @@ def _way(run, course):
     run.figure(
         panels(*charts),
         "design_curves",
-        "The best design so far: change since the detuned start (the last curvature holds the focal length), and spots.",
+        "The best design so far: change since the detuned start (the last curvature holds the "
+        "focal length), and spots.",
     )
 
 

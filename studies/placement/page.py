@@ -47,13 +47,21 @@ def answer(outcome: Outcome) -> str:
     """In one sentence."""
     name = outcome.race.problem.pair.name
     where = place_in_words(outcome.race.problem, outcome.share)
-    beside = f"{outcome.error:.3f} against {outcome.default_error:.3f} on {outcome.unseen.samples} unseen samples with single events."
+    unseen = f"{outcome.unseen.samples} unseen samples with single events"
+    beside = f"{outcome.error:.3f} against {outcome.default_error:.3f} on {unseen}."
     if outcome.best[1] == DEFAULT:
         places = outcome.starts * (1 + len(outcome.rivals))
         none = f"none of {places} places found is" if places > 1 else "the one place found is not"
-        return f"The camera of '{name}' stays at its default mount, {where}: on training drives {none} better (error {outcome.default_error:.3f} on unseen samples with single events)."
+        return (
+            f"The camera of '{name}' stays at its default mount, {where}: on training drives "
+            f"{none} better (error {outcome.default_error:.3f} on unseen samples with single "
+            "events)."
+        )
     if outcome.error >= outcome.default_error:
-        return f"The place found for the camera of '{name}' by {outcome.found_by}, {where}, is no better than its default mount: {beside}"
+        return (
+            f"The place found for the camera of '{name}' by {outcome.found_by}, {where}, is no "
+            f"better than its default mount: {beside}"
+        )
     ratio, low, high = outcome.over_default
     unit, of = ("group", " of drives") if outcome.unseen.pair.one_world else ("world", "")
     sure = outcome.groups >= LEAST_UNITS
@@ -64,8 +72,8 @@ def answer(outcome: Outcome) -> str:
     )
     sits = "belongs at" if sure and high < 1 else "may be better off at"
     return (
-        f"The camera of '{name}' {sits} {where}, found by {outcome.found_by}: its error there is {ratio:.2f}{interval} times "
-        f"that at its default mount, {beside}"
+        f"The camera of '{name}' {sits} {where}, found by {outcome.found_by}: its error there is "
+        f"{ratio:.2f}{interval} times that at its default mount, {beside}"
     )
 
 
@@ -88,9 +96,10 @@ def searches(run: Run[Any], outcome: Outcome) -> None:
     told = "drives through the one world" if outcome.unseen.pair.one_world else "worlds and drives"
     run.section(
         "Searches at equal renders",
-        f"Every search began at the same {begun} and rendered {samples} samples; "
-        "errors are means of q / (1 + q), q the squared error of the velocities that count in units of 0.05 m/s plus a "
-        f"tenth of the speed, and 0.15 rad/s, with single events in {told} that no search saw.{resampled if outcome.starts >= LEAST_UNITS else ''}",
+        f"Every search began at the same {begun} and rendered {samples} samples; errors are means "
+        "of q / (1 + q), q the squared error of the velocities that count in units of 0.05 m/s "
+        f"plus a tenth of the speed, and 0.15 rad/s, with single events in {told} that no search "
+        f"saw.{resampled if outcome.starts >= LEAST_UNITS else ''}",
     )
     rows: list[list[Any]] = []
     for name, values in outcome.errors.items():
@@ -109,9 +118,10 @@ def searches(run: Run[Any], outcome: Outcome) -> None:
     run.figure(
         figures.ways(race.problem, trails, outcome.errors, samples),
         "ways",
-        "Left: errors on unseen samples at the start and the end, median over starts (thin: each start); dashed the least "
-        "that searches without gradient have seen of the errors of their own drives. Right: the map, every mount that these "
-        "looked at with its error, and the ways of the descents.",
+        "Left: errors on unseen samples at the start and the end, median over starts (thin: each "
+        "start); dashed the least that searches without gradient have seen of the errors of their "
+        "own drives. Right: the map, every mount that these looked at with its error, and the "
+        "ways of the descents.",
     )
 
 
@@ -122,8 +132,8 @@ def seen(run: Run[Any], outcome: Outcome) -> None:
     run.figure(
         figures.before_and_after(unseen, mount),
         "before_and_after",
-        "The robot with its default mount (above) and that of the answer (below): frame of an unseen drive with the windows read, "
-        "events of the hard sensor in them, flow.",
+        "The robot with its default mount (above) and that of the answer (below): frame of an "
+        "unseen drive with the windows read, events of the hard sensor in them, flow.",
     )
     verdicts = judge(problem.requirements, mount, problem.camera)
     run.text("Requirements: " + "; ".join(map(str, verdicts)) + ".")
@@ -137,8 +147,8 @@ def left(run: Run[Any], outcome: Outcome) -> None:
     found = controls(unseen, mount, samples)
     run.section(
         "Controls",
-        "Single events on unseen samples. Errors of an answer that is always zero, of a camera that sees nothing move, and of "
-        "one that looks at its own robot should be alike.",
+        "Single events on unseen samples. Errors of an answer that is always zero, of a camera "
+        "that sees nothing move, and of one that looks at its own robot should be alike.",
     )
     run.table(
         "What is left",
@@ -169,8 +179,8 @@ def handed(run: Run[Any], outcome: Outcome) -> VelocityErrors:
     run.record(hand_over_score_again=again, hand_over_score=outcome.error)
     run.section(
         "Hand-over",
-        f"`mount.yaml` has the transform, lens, camera and sensor; read back it scores {float(again):.4f} where the "
-        f"answer had {outcome.error:.4f}.",
+        "`mount.yaml` has the transform, lens, camera and sensor; read back it scores "
+        f"{float(again):.4f} where the answer had {outcome.error:.4f}.",
     )
     return found
 

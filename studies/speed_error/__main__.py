@@ -14,10 +14,10 @@ import sys
 from codesign.errors import DomainError
 from studies.frame.run import Run, main
 from studies.frame.show import asked
-from studies.speed_error import Config, chain, events, frames, lens, levels, select
+from studies.speed_error import Config, chain, events, flow, frames, lens, placement, select
 
 STAGES = {
-    "chain": levels.stage,
+    "chain": chain.stage,
     "select": select.stage,
     "lens": lens.stage,
     "render": frames.render_stage,
@@ -25,8 +25,8 @@ STAGES = {
     "light": frames.light_stage,
     "events": events.stage,
     "spiking": events.spiking_stage,
-    "flow": chain.flow_stage,
-    "placement": chain.placement_stage,
+    "flow": flow.stage,
+    "placement": placement.stage,
 }
 
 

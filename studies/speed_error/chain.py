@@ -1,233 +1,187 @@
-"""Stages "flow" and "placement": what event flow costs, and a step of a placement."""
+"""Stage "chain": time and error of every level of every stage, and of the whole chain, before a
+textured wall."""
 
-import statistics
-import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-import drjit as dr
 import torch
+from torch import Tensor
 
-from codesign import events, lens
-from codesign.flow import estimate_lk
-from codesign.flow.baselines import FlowNetEvents, SpikeFlowNet
-from codesign.flow.baselines.parts import count_weights
-from codesign.flow.refiner import Refiner
-from codesign.mount import Mount
-from codesign.system import Batch, System
-from codesign.types import EventVolume
-from scenes import textures, worlds
-from scenes.robots import pair as robot_pair
-from scenes.robots.pairs import PAIRS
-from studies.frame.bench import cost
+from codesign.errors import DomainError
+from codesign.fidelity import Fidelity, Task, levels_of, survey
+from codesign.fidelity.levels import Levels, batch_of, system_of
+from codesign.fidelity.search import cheapest as cheapest_combination
+from codesign.fidelity.survey import change, outcome
+from scenes import worlds
+from studies.frame.bench import Timing, turns
+from studies.frame.compare import median_ratio
 from studies.frame.run import Run
-from studies.frame.show import Asked, tabulate
-from studies.frame.sweep import sweep
+from studies.frame.show import Asked, Panel, panels, tabulate
+from studies.frame.sweep import select, sweep
 from studies.speed_error import Config
-from studies.train_flow.peers import ECN, IDNet
+from studies.speed_error.select import Case, once, triplet
 
-CLOSED = "closed form"
-CELLS = "closed form with cells"
-REFINER = "refiner"
-PUBLISHED = "Spike-FlowNet form"
-SIZE_PX = 256
-SIZES_PX = (128, 256, 512, 1024)
-SMALL = (64, 32)  # pixels a side and number of windows, as loops that design a lens take them
-BOTH = ("forward", "forward_backward")
-# of the processor time of the published width's forward pass, 119 ms where these were asked for;
-# the small windows: a third of what the closed form took before it ran on kernels of its own
-ASKED_FLOW = {
-    (REFINER, "forward", SIZE_PX, 1): 1 / 10,
-    (CLOSED, "forward", SIZE_PX, 1): 25 / 119,
-    (CLOSED, "forward_backward", SIZE_PX, 1): 60 / 119,
-    (CLOSED, "forward", *SMALL): 117 / 170 / 3,
-    (CLOSED, "forward_backward", *SMALL): 305 / 170 / 3,
+WALL = Case(
+    partial(worlds.smooth_plane, 0, finest_period_m=0.03, coarsest_period_m=0.3),
+    partial(triplet, 50.0),
+    0.15,
+    ((0.0, -0.01, 2.0), (0.0, 0.0, 0.0)),
+    (0.4, 0.25, 0.5, 0.0, 0.0, 0.0),
+)
+TOLERANCES_PX = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12, 0.08)  # of the whole chain
+LEAST_PX = 1e-3  # what is drawn of a change that is 0
+MADE = {"frames": "frames", "events": "volume"}  # at the junctions that stages start from
+
+
+@dataclass(frozen=True)
+class Measure:
+    """Where a stage is timed and judged: what it makes, the junction that it starts from, what
+    about it is judged, and how much of that is tolerated."""
+
+    made: str
+    begins_at: str
+    off: Callable[[Any, Any], float]
+    what: str
+    tolerated: float
+
+
+def off_frames(found: Tensor, finest: Tensor) -> float:
+    """RMS difference over RMS contrast."""
+    off = (found.double() - finest.double()).square().mean().sqrt()
+    return float(off / finest.double().std())
+
+
+def off_counts(found: Any, finest: Any) -> float:
+    """Wrong counts of the pixels over the whole window, per true one."""
+    counts, truth = (volume.counts.double().sum(2) for volume in (found, finest))
+    return float((counts - truth).abs().sum() / truth.sum())
+
+
+def off_flow(found: Any, finest: Any) -> float:
+    """Root mean square change, px."""
+    return change(found.flow_px[None], finest.flow_px[None])
+
+
+IMAGE = Measure("frames", "", off_frames, "RMS difference of frames over contrast", 0.05)
+EVENTS = Measure("volume", "frames", off_counts, "wrong counts per true one", 0.1)
+FLOW = Measure("field", "events", off_flow, "RMS change of the flow, px", 0.3)
+MEASURES = {
+    "camera": IMAGE,
+    "samples": replace(IMAGE, tolerated=0.01),
+    "frames": replace(EVENTS, begins_at=""),
+    "events": EVENTS,
+    "bins": replace(FLOW, begins_at="frames"),
+    "flow": FLOW,
 }
-ASKED_GROWTH = 0.2
-
-ASKED_CPU_S = 0.6
-BOX_HALF_M = (0.05, 0.05, 0.05)
-PARTS = {
-    "rays": "lens",
-    "frames": "render",
-    "volume": "events",
-    "field": "flow",
-    "estimate": "estimate",
-}
-GROUND = "ground"
 
 
-def flow_stage(run: Run[Config]) -> list[Asked]:
-    """Closed form, refiner, plain and spiking networks at 256 x 256 pixels, the closed form on 32
-    windows of 64 x 64 pixels, and how cost grows with size. One call in float32 by one thread (two
-    spin while they wait for each other, which counts as processor time), each in processes of its
-    own, in turns. Backward:
-    gradient of volume and weights. Peak: memory of the first call beyond what was in use. Networks
-    are
-    untrained: the same arithmetic."""
-    config = run.config
-    sizes = SIZES_PX[:2] if config.quick else SIZES_PX
-    grown = (CLOSED, CELLS, REFINER, PUBLISHED)
-    cases = [(name, kind, SIZE_PX, 1) for name in ESTIMATORS for kind in BOTH]
-    cases += [(name, "forward", size, 1) for name in grown for size in sizes if size != SIZE_PX]
-    cases += [(name, kind, *SMALL) for name in (CLOSED, CELLS) for kind in BOTH]
-    labels = [_label(*case) for case in cases]
-    rows = sweep(
-        run,
-        flow,
-        "flow",
-        processes=1,
-        turns=config.rounds,
-        given={"repeats": config.repeats, "seed": config.seed},
-        case=dict(zip(labels, cases, strict=True)),
+def stage(run: Run[Config]) -> list[Asked]:
+    """Every level of every stage, all else finest: its own processor time and its error where it
+    ends. Then whole chains, those that are chosen for tolerances from coarse to fine: time and
+    change of the flow against the finest chain. All times are medians of turns; ratios are medians
+    of pairs with 95 % intervals, and a level is undecided against the quickest that is tolerated
+    where that interval holds 1."""
+    world, task = WALL.scene(), WALL.task(run.config.seed)
+    levels = {
+        name: found[:2] + found[-1:] if run.config.quick else found
+        for name, found in levels_of(task).items()
+    }
+    cell = partial(of_stage, world, task, levels, rounds=run.config.repeats)
+    rows = sweep(run, cell, "levels", stage=list(levels))
+    for name, measure in MEASURES.items():
+        found = select(rows, stage=name)
+        caption = f"Error: {measure.what}; {measure.tolerated:g} is tolerated."
+        tabulate(run, name.capitalize(), found, "stage", "level", caption=caption)
+    chains = sweep(run, lambda: of_chains(world, task, levels, run.config), "chains")
+    tabulate(run, "Whole chains", chains, "levels", prefix="chain")
+    lines = {"found": ("cpu_s", "change"), "forecast": ("forecast_s", "forecast")}
+    series = {name: _front(chains, *columns) for name, columns in lines.items()}
+    chart = Panel(series, "processor time of the chain, ms", "change of the flow, px", "xy")
+    caption = "Whole chains that no other of them is both faster and nearer to the finest than."
+    run.figure(panels(chart, width=7), "speed_error_chain", caption)
+    return []
+
+
+def _front(rows, seconds, change_px):
+    """Milliseconds and changes of the rows that no quicker one equals."""
+    front = []
+    for row in sorted(rows, key=lambda row: row[seconds]):
+        if not front or row[change_px] < front[-1][change_px]:
+            front.append(row)
+    return (
+        [1e3 * row[seconds] for row in front],
+        [max(row[change_px], LEAST_PX) for row in front],
     )
-    tabulate(run, "One call, medians", rows, "case", prefix="flow")
-    cpu_s = dict(zip(cases, [row["cpu_s"] for row in rows], strict=True))
-    peer = cpu_s[PUBLISHED, "forward", SIZE_PX, 1]
-    figures = [
-        Asked(f"{_label(*case)} over {PUBLISHED}: CPU", cpu_s[case] / peer, most=most)
-        for case, most in ASKED_FLOW.items()
+
+
+def of_stage(
+    world: Any, task: Task, levels: Levels, stage: str, rounds: int
+) -> list[dict[str, Any]]:
+    """Rows of the levels of one stage, timed in turns."""
+    measure = MEASURES[stage]
+    finest = Fidelity.finest(levels)
+    run = system_of(world, task, finest).begin(batch_of(task, finest))
+    with torch.no_grad():
+        given = {name: run[MADE[name]] for name in (measure.begins_at,) if name}
+
+    @torch.no_grad()
+    def work(level):
+        tried = replace(finest, **{stage: level})
+        return system_of(world, task, tried).begin(batch_of(task, tried), given)[measure.made]
+
+    timed = turns({level: partial(work, level) for level in levels[stage]}, rounds)
+    best = work(levels[stage][-1])
+    errors = {level: measure.off(work(level), best) for level in timed}
+    return verdicts(timed, errors, measure.tolerated)
+
+
+def verdicts(
+    timed: Mapping[Any, Timing], errors: Mapping[Any, float], tolerated: float
+) -> list[dict[str, Any]]:
+    """Rows of levels that were timed in turns: error, median time, its ratio to that of the
+    quickest level that is tolerated (of the one of least error, where none is), and the verdict.
+
+    Raises: DomainError when there is no level.
+    """
+    if not timed:
+        raise DomainError("there is no level to choose from; give at least one.")
+    enough = [level for level in timed if errors[level] <= tolerated]
+    best = (
+        min(enough, key=lambda level: timed[level].cpu)
+        if enough
+        else min(timed, key=lambda level: errors[level])
+    )
+    ratios = {level: median_ratio(timed[level].cpu_s, timed[best].cpu_s) for level in timed}
+    alike = [level for level in enough if ratios[level].low <= 1 <= ratios[level].high]
+    rows = []
+    for level, timing in timed.items():
+        verdict = "not tolerated" if level not in enough else "dearer"
+        if level in alike:
+            verdict = "cheapest" if alike == [best] else "undecided"
+        found = {"cpu_ms": 1e3 * timing.cpu, "ratio": f"{ratios[level]:.2f}", "verdict": verdict}
+        rows.append({"level": str(level), "error": errors[level], **found})
+    return rows
+
+
+def of_chains(world: Any, task: Task, levels: Levels, config: Config) -> list[dict[str, Any]]:
+    """Rows of the combinations that are chosen for TOLERANCES_PX, and of the finest, timed in
+    turns; forecasts of the survey beside what was found."""
+    known = survey(world, task, levels, config.seed)
+    finest = Fidelity.finest(known.levels)
+    picks = [cheapest_combination(known, task, tolerance) for tolerance in TOLERANCES_PX]
+    tried = list(dict.fromkeys([*picks, finest]))
+    timed = turns({each: once(world, task, each) for each in tried}, config.repeats)
+    reference = outcome(world, task, finest).judged
+    return [
+        {
+            "levels": str(each),
+            "change": change(outcome(world, task, each).judged, reference),
+            "forecast": known.predicted(each),
+            "cpu_s": timed[each].cpu,
+            "forecast_s": known.cpu_s(each),
+            "faster": f"{median_ratio(timed[finest].cpu_s, timed[each].cpu_s):.2f}",
+        }
+        for each in tried
     ]
-    for name in (CLOSED, CELLS, REFINER):
-        first, last = (cpu_s[name, "forward", size, 1] / size**2 for size in (sizes[0], sizes[-1]))
-        what = f"{name}, CPU per pixel at {sizes[-1]} px over {sizes[0]} px"
-        figures.append(Asked(what, last / first, 1 - ASKED_GROWTH, 1 + ASKED_GROWTH))
-    return figures
-
-
-def _label(name, kind, size, windows):
-    return f"{name}, {kind}, {windows} x {size} px"
-
-
-def like_the_refiner(network, seed):
-    """A network of as many weights as the refiner."""
-    return network.with_weights(count_weights(Refiner()), seed=seed)
-
-
-ESTIMATORS: dict[str, Callable[[int], Any]] = {
-    CLOSED: lambda seed: estimate_lk,
-    CELLS: lambda seed: partial(estimate_lk, model="local"),
-    REFINER: lambda seed: Refiner(),
-    "FlowNetEvents, equal weights": partial(like_the_refiner, FlowNetEvents),
-    f"{PUBLISHED}, equal weights": partial(like_the_refiner, SpikeFlowNet),
-    "ECN, equal weights": partial(like_the_refiner, ECN),
-    "ECN": lambda seed: ECN(seed=seed),
-    "IDNet, equal weights": partial(like_the_refiner, IDNet),
-    "IDNet, small": lambda seed: IDNet(seed=seed),
-    PUBLISHED: lambda seed: SpikeFlowNet(seed=seed),
-    f"{PUBLISHED}, 10 bins": lambda seed: SpikeFlowNet(bins=10, seed=seed),
-}
-
-
-def flow(case: tuple[str, str, int, int], repeats: int, seed: int) -> dict[str, float]:
-    """Cost of one estimator, and its learned numbers."""
-    torch.set_num_threads(1)
-    dr.set_thread_count(1)
-    name, kind, size, windows = case
-    estimate: Any = ESTIMATORS[name](seed)
-    learned = ()
-    bins = 8
-    if isinstance(estimate, torch.nn.Module):
-        learned = tuple(estimate.eval().parameters())
-        bins = getattr(estimate, "config", {}).get("bins", bins)
-
-    def work(volume):
-        if kind == "forward":
-            with torch.no_grad():
-                return estimate(volume)
-        counts = volume.counts.detach().requires_grad_()
-        field = estimate(EventVolume(counts, volume.centroid_s, volume.collected_s))
-        # confidences have weights that the flow does not use
-        return torch.autograd.grad(
-            field.flow_px.square().sum(), (counts, *learned), allow_unused=True
-        )
-
-    # what the first call loads
-    work(scattered(64, bins, seed))
-    volume = scattered(size, bins, seed, windows)
-    return cost(lambda: work(volume), repeats) | {"weights": sum(p.numel() for p in learned)}
-
-
-def scattered(size_px: int, bins: int, seed: int, windows: int = 1) -> EventVolume:
-    """One event in 20 bins and pixels at random: what a call costs hardly depends on where they
-    are."""
-    mean = torch.full((windows, 2, bins, size_px, size_px), 0.05)
-    spacing = 0.05 / bins
-    return EventVolume(
-        torch.poisson(mean, generator=torch.Generator().manual_seed(seed)),
-        (torch.arange(bins, dtype=torch.float64) + 0.5) * spacing,
-        torch.full((bins,), spacing, dtype=torch.float64),
-    )
-
-
-def placement_stage(run: Run[Config]) -> list[Asked]:
-    """A step of a placement, forward and backward to lens, mount and thresholds: twelve drives
-    before nine windows of 32 x 32, eight rays a pixel, for the three pairs of robot and world, with
-    the robot in view, and for flat ground through a pinhole. Medians of processor seconds; the
-    first step, which compiles, is left out."""
-
-    def costs(pair):
-        case = case_of(pair, run.config.seed)
-        steps = [one_step(*case) for _ in range(run.config.repeats + 1)][1:]
-        return {name: statistics.median(step[name] for step in steps) for name in steps[0]}
-
-    rows = sweep(run, costs, "placement", pair=(*PAIRS, GROUND))
-    tabulate(run, "Processor seconds", rows, "pair", prefix="step_cpu_s")
-    return [Asked(f"step, {row['pair']}, CPU-s", row["step"], most=ASKED_CPU_S) for row in rows]
-
-
-def case_of(name: str, seed: int, worlds_of: int = 3, drives: int = 4) -> tuple[System, Batch, Any]:
-    """A pair at its own design, everything learnable; or, of the name "ground", the drives of the
-    outdoor rover over one textured ground, without a body, through a pinhole."""
-    pair: Any = PAIRS["outdoors" if name == GROUND else name]()
-    batch = pair.batch(robot_pair.training(worlds_of), drives, seed)
-    design = pair.design
-    camera = design.camera()
-    if name == GROUND:
-        scene = worlds.ground(textures.speckle(0, finest_px=3.0, coarsest_px=128.0))
-        batch = replace(batch, T_world_body=batch.T_world_body.flatten(0, 1), scene=scene)
-        camera = camera.with_lens(lens.Pinhole(design.efl_mm))
-    camera.lens.requires_grad_()
-    angles = {"yaw_rad": design.yaw_rad, "pitch_rad": design.pitch_rad, "roll_rad": design.roll_rad}
-    mount = Mount((design.x_m, design.y_m, design.z_m), BOX_HALF_M, **angles)
-    layer = events.Settled(events.layer("memory", robot_pair.SENSOR), robot_pair.LEAD_S)
-    return pair.system(design).replaced(camera=camera, mount=mount, events=layer), batch, pair
-
-
-def one_step(system: System, batch: Batch, pair: Any) -> dict[str, float]:
-    """Processor seconds of one step: "forward", then by part both ways together, and "step" for
-    all. Forward parts are timed as each is asked for, backward ones as gradients arrive at the
-    junctions between them."""
-    system.zero_grad()
-    passed = system.begin(batch)
-    clock = [time.process_time()]
-    for name in PARTS:
-        passed[name]
-        if name == "rays":
-            passed["T_world_cam"]
-        clock.append(time.process_time())
-    loss = pair.errors(passed["estimate"], batch).bounded().mean()
-    arrived: dict[str, float] = {}
-    junctions = {
-        "field": (passed["field"].flow_px, passed["field"].covariance_px2),
-        "volume": (passed["volume"].counts,),
-        "frames": (passed["frames"],),
-        "rays": (passed["rays"].origin_m, passed["rays"].direction),
-    }
-    for name, tensors in junctions.items():
-        for tensor in tensors:
-            tensor.register_hook(
-                lambda grad, name=name: arrived.__setitem__(name, time.process_time())
-            )
-    begun = time.process_time()
-    loss.backward()
-    ended = time.process_time()
-    # a junction's gradient has arrived when the part behind it is done
-    back = [ended, *(arrived[name] for name in list(PARTS)[:-1]), begun]
-    both = {
-        label: clock[k + 1] - clock[k] + max(back[k] - back[k + 1], 0.0)
-        for k, label in enumerate(PARTS.values())
-    }
-    return {"forward": begun - clock[0], **both, "step": ended - clock[0]}

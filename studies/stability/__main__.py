@@ -3,16 +3,14 @@ seen.
 
 Nothing to see, everything lost, no turn, half a turn, one event, thresholds and coordinates at both
 ends of their range, 1e5 frames, NaN: each is tried at the ends of its numbers and at random ones
-between, and a cell of the matrix is the worst of them. Beside it, gradients of random lenses whose
-coincidences (equal neighbours, flats, zeros) leave a surface without effect but not without a
-derivative. A miss is listed and explained, not hidden, and does not make the study fail.
+between, and a cell of the matrix is the worst of them. Random lenses whose coincidences (equal
+neighbours, flats, zeros) leave a surface without effect but not without a derivative are among
+them. A miss is listed and explained, not hidden, and does not make the study fail.
 """
 
 import sys
 from dataclasses import dataclass
 from typing import Any, ClassVar
-
-import torch
 
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.show import table
@@ -20,19 +18,15 @@ from studies.frame.sweep import metrics, sweep
 from studies.stability.case import Case, judge, trials, worst
 from studies.stability.cases import CASES
 from studies.stability.matrix import matrix
-from studies.stability.systems import errors_of_systems
 
-ALLOWED = 1e-6  # relative error of a gradient
 Rows = list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
-    QUICK: ClassVar = {"tries": 0, "systems": 10}
+    QUICK: ClassVar = {"tries": 0}
     tries: int = 10
     """Random numbers that a case is tried at, beside the ends of its spans."""
-    systems: int = 100
-    """Random lenses whose gradients are compared with differences."""
 
 
 def cells(case: Case, tries: int, seed: int) -> Rows:
@@ -68,37 +62,10 @@ def study(run: Run[Config]) -> None:
         *table([_shown(row) for row in rows]),
         "The worst of all trials. Errors are over the largest number expected, or over the natural unit.",
     )
-    wrong = random_systems(run)
     lead = f"**{seen} of {len(rows)} cells are as theory says**" + (
         f"; missed: {', '.join(dict.fromkeys(row['case'] for row in missed))}." if missed else "."
     )
-    lead += f" Wrong in random lenses: {', '.join(wrong)}." if wrong else ""
     run.finish("Hard cases", lead)
-
-
-def random_systems(run: Run[Config]) -> list[str]:
-    """Gradients of random lenses against differences; returns what was missed."""
-    count = run.config.systems
-    with run.progress(count, "random lenses") as progress:
-        errors = errors_of_systems(
-            count, torch.Generator().manual_seed(0), alone_every=10, advance=progress.advance
-        )
-    largest = max(errors.values())
-    run.record(gradient_systems=count, gradient_relative_error=largest)
-    run.record(**{f"gradient_relative_error_{name}": error for name, error in errors.items()})
-    run.card(
-        "Gradients of random lenses", f"{largest:.1e}", f"worst relative error of {count} lenses"
-    )
-    run.section("Gradients of random lenses")
-    run.table(
-        "Worst relative error of a gradient",
-        ("numbers", "error", "pass"),
-        [(name, f"{error:.1e}", error <= ALLOWED) for name, error in errors.items()],
-        f"{count} random lenses with equal neighbours, flats, concentric surfaces, zero conics and asphere "
-        "terms, stops in air, mirrors and zero phases, against differences of a trace in extended "
-        "precision. In every tenth, each kind of number asks for a gradient alone.",
-    )
-    return [f"gradient to {name}" for name, error in errors.items() if not error <= ALLOWED]
 
 
 def _shown(row):

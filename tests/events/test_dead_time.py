@@ -8,7 +8,8 @@ import torch
 
 from codesign.errors import DomainError
 from codesign.events import SensorModel, dense_counts, sensor_counts
-from codesign.events.layers.dead_time import GOLDEN, PHASES, STEPS, WIDTH, mean_counts
+from codesign.events.layers.dead_time import GOLDEN, PHASES, WIDTH, mean_counts
+from codesign.events.layers.dead_time_parts import STEPS
 from codesign.events.level_path import parts
 from codesign.events.sensor.state import SensorState, begin
 from tests.events.slopes import cosine_and_scale

@@ -1,5 +1,7 @@
 """Random instances of the hard cases of `studies.stability`: each ends as theory says."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -8,6 +10,7 @@ from hypothesis import strategies as st
 from codesign.errors import DomainError
 from studies.stability.case import Case, Span, judge, trials
 from studies.stability.cases import CASES
+from studies.stability.coincidences import FORMS, UNITS, traced
 
 RIGHT = [label for label, case in CASES.items() if not case.known]
 KNOWN = [label for label, case in CASES.items() if case.known]
@@ -84,3 +87,23 @@ def test_no_gradient_no_number_and_another_error_are_misses():
     assert judged(refuses, "back to front") == {"value": (None, False), "float32": (None, False)}
     assert judged(refuses, "upside down") == {"value": (0.0, True), "float32": (0.0, True)}
     assert judged(lambda x: x, "upside down")["value"] == (None, False)
+
+
+@pytest.mark.parametrize("kind", UNITS)
+def test_a_lens_that_leaves_out_a_derivative_is_a_miss(kind):
+    """As once that to the index between equal neighbours was."""
+    case = CASES["equal neighbours, lens"]
+
+    def lacking(**numbers):
+        return traced(FORMS[case.name], **{**numbers, kind: numbers[kind].detach()})
+
+    # seeds of lenses some of which diffract
+    rows = [
+        row
+        for seed in range(5)
+        for row in judge(
+            replace(case, seen=lacking),
+            trials(case, 0, 0)[0] | {"seed": torch.tensor(float(seed), dtype=torch.float64)},
+        )
+    ]
+    assert {row["kind"] for row in rows if not row["passed"]} == {"gradient"}

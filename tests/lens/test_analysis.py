@@ -206,7 +206,6 @@ def test_a_telecentric_lens_has_a_plane_for_a_reference_sphere():
             [stop, *(Surface(s.radius_mm, s.thickness_mm, s.medium, 12.7) for s in surfaces)], 10.0
         )
         found.append(wavefront(geo, 0.02, grid=16).waves.detach())
-    assert found[0].isfinite().all()
     # moved 1e-4 mm: slopes of the wavefront by 1e-6 of 10 waves
     close(found[0], found[1], atol=1e-4)
 

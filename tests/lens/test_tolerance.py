@@ -234,7 +234,11 @@ def test_trials_repeat_and_failures_are_counted(triplet):
     trials = monte_carlo(triplet, ALL, sometimes, 5, torch.Generator().manual_seed(0))
     assert trials.failed == 1
     assert trials.figures.isnan().any(1).tolist() == [False, True, False, False, False]
-    assert trials.quantiles().isfinite().all()
+    # of four: places 0.15, 1.5 and 2.85 among them
+    good = trials.figures[[0, 2, 3, 4], 0].sort().values
+    lower, upper = good[[0, 1, 2]], good[[1, 2, 3]]
+    share = torch.tensor([0.15, 0.5, 0.85], dtype=good.dtype)
+    close(trials.quantiles()[:, 0], lower + share * (upper - lower), 1e-14)
 
 
 def test_tolerances_of_elements_move_them_as_bodies():

@@ -13,7 +13,7 @@ from codesign.render.moving import views_of
 from codesign.render.sequence import cheapest
 from codesign.render.silhouettes.curve_points import places as _places
 from scenes import silhouettes as silhouette_scenes
-from studies.gradient_flow.silhouettes.frames import STEPS, Task
+from studies.gradient_flow.silhouettes import STEPS, Task
 from tests.render.differences import smooth_weights, to_twist
 from tests.render.solids import area
 

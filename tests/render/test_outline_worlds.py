@@ -17,7 +17,7 @@ from codesign.render.silhouettes import occlusion_check
 from codesign.render.silhouettes.curve_points import CurvePoints
 from codesign.render.silhouettes.jumps import jumps
 from scenes.silhouettes import smooth
-from studies.gradient_flow.silhouettes.frames import PITCH_MM, SIZE_PX, STEPS, Task
+from studies.gradient_flow.silhouettes import PITCH_MM, SIZE_PX, STEPS, Task
 from tests.hostile import judge
 from tests.hostile.outline_cases import icosphere
 from tests.render.solids import area

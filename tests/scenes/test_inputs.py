@@ -48,6 +48,10 @@ def test_a_damaged_hdr_ends_in_a_sentence(tmp_path, damage):
     [
         (lambda: worlds.wall(np.full((4, 4), 99, np.uint8)), "encoding='srgb'"),
         (lambda: textures.picture(EVEN.astype(np.uint16)), "encoding='linear'"),
+        (lambda: textures.picture(EVEN.astype(np.int64)), "int64 may hold pixels"),
+        (lambda: worlds.room(photos=[np.full((4, 4), 99)]), "int64 may hold pixels"),
+        (lambda: textures.picture(EVEN.astype(int), encoding="srgb"), r"not int64 .*np.uint8"),
+        (lambda: textures.picture(EVEN.astype(np.uint32), encoding="srgb"), "not uint32"),
         (lambda: textures.picture(np.array([["a"]])), "holds no numbers"),
         (lambda: textures.picture(np.empty((0, 0))), r"shape \(0, 0\)"),
         (lambda: textures.picture(1e39 * EVEN), "NaN or infinite"),
@@ -78,7 +82,8 @@ def test_an_array_of_bytes_says_how_it_is_coded(tmp_path):
         textures.picture(tmp_path / "grey.png"),
         rtol=1e-6,
     )
-    assert float(textures.picture(pixels, encoding="linear").max()) == 188
+    for whole in (np.uint8, np.int32, np.int64):
+        assert float(textures.picture(pixels.astype(whole), encoding="linear").max()) == 188
 
 
 def test_colours_of_a_needle_a_kilometre_long_are_those_between_its_corners():

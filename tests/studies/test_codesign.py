@@ -18,6 +18,7 @@ from studies.codesign import couplings, slopes
 from studies.codesign.arms import Task, Way, chosen_by_the_book, read_out
 from studies.codesign.design import Space
 from studies.codesign.objective import Objective
+from studies.codesign.page import every_ratio
 from studies.codesign.problem import Drawn
 from studies.codesign.race import compared, kept, start
 from studies.frame.run import main
@@ -213,6 +214,13 @@ def test_the_comparison_is_of_pairs():
     # of 64 signs two are as extreme, and two tests were made
     assert p == pytest.approx(2 * 2 / 64)
     assert found["random"][0].outcome == "ties"
+    every = every_ratio(rows)
+    assert len(every) == 6
+    assert every["book", "random"].value == pytest.approx(1.25)
+    for (arm, other), ratio in every.items():
+        ends = [1 / each for each in (ratio.value, ratio.high, ratio.low)]
+        back = every[other, arm]
+        assert [back.value, back.low, back.high] == pytest.approx(ends, rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -274,6 +282,10 @@ def test_a_small_race_says_that_it_decides_nothing(tmp_path, monkeypatch):
     assert main(codesign.study, codesign.Config, [*given.split(), *free, "--out", str(folder)]) == 0
     assert "decides nothing" in (folder / "report.html").read_text()
     numbers = json.loads((folder / "metrics.json").read_text())
+    ratio = numbers["race_joint_median"] / numbers["race_default_median"]
+    for name, value in (("joint_over_default", ratio), ("default_over_joint", 1 / ratio)):
+        assert numbers[f"{name}_median_outdoors"] == pytest.approx(value)
+    assert numbers["joint_over_best_order_median_outdoors"] == pytest.approx(ratio)
     assert numbers["race_joint_drives"] == 2
     assert 0 < numbers["race_joint_median"] <= 1
     assert numbers["race_joint_median_with_head"] != numbers["race_joint_median"]

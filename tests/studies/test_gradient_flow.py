@@ -12,11 +12,9 @@ from codesign import events
 from codesign.system import check
 from studies.frame.run import main
 from studies.gradient_flow import __main__ as study
-from studies.gradient_flow import chain
+from studies.gradient_flow import chain, silhouettes
 from studies.gradient_flow.events import case as scene
 from studies.gradient_flow.events import compare, topics
-from studies.gradient_flow.silhouettes import flow
-from studies.gradient_flow.silhouettes.flow import GROUPS, Case
 from studies.gradient_flow.topic import Row
 
 D = torch.float64
@@ -173,65 +171,26 @@ def test_the_timing_judge_sees_what_the_stream_shows(generator):
     )
 
 
-# ---- silhouettes through the chain
-
-
-@pytest.fixture(scope="module")
-def case():
-    return Case(0, 24)
-
-
-def test_hard_counts_are_whole_and_in_the_mean_the_smooth_ones_of_a_rise(case):
-    level = torch.linspace(0, 1.7, 12)[:, None, None].expand(12, 24, 24)
-    frames = 60 * level.exp()  # above 20 the front end is a logarithm
-    hard = case.hard(frames, case.places(64, 0)).sum(0)
-    assert torch.equal(hard, hard.round())
-    # one threshold from the middle of its place, half a threshold is not yet reached: floor(x - u)
-    # over a unit of u
-    expected = 1.7 / case.theta - 0.5
-    assert float((hard[0].mean(0) - expected).abs().max()) <= 1 / 64
-    assert float(hard[1].abs().max()) == 0
-    torch.testing.assert_close(case.smooth(frames).sum(0)[0], 1.7 / case.theta, rtol=1e-5, atol=0)
+# ---- silhouettes
 
 
 def test_the_judge_finds_the_error_noise_and_cosine_that_were_put_in(generator):
-    truth = torch.randn(3, 1, 6, generator=generator, dtype=D)
-    noise = torch.randn(3, 400, 6, generator=generator, dtype=D)
+    truth = torch.randn(18, generator=generator, dtype=D)
+    noise = torch.randn(400, 18, generator=generator, dtype=D)
     values = torch.stack(
-        [truth + 0.5 * noise, 0 * noise - truth, 1.25 * truth + 0 * noise, 0 * noise], 2
+        [truth + 0.5 * noise, 0 * noise - truth, 1.25 * truth + 0 * noise, 0 * noise], 1
     )
-    row = flow.judged(values)
+    row = silhouettes.judged(values)
     size = float(truth.norm())
     # 18 numbers of a standard error of 0.5 / 20 each, known to 1 in sqrt(2 x 18 x 399)
     assert row["noise"] == pytest.approx(0.025 * math.sqrt(18) / size, rel=0.05)
-    found = (truth[:, 0] + 0.5 * noise.mean(1)).flatten()
-    away = (1.25 * truth.flatten() - found).norm() / found.norm()
+    found = truth + 0.5 * noise.mean(0)
+    away = (1.25 * truth - found).norm() / found.norm()
     assert row["with_boundary"] == pytest.approx(float(away), rel=1e-12)
     assert row["noise_with_boundary"] == pytest.approx(0, abs=1e-12)
     assert row["one_estimate"] == pytest.approx(1, rel=1e-12)
-    cosine = float(truth.flatten() @ found / (truth.norm() * found.norm()))
+    cosine = float(truth @ found / (truth.norm() * found.norm()))
     assert (row["cosine"], row["cosine_interior"]) == pytest.approx((cosine, -cosine), rel=1e-12)
-
-
-def test_the_pose_gradient_of_counts_needs_the_boundary_term(case):
-    losses = {k: v for k, v in case.losses(case.places(8, 0)).items() if k.endswith("counts")}
-    pose = GROUPS["pose"]
-    seeds = range(4)
-    truth = [case.differences(losses, 64, seed) for seed in seeds]
-    found = {
-        way: [case.gradients(losses, 64, seed, way, 16.0) for seed in seeds]
-        for way in ("interior", "boundary")
-    }
-    for name in losses:
-        values = torch.stack([t[name][pose] for t in truth])
-        mean = values.mean(0)
-        for way, (least, most) in {"interior": (0.3, 3.0), "boundary": (0.0, 0.05)}.items():
-            other = torch.stack([g[name][pose] for g in found[way]])
-            error = float((other.mean(0) - mean).norm() / mean.norm())
-            # both sides are means over four seeds
-            noise = float((values.var(0) + other.var(0)).sum().sqrt() / 2 / mean.norm())
-            assert noise < 0.15
-            assert least <= error <= most + 2 * noise, (name, way)
 
 
 # ---- lens, mount, thresholds and network in one graph

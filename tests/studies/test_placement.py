@@ -4,7 +4,6 @@ differences, controls that see nothing, its bad input, and the whole of it, resu
 import contextlib
 import csv
 import json
-import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -314,7 +313,6 @@ def test_the_whole_study_and_its_resumption(tmp_path):
     chosen = "default" if found["chosen_start"] < 0 else chosen
     row = next(row for row in rows if row["search"] == chosen)
     assert handed.mount()[2, 3].item() == pytest.approx(float(row["z_m"]), abs=1e-4)
-    assert math.isfinite(found["control_no_texture_error"])
     assert 0 < found["forward_error_p50_m_s"] < found["forward_error_p90_m_s"]
     (out / "report.html").unlink()
     assert main(placement.study, placement.Config, ["--resume", str(out)]) == 0

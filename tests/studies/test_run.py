@@ -9,7 +9,10 @@ import torch
 
 from codesign.errors import CodesignError, DomainError, FileFormatError, NonFiniteError, ShapeError
 from codesign.state import write_state
-from studies.frame.run import open_run
+from studies.flow_quality import __main__ as flow_quality
+from studies.flow_recording import __main__ as flow_recording
+from studies.frame.run import main, open_run
+from studies.lens_opt import __main__ as lens_opt
 from tests.studies.smallest_study import Config, numbers
 
 
@@ -73,6 +76,22 @@ def test_the_state_of_another_run_is_refused(tmp_path):
     write_state(mine / "state.npz", {}, {"numbers": {}, "times": {"seconds": 0.0, "loops": {}}})
     with pytest.raises(FileFormatError, match=r"another version .*start a new run"):
         resumed()
+
+
+@pytest.mark.parametrize(
+    ("study", "words"),
+    [
+        (flow_recording, ["--recording", ""]),
+        (flow_recording, ["--quick", "--truth="]),
+        (flow_recording, ["--out", "", "--quick"]),
+        (flow_quality, ["--recording", "a.h5", ""]),
+        (lens_opt, ["--resume", ""]),
+    ],
+)
+def test_an_empty_path_is_not_the_present_folder(study, words, capsys):
+    assert main(study.study, study.Config, words) == 2
+    option = next(word for word in words if word != "--quick").rstrip("=")
+    assert f"the path of {option} is empty; give one" in capsys.readouterr().err
 
 
 def test_metrics_are_finite_numbers(run):

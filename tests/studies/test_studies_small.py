@@ -5,14 +5,7 @@ import torch
 
 from codesign.errors import DomainError
 from studies.frame.bench import Timing
-from studies.speed_error import chain, events, levels
-from studies.stability.systems import (
-    KINDS,
-    differences,
-    draw_system,
-    errors_of_systems,
-    worst_error,
-)
+from studies.speed_error import chain, events, placement
 
 # level -> processor seconds of five turns, and its error
 TURNS = {
@@ -36,33 +29,16 @@ def test_levels_whose_times_differ_from_turn_to_turn_are_undecided(tolerance, ex
     each."""
     timed = {name: Timing(cpu_s, cpu_s) for name, (cpu_s, _) in TURNS.items()}
     errors = {name: error for name, (_, error) in TURNS.items()}
-    rows = levels.verdicts(timed, errors, tolerance)
+    rows = chain.verdicts(timed, errors, tolerance)
     assert [row["verdict"] for row in rows] == expected
 
 
 def test_where_none_is_good_enough_all_are_told_so():
     timed = {"thin": Timing((1.0, 1.0), (1.0, 1.0))}
-    (row,) = levels.verdicts(timed, {"thin": 0.1}, 0.01)
+    (row,) = chain.verdicts(timed, {"thin": 0.1}, 0.01)
     assert row["verdict"] == "not tolerated"
     with pytest.raises(DomainError, match="no level"):
-        levels.verdicts({}, {}, 0.1)
-
-
-def test_gradients_of_random_lenses_with_coincidences_agree_with_differences():
-    """Equal neighbours, flats, concentric surfaces, zeros: what has no effect today has a
-    derivative."""
-    errors = errors_of_systems(100, torch.Generator().manual_seed(1), alone_every=60)
-    assert max(errors.values()) <= 1e-6
-
-
-def test_the_differences_see_a_wrong_gradient():
-    """Every kind's gradient moves the scalar: one that is left out, as the index of equal
-    neighbours once was, is an error of 1."""
-    system = draw_system(torch.Generator().manual_seed(2), "geaso")
-    truth = differences(system) | {"glass": system.lens.glass.numpy()}
-    for name in KINDS:
-        if truth[name].size:
-            assert worst_error({name: 0 * truth[name]}, truth)[name] == pytest.approx(1, rel=1e-12)
+        chain.verdicts({}, {}, 0.1)
 
 
 def test_the_convolution_of_the_bench_is_the_layer_up_to_its_cut_kernel():
@@ -76,9 +52,9 @@ def test_the_convolution_of_the_bench_is_the_layer_up_to_its_cut_kernel():
 
 
 def test_the_stages_of_a_placement_make_up_its_step_and_gradients_arrive_everywhere():
-    system, batch, pair = chain.case_of("ground", 0, worlds_of=1, drives=1)
-    found = chain.one_step(system, batch, pair)
-    stages = [found[name] for name in chain.PARTS.values()]
+    system, batch, pair = placement.case_of("ground", 0, worlds_of=1, drives=1)
+    found = placement.one_step(system, batch, pair)
+    stages = [found[name] for name in placement.PARTS.values()]
     # the loss itself and the sum of gradients into mount and lens are in the step only
     assert 0.9 * found["step"] < sum(stages) <= found["step"] + 1e-6
     assert min(stages) > 0

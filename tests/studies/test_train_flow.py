@@ -270,6 +270,8 @@ def test_a_checkpoint_that_does_not_fit_is_named(tmp_path, capsys, damage, sente
         ("--loss photometric", "needs frames, and these windows have none"),
         ("--bins 5", "the windows have 2 time bins, the network 5"),
         ("--steps 0", "--steps is 0; at least 1"),
+        ("--height-px 15", "--height-px is 15; at least 16 is needed"),
+        ("--width-px 0", "--width-px is 0; at least 16 is needed"),
         ("--cpu-minutes -1", "--cpu-minutes is -1.0; more than 0"),
         ("--mixed-precision", "--mixed-precision needs CUDA"),
         ("--start nowhere.safetensors", "no file lies at nowhere.safetensors"),

@@ -3,14 +3,15 @@ are right are not."""
 
 import functools
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from torch import nn
 
 from codesign import events
-from codesign.errors import CodesignError
-from codesign.system import Batch
+from codesign.errors import CodesignError, DomainError, ShapeError
+from codesign.system import Batch, System
 from codesign.types import FlowField
 from tests.hostile import stages as s
 from tests.hostile.stages import (
@@ -182,6 +183,31 @@ WRAPPED = [
 def test_methods_and_partials_bring_their_weights(part, count, given):
     names = [name for name, _ in s.checked(**{part: given})[0].named_parameters()]
     assert len([name for name in names if name.startswith(f"{part}.")]) == count
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [("netwrk", "'flow'"), ("event", "'events'"), ("flwo", "'flow'"), ("qqq", "it has camera")],
+)
+def test_a_part_of_another_name_is_told_the_nearest(name, meant):
+    parts: Any = {name: 1}
+    with pytest.raises(DomainError, match=f"no part '{name}'.*{meant}"):
+        System(**parts)
+
+
+@pytest.mark.parametrize("channels", [8, 7])
+def test_a_network_of_other_bins_is_told_both_numbers(channels):
+    class Mine(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.layers = nn.Sequential(nn.Conv2d(channels, 2, 3, padding=1))
+
+        def forward(self, volume):
+            return field_of(self.layers(volume.counts.float().flatten(1, 2)))
+
+    says = f"{channels} channels, and the volume has 2 bins of two polarities, 4 channels"
+    with pytest.raises(ShapeError, match=says):
+        s.checked(flow=Mine())
 
 
 def test_typos_are_refused():

@@ -21,7 +21,6 @@ those of the block. The forward loop stores the state at the beginning of every 
 goes from block to block backward, walks each forward once more, and then back.
 """
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -31,9 +30,8 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
 from codesign.backend import pull_back
-from codesign.errors import DomainError
 from codesign.events.kernels import Lanes, beyond
-from codesign.events.level_path import parts
+from codesign.events.layers.dead_time_parts import cut_intervals, rows_wanted
 from codesign.exclusive import exclusive
 
 PHASES = 6
@@ -41,11 +39,6 @@ WIDTH = 2 / PHASES  # of a count: every phase belongs to two groups
 BLOCK = 32  # parts between two stored states, at least
 # its multiples spread evenly: neighbouring pixels stand at different phases
 GOLDEN = (5**0.5 - 1) / 2
-STEPS = 5  # of the recursion in a dead time, at least
-MOST_ROWS = 2000  # of the recursion in a dead time: they lie in the memory of a thread
-MOST_LOAD = 5.0  # rate x dead time up to which gradients were measured to point right
-THRESHOLD_LOAD = 2.0  # the same for gradients to thresholds
-FEWEST = 8  # dead times shorter than an interval over this are taken as local
 
 
 @dataclass(frozen=True)
@@ -91,7 +84,7 @@ def mean_counts(
         nothing = level.new_zeros(PHASES, *level.shape[1:])
         position = ((0.37 + GOLDEN * pixels) % 1).to(level).reshape(level.shape[1:])
         state = DeadTimeState(position, nothing[0], nothing, nothing[None], interval_s.new_zeros(1))
-    cut, rows_s = _cut(interval_s, float(dead_s.detach()), state.ago_s)
+    cut, rows_s = cut_intervals(interval_s, float(dead_s.detach()), state.ago_s)
     missing = cut.reach - len(state.kept)
     rows = state.kept[-cut.reach :]
     if missing > 0:
@@ -100,7 +93,7 @@ def mean_counts(
         level, *thetas, dead_s, centre, state.position, state.heading, state.begun, rows, cut
     )
     ago_s = rows_s[-1] - rows_s
-    kept = rows[-_wanted(ago_s, float(dead_s.detach())) :]
+    kept = rows[-rows_wanted(ago_s, float(dead_s.detach())) :]
     base = kept[-1].detach()
     after = DeadTimeState(
         position - position.detach().floor(),
@@ -147,23 +140,6 @@ class _Kept(Function):
             of_rows,
             None,
         )
-
-
-@dataclass(frozen=True)
-class Parts:
-    """Parts of intervals. interval: [N] that each lies in. share: [N] of the interval that has
-    passed at its end.
-    back: [N] >= 1 rows from its start to the row before the look, a dead time before its middle;
-    blend: [N] of the way from that row to the next; slope: [N] of blend, per second of dead time,
-    negative sign left out.
-    reach: rows to keep."""
-
-    interval: Tensor
-    share: Tensor
-    back: Tensor
-    blend: Tensor
-    slope: Tensor
-    reach: int
 
 
 class _Run(Lanes):
@@ -433,81 +409,3 @@ def _filled(dr, place):
 def _at_most_one(dr, share):
     """No slope from 1 on: a phase that nothing blocks stays so."""
     return dr.select(share < 1, share, 1)
-
-
-def _cut(interval_s, refractory_s, ago_s):
-    """Parts of the intervals, at most a fifth of the dead time long, as the kernel wants them; the
-    times [rows] that it knows what was kept at, of the state's rows and of the ends of parts."""
-    ends_s = torch.cat((interval_s.new_zeros(1), interval_s.cumsum(0)))
-    interval, share, fine_s = parts(ends_s, refractory_s / STEPS)
-    first = len(ago_s) - 1
-    rows_s = torch.cat((-ago_s, fine_s[1:]))
-    # what had been kept a dead time before the middle of every part
-    middle = (rows_s[first:-1] + rows_s[first + 1 :]) / 2 - refractory_s
-    now = first + torch.arange(len(middle))
-    at = torch.searchsorted(rows_s, middle, right=True) - 1
-    at = torch.minimum(at.clamp(min=0), now - 1)  # -1 where nothing was before
-    step = rows_s[at + 1] - rows_s[at]
-    blend = (middle - rows_s[at]) / step
-    inside = (blend > 0) & (blend <= 1)
-    back = now - at
-    reach = max(int(back.max()) + 1, _wanted(rows_s[-1] - rows_s, refractory_s))
-    if reach > MOST_ROWS:
-        raise DomainError(
-            f"the dead time of {refractory_s:g} s reaches over {int(back.max())} intervals; its gradient "
-            f"over fewer than {MOST_ROWS}: give fewer frames per second."
-        )
-    reach = -(-reach // 4) * 4  # few sizes, and so few kernels
-    slope = torch.where(inside, 1 / step, 0)
-    return Parts(interval, share, back, blend.clamp(0, 1), slope, reach), rows_s
-
-
-def _wanted(ago_s, refractory_s):
-    """How many rows the next chunk looks back at: one more for the interval in which the dead time
-    begins."""
-    return len(ago_s) - max(0, int((ago_s > refractory_s).sum()) - 1)
-
-
-def reaches(interval_s: Tensor, refractory_s: float) -> bool:
-    """Whether a dead time is long enough beside the intervals for the recursion; otherwise
-    ``local_share``."""
-    return refractory_s * FEWEST >= float(interval_s.max())
-
-
-def warn_beyond(
-    level: Tensor, thetas: Sequence[Tensor], interval_s: Tensor, refractory_s: Tensor | float
-) -> None:
-    """Warn where rate x dead time is beyond ``MOST_LOAD``, the mean over events, or beyond
-    ``THRESHOLD_LOAD`` where thresholds have gradients."""
-    with torch.no_grad():
-        step = level.diff(dim=0)
-        moved = (step.clamp(min=0) / thetas[0] + (-step).clamp(min=0) / thetas[1]).sum(0)
-        rate_hz = moved / float(interval_s.sum())
-        mean_hz = float((rate_hz * moved).sum() / moved.sum().clamp(min=1e-30))
-        most = mean_hz * float(torch.as_tensor(refractory_s))
-    if most > MOST_LOAD:
-        warnings.warn(
-            f"rate x dead time is {most:.2g} for the average event, of which about one in {most + 0.5:.2g} "
-            f"is kept; gradients are measured up to {MOST_LOAD:g} (docs/events.md). Beyond, which event is "
-            "kept depends on each one before, and the gradient of a shift is lost first (cosine 0.45 "
-            "against differences at 8.8): shorten the dead time or raise the thresholds.",
-            stacklevel=4,
-        )
-    elif most > THRESHOLD_LOAD and any(theta.requires_grad for theta in thetas):
-        # no figure in it, so that a design loop says it once
-        warnings.warn(
-            f"rate x dead time is above {THRESHOLD_LOAD:g} for the average event: gradients to "
-            "thresholds, one apart from the other, may point wrong there (docs/events.md); shorten the "
-            "dead time, or set thresholds by differences.",
-            stacklevel=4,
-        )
-
-
-def local_share(
-    step: Tensor, thetas: Sequence[Tensor], interval_s: Tensor, refractory_s: Tensor | float
-) -> Tensor:
-    """Share of regularly arriving events that a short dead time lets pass, [T-1, ...]: one in
-    ceil(r T), averaged over phases. step: [T-1, ...] of the level."""
-    theta = torch.where(step > 0, thetas[0], thetas[1])
-    rate_hz = step.abs() / theta / interval_s.to(step).reshape(-1, *[1] * (step.ndim - 1))
-    return 1 / (rate_hz * refractory_s + 0.5).clamp(min=1)

@@ -10,7 +10,7 @@ from torch import Generator, Tensor
 from codesign.errors import ShapeError
 from codesign.events.entry import Times, check_frames, check_later, check_state, check_times
 from codesign.events.intensity import FrontEnd
-from codesign.events.layers import dead_time
+from codesign.events.layers import dead_time, dead_time_limits
 from codesign.events.layers.layer import EventLayer
 from codesign.events.layers.memory import memory
 from codesign.events.low_pass import low_pass
@@ -128,11 +128,11 @@ def _mean_counts(seen, thetas, interval_s, refractory_s, state):
     # without gradients the values are the hard sensor's: nobody asks for what the mean passes
     if refractory_s is None or not asked:
         return *memory(seen[1:], *thetas, state=start, log_input=True), None
-    dead_time.warn_beyond(seen, thetas, interval_s, refractory_s)
+    dead_time_limits.warn_beyond(seen, thetas, interval_s, refractory_s)
     dead_s = float(torch.as_tensor(refractory_s).detach())
-    if not dead_time.reaches(interval_s, dead_s):
+    if not dead_time_limits.reaches(interval_s, dead_s):
         smooth, reference = memory(seen[1:], *thetas, state=start, log_input=True)
-        share = dead_time.local_share(seen.diff(dim=0), thetas, interval_s, refractory_s)
+        share = dead_time_limits.local_share(seen.diff(dim=0), thetas, interval_s, refractory_s)
         return smooth * share[:, None], reference, None
     centre, before = (start, None) if state is None else (start[1], state.dead)
     passed, centre, dead = dead_time.mean_counts(

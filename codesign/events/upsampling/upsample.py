@@ -14,7 +14,7 @@ from torch.nn.functional import max_pool2d
 
 from codesign.checks import FLOATS, check, check_number, check_positive, check_whole
 from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import Times, check_times
+from codesign.events.entry import PICTURE, Times, check_times, warn_of_black
 from codesign.events.intensity import lin_log
 from codesign.events.upsampling.flow import (
     blurred,
@@ -251,7 +251,8 @@ def upsample_stream(
 def _pieces(frames, t_s, max_displacement_px, max_log_change, max_steps):
     before = None
     before_s = -math.inf
-    sizes = {}
+    brightest = 0.0
+    values = 0
     sizes = {}
     for index, (frame, time_s) in enumerate(zip_longest(frames, t_s)):
         if frame is None or time_s is None:
@@ -272,6 +273,10 @@ def _pieces(frames, t_s, max_displacement_px, max_log_change, max_steps):
             yield made, times_s
         before = frame
         before_s = time_s
+        brightest = max(brightest, float(frame.detach().max()))
+        values += frame.numel()
+    if values >= PICTURE and 0 < brightest <= 1:
+        warn_of_black()
 
 
 def _interval(first, second, start_s, end_s, max_displacement_px, max_log_change, max_steps):

@@ -12,9 +12,9 @@ from torch import Tensor
 from codesign import lens, pose, render
 from codesign.render.sequence import Way
 from scenes import silhouettes, worlds
-from studies.gradient_flow.silhouettes.flow import WIDTH_MM
 
 SIZE_PX = 32
+WIDTH_MM = 8.0  # of the film
 FRAMES = 5
 DURATION_S = 0.05
 # of the camera over the time, metres and radians, in its own axes: about two pixels

@@ -1,17 +1,19 @@
 """Frames of occluders over a wall, to the camera's pose and to the lens: one scene before one lens,
 and the ways to its gradient beside differences with common random numbers."""
 
+import math
+
 import torch
 
 from codesign import lens, pose, render
 from codesign.render.sequence import Way
 from scenes import silhouettes as silhouette_scenes
-from studies.gradient_flow.silhouettes.flow import PER_PX, judged
 from studies.gradient_flow.topic import Asked, Row, Topic
 
 SIZE_PX = 32
 PITCH_MM = 0.25
 SAMPLES = 16  # per pixel of one estimate as an optimiser takes it
+PER_PX = 64.0  # of the precise ones
 LENSES = ("pinhole", "thin", "traced")
 # metres and radians; curvatures per mm, thicknesses mm
 STEPS = {
@@ -73,6 +75,24 @@ class Task:
         return torch.stack(found)
 
 
+def judged(values):
+    """Relative L2 errors against differences, noises and cosines out of values [seeds, 4, n]: of
+    differences, interior gradients, those with the boundary term and single estimates of it."""
+    truth, interior, boundary, _ = values.mean(0)
+    size = float(truth.norm())
+    noise = values.std(0).norm(dim=1) / (math.sqrt(len(values)) * size)
+    single = (values[:, 3] - truth).norm(dim=1) / size
+    return {
+        "interior_only": float((interior - truth).norm()) / size,
+        "with_boundary": float((boundary - truth).norm()) / size,
+        "one_estimate": float(single.median()),
+        "noise": float(noise[0]),
+        "noise_with_boundary": float(noise[2]),
+        "cosine_interior": float(interior @ truth / interior.norm()) / size,
+        "cosine": float(boundary @ truth / boundary.norm()) / size,
+    }
+
+
 def measure(config, scene, kind, group):
     """Relative L2 errors of the ways against differences, scaled so that every number counts by its
     own step."""
@@ -86,7 +106,7 @@ def measure(config, scene, kind, group):
         return torch.stack(ways) * torch.tensor(STEPS[group], dtype=torch.float64)
 
     values = torch.stack([estimates(config.seed + number) for number in range(config.seeds)])
-    yield Row((scene, kind, group), judged(values[None]))
+    yield Row((scene, kind, group), judged(values))
 
 
 def jobs(quick):
