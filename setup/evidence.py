@@ -70,7 +70,7 @@ def gains(comparison: str) -> Callable[[Metrics], str]:
 def joint(pair: str, more: str) -> Part:
     """The race of whole designs on a robot, from its committed answers."""
     return Part(
-        f"codesign --pair {pair} --grid 2 --slopes 0 --couplings 0 --read-outs 0 --processes 2 "
+        f"codesign --pair {pair} --grid 2 --slopes 0 --couplings 3 --read-outs 0 --processes 2 "
         f"--raw docs/joint_race_{pair}.jsonl {more}",
         ("codesign", "scenes", "studies/codesign"),
         {
