@@ -56,7 +56,7 @@ class Config(CellsConfig):
 def study(run: Run[Config]) -> None:
     config = run.config
     cells = {
-        f"{light:g} of daylight, {f'f/{fno:g}' if fno else 'f free'}, {speed:g} of the speed": setting(
+        f"light {light:g}, {f'f/{fno:g}' if fno else 'f free'}, speed {speed:g}": setting(
             config, light, speed, {"fno": fno} if fno else {}
         )
         for speed, light, fno in product(config.speeds, config.lights, config.fnos)
@@ -175,7 +175,7 @@ def drawn(ratios: Mapping[str, Interval], foretold: Sequence[float]) -> Figure:
     axis.set(xlabel="joint / better order", xscale="log")
     axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axis.xaxis.set_minor_formatter(lambda value, _: f"{value:g}")
-    axis.invert_yaxis()
+    axis.set_ylim(len(ratios) - 0.4, -0.6)
     return figure
 
 

@@ -44,7 +44,7 @@ def test_a_map_says_which_cells_are_won_and_what_their_valleys_foretell(tmp_path
         asked.update(regimes)
         rows = []
         for cell, seed, arm in product(regimes, range(run.config.seeds), arms):
-            joint = 0.2 if cell.startswith("1 ") else 0.3125
+            joint = 0.2 if cell.startswith("light 1,") else 0.3125
             error = {"joint": joint, arms[1]: 0.25}.get(arm, 0.5)
             rows.append(
                 {"regime": cell, "seed": seed, "arm": arm, "errors": [error] * 3, "expected": error}
@@ -55,7 +55,7 @@ def test_a_map_says_which_cells_are_won_and_what_their_valleys_foretell(tmp_path
         found = []
         for cell, given in regimes.items():
             space = cells.space_of(given)
-            pull = 0.8 if cell.startswith("1 ") else 0.0
+            pull = 0.8 if cell.startswith("light 1,") else 0.0
             a, b = space.block("lens")[0], space.block("mount")[0]
             for one, other in product(range(len(space.free)), repeat=2):
                 if one <= other:
@@ -73,12 +73,12 @@ def test_a_map_says_which_cells_are_won_and_what_their_valleys_foretell(tmp_path
     assert raced(joint_map, *out) == 0
     numbers = json.loads((tmp_path / "map" / "metrics.json").read_text())
     assert (numbers["cells"], numbers["cells_won"], numbers["cells_lost"]) == (6, 3, 3)
-    day, night = ("cell_1_of_daylight_f_free_1", "cell_0_1_of_daylight_f_free_1")
-    assert numbers[f"{day}_of_the_speed_value"] == pytest.approx(0.8)
-    assert numbers[f"{night}_of_the_speed_value"] == pytest.approx(1.25)
+    day, night = ("cell_light_1_f_free_speed_1", "cell_light_0_1_f_free_speed_1")
+    assert numbers[f"{day}_value"] == pytest.approx(0.8)
+    assert numbers[f"{night}_value"] == pytest.approx(1.25)
     # one pass over parts that stand alone ends at the bottom
-    assert numbers[f"{night}_of_the_speed_at_the_bottom"] == pytest.approx(1.0)
-    given = asked["1 of daylight, f free, 1 of the speed"]
+    assert numbers[f"{night}_at_the_bottom"] == pytest.approx(1.0)
+    given = asked["light 1, f free, speed 1"]
     space = cells.space_of(given)
     b = space.block("mount")[0]
     left = []
@@ -89,7 +89,7 @@ def test_a_map_says_which_cells_are_won_and_what_their_valleys_foretell(tmp_path
         height = (lens**2 + mount**2 + 1.6 * lens * mount) / 2
         left.append(1 + height * 0.9 / (height + 0.9) / 0.1)
     expected = 1 / float(torch.tensor(left, dtype=F).quantile(0.5))
-    assert numbers[f"{day}_of_the_speed_at_the_bottom"] == pytest.approx(expected)
+    assert numbers[f"{day}_at_the_bottom"] == pytest.approx(expected)
     assert numbers["rank_of_foretold"] > 0.8
     assert "in 3, loses in 3, and is undecided in 0" in (tmp_path / "map/report.html").read_text()
 
