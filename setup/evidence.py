@@ -80,6 +80,8 @@ def joint(pair: str, more: str) -> Part:
                 "joint-order": "joint_over_best_order",
                 "joint-book": "joint_over_book",
                 "joint-default": "joint_over_default",
+                "nested-book": "nested_over_book",
+                "nested-default": "nested_over_default",
             }.items()
         },
         {f"joint_race_{pair}.png": "ratios.png", f"joint_designs_{pair}.png": "designs.png"},
@@ -141,6 +143,7 @@ PARTS = {
     "joint-corridor": joint(
         "corridor", f"--seeds 20 --designs 64 --arms joint {ORDERS} book nested default"
     ),
+    "joint-flight": joint("flight", f"--designs 64 --arms joint {ORDERS} book nested default"),
 }
 
 
