@@ -79,7 +79,7 @@ test-bits: setup ## tests that promise equal bits, as other processors and numbe
 	    "MKL_CBWR=AVX2 ATEN_CPU_CAPABILITY=avx2" \
 	    "MKL_CBWR=AVX512 CODESIGN_TEST_THREADS=2"; do \
 	  echo "== $$how"; \
-	  env $$how $(RUN) -m pytest -q -n auto --maxprocesses 8 -m bits $(ARGS) \
+	  env $$how $(RUN) -m pytest -q -n auto --maxprocesses 8 --dist worksteal -m bits $(ARGS) \
 	    $$(grep -rl --include='test_*.py' 'mark\.bits' tests) || failed=1; \
 	done; exit $$failed
 

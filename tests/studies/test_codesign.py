@@ -233,7 +233,6 @@ def test_the_comparison_is_of_pairs():
         (["--arms", "joint", "luck"], "choose from joint"),
         (["--per-draw", "7", "--worlds", "3"], "spread evenly"),
         (["--family", "fisheye-9"], "no lens family"),
-        (["--free", "colour"], "no number 'colour'"),
         (["--speed", "2"], "speed is 2"),
         (["--hold", "fno"], "such as fno=4"),
         (["--hold", "fno=40"], "give a value within 1.2 to 8"),
@@ -273,13 +272,46 @@ def test_a_held_lens_is_focused_by_the_book_as_what_it_is():
     )
 
 
-def test_a_small_race_says_that_it_decides_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr(codesign, "LEAST_STEPS", 2)
-    monkeypatch.setattr("studies.codesign.read_outs.WORLDS", 1)
-    folder = tmp_path / "run"
-    given = "--quick --steps 2 --worlds 1 --per-draw 1 --judged-worlds 1 --judged-drives 1 --arms joint default --slopes 2 --couplings 1 --read-outs 4"
-    free = ["--family", "thin", "--free", "efl_mm", "z_m", "theta"]
-    assert main(codesign.study, codesign.Config, [*given.split(), *free, "--out", str(folder)]) == 0
+SMALL = (
+    "--quick --steps 2 --worlds 1 --per-draw 1 --judged-worlds 1 --judged-drives 1 --family thin "
+    "--free efl_mm z_m theta --arms joint default"
+)
+
+
+@pytest.fixture(scope="module")
+def race(tmp_path_factory):
+    """Runs the small race with more options: its exit code, folder and judged answers. Its
+    landscape is always the same one, and looked at once."""
+    real = codesign.landscape
+    known = []
+
+    def landscape(*given):
+        return known[0] if known else known.append(real(*given)) or known[0]
+
+    def raced(*more):
+        folder = tmp_path_factory.mktemp("race") / "run"
+        given = [*SMALL.split(), *more, "--out", str(folder)]
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(codesign, "landscape", landscape)
+            code = main(codesign.study, codesign.Config, given)
+        path = folder / "answers.jsonl"
+        return code, folder, path.read_text().splitlines() if path.exists() else []
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(codesign, "LEAST_STEPS", 2)
+        patched.setattr("studies.codesign.read_outs.WORLDS", 1)
+        yield raced
+
+
+@pytest.fixture(scope="module")
+def here(race):
+    """A small race with everything beside it."""
+    return race("--slopes", "2", "--couplings", "1", "--read-outs", "4")
+
+
+def test_a_small_race_says_that_it_decides_nothing(here):
+    code, folder, _ = here
+    assert code == 0
     assert "decides nothing" in (folder / "report.html").read_text()
     numbers = json.loads((folder / "metrics.json").read_text())
     ratio = numbers["race_joint_median"] / numbers["race_default_median"]
@@ -309,46 +341,20 @@ def test_designs_are_carried_together_as_each_alone(drawn, space):
     assert len({round(value, 6) for value in alone.tolist()}) == 4
 
 
-def test_answers_of_an_earlier_run_are_not_raced_again(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(codesign, "LEAST_STEPS", 2)
-    given = [
-        "--quick",
-        "--steps",
-        "2",
-        "--worlds",
-        "1",
-        "--per-draw",
-        "1",
-        "--judged-worlds",
-        "1",
-        "--judged-drives",
-        "1",
-        "--family",
-        "thin",
-    ]
-    free = ["--free", "efl_mm", "z_m", "theta", "--arms", "joint", "default"]
-
-    def raced(folder, *more):
-        code = main(
-            codesign.study, codesign.Config, [*given, *free, *more, "--out", str(tmp_path / folder)]
-        )
-        return code, (tmp_path / folder / "answers.jsonl").read_text().splitlines()
-
-    code, one = raced("here")
-    assert code == 0
+def test_answers_of_an_earlier_run_are_not_raced_again(race, here, tmp_path, capsys):
+    _, folder, one = here
     # a process of its own finds the same
-    code, other = raced("apart", "--processes", "1")
+    code, _, other = race("--processes", "1")
+    assert code == 0
     for a, b in zip(one, other, strict=True):
         assert json.loads(a)[1][0]["share"] == json.loads(b)[1][0]["share"]
     known = tmp_path / "known.jsonl"
     cell, rows = json.loads(one[0])
     known.write_text(json.dumps([cell, [{**rows[0], "cpu_s": 1e6}]]) + "\n")
-    code, again = raced("again", "--raw", str(known))
+    code, _, again = race("--raw", str(known))
     assert code == 0
     assert json.loads(again[0])[1][0]["cpu_s"] == 1e6
     assert len(again) == 2
-    code, _ = raced("afresh", "--raw", str(tmp_path / "here" / "race.jsonl"))
-    assert code == 0
-    dark = ["--raw", str(known), "--light", "0.5", "--out", str(tmp_path / "dark")]
-    assert main(codesign.study, codesign.Config, [*given, *free, *dark]) == 2
+    assert race("--raw", str(folder / "race.jsonl"))[0] == 0
+    assert race("--raw", str(known), "--light", "0.5")[0] == 2
     assert "light is 1.0 there and 0.5 here" in capsys.readouterr().err

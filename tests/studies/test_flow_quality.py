@@ -120,18 +120,9 @@ def test_quick_form(tmp_path, monkeypatch):
     file or a wrong convention would not."""
     # pictures and their tables take a third of the time
     monkeypatch.setattr(flow_quality, "SHOWN", 1)
-    chosen = ["fine_theta_0.1", "worlds", "layers_0.3", "mixed_theta_0.2_noise_0.002"]
-    options = [
-        "--quick",
-        "--sets",
-        *chosen,
-        "--models",
-        "affine",
-        "constant",
-        "--out",
-        str(tmp_path),
-    ]
-    assert main(study, Config, options) == 0
+    chosen = "fine_theta_0.1 worlds layers_0.3 mixed_theta_0.2_noise_0.002"
+    options = f"--quick --models affine constant --sets {chosen}".split()
+    assert main(study, Config, [*options, "--out", str(tmp_path)]) == 0
     found = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))
     assert found["fine_theta_0.1_refiner_ratio"] < 0.2
     assert found["worlds_refiner_ratio"] < 0.8

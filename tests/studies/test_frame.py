@@ -4,10 +4,8 @@ charts."""
 import json
 import math
 import os
-import signal
 import sys
 import time
-from pathlib import Path
 from statistics import stdev
 
 import numpy as np
@@ -29,19 +27,12 @@ from studies.frame.config import StudyConfig
 from studies.frame.run import open_run
 from studies.frame.show import Asked, Panel
 from studies.frame.sweep import column, metrics, select, sweep
+from tests.studies.called_apart import killed, killed_once, power, slow, told
 
 
 @pytest.fixture
 def run(tmp_path):
     return open_run("test_frame", StudyConfig(out=tmp_path / "out"))
-
-
-def power(base, exponent):
-    """A cell, and something to call in another process."""
-    print("noise")
-    if exponent < 0:
-        raise DomainError("exponents are not below 0")
-    return {"power": base**exponent, "process": os.getpid()}
 
 
 # sweep
@@ -96,15 +87,6 @@ def test_cells_in_processes_give_the_same_table(run):
     assert not bench.RUNNING
 
 
-def killed_once(folder, exponent):
-    """Ends as by the system's memory killer, the first time."""
-    mark = Path(folder) / str(exponent)
-    if not mark.exists():
-        mark.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return {"power": 2**exponent}
-
-
 @pytest.mark.parametrize("way", [{"processes": 2}, {"cluster": "here"}])
 def test_cells_whose_worker_is_killed_are_asked_again(run, way, tmp_path):
     if "cluster" in way:
@@ -112,10 +94,6 @@ def test_cells_whose_worker_is_killed_are_asked_again(run, way, tmp_path):
     found = sweep(run, killed_once, given={"folder": str(tmp_path)}, exponent=(1, 5, 6), **way)
     assert column(found, "power") == [2, 32, 64]
     assert len((run.folder / "table.jsonl").read_text().splitlines()) == 3
-
-
-def killed(exponent):
-    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_a_worker_that_is_killed_again_and_again_ends_the_sweep(run):
@@ -132,11 +110,6 @@ def test_a_cluster_refuses_in_a_sentence(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingPackageError, match=r"codesign\[cluster\]"):
         sweep(run, power, cluster="here", given={"base": 2}, exponent=(1,))
-
-
-def slow(seconds):
-    time.sleep(seconds)
-    return {"slept": seconds}
 
 
 def test_an_interruption_ends_the_processes_and_keeps_what_is_done(run):
@@ -311,13 +284,6 @@ def test_functions_take_turns():
     )
     assert "".join(order) == "aaabbbaabb"
     assert {len(timing.wall_s) for timing in found.values()} == {4}
-
-
-def told(name, peak_of):
-    """A variable of the environment, and the peaks of calls with so many megabytes and with
-    none."""
-    calls = (lambda: np.ones(peak_of * 10**6, dtype=np.uint8).sum(), lambda: None)
-    return [os.environ.get(name), *map(bench.peak_mb, calls)]
 
 
 @pytest.mark.skipif(

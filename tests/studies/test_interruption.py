@@ -12,54 +12,16 @@ from pathlib import Path
 
 import pytest
 
-from studies.frame.run import Run
+from studies.frame.run import Run, main
+from tests.studies import walk
 from tests.studies.smallest_study import Config, numbers
 
 ROOT = Path(__file__).resolve().parents[2]
-# a noisy descent: its numbers depend on the generator, the momentum and the step counter, so a
-# wrong resume shows
-WALK = '''
-"""A walk that can be interrupted."""
-import sys, time
-from dataclasses import dataclass
-import torch
-from studies.frame.run import Run, StudyConfig, main
-
-@dataclass(frozen=True)
-class Config(StudyConfig):
-    steps: int = 40
-    """Number of steps."""
-    pause_s: float = 0.0
-
-def study(run: Run[Config]):
-    generator = torch.Generator().manual_seed(run.config.seed)
-    x, velocity, first = torch.ones(3), torch.zeros(3, dtype=torch.float64), 0
-    if (state := run.load_state()) is not None:
-        x, velocity, first = state.tensors["x"], state.tensors["velocity"], state.numbers["step"]
-        generator.set_state(state.tensors["generator"])
-    step = first
-    save = lambda: run.save_state({"x": x, "velocity": velocity, "generator": generator.get_state()}, {"step": step})
-    run.on_interrupt(save)
-    with run.progress(run.config.steps, "walking", done=first) as bar:
-        while step < run.config.steps:
-            velocity = 0.9 * velocity - 0.1 * x.double() + 0.01 * torch.randn(3, generator=generator)
-            x = x + velocity.float()
-            time.sleep(run.config.pause_s)
-            step += 1
-            run.say(f"step {step}")
-            bar.advance(loss=x.square().sum())
-    run.record(loss_last=x.square().sum(), x_0=x[0], steps=step, first_step=first)
-    run.finish("A walk", "It went on.")
-
-if __name__ == "__main__":
-    sys.exit(main(study, Config))
-'''
 
 
 def started(folder, *arguments):
-    (folder / "walk.py").write_text(WALK)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
-    command = [sys.executable, "-W", "error", "walk.py", *arguments]
+    command = [sys.executable, "-W", "error", "-m", "tests.studies.walk", *arguments]
     return subprocess.Popen(
         command,
         cwd=folder,
@@ -73,14 +35,13 @@ def started(folder, *arguments):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """Numbers of a walk that nothing interrupted."""
-    folder = tmp_path_factory.mktemp("whole")
-    said, complaint = started(folder, "--out", "out").communicate(timeout=120)
-    assert "walking  40/40  loss" in said, complaint
-    return numbers(folder / "out")
+    folder = tmp_path_factory.mktemp("whole") / "out"
+    assert main(walk.study, walk.Config, ["--out", str(folder)]) == 0
+    return numbers(folder)
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_interrupted_and_resumed_gives_the_same_numbers(tmp_path, whole, number, code):
+def test_interrupted_and_resumed_gives_the_same_numbers(tmp_path, whole, number, code, capsys):
     folder = tmp_path / "with space"
     broken = started(tmp_path, "--out", folder.name, "--pause-s", "0.05")
     assert broken.stdout is not None
@@ -89,10 +50,9 @@ def test_interrupted_and_resumed_gives_the_same_numbers(tmp_path, whole, number,
     if number == signal.SIGINT:
         # it is there, and gets no further
         broken.send_signal(signal.SIGSTOP)
-        second = started(tmp_path, "--resume", folder.name)
-        complaint = second.communicate(timeout=120)[1]
-        assert second.returncode == 2
-        assert complaint.startswith("error: another process works on the run in 'with space'")
+        assert main(walk.study, walk.Config, ["--resume", str(folder)]) == 2
+        complaint = capsys.readouterr().err
+        assert complaint.startswith(f"error: another process works on the run in '{folder}'")
         broken.send_signal(signal.SIGCONT)
     broken.send_signal(number)
     _, complaint = broken.communicate(timeout=60)
@@ -104,9 +64,8 @@ def test_interrupted_and_resumed_gives_the_same_numbers(tmp_path, whole, number,
     left = [folder / name for name in (".decay-a_b3c4d5.mp4", ".state-abcdefgh.npz", ".mine")]
     for path in left:
         path.write_bytes(b"half")
-    resumed = started(tmp_path, "--resume", folder.name)
-    complaint = resumed.communicate(timeout=120)[1]
-    assert resumed.returncode == 0, complaint
+    assert main(walk.study, walk.Config, ["--resume", str(folder)]) == 0
+    assert "walking  40/40  loss" in capsys.readouterr().out
     found = numbers(folder)
     assert 5 <= found["first_step"] < 40
     assert found == {**whole, "first_step": found["first_step"]}
@@ -155,9 +114,8 @@ def test_what_libraries_make_of_a_full_disk_or_a_signal(
 
 
 def test_a_reader_that_goes_away_gets_no_traceback(tmp_path):
-    (tmp_path / "walk.py").write_text(WALK)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "4000"}
-    for line in ("walk.py --help", "-m codesign --help", "-m studies"):
+    for line in ("-m tests.studies.walk --help", "-m codesign --help", "-m studies"):
         shell = f"{shlex.quote(sys.executable)} {line} | head -c 1"
         done = subprocess.run(
             shell, shell=True, cwd=tmp_path, env=environment, capture_output=True, check=False

@@ -144,16 +144,8 @@ def test_a_quick_run_is_reached_from_the_main_job_and_says_that_it_decides_nothi
     tmp_path, capsys
 ):
     out = tmp_path / "run"
-    command = [
-        "--motion",
-        "turn",
-        "--quick",
-        "--steps=2",
-        "--developed=1",
-        "--judged=2",
-        "--judged-turned=2",
-    ]
-    assert lens_opt.start([*command, "--out", str(out)]) == 0
+    command = "--motion turn --quick --steps=2 --developed=1 --judged=2 --judged-turned=2"
+    assert lens_opt.start([*command.split(), "--out", str(out)]) == 0
     metrics = json.loads((out / "metrics.json").read_text())
     for name in ("refocused", "spots", "mtf", "mtf_along", "edge"):
         low, value, high = (metrics[f"log_ratio_{name}{end}"] for end in ("_low", "", "_high"))

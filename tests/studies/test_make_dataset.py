@@ -39,20 +39,7 @@ from tests.rounding_case import RoundsByPlace
 D = torch.float64
 ROOT = Path(__file__).resolve().parents[2]
 # frames 0.0111 s apart: no whole microseconds
-SMALL = [
-    "--trajectories",
-    "2",
-    "--frames",
-    "14",
-    "--size",
-    "24",
-    "--samples",
-    "2",
-    "--chunk",
-    "4",
-    "--rate-hz",
-    "90",
-]
+SMALL = "--trajectories 2 --frames 14 --size 24 --samples 2 --chunk 4 --rate-hz 90"
 
 
 def camera(name="cooke-triplet", size=24, level: Literal["traced", "thin", "pinhole"] = "traced"):
@@ -146,7 +133,7 @@ def test_every_world_has_a_clear_path_of_every_family(world):
 
 
 def run_study(folder, *more):
-    return main(study.study, study.Config, [*SMALL, "--out", str(folder), *more])
+    return main(study.study, study.Config, [*SMALL.split(), "--out", str(folder), *more])
 
 
 @pytest.fixture(scope="module")
@@ -294,7 +281,7 @@ def kill_when(folder, appears, *options):
 def test_a_run_killed_many_times_ends_with_the_same_bytes(dataset, tmp_path):
     folder = tmp_path / "set"
     resume = ("--resume", str(folder))
-    begin = (*SMALL, "--flo", "--out", str(folder))
+    begin = (*SMALL.split(), "--flo", "--out", str(folder))
     assert kill_when(folder, "sequence_000_orbital/flow/forward/000002.png", *begin)
     assert not (folder / "manifest.json").exists()
     for appears in ("*/events.h5", "sequence_001*/parts/000002.h5"):

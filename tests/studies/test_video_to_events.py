@@ -142,18 +142,8 @@ def test_an_interrupted_run_goes_on_with_the_same_events(tmp_path, monkeypatch, 
     monkeypatch.setattr(study, "PIXELS_PER_CHUNK", 4 * 12 * 16)
     monkeypatch.setattr(study, "SECONDS_BETWEEN_SAVES", 0.0 if how == "killed" else 1e9)
     folder = write_folder(tmp_path / "in", waves())
-    common = [
-        "--input",
-        folder,
-        "--fps",
-        300,
-        "--preset",
-        "noisy",
-        "--events",
-        "e.npz",
-        "--seed",
-        7,
-    ]
+    options = "--fps 300 --preset noisy --events e.npz --seed 7"
+    common = ["--input", folder, *options.split()]
     assert call(tmp_path / "whole", *common) == 0
     real = events.simulate
     calls = []
