@@ -67,6 +67,14 @@ def gains(comparison: str) -> Callable[[Metrics], str]:
     return text
 
 
+def foretold(arm: str) -> Callable[[Metrics], str]:
+    """An arm's error over the joint one as couplings foretell it, and as measured."""
+    stem = f"arm_over_joint_{arm}"
+    return lambda metrics: "{:.2f}, {:.2f}".format(
+        *(metrics[f"{stem}_{name}"] for name in ("at_budget", "measured"))
+    )
+
+
 def joint(pair: str, more: str) -> Part:
     """The race of whole designs on a robot, from its committed answers."""
     return Part(
@@ -83,6 +91,11 @@ def joint(pair: str, more: str) -> Part:
                 "nested-book": "nested_over_book",
                 "nested-default": "nested_over_default",
             }.items()
+        }
+        | {
+            f"joint.{pair}.foretold-lens-first": foretold("lens_mount_read_out"),
+            f"joint.{pair}.foretold-mount-first": foretold("mount_lens_read_out"),
+            f"joint.{pair}.foretold-nested": foretold("nested"),
         },
         {f"joint_race_{pair}.png": "ratios.png", f"joint_designs_{pair}.png": "designs.png"},
     )
