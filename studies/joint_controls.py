@@ -21,7 +21,7 @@ from codesign import lens
 from codesign.errors import DomainError
 from codesign.types import EventVolume
 from scenes.robots import pair as robot_pair
-from studies.codesign.design import Space, Whole
+from studies.codesign.design import BLOCKS, Space, Whole
 from studies.codesign.problem import Drawn, Looked
 from studies.codesign.race import JUDGED, SPACE, answers, compared
 from studies.frame.run import Run, StudyConfig, main
@@ -32,7 +32,7 @@ from studies.frame.sweep import plain, select, sweep
 # dioptre, 5 mm and half a degree
 MADE = {
     "efl_mm": lambda value, deviate: value * (1 + 0.01 * deviate),
-    "focus_per_m": lambda value, deviate: max(0.0, value + 0.1 * deviate),
+    "focus_per_m": lambda value, deviate: value + 0.1 * deviate,
     "x_m": lambda value, deviate: value + 0.005 * deviate,
     "z_m": lambda value, deviate: value + 0.005 * deviate,
     "pitch_rad": lambda value, deviate: value + math.radians(0.5) * deviate,
@@ -155,12 +155,14 @@ def as_designed(drawn, whole, seed):
 
 
 def made_and_mounted(drawn, whole, seed):
-    """Seen by a lens and from a place that are a little off, read as if they were not."""
+    """Seen by a lens and from a place that are a little off, read as if they were not. What the
+    lens's bounds do not have is off the other way."""
     deviates = torch.randn(len(MADE), generator=torch.Generator().manual_seed(seed)).tolist()
-    off = {
-        name: change(whole.numbers[name], deviate)
-        for (name, change), deviate in zip(MADE.items(), deviates, strict=True)
-    }
+    off = {}
+    for (name, change), deviate in zip(MADE.items(), deviates, strict=True):
+        one, other = (change(whole.numbers[name], sign * deviate) for sign in (1, -1))
+        low, high = whole.space.limits(name)
+        off[name] = one if name in BLOCKS["mount"] or low <= one <= high else other
     return looked(drawn, whole.with_numbers(**off)).again(whole, "sensor").hard()
 
 
