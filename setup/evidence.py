@@ -75,6 +75,15 @@ def foretold(arm: str) -> Callable[[Metrics], str]:
     )
 
 
+def control(name: str) -> Callable[[Metrics], str]:
+    """Median error of nested under a control, and its ratio to the best order."""
+    stem = f"{name}_nested_over_lens_mount_read_out"
+    return lambda metrics: "{:.2f}; {:.2f} ({:.2f} to {:.2f})".format(
+        metrics[f"control_{name}_nested"],
+        *(metrics[f"{stem}{end}"] for end in ("", "_low", "_high")),
+    )
+
+
 def joint(pair: str, more: str) -> Part:
     """The race of whole designs on a robot, from its committed answers."""
     return Part(
@@ -157,6 +166,17 @@ PARTS = {
         "corridor", f"--seeds 20 --designs 64 --arms joint {ORDERS} book nested default"
     ),
     "joint-flight": joint("flight", f"--designs 64 --arms joint {ORDERS} book nested default"),
+    "joint-controls": Part(
+        'joint_controls --arms nested "lens > mount > read-out"',
+        ("codesign", "scenes", "studies/codesign"),
+        {
+            f"joint.controls.{name.replace('_', '-')}": control(name)
+            for name in (
+                *("as_designed", "made_and_mounted_with_errors", "thresholds_a_tenth_higher"),
+                *("without_blur", "order_of_events_lost", "no_contrast"),
+            )
+        },
+    ),
 }
 
 

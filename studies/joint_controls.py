@@ -85,7 +85,9 @@ def study(run: Run[Config]) -> None:
             log = over[arm][0]
             low, middle, high = (math.exp(x) for x in (log.low, log.value, log.high))
             line[f"over {arm}"] = f"{middle:.2f} ({low:.2f} to {high:.2f})"
-            run.record(**{plain(control, ours, "over", arm): middle})
+            ends = {"": middle, "_low": low, "_high": high}
+            name = plain(control, ours, "over", arm)
+            run.record(**{f"{name}{end}": value for end, value in ends.items()})
         lines.append(line)
     run.section(
         "Judged again",
