@@ -10,16 +10,17 @@ import pytest
 
 import codesign  # noqa: F401  (first: it sets OpenMP's wait policy before torch is imported)
 
-import drjit  # isort: skip
 import torch  # isort: skip
 
 from tests.rounding_case import RoundsByPlace  # isort: skip
 
 os.environ.setdefault("MPLBACKEND", "Agg")
-# small tensors: a second thread costs more than it gives, in drjit's pool too, whose threads wait by
-# spinning
+# small tensors: a second thread costs more than it gives
 torch.set_num_threads(int(os.environ.get("CODESIGN_TEST_THREADS", "1")))
-drjit.set_thread_count(torch.get_num_threads())
+if "CODESIGN_TEST_THREADS" in os.environ:
+    import drjit
+
+    drjit.set_thread_count(torch.get_num_threads())
 # modules that extras of pyproject.toml bring
 EXTRAS = {
     "h5py",

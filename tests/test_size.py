@@ -44,7 +44,7 @@ BUDGETS = {
     "studies/train_flow": 5_100,
     "studies/viewer": 3_450,
     "studies/video_to_events": 4_300,
-    "tests": 13_500,
+    "tests": 13_550,
     "tests/data": 1_000,
     "tests/events": 33_350,
     "tests/flow": 29_450,
