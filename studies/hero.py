@@ -27,9 +27,10 @@ from codesign.report.flow_colours import flow_colours
 from codesign.report.lens_figures import draw_layout
 from scenes.robots import pair as robot_pair
 from scenes.robots.costs import Exposed
+from studies.codesign.cells import space_of
 from studies.codesign.design import Space, Whole
 from studies.codesign.problem import Drawn
-from studies.codesign.race import SPACE, answers
+from studies.codesign.race import answers
 from studies.frame.run import Run, StudyConfig, main
 from studies.placement.figures import draw_pair
 from studies.placement.problem import Samples
@@ -76,7 +77,7 @@ class Film:
 def study(run: Run[Config]) -> None:
     config = run.config
     setting, rows = answers(config.answers)
-    space = Space.of(**{name: setting[name] for name in SPACE})
+    space = space_of(setting)
     drawn = Drawn(driving(space, config), (config.world,), 1, config.pictures)
     titles = ("as it came", "designed together")
     films = {}

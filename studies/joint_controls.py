@@ -21,9 +21,10 @@ from codesign import lens
 from codesign.errors import DomainError
 from codesign.types import EventVolume
 from scenes.robots import pair as robot_pair
-from studies.codesign.design import BLOCKS, Space, Whole
+from studies.codesign.cells import space_of
+from studies.codesign.design import BLOCKS, Whole
 from studies.codesign.problem import Drawn, Looked
-from studies.codesign.race import JUDGED, SPACE, answers, compared
+from studies.codesign.race import JUDGED, answers, compared
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.show import tabulate
 from studies.frame.sweep import plain, select, sweep
@@ -65,7 +66,7 @@ def study(run: Run[Config]) -> None:
             f"--arms {' '.join(lacking) or 'names fewer than two'}: choose from "
             f"{', '.join(dict.fromkeys(arm for _, arm in found))}, and give one start or more."
         )
-    space = Space.of(**{name: setting[name] for name in SPACE})
+    space = space_of(setting)
     drawn = Drawn(space, robot_pair.unseen(config.judged_worlds), config.judged_worlds, 2)
 
     def cell(seed, arm, control):
@@ -82,12 +83,9 @@ def study(run: Run[Config]) -> None:
         errors = torch.tensor([row["errors"] for row in select(mine, arm=ours)])
         line: dict[str, Any] = {"control": control, ours: float(errors.mean(1).quantile(0.5))}
         for arm in others:
-            log = over[arm][0]
-            low, middle, high = (math.exp(x) for x in (log.low, log.value, log.high))
-            line[f"over {arm}"] = f"{middle:.2f} ({low:.2f} to {high:.2f})"
-            ends = {"": middle, "_low": low, "_high": high}
-            name = plain(control, ours, "over", arm)
-            run.record(**{f"{name}{end}": value for end, value in ends.items()})
+            ratio = over[arm][0].ratio()
+            line[f"over {arm}"] = f"{ratio:.2f}"
+            run.record(**ratio.metrics(plain(control, ours, "over", arm)))
         lines.append(line)
     run.section(
         "Judged again",

@@ -6,10 +6,9 @@ as the pair has it. A part's share of the gain is its Shapley value: what it add
 error, averaged over all orders in which parts can be let free.
 """
 
-import math
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 from math import comb
 from typing import ClassVar
@@ -19,7 +18,7 @@ from torch import Tensor
 
 from studies.codesign.cells import CellsConfig, answers, judged_errors, setting, space_of
 from studies.codesign.design import BLOCKS
-from studies.frame.compare import Interval, crossed
+from studies.frame.compare import crossed
 from studies.frame.run import Run, main
 from studies.frame.show import bars, tabulate
 from studies.frame.sweep import column
@@ -64,7 +63,9 @@ def study(run: Run[Config]) -> None:
     logs = {parts: torch.tensor(of, dtype=torch.float64).log() for parts, of in errors.items()}
     lines = []
     for parts, of in logs.items():
-        over, rest = (ratio(of - logs[other]) for other in (frozenset(), frozenset(BLOCKS)))
+        over, rest = (
+            crossed(of - logs[other]).ratio() for other in (frozenset(), frozenset(BLOCKS))
+        )
         lines.append(
             {
                 "designed": told(parts),
@@ -73,7 +74,7 @@ def study(run: Run[Config]) -> None:
                 "over the whole": f"{rest:.2f}" if parts != frozenset(BLOCKS) else "",
             }
         )
-    shares = {NAMES[part]: ratio(of) for part, of in shapley(logs).items()}
+    shares = {NAMES[part]: crossed(of).ratio() for part, of in shapley(logs).items()}
     for name, share in shares.items():
         run.record(**share.metrics(f"share_{name}"))
     run.section(
@@ -102,12 +103,6 @@ def study(run: Run[Config]) -> None:
 def told(parts: Iterable[str]) -> str:
     """Names of parts, in the order of a design."""
     return ", ".join(NAMES[part] for part in BLOCKS if part in set(parts)) or "nothing"
-
-
-def ratio(logs: Tensor) -> Interval:
-    """Of logs [seeds, worlds] the ratio and its interval."""
-    over = crossed(logs)
-    return replace(over, **{end: math.exp(getattr(over, end)) for end in ("value", "low", "high")})
 
 
 def shapley(values: Mapping[frozenset[str], Tensor]) -> dict[str, Tensor]:

@@ -68,7 +68,7 @@ def study(run: Run[Config]) -> None:
         mine = select(rows, regime=cell)
         found = compared(mine)
         order = max(ORDERS, key=lambda arm: found[arm][0].value)
-        over = found[order][0]
+        over = found[order][0].ratio()
         ratios[cell] = over
         errors = {arm: _median(mine, arm) for arm in ("joint", order)}
         line = {
@@ -76,7 +76,7 @@ def study(run: Run[Config]) -> None:
             "best order": order,
             "joint": errors["joint"],
             "order": errors[order],
-            **{name: _ratio(getattr(over, name)) for name in ("value", "low", "high")},
+            **{name: getattr(over, name) for name in ("value", "low", "high")},
             "rank": ranked([row["expected"] for row in mine], [_error(row) for row in mine]),
         }
         if pulls:
@@ -134,10 +134,6 @@ def _median(rows, arm):
     return float(torch.tensor(errors, dtype=torch.float64).quantile(0.5))
 
 
-def _ratio(log):
-    return float(torch.tensor(log, dtype=torch.float64).exp())
-
-
 def _answer(run: Run[Config], lines: Sequence[Row], foretold: Sequence[float]) -> str:
     """The map in one sentence, and the rank of what was foretold."""
     won = sum(line["high"] < 1 for line in lines)
@@ -163,12 +159,11 @@ def _answer(run: Run[Config], lines: Sequence[Row], foretold: Sequence[float]) -
 
 
 def drawn(ratios: Mapping[str, Interval], foretold: Sequence[float]) -> Figure:
-    """Dots with whiskers for log ratios of each cell, crosses for ratios that were foretold."""
+    """Dots with whiskers for the ratio of each cell, crosses for ratios that were foretold."""
     figure, axis = plt.subplots(figsize=(7, 1 + 0.35 * len(ratios)), layout="constrained")
     for at, over in enumerate(ratios.values()):
-        middle, low, high = (_ratio(x) for x in (over.value, over.low, over.high))
-        axis.plot([low, high], [at, at], color="#1b6ca8")
-        axis.plot(middle, at, "o", color="#1b6ca8")
+        axis.plot([over.low, over.high], [at, at], color="#1b6ca8")
+        axis.plot(over.value, at, "o", color="#1b6ca8")
     axis.plot(foretold, range(len(foretold)), "x", color="#c44e17")
     axis.axvline(1, color="0.5", linewidth=1)
     axis.set_yticks(range(len(ratios)), list(ratios), fontsize=8)

@@ -57,6 +57,12 @@ class Interval:
             return "wins"
         return "loses" if self.low > 0 else "ties"
 
+    def ratio(self) -> "Interval":
+        """A log ratio as the ratio it is."""
+        return replace(
+            self, **{end: math.exp(getattr(self, end)) for end in ("value", "low", "high")}
+        )
+
     def percent(self) -> str:
         """A log ratio as the change it is: "-3.1 % (-5.0 to -1.2 %)"."""
         value, low, high = (

@@ -79,11 +79,9 @@ def test_ratios_are_those_of_the_errors_under_each_control(tmp_path, monkeypatch
     monkeypatch.setattr(joint_controls, "CONTROLS", known)
     monkeypatch.setattr(
         joint_controls,
-        "Space",
-        SimpleNamespace(
-            of=lambda **_: SimpleNamespace(
-                made=lambda share: share.repeat(4), pair=SimpleNamespace(name="x")
-            )
+        "space_of",
+        lambda setting: SimpleNamespace(
+            made=lambda share: share.repeat(4), pair=SimpleNamespace(name="x")
         ),
     )
     monkeypatch.setattr(joint_controls, "Drawn", lambda *_: None)
