@@ -35,7 +35,6 @@ class Config(CellsConfig):
     QUICK: ClassVar = {
         "lights": (1.0,),
         "fnos": (4.0,),
-        "speeds": (1.0, 0.3),
         "seeds": 1,
         "worlds": 2,
         "per_draw": 2,
