@@ -7,7 +7,7 @@ ARGS ?=
 STUDY :=
 RUN := .venv/bin/python
 INSTALL := $(RUN) -m pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable
-STUDIES := lens-opt lens-report lens-scratch lens-tolerance lens-bench dataset video-to-events \
+STUDIES := lens-opt lens-report lens-tolerance lens-bench dataset video-to-events \
 	srm-bench sensor-fit train-flow flow-quality flow-recording \
 	placement codesign speed-error stability gradcheck
 
@@ -38,7 +38,6 @@ $(STUDIES): .venv/core.stamp .venv/llvm.stamp
 
 lens-opt: .venv/with-video.stamp ## optimise a lens for event flow, the main job
 lens-report: ## everything about one lens: make lens-report ARGS="--lens double-gauss"
-lens-scratch: ## triplets designed from flat plates
 lens-tolerance: ## what errors of making and mounting do to a lens
 lens-bench: .venv/with-bench.stamp ## speed and error against another ray tracer (installs it)
 lens-bench: STUDY := speed_error --stages lens

@@ -41,7 +41,7 @@ def test_every_study_that_a_page_names_is_there_and_is_tried(try_all):
             ".venv/bin/python -m studies.train_flow --seed 1     # another",
             'make train-flow ARGS="--seed 1"',
         ),
-        ("python -m studies.phase_plate [--steps 3]", "python -m studies.phase_plate"),
+        ("python -m studies.velocity_head [--steps 3]", "python -m studies.velocity_head"),
         ("make it", ""),
         ("codesign run NAME …", ""),
         ('make placement ARGS="--robot', ""),

@@ -1,11 +1,10 @@
-"""How sure a figure is: intervals of means, of shares, of anything that can be resampled, and of
+"""How sure a figure is: intervals of means, of anything that can be resampled, and of
 paired errors.
 
     student(accuracies)                             # mean over seeds, Student's t
     bootstrap(lambda x: x.median(-1).values, errors)    # any statistic of units that can be redrawn
     ratio_of_means(ours, zero_flow)                 # same windows, redrawn together
     log_ratio(ours, theirs).percent()               # "-3.1 % (-5.0 to -1.2 %)": paired cases
-    share(wins, count)                              # of successes
 
 Every interval prints as "value (low to high)", with a format of its own: f"{interval:.3f}".
 """
@@ -16,7 +15,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from scipy.stats import norm
 from scipy.stats import t as student_t
 from torch import Tensor
 
@@ -86,22 +84,6 @@ def student(values: Any, level: float = LEVEL) -> Interval:
     return Interval(mean, mean - half, mean + half, count)
 
 
-def pooled(values: Any, level: float = LEVEL) -> Interval:
-    """Mean of values [seeds, cases], the same cases for every seed.
-
-    The interval is the wider of two: over cases, each averaged over the seeds
-    (other cases, these seeds), and over seeds, each averaged over its cases
-    (these cases, other seeds). Of a single seed it is that over its cases.
-    """
-    values = torch.as_tensor(values, dtype=torch.float64)
-    if len(values) == 1:
-        return student(values[0], level)
-    both = (student(values.mean(0), level), student(values.mean(1), level))
-    return replace(
-        max(both, key=lambda interval: interval.high - interval.low), count=values.shape[1]
-    )
-
-
 def bootstrap(
     statistic: Callable[..., Tensor],
     *samples: Any,
@@ -163,16 +145,6 @@ def log_ratios(ours: Sequence[float], theirs: Sequence[float]) -> Tensor:
 def log_ratio(ours: Sequence[float], theirs: Sequence[float], level: float = LEVEL) -> Interval:
     """Mean log ratio of errors on the same cases, by Student's t; below 0 ours are smaller."""
     return student(log_ratios(ours, theirs), level)
-
-
-def share(wins: int, count: int, level: float = LEVEL) -> Interval:
-    """Share of successes. Source: Wilson, J. Am. Stat. Assoc. 22 (1927)."""
-    z = float(norm.ppf((1 + level) / 2))
-    value = wins / count
-    spread = z * z / count
-    centre = (value + spread / 2) / (1 + spread)
-    half = z * math.sqrt(value * (1 - value) / count + spread / (4 * count)) / (1 + spread)
-    return Interval(value, max(0.0, centre - half), min(1.0, centre + half), count)
 
 
 def _units(values) -> Tensor:

@@ -12,12 +12,12 @@ from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parents[1]
 GROUPS = {
-    "lens": ("lens_report", "lens_scratch", "lens_tolerance", "phase_plate", "lens_files"),
+    "lens": ("lens_report", "lens_tolerance"),
     "render": ("make_dataset",),
     "events": ("video_to_events", "sensor_fit", "spike_esim"),
     "flow": ("train_flow", "flow_quality", "flow_recording"),
     "whole chain": (
-        *("lens_opt", "lens_opt_seeds", "lens_motion", "placement"),
+        *("lens_opt", "lens_motion", "placement"),
         *("codesign", "joint_map", "joint_levers", "joint_controls", "velocity_head"),
         *("gradient_flow", "speed_error", "stability", "chain_picture", "hero", "viewer"),
     ),

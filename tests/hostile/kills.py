@@ -30,9 +30,7 @@ STUDIES = {
     "--reuse 2 --validation-windows 2 --final-windows 2",
     "gradient_flow": "--quick --cases sensors layers",
     "spike_esim": "--classes --quick --training 20 --test 20 --calibration 10",
-    "lens_scratch": "--quick --seeds 2",
     "placement": "--seeds 1 --steps 2 --worlds 1 --per-world 1 --judged-worlds 1 --judged-drives 2 --searches random",
-    "phase_plate": "--quick",
     "lens_opt": "--quick --after-steps 1 --cases 1 --scored 1 --spot-steps 1 --steps 2 --judged 2 --samples 4",
 }
 KINDS = {
