@@ -2,9 +2,7 @@
 ESIM, and ours?
 
 Trained on rendered sequences with hard events of a noisy, slow, unequal sensor; judged on motions
-and worlds never seen by van Rossum distance, number, rates over time, flicker and delay. With
---classes instead by what a classifier that is trained on their events makes of the sensor's
-(docs/event_classes.md).
+and worlds never seen by van Rossum distance, number, rates over time, flicker and delay.
 """
 
 import sys
@@ -19,7 +17,7 @@ from codesign.report.prose import counted
 from studies.frame.compare import Interval
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.show import Panel, panels, pictures, table, tabulate
-from studies.spike_esim import classes, judge
+from studies.spike_esim import judge
 from studies.spike_esim.train import SENSOR, generators, rendered
 
 TRAINING = [
@@ -57,43 +55,19 @@ class Config(StudyConfig):
     QUICK: ClassVar = {
         "frames": 60,
         "steps": 8,
-        "seeds": 2,
-        "training": 60,
-        "test": 60,
-        "calibration": 30,
-        "epochs": 3,
     }
-    classes: bool = False
-    """Judge the generators by a classifier of moved digits."""
     frames: int = 200
     """Frames of every rendered sequence, at 500 per second."""
     steps: int = 160
     """Optimisation steps of our generator; the thesis network gets half as many from either of two
     starts."""
-    seeds: int = 5
-    """Classifiers of each generator, each with training pictures, noise and first weights of its
-    own."""
-    training: int = 800
-    """Pictures that a classifier is trained on."""
-    test: int = 1000
-    """Pictures that it is tested on."""
-    calibration: int = 200
-    """Recorded pictures that thresholds and generators are fitted to."""
-    epochs: int = 12
-    """Passes over the training pictures."""
-    video_hz: float = 100.0
-    """Frame rate at which generators see the moved pictures."""
 
 
 def study(run: Run[Config]) -> None:
+    """Train all generators, judge them on every unseen set, write the page."""
     if run.config.frames < 40 or run.config.steps < 4:
         given = f"{run.config.frames} and {run.config.steps}"
         raise DomainError(f"frames and steps are {given}; at least 40 and 4 are needed.")
-    classes.study(run) if run.config.classes else compare(run)
-
-
-def compare(run):
-    """Train all generators, judge them on every unseen set, write the page."""
     training, *unseen = sequences(run, [TRAINING, *UNSEEN.values()])
     made, ours, theta = generators(run, training)
     on, off = ours.thetas().tolist()

@@ -1,7 +1,6 @@
 """The Spike-ESIM study: figures of judgement, thesis variants, digits and saccades against closed
-forms and values worked out by hand; a run that goes on where it stopped."""
+forms and values worked out by hand."""
 
-import json
 import math
 from pathlib import Path
 
@@ -29,7 +28,7 @@ from scenes.digits import (
 )
 from studies.frame.run import main
 from studies.spike_esim import __main__ as study
-from studies.spike_esim import classes, judge, train
+from studies.spike_esim import judge, train
 
 D = torch.float64
 DT_S = 2e-3
@@ -240,102 +239,6 @@ def test_pictures_come_from_their_seed_and_the_lens_fades_a_wave_as_a_gaussian()
     )
 
 
-def test_voxels_hold_every_event_once_and_in_its_own_picture():
-    pictures, _ = draw_pictures(5, "test", 7)
-    t_s = frame_times(100.0)
-    seen = frames(pictures, t_s)
-    sensor = events.SensorModel(0.15, 0.15)
-    made = classes.of_esim(0.15)(seen, t_s, torch.Generator())
-    voxels = classes.voxels_of(made, t_s, 4)
-    assert voxels.shape == (5, 2, 4, 32, 32)
-    for k in range(5):
-        alone = events.simulate(seen[:, k], t_s, sensor)
-        for polarity, sign in enumerate((1, -1)):
-            # single precision sums some 500 shares of at most 1: 1e-4
-            assert float(voxels[k, polarity].sum()) == pytest.approx(
-                int((alone.p == sign).sum()), abs=1e-3
-            )
-    assert float(voxels.sum()) == pytest.approx(len(made), abs=1e-2)
-    of_counts = classes.voxels_of(events.dense_counts(seen, t_s, sensor), t_s, 4)
-    assert float(of_counts.sum()) == pytest.approx(len(made), abs=1e-2)
-    # the mean time of all events, from bins of 60 ms: linear sharing keeps it exactly for a stream
-    nodes_s = torch.linspace(0, 3 * LEG_S, 4, dtype=D)
-    mean_s = float((voxels.double().sum((0, 1, 3, 4)) * nodes_s).sum() / voxels.double().sum())
-    assert mean_s == pytest.approx(float(made.t_us.double().mean()) * 1e-6, abs=1e-6)
-
-
-def separable(count, generator):
-    """Recordings whose class is the one channel (of 2 polarities x 5 bins) that has events, at
-    random places."""
-    labels = torch.arange(count) % 10
-    voxels = torch.zeros(count, 10, 32 * 32)
-    for k, label in enumerate(labels.tolist()):
-        voxels[k, label] = (torch.rand(32 * 32, generator=generator) < 0.2).float()
-    return voxels.reshape(count, 2, 5, 32, 32), labels
-
-
-@pytest.mark.bits
-def test_a_trivially_separable_set_is_learnt_completely_and_training_repeats_from_its_seed(
-    generator,
-):
-    voxels, labels = separable(200, generator)
-    unseen, truth = separable(50, generator)
-    net = classes.train(voxels, labels, 6, seed=3)
-    assert classes.predict(net, unseen).tolist() == truth.tolist()
-    torch.rand(7)  # the global generator has no say
-    again = classes.train(voxels, labels, 6, seed=3)
-    other = classes.train(voxels[:50], labels[:50], 1, seed=4)
-    weights = [
-        torch.cat([p.detach().flatten() for p in each.parameters()]) for each in (net, again, other)
-    ]
-    assert torch.equal(weights[0], weights[1])
-    assert not torch.equal(weights[0], weights[2])
-
-
-@pytest.mark.bits
-def test_the_network_of_the_thesis_sees_each_picture_alone():
-    t_s = frame_times(50.0)
-    seen = frames(draw_pictures(3, "training", 5)[0], t_s)
-    network = events.TwoBranchSpikes(1, seed=0).requires_grad_(False)
-    network.wake(classes.tall(seen) / 255)
-    together = classes.spikes_of(network, seen)
-    assert float(together.sum()) > 0
-    for k in range(3):
-        alone = classes.spikes_of(network, seen[:, k : k + 1])
-        # a convolution of three pictures may round differently from one of one, by 9 products of
-        # 1e-7: of 27,648 potentials few are that near a threshold, and their spikes come a step
-        # later
-        assert int((together[:, :, k : k + 1] != alone).sum()) <= 1e-3 * alone.numel()
-
-
-def test_a_classification_that_was_stopped_goes_on_with_what_is_left(tmp_path, monkeypatch, capsys):
-    kept = {key: classes.SOURCES[key] for key in ("naive", "esim", "physical")}
-    monkeypatch.setattr(classes, "SOURCES", kept)
-    monkeypatch.setattr(classes, "ASKED", (("esim", "naive"),))
-    for name in ("best_thresholds", "fitted"):
-        monkeypatch.setattr(classes, name, lambda *given: {})
-    sizes = ["--training", "20", "--test", "20", "--calibration", "10", "--device", "cpu"]
-    folder = tmp_path / "a"
-    assert (
-        main(study.study, study.Config, ["--classes", "--quick", *sizes, "--out", str(folder)]) == 0
-    )
-    first = json.loads((folder / "metrics.json").read_text())
-    # 20 pictures, 2 seeds
-    assert first["physical_mean"] * 40 == pytest.approx(round(first["physical_mean"] * 40))
-    # naive events of the very pictures, counted in another way
-    tiles, _ = draw_pictures(20, "training", (0, classes.TRAINING, 0))
-    steps = events.lin_log(frames(tiles, frame_times(100.0)).flatten(1, 2)).diff(dim=0)
-    assert first["naive_events_per_picture"] == pytest.approx(
-        int((steps.abs() >= 0.2).sum()) / 20, abs=1e-3
-    )
-    # every training is found again
-    monkeypatch.setattr(classes, "train", None)
-    assert main(study.study, study.Config, ["--resume", str(folder)]) == 0
-    again = json.loads((folder / "metrics.json").read_text())
-    assert all(again[name] == value for name, value in first.items() if not isinstance(value, dict))
-
-
-@pytest.mark.parametrize("options", [["--steps", "1"], ["--classes", "--seeds", "1"]])
-def test_too_small_a_study_is_refused(options, tmp_path, capsys):
-    assert main(study.study, study.Config, [*options, "--out", str(tmp_path / "a")]) == 2
+def test_too_small_a_study_is_refused(tmp_path, capsys):
+    assert main(study.study, study.Config, ["--steps", "1", "--out", str(tmp_path / "a")]) == 2
     assert "at least" in capsys.readouterr().err
