@@ -32,7 +32,6 @@ DOOR = "codesign"  # the package itself, which names its rooms and imports them 
 MITSUBA = {
     "codesign.render": "makes pictures with it",
     "scenes": "describe worlds to it",
-    "studies.speed_error.frames": "compares with its sensors",
     "studies.stability.render_cases": "mirrors shapes by its transforms",
 }
 

@@ -37,7 +37,7 @@ BUDGETS = {
     "studies/make_dataset": 3_850,
     "studies/placement": 7_900,
     "studies/sensor_fit": 2_000,
-    "studies/speed_error": 8_400,
+    "studies/speed_error": 6_650,
     "studies/spike_esim": 3_050,
     "studies/stability": 8_250,
     "studies/train_flow": 5_100,
@@ -55,7 +55,7 @@ BUDGETS = {
     "tests/optimise": 3_500,
     "tests/render": 30_900,
     "tests/scenes": 21_700,
-    "tests/studies": 32_250,
+    "tests/studies": 32_150,
     "tests/system": 7_000,
     "tests/train": 4_500,
 }

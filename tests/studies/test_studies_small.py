@@ -5,7 +5,7 @@ import torch
 
 from codesign.errors import DomainError
 from studies.frame.bench import Timing
-from studies.speed_error import chain, events, placement
+from studies.speed_error import chain, events
 
 # level -> processor seconds of five turns, and its error
 TURNS = {
@@ -49,18 +49,3 @@ def test_the_convolution_of_the_bench_is_the_layer_up_to_its_cut_kernel():
     agree = (events.convolution(drive) == events.ours(drive)).double().mean()
     assert float(events.ours(drive).sum()) > 50
     assert float(agree) > 0.97
-
-
-def test_the_stages_of_a_placement_make_up_its_step_and_gradients_arrive_everywhere():
-    system, batch, pair = placement.case_of("ground", 0, worlds_of=1, drives=1)
-    found = placement.one_step(system, batch, pair)
-    stages = [found[name] for name in placement.PARTS.values()]
-    # the loss itself and the sum of gradients into mount and lens are in the step only
-    assert 0.9 * found["step"] < sum(stages) <= found["step"] + 1e-6
-    assert min(stages) > 0
-    assert found["forward"] < found["step"]
-    asking = {name: p for name, p in system.named_parameters() if p.requires_grad}
-    assert {name.split(".")[0] for name in asking} == {"lens", "mount", "events"}
-    assert all(
-        p.grad is not None and 0 < float(p.grad.abs().max()) < torch.inf for p in asking.values()
-    )
