@@ -30,7 +30,7 @@ BUDGETS = {
     "studies/flow_quality": 5_450,
     "studies/flow_recording": 3_300,
     "studies/frame": 8_050,
-    "studies/gradient_flow": 8_850,
+    "studies/gradient_flow": 6_300,
     "studies/lens_motion": 4_000,
     "studies/lens_opt": 6_400,
     "studies/lens_report": 2_350,
@@ -55,7 +55,7 @@ BUDGETS = {
     "tests/optimise": 3_500,
     "tests/render": 30_900,
     "tests/scenes": 21_700,
-    "tests/studies": 32_150,
+    "tests/studies": 31_300,
     "tests/system": 7_000,
     "tests/train": 4_500,
 }

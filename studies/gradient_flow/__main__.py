@@ -3,8 +3,7 @@ random numbers, by case.
 
 scenes: every junction and every group on five scenes, each right, wrong or not judgeable; its
 count is the first line of the page. chain, joint: more precisely, junction by junction, and the
-whole graph with lens, mount, thresholds and network. layers, sensors, timing: the event layers
-against differences of hard counts. silhouettes: where objects hide one another.
+whole graph with lens, mount, thresholds and network. silhouettes: where objects hide one another.
 """
 
 import json
@@ -20,16 +19,12 @@ from studies.frame.run import Run, StudyConfig, main
 from studies.frame.sweep import sweep
 from studies.gradient_flow import chain, silhouettes
 from studies.gradient_flow.certificates import topic as certificates
-from studies.gradient_flow.events import topics
 from studies.gradient_flow.topic import NOT_JUDGEABLE, Row, Topic, label
 
 CASES: dict[str, Topic] = {
     "scenes": certificates.TOPIC,
     "chain": chain.CHAIN,
     "joint": chain.JOINT,
-    "layers": topics.LAYERS,
-    "sensors": topics.SENSORS,
-    "timing": topics.TIMING,
     "silhouettes": silhouettes.TOPIC,
 }
 
@@ -42,12 +37,11 @@ class Config(StudyConfig):
         "draws": 4,
         "directions": 1,
         "hard_cases": 2,
-        "scenes": 1,
         "samples": 512,
         "seeds": 2,
     }
     cases: tuple[str, ...] = ("scenes", "chain", "joint")
-    """What to measure: scenes, chain, joint, layers, sensors, timing, silhouettes."""
+    """What to measure: scenes, chain, joint, silhouettes."""
     film_samples: int = 256
     """Samples per pixel of the frames of the five scenes."""
     draws: int = 16
@@ -58,8 +52,6 @@ class Config(StudyConfig):
     hard_cases: int = 32
     """Motions and textures averaged for the straight-through layer against the hard loss
     (chain)."""
-    scenes: int = 2
-    """Textures and paths over which cosine and scale are taken together (event layers)."""
     samples: int = 1024
     """Samples per pixel of differences and precise gradients at silhouettes."""
     seeds: int = 4
@@ -78,7 +70,6 @@ def study(run: Run[Config]) -> None:
         ("draws", 2),
         ("directions", 0),
         ("hard_cases", 1),
-        ("scenes", 1),
         ("samples", 64),
         ("seeds", 2),
     ):

@@ -60,13 +60,6 @@ class Asked:
         )
 
 
-def pointing(cosine: float, low: float | None = None, high: float | None = None) -> Asked:
-    """Asked of a derivative beside differences: its cosine, and a scale within bounds."""
-    if low is None or high is None:
-        return Asked({"cosine": cosine}, {})
-    return Asked({"cosine": cosine, "scale": low}, {"scale": high})
-
-
 @dataclass(frozen=True)
 class Topic:
     """Rows about one question.

@@ -28,7 +28,7 @@ STUDIES = {
     "make_dataset": "--trajectories 2 --frames 14 --size 24 --samples 2 --chunk 4 --rate-hz 90",
     "train_flow": "--steps 8 --save-every 1 --validate-every 4 --batch 2 --height-px 32 --width-px 32 "
     "--reuse 2 --validation-windows 2 --final-windows 2",
-    "gradient_flow": "--quick --cases sensors layers",
+    "gradient_flow": "--quick --cases chain joint",
     "spike_esim": "--quick",
     "placement": "--seeds 1 --steps 2 --worlds 1 --per-world 1 --judged-worlds 1 --judged-drives 2 --searches random",
     "lens_opt": "--quick --after-steps 1 --cases 1 --scored 1 --spot-steps 1 --steps 2 --judged 2 --samples 4",
