@@ -23,6 +23,7 @@ from codesign.report.prose import counted
 from scenes.robots import pair as robot_pair
 from scenes.robots.pair import Design, RobotPair
 from scenes.robots.pairs import PAIRS, check_pairs
+from studies.frame.config import check_least
 from studies.frame.run import Run, StudyConfig, main
 
 AT_ONCE = 6  # drives in each world, rendered together: 8 million rays for every 12 samples
@@ -90,10 +91,8 @@ def study(run: Run[Config]) -> None:
 def check(config: Config) -> None:
     """Raises: DomainError for pairs that are unknown, and sizes out of range."""
     check_pairs(config.pair)
-    if min(config.designs, config.steps, config.batch, config.width) < 1 or config.worlds < 2:
-        raise DomainError(
-            "--designs, --steps, --batch and --width need at least 1, --worlds at least 2."
-        )
+    check_least(config, 1, "designs", "steps", "batch", "width")
+    check_least(config, 2, "worlds")
     if not 1 <= config.motions <= AT_ONCE:
         raise DomainError(f"--motions is {config.motions}; a design has 1 to {AT_ONCE} in a world.")
 

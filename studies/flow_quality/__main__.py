@@ -23,6 +23,7 @@ from scenes.windows.worlds import ALL, WorldWindows
 from studies.flow_quality import recordings
 from studies.flow_quality.estimators import estimators
 from studies.flow_quality.measures import figures, join, mean_of_known, measure
+from studies.frame.config import check_least
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.show import pictures
 from studies.train_flow import peers  # noqa: F401  which network files know
@@ -163,11 +164,7 @@ def answer(found):
 
 def check(config):
     """Raises: DomainError for numbers and models that give no figures."""
-    if min(config.windows, config.world_windows, config.real_windows) < 2:
-        raise DomainError(
-            f"--windows {config.windows}, --world-windows {config.world_windows}, --real-windows "
-            f"{config.real_windows}: at least 2 are needed."
-        )
+    check_least(config, 2, "windows", "world_windows", "real_windows")
     if config.packets < 1 or not config.packet_events or min(config.packet_events) < 100:
         raise DomainError(
             f"--packets {config.packets}, --packet-events {config.packet_events}: at least 1 packet of at "

@@ -82,6 +82,14 @@ def read_config(path: Path, study: str, kind: type[Config]) -> Config:
     return kind(**{name: _typed(path, name, value, hints[name]) for name, value in stored.items()})
 
 
+def check_least(config: StudyConfig, least: float, *names: str) -> None:
+    """Raises: DomainError for the first of these options that is below ``least``."""
+    for name in names:
+        value = getattr(config, name)
+        if value < least:
+            raise DomainError(f"--{name.replace('_', '-')} is {value}; at least {least} is needed.")
+
+
 def resume_command(study: str, folder: Path) -> str:
     """The line that goes on with the run in ``folder``, fit to be pasted into a shell."""
     return f"{shipped.command(study)} --resume {shlex.quote(str(folder))}"

@@ -15,6 +15,7 @@ import numpy as np
 
 from codesign.errors import DomainError
 from codesign.report import chain_figures
+from studies.frame.config import check_least
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.sweep import sweep
 from studies.gradient_flow import chain, silhouettes
@@ -65,16 +66,10 @@ def study(run: Run[Config]) -> None:
         raise DomainError(
             f"--cases is {' '.join(config.cases)!r}; choose among {', '.join(CASES)}."
         )
-    for name, least in (
-        ("film_samples", 1),
-        ("draws", 2),
-        ("directions", 0),
-        ("hard_cases", 1),
-        ("samples", 64),
-        ("seeds", 2),
-    ):
-        if getattr(config, name) < least:
-            raise DomainError(f"{name} = {getattr(config, name)} must be at least {least}.")
+    check_least(config, 0, "directions")
+    check_least(config, 1, "film_samples", "hard_cases")
+    check_least(config, 2, "draws", "seeds")
+    check_least(config, 64, "samples")
     if config.quick:
         run.say(
             "quick form: few samples and directions; frames with silhouettes are left to the full form."

@@ -24,6 +24,7 @@ from codesign.flow import checkpoint
 from codesign.lens.design import edge_thickness_mm
 from codesign.system import check
 from studies.frame.compare import log_ratio
+from studies.frame.config import check_least
 from studies.frame.run import Run, StudyConfig, main
 from studies.lens_motion import __main__ as lens_motion
 from studies.lens_opt import page as lens_opt_page
@@ -157,7 +158,9 @@ def study(run: Run[Config]):
 
 
 def _check(config):
-    for name in (
+    check_least(
+        config,
+        1,
         "steps",
         "after_steps",
         "cases",
@@ -168,11 +171,7 @@ def _check(config):
         "weights",
         "spot_steps",
         "spot_starts",
-    ):
-        if getattr(config, name) < 1:
-            raise DomainError(
-                f"--{name.replace('_', '-')} is {getattr(config, name)}; at least 1 is needed."
-            )
+    )
     if config.samples % len(LIGHT.weights):
         raise DomainError(
             f"--samples is {config.samples}; the light has {len(LIGHT.weights)} wavelengths, so give a multiple of that."

@@ -19,6 +19,7 @@ from scenes.robots import pair as robot_pair
 from scenes.robots.check import check_pair
 from scenes.robots.own import own_pair
 from scenes.robots.pairs import PAIRS
+from studies.frame.config import check_least
 from studies.frame.run import Run, StudyConfig, main
 from studies.placement.look import look, size_in_words
 from studies.placement.outcome import Outcome
@@ -103,11 +104,7 @@ def checked(size: Config) -> None:
         raise DomainError(
             f"--pair {size.pair}: choose from {', '.join(PAIRS)}, or give --robot and a .yaml file."
         )
-    for name in ("seeds", "steps", "worlds", "per_world", "judged_worlds", "judged_drives"):
-        if getattr(size, name) < 1:
-            raise DomainError(
-                f"--{name.replace('_', '-')} is {getattr(size, name)}; at least 1 is needed."
-            )
+    check_least(size, 1, "seeds", "steps", "worlds", "per_world", "judged_worlds", "judged_drives")
     for name in ("per_world", "judged_drives"):
         if getattr(size, name) > DRIVES:
             raise DomainError(

@@ -17,6 +17,7 @@ import torch
 
 from codesign import events
 from codesign.errors import DomainError
+from studies.frame.config import check_least
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.show import pictures
 from studies.sensor_fit.recording import default_path, load
@@ -37,8 +38,7 @@ class Config(StudyConfig):
 
 def study(run: Run[Config]) -> None:
     config = run.config
-    if config.steps < 1:
-        raise DomainError(f"steps are {config.steps}; at least 1 is needed.")
+    check_least(config, 1, "steps")
     recording = load(config.recording or default_path())
     recorded = recording.counts()
     half = len(recorded) // 2

@@ -12,9 +12,9 @@ from typing import ClassVar
 import torch
 
 from codesign import events
-from codesign.errors import DomainError
 from codesign.report.prose import counted
 from studies.frame.compare import Interval
+from studies.frame.config import check_least
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.show import Panel, panels, pictures, table, tabulate
 from studies.spike_esim import judge
@@ -65,9 +65,8 @@ class Config(StudyConfig):
 
 def study(run: Run[Config]) -> None:
     """Train all generators, judge them on every unseen set, write the page."""
-    if run.config.frames < 40 or run.config.steps < 4:
-        given = f"{run.config.frames} and {run.config.steps}"
-        raise DomainError(f"frames and steps are {given}; at least 40 and 4 are needed.")
+    check_least(run.config, 40, "frames")
+    check_least(run.config, 4, "steps")
     training, *unseen = sequences(run, [TRAINING, *UNSEEN.values()])
     made, ours, theta = generators(run, training)
     on, off = ours.thetas().tolist()

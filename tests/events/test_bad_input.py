@@ -3,6 +3,7 @@ one sentence that names what was given. Plain types and signs of single argument
 (``tests/test_doors.py``)."""
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from codesign import events
 from codesign.errors import CodesignError, DomainError, ShapeError
 from codesign.events import SensorModel, layer
 from codesign.events.stream import check_stream, ordered
-from codesign.events.views.figures import rate_figure, space_time_figure
+from codesign.events.views import figures
 from codesign.types import EventStream
 
 FRAMES = torch.rand(5, 4, 6, generator=torch.Generator().manual_seed(0)) * 200 + 10
@@ -142,129 +143,17 @@ OURS = events.SpikeEsim()
 STATE = OURS(FRAMES, T_S)[1]
 NETWORK = events.TwoBranchSpikes(1)
 UNSTABLE = {"cutoff_hz": 300.0, "shot_rate_hz": 5.0, "photoreceptor_noise": True, "timing": "v2e"}
-WRONG = [
-    # streams, volumes, surfaces, spikes
-    (lambda: ordered(*(torch.tensor([x]) for x in (0.5, 1, 1, 1)), 4, 6), "t_us holds 0.5"),
-    (lambda: events.concatenate([]), "at least one"),
-    (lambda: events.concatenate([STREAM, ordered(*[torch.zeros(0)] * 4, 5, 6)]), "one sensor"),
-    (lambda: events.to_counts(STREAM, [0.0, 1e-7]), "microsecond"),
-    (lambda: events.HardSensor(SENSOR, 5)(FRAMES, T_S), r"\[N, T, H, W\]"),
-    (lambda: events.from_counts(COUNTS, T_S, 20), "fewer bins"),
-    (lambda: events.from_stream(STREAM, 5, 2, 2), "t1_us must be a whole number >= 6"),
-    (lambda: events.surface_from_stream(STREAM, [5, 5], 1.0), "whole microseconds"),
-    (lambda: events.decay(COUNTS, T_S, 1e-200), "tau_s must be .*, got 1e-200"),
-    (
-        lambda: events.decay_from_stream(STREAM, [10], 0.1, start=(COUNTS[0], 2**40)),
-        "the trace is of",
-    ),
-    (
-        lambda: events.decay_from_stream(STREAM, [10], 0.1, start=(torch.zeros(2, 6, 4), 0)),
-        r"to go on with must be \[2, 4, 6\]",
-    ),
-    # pictures
-    (lambda: events.picture(COUNTS[:, 0]), "ON first"),
-    (lambda: events.write_video("e.avi", PICTURES, 10), r"\.mp4 or \.gif"),
-    (lambda: events.write_video("none/e.gif", PICTURES, 10), "folder"),
-    (lambda: events.write_video("e.gif", iter(()), 10), "at least one"),
-    (lambda: events.write_video("e.mp4", iter([PICTURES[0], PICTURES[0, :2]]), 10), "one size"),
-    (lambda: rate_figure(torch.zeros(3), torch.zeros(2, 2)), r"\[K, 2\]"),
-    (lambda: space_time_figure(ordered(*[torch.zeros(0)] * 4, 3, 3)), "no event"),
-    # sensors
-    (lambda: events.simulate(FRAMES[:, 0], T_S, SENSOR), "H, W"),
-    (lambda: events.simulate(FRAMES, T_S, "noisy"), "events.PRESETS"),
-    (
-        lambda: events.simulate(FRAMES, T_S, SENSOR, 3),
-        "the generator must be a Generator, got an int",
-    ),
-    (lambda: events.dense_counts(FRAMES, T_S, SensorModel(timing="v2e")), "interpolated"),
-    (lambda: SensorModel(theta_on=torch.tensor(0.2)), "events.sensor_counts"),
-    (lambda: SensorModel(photoreceptor_noise=True), "needs cutoff_hz and shot_rate_hz"),
-    (lambda: events.simulate(FRAMES, T_S, SensorModel(**UNSTABLE)), "unstable"),
-    (lambda: SensorModel(hot_pixel_share=2.0), "0 to 1"),
-    (
-        lambda: events.sensor_counts(FRAMES, T_S, SENSOR, leak_rate_hz=T_S[1]),
-        "'leak_rate_hz' cannot carry",
-    ),
-    (
-        lambda: events.sensor_counts(
-            FRAMES, T_S, SENSOR, refractory_s=torch.tensor(0.0, requires_grad=True)
-        ),
-        "0, which switches it off",
-    ),
-    # functions of frames
-    (lambda: events.expected(FRAMES, 0.2, 0.2, 0.1, state=FRAMES[0] * NAN), "state"),
-    (lambda: events.memory(FRAMES, 0.2, 0.2, state=FRAMES[0].double()), "must be float32"),
-    (lambda: events.memory(FRAMES, 0.2, 0.2, gradient="mean"), "'exact', 'play'"),
-    (lambda: events.one_pole(FRAMES, torch.ones(3, 1, 1)), "one per interval"),
-    (
-        lambda: events.one_pole(FRAMES, torch.ones(4, 1, 1), torch.zeros(6)),
-        r"must be \[4, 6\], got \[6\]",
-    ),
-    (
-        lambda: events.upsample(FRAMES.roll((3, 5), (1, 2)), T_S, max_steps=1),
-        "max_steps = 1: record faster",
-    ),
-    (lambda: streamed(FRAMES, [0.0]), "there is no time 1"),
-    (lambda: streamed([FRAMES[0], FRAMES[1, 1:]], T_S[:2]), "frame 1"),
-    (lambda: streamed(FRAMES, [0.1, 0.0, 0.2, 0.3, 0.4]), r"frame 1 must be .* > 0\.1, got 0\.0"),
-    # layers
-    (lambda: layer("memroy"), "no event layer 'memroy', did you mean 'memory'"),
-    (lambda: layer("memory", spread=0.1), "no option 'spread'; its options are learn, log_input"),
-    (lambda: layer("srm", steps=0), "steps must be a whole number from 1 .*, got 0"),
-    (lambda: layer("memory", learn="theta_on"), "learn is 'theta_on'"),
-    (
-        lambda: layer("memory", learn=("refractory_s",)),
-        "cannot learn 'refractory_s'.*the layer 'physical'",
-    ),
-    (lambda: layer("physical", learn=("cutoff_hz",)), "switched off"),
-    (
-        lambda: layer("expected", SensorModel(theta_sigma=0.03), learn=("theta_sigma",)),
-        "no gradient in the",
-    ),
-    (lambda: layer("memory")(FRAMES.expand(2, 5, 4, 6), T_S, [GENERATOR]), "batch of 2"),
-    (lambda: layer("memory").finely(FRAMES, T_S, 1e-12), r"1e-12 s would hold .* of one call"),
-    (lambda: going_on(generator=GENERATOR), "leave the generator out"),
-    (lambda: going_on(t_s=T_S), "go on increasing"),
-    (
-        lambda: events.Settled(layer("memory"), 0.007).volume(FRAMES, T_S, 2),
-        r"no frame stands 0\.007 s after",
-    ),
-    # spikes
-    (lambda: events.drive_scale(torch.zeros(10, 2), theta=0.7), "silent"),
-    (lambda: events.drive_scale(FRAMES, theta=0.7, share=1.0), "share"),
-    (lambda: events.Laplace(0.0, 1.0), "alpha"),
-    (lambda: events.Triangular(1.0, math.inf), "beta"),
-    (
-        lambda: events.FastSigmoid(1.0, 1.0).torch_density(torch.ones(2, dtype=torch.int64)),
-        "real numbers",
-    ),
-    (lambda: torch.autograd.functional.hessian(potential, FRAMES[:2, :2, :1]), "second derivative"),
-    (lambda: OURS(FRAMES[:, 0], T_S), "H, W"),
-    (lambda: OURS(FRAMES, T_S[:3]), r"\[5\]"),
-    (lambda: OURS(FRAMES, T_S, STATE), "go on increasing"),
-    (lambda: OURS(FRAMES.double(), T_S + 1, STATE), "keep their size"),
-    (lambda: OURS(FRAMES, T_S, 3), "the state must be .* got an int"),
-    (lambda: OURS(FRAMES, T_S, theta_scale=torch.ones(3)), "theta_scale"),
-    (lambda: events.SpikeEsim(theta_on=0.0), "theta_on"),
-    (lambda: events.SpikeEsim(width=2**40), "width must be"),
-    (lambda: events.SpikeEsim(comparator="soft"), "comparator"),
-    (lambda: events.SpikeEsim(refractory_s=1e-3, comparator="srm"), "dead time"),
-    (lambda: NETWORK(FRAMES * NAN), "NaN"),
-    (lambda: NETWORK(FRAMES[:, None].expand(-1, 3, -1, -1)), "channels=1"),
-    (lambda: NETWORK(FRAMES[:, :3], NETWORK(FRAMES)[2]), "keep their size"),
-    (lambda: NETWORK(FRAMES, 3), "must be .* got an int"),
-    (lambda: NETWORK.wake(torch.full((10, 4, 4), 3.0)), "silent"),
-    (lambda: events.van_rossum(COUNTS, COUNTS[..., :2], tau_s=1.0), "no distance"),
-    (lambda: events.van_rossum(COUNTS[:, 0, 0], COUNTS[:, 0, 0], tau_s=1.0), "ON first"),
-    (lambda: events.count_loss(COUNTS, COUNTS, side_px=5, steps=2), "do not fit"),
-]
 
 
-@pytest.mark.parametrize(("call", "words"), WRONG)
+TEXT = Path(__file__).with_name("refusals.txt").read_text()
+ROWS = [row.split(" | ", 1) for row in TEXT.splitlines() if " | " in row]
+
+
+@pytest.mark.parametrize(("call", "words"), ROWS, ids=[call[:60] for call, _ in ROWS])
 def test_one_wrong_value(call, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(CodesignError, match=words):
-        call()
+        eval(call, vars(figures) | globals())
     assert not list(tmp_path.iterdir())
 
 

@@ -24,7 +24,7 @@ from codesign.atomic import UNFINISHED
 ROOT = Path(__file__).resolve().parents[2]
 # whose state is kept between steps, in small sizes; without those that begin with a recording
 STUDIES = {
-    "lens_tolerance": "--trials 300",
+    "lens_tolerance": "--lens la1509 --half-field-deg 3 --trials 120",
     "make_dataset": "--trajectories 2 --frames 14 --size 24 --samples 2 --chunk 4 --rate-hz 90",
     "train_flow": "--steps 8 --save-every 1 --validate-every 4 --batch 2 --height-px 32 --width-px 32 "
     "--reuse 2 --validation-windows 2 --final-windows 2",

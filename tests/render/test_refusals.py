@@ -4,21 +4,22 @@ import contextlib
 import dataclasses
 import functools
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from codesign import backend, lens, render
+from codesign import backend, errors, lens, render
 from codesign.errors import BackendError, CodesignError, DomainError, FileFormatError, ShapeError
 from codesign.pose import as_poses, look_at, se3_exp
 from codesign.render import Camera, Film, MitsubaScene, MovingScene, TexturedPlane, light
 from codesign.render.charts import emissive_mesh
 from codesign.types import Rays
 from scenes import textures, worlds
+from tests.render import test_own_lens
 from tests.render.solids import area
-from tests.render.test_own_lens import Barrel
 
 D = torch.float64
 SQUARE = np.array([[-1.0, -1, 0], [1, -1, 0], [-1, 1, 0], [1, 1, 0]])
@@ -33,20 +34,6 @@ NARROW = Camera(lens.load("cooke-triplet").scaled(0.1), 32, 24, 0.1, 4)
 THIN = Camera(lens.ThinLens(10.0, 2.0).focus_at(1.0), 48, 40, 0.02, 256)
 SHEET = {"type": "rectangle"}
 GREY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
-# any argument may be given to these
-make: Any = Camera
-show: Any = render
-
-
-def refusals(*rows):
-    """A test of rows (call, kind of error, part of the sentence)."""
-
-    @pytest.mark.parametrize(("call", "kind", "sentence"), rows)
-    def test(call, kind, sentence):
-        with pytest.raises(kind, match=sentence):
-            call()
-
-    return test
 
 
 def mesh(vertices=SQUARE, faces=FACES, radiance: Any = (5.0, 5.0)):
@@ -99,56 +86,6 @@ def unlit():
 def loaded():
     """A scene of Mitsuba, not yet one of ours."""
     return backend.mitsuba().load_dict({"type": "scene", "wall": SHEET})
-
-
-test_scenes_that_cannot_be = refusals(
-    (
-        lambda: mesh(with_vertex(math.nan)),
-        DomainError,
-        r"1 of 4 vertices are NaN .*\(first number 3\)",
-    ),
-    (
-        lambda: mesh(faces=np.array([[0, 1, 4]]), radiance=[1.0]),
-        DomainError,
-        "but it has 4, counted from 0",
-    ),
-    (lambda: mesh(radiance=[1.0, 2.0, 3.0]), ShapeError, "3 values of radiance per face for 2"),
-    (placed_nowhere, DomainError, "shape 'ball': its place or size is NaN or infinite"),
-    (unpainted, DomainError, "'painted': the mesh has no attribute 'face_colour'"),
-    (unlit, DomainError, r"shape '(table|chair)', '(table|chair)' has no emitter"),
-    (lambda: MitsubaScene(loaded()), DomainError, "'wall' has no emitter"),
-    (
-        lambda: MitsubaScene({"a": {"type": "no-such"}}),
-        DomainError,
-        "Mitsuba cannot build the scene",
-    ),
-    (lambda: show.MitsubaScene("scene.xml"), DomainError, "got a str; .* worlds.from_mitsuba"),
-    (
-        lambda: worlds.wall(np.full((4, 4), math.nan)),
-        DomainError,
-        "texture of the scene: NaN or infinite",
-    ),
-    (lambda: moving(1.1 * STILL), DomainError, "object 'card': poses are not rigid"),
-    (lambda: moving(STILL[0]), ShapeError, "object 'card': poses must be"),
-    (
-        lambda: MovingScene(PLANE, {"a": (PLANE, STILL), "b": (PLANE, STILL[:2])}),
-        ShapeError,
-        r"\{'a': 3, 'b': 2\} poses",
-    ),
-    (lambda: moving(STILL, moving(STILL)), DomainError, "itself a moving scene"),
-    (
-        lambda: moving(STILL, Brighter({"ball": {"type": "cube", "emitter": area(1.0)}})),
-        DomainError,
-        "part 'card', a Brighter, does not say how far",
-    ),
-    (lambda: show.MovingScene(PLANE, {"a": PLANE}), DomainError, "objects are a dictionary"),
-    (lambda: TexturedPlane([[math.nan, 1]], [1.0], [0.0]), DomainError, "frequency_per_m"),
-    (
-        lambda: TexturedPlane([[1, 1], [1, 2]], [1.0], [0.0, 1.0]),
-        DomainError,
-        "2 frequencies, 1 amplitudes",
-    ),
-)
 
 
 def test_a_mesh_of_ones_own_is_looked_at_before_mitsuba_uses_it():
@@ -341,7 +278,7 @@ def test_what_is_no_scene(call, scene, sentence):
 
 
 def film(*windows):
-    return make(PINHOLE, 4, 4, 0.1, film=Film(10, 10, 4, 4, 0.1, windows))
+    return Camera(PINHOLE, 4, 4, 0.1, film=Film(10, 10, 4, 4, 0.1, windows))
 
 
 def too_many():
@@ -352,90 +289,6 @@ def too_many():
 def differences_to_an_object():
     asks = STILL.clone().requires_grad_(True)
     return render.frames(CAMERA, moving(asks), STILL, gradient="difference")
-
-
-test_cameras_and_frames_that_cannot_be = refusals(
-    (lambda: make(None, 8, 8, 0.1), DomainError, "a NoneType has no camera_rays"),
-    (lambda: make(lens.Pinhole, 8, 8, 0.1), DomainError, "so it is no lens"),
-    (lambda: film((0,)), DomainError, r"window \(0,\) is no pair"),
-    (lambda: film((8, 0)), DomainError, r"window \(8, 0\)"),
-    (film, DomainError, "no window"),
-    (
-        lambda: Camera(PINHOLE, 200_000, 200_000, 0.001),
-        DomainError,
-        r"6.4e\+11 rays per frame, at least 5.25e\+04 GiB; this machine has",
-    ),
-    (
-        lambda: show.frames(PINHOLE, PLANE, POSES),
-        DomainError,
-        "the camera must be a Camera, got a Pinhole",
-    ),
-    (
-        lambda: show.frames(CAMERA, PLANE, POSES, "exact"),
-        DomainError,
-        "gradient must be one of 'interior', 'boundary'",
-    ),
-    (
-        lambda: show.frames(CAMERA, PLANE, POSES, rays=3),
-        DomainError,
-        "the rays must be a Rays, got an int",
-    ),
-    (
-        lambda: show.frames(CAMERA, PLANE, POSES, rays=NARROW.rays()),
-        ShapeError,
-        "3072 rays for a camera of 24 pixels with 2 samples",
-    ),
-    (
-        lambda: show.frames(CAMERA, PLANE, POSES, "auto", rays=CAMERA.rays()),
-        DomainError,
-        "leave rays out",
-    ),
-    (
-        lambda: render.frames(Camera(Barrel(), 8, 8, 1.0, 1), PLANE, POSES, gradient="difference"),
-        DomainError,
-        "no step for the lens's parameter 'efl_mm_'",
-    ),
-    (differences_to_an_object, DomainError, "the pose of an object asks for one"),
-    (
-        lambda: render.frames(CAMERA, worlds.blank_room(), POSES, "boundary", per_px=math.nan),
-        DomainError,
-        "per_px must be ",
-    ),
-    (
-        lambda: show.shade(CAMERA.rays(), PLANE, POSES, 5),
-        ShapeError,
-        "48 rays are not a whole number",
-    ),
-    (too_many, DomainError, r"4294967296 rays .* \(frame_chunks\)"),
-    (
-        lambda: show.view(CAMERA, PLANE, POSES, 2),
-        DomainError,
-        "frame must be .* from -2 to 1, got 2",
-    ),
-    *(
-        (
-            lambda n=n: show.true_flow(CAMERA, PLANE, POSES, n),
-            DomainError,
-            "stride must be a whole number from 1",
-        )
-        for n in (0, 2, 1.5)
-    ),
-    (
-        lambda: show.project(CAMERA, torch.ones(3, 2)),
-        ShapeError,
-        r"points .* \[..., N, 3\], got \(3, 2\)",
-    ),
-    (
-        lambda: render.project(CAMERA, torch.tensor([[0.0, 0.0, -1.0]])),
-        DomainError,
-        "behind the camera",
-    ),
-    (
-        lambda: render.project(CAMERA, torch.full((1, 3), math.nan)),
-        DomainError,
-        "points to project",
-    ),
-)
 
 
 def test_more_frames_than_memory_holds_are_refused(monkeypatch):
@@ -463,24 +316,6 @@ def half_a_turn():
     return se3_exp(torch.tensor([[0.0] * 6, [0, 0, 0, 0, 3.1, 0]], dtype=D))
 
 
-test_times_that_cannot_be = refusals(
-    (jumping, DomainError, "jumps by"),
-    (
-        lambda: render.frame_chunks(CAMERA, moving(STILL), POSES, 1),
-        ShapeError,
-        "'card' has 3 poses for 2",
-    ),
-    (lambda: render.camera_velocity(STILL, [0.0, 1.0]), ShapeError, "one time per pose"),
-    (lambda: render.camera_velocity(STILL[:1], [0.0]), ShapeError, "at least two"),
-    (lambda: render.camera_velocity(STILL, [0.0, 1.0, 1.0]), DomainError, "must increase"),
-    (
-        lambda: render.camera_velocity(half_a_turn(), [0.0, 1.0]),
-        DomainError,
-        "turns by 178 degrees",
-    ),
-)
-
-
 # ---- light and point spread functions
 
 COPIES = {
@@ -500,29 +335,6 @@ def covered():
     return light.bake(
         {n: {**SHEET, "to_world": at, "bsdf": GREY} for n, at in sheets.items()}, samples=1
     )
-
-
-test_light_that_cannot_be = refusals(
-    (
-        lambda: baked(bsdf={"type": "conductor"}),
-        DomainError,
-        "shape 'a', a .*, lies behind it or before it",
-    ),
-    (
-        lambda: baked(bsdf={"type": "mask", "bsdf": GREY}),
-        DomainError,
-        "shape 'a', a .*, lies behind it",
-    ),
-    (lambda: baked(interior={"type": "homogeneous"}), DomainError, "shape 'a' holds a medium"),
-    (
-        lambda: light.bake(COPIES),
-        DomainError,
-        r"a Instance, has no texture chart here; .*copies instead",
-    ),
-    (covered, DomainError, "nothing of shape 'a' can be seen"),
-    (lambda: light.choose({}, CAMERA, POSES, 0.1), DomainError, "no level"),
-    (lambda: light.level_error(flat(1.0), flat(0.0), CAMERA, POSES), DomainError, "black"),
-)
 
 
 class Glow:
@@ -545,41 +357,6 @@ def psf():
     return render.psf_map(THIN, nearest_m=1.0)
 
 
-test_point_spread_functions_that_cannot_be = refusals(
-    (
-        lambda: psf().energy(torch.tensor([0.5])),
-        DomainError,
-        "between 0 and 1 per metre, .* smaller nearest_m",
-    ),
-    (
-        lambda: psf().energy(torch.tensor([2.0]), size_px=3),
-        DomainError,
-        "3 x 3 pixels .* odd number",
-    ),
-    (lambda: psf().energy(2.0), ShapeError, r"distances must be a list \[D\]"),
-    (
-        lambda: render.psf_frames(
-            THIN, PLANE, look_at((0, 0, 0.5), (0, 0, 0), down=(0, 1, 0))[None], psf()
-        ),
-        DomainError,
-        "0.5 m away, nearer than the 1 m of the map",
-    ),
-    (
-        lambda: render.psf_map(Camera(lens.ThinLens(10.0, 5.0), 48, 40, 0.02), nearest_m=0.02),
-        DomainError,
-        "blur reaches .* pixels .* larger nearest_m, or render traced",
-    ),
-    (lambda: render.psf_map(THIN, rays_per_px=9), DomainError, "rays_per_px = 9"),
-    (lambda: render.psf_map(hollow()), DomainError, "central obstruction, .* traced frames"),
-    (
-        lambda: render.psf_frames(CAMERA, PLANE, POSES, psf()),
-        ShapeError,
-        "make the map of this camera",
-    ),
-    (lambda: show.psf_frames(THIN, Glow(), POSES, psf()), DomainError, "does not say how far away"),
-)
-
-
 def test_light_that_is_traced_has_no_gradient():
     efl = torch.tensor(6.0, dtype=D, requires_grad=True)
     lamp = light.PathScene({"lamp": {"type": "cube", "emitter": area(1.0)}}, samples=1)
@@ -587,3 +364,13 @@ def test_light_that_is_traced_has_no_gradient():
     assert float(frames.detach().max()) > 0
     with pytest.raises(CodesignError, match="PathScene has no gradient"):
         frames.sum().backward()
+
+
+TEXT = Path(__file__).with_name("refusals.txt").read_text()
+ROWS = [row.split(" | ", 2) for row in TEXT.splitlines() if "Error | " in row]
+
+
+@pytest.mark.parametrize(("call", "kind", "sentence"), ROWS, ids=[call[:60] for call, *_ in ROWS])
+def test_what_cannot_be_gets_a_sentence(call, kind, sentence):
+    with pytest.raises(getattr(errors, kind), match=sentence):
+        eval(call, vars(test_own_lens) | globals())

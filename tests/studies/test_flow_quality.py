@@ -140,7 +140,7 @@ def test_quick_form(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--windows", "1"], "at least 2 are needed"),
+        (["--windows", "1"], "--windows is 1; at least 2 is needed"),
         (["--sets", "roads"], "--sets roads is unknown"),
         (["--models", "constant"], "affine is needed"),
         (

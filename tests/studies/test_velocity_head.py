@@ -89,7 +89,7 @@ def test_a_little_training_lowers_the_error_on_worlds_kept_from_it_and_what_it_s
     ("arguments", "sentence"),
     [
         (["--pair", "attic"], "choose from outdoors, corridor, flight"),
-        (["--worlds", "1"], "--worlds at least 2"),
+        (["--worlds", "1"], "--worlds is 1; at least 2"),
         (["--motions", "7"], "a design has 1 to 6 in a world"),
     ],
 )
