@@ -11,7 +11,7 @@ STUDIES := lens-opt lens-report lens-tolerance lens-bench dataset video-to-event
 	srm-bench sensor-fit train-flow flow-quality flow-recording \
 	placement codesign speed-error stability gradcheck
 
-.PHONY: help setup docs evidence test fuzz kill-test test-bits lint core-check try-all doctor clean $(STUDIES)
+.PHONY: help setup docs evidence test bench-check cuda-check fuzz kill-test test-bits lint core-check try-all doctor clean $(STUDIES)
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1|/p' Makefile | awk -F'|' '{printf "%-24s %s\n", $$1, $$2}'
@@ -65,6 +65,12 @@ evidence: setup ## the figures of README and docs whose code has changed, measur
 
 test: setup ## all tests, on all cores
 	@$(RUN) -m pytest -n auto --maxprocesses 8 --dist worksteal $(ARGS)
+
+bench-check: setup ## speed beside plain torch work, against the committed ratios (fails when 20 % worse)
+	@$(RUN) setup/bench.py check $(ARGS)
+
+cuda-check: setup ## on a GPU: its tests, speed, training in bfloat16; writes docs/speed_cuda.md
+	@$(RUN) setup/bench.py cuda $(ARGS)
 
 fuzz: setup ## mutants of every file format for hours: make fuzz ARGS="--minutes 120 --format .npz"
 	@$(RUN) -m tests.hostile fuzz $(ARGS)

@@ -55,6 +55,11 @@ def _without_extras(report, path):
     return report
 
 
+def pytest_runtest_setup(item):
+    if item.get_closest_marker("cuda") and not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_make_collect_report(collector):
     return _without_extras((yield), collector.path)

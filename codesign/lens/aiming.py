@@ -129,8 +129,8 @@ def aimed_rays(
     dtype = lens.dtype
     lens = in_float64(lens)
     f = lens.first_order(wavelength_um)
-    pupil = pupil.to(lens.dtype)
-    tangent = torch.tan(torch.as_tensor(field_rad, dtype=lens.dtype))
+    pupil = pupil.to(f.entrance_pupil_z_mm)
+    tangent = torch.tan(torch.as_tensor(field_rad, dtype=pupil.dtype, device=pupil.device))
 
     def rays(points, share):
         slope = torch.cat([0 * share, tangent * share, torch.ones_like(share)], 1)

@@ -172,7 +172,11 @@ class EgoVelocity:
         pixels, flow, precision, confidence = self._measured(field, camera, len(poses))
         frame, over = _middle(poses.shape[1], t_s, field.interval_s)
         middle = pixels + over * flow.detach()  # where the points are at that frame
-        mounts = T_body_cam.double().expand(*T_world_cam.shape[:-3], 4, 4).reshape(-1, 4, 4)
+        mounts = (
+            T_body_cam.to(poses.device, torch.float64)
+            .expand(*T_world_cam.shape[:-3], 4, 4)
+            .reshape(-1, 4, 4)
+        )
         known = depth or self.depth
         depth_m = known(camera, middle, poses[:, frame], scene)
         rows, on_surface = self._rows(camera, depth_m, mounts, middle, field.interval_s)

@@ -140,7 +140,8 @@ class VelocityErrors:
     def unit(self) -> Tensor:
         """[N, K]: the error that counts 1: 0.05 m/s plus a tenth of the speed, and 0.15 rad/s."""
         linear = (UNIT_M_S + UNIT_SHARE * self.speed_m_s)[:, None].expand(self.error.shape)
-        return torch.where(torch.tensor(self.axes) < LINEAR, linear, UNIT_RAD_S)
+        axes = torch.tensor(self.axes, device=linear.device)
+        return torch.where(axes < LINEAR, linear, UNIT_RAD_S)
 
     def squared(self) -> Tensor:
         """[N]: mean over the velocities of the squared error in units of ``unit``."""
@@ -162,7 +163,7 @@ class VelocityErrors:
                 f"rms_{unit}": float(size.square().mean().sqrt()),
                 f"bias_{unit}": float(column.mean()),
             }
-            levels = torch.tensor(PERCENTILES, dtype=size.dtype) / 100
+            levels = size.new_tensor(PERCENTILES) / 100
             for percent, value in zip(
                 PERCENTILES, torch.quantile(size, levels).tolist(), strict=True
             ):

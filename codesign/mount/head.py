@@ -145,7 +145,7 @@ def window_optics(camera: ChiefRayCamera, read: Readings) -> Tensor:
     seen = read.share.detach() > 0
     near = torch.where(seen, 1 / read.depth_m, 0.0).unflatten(1, (read.windows, -1))
     count = seen.unflatten(1, (read.windows, -1)).sum(2).clamp_min(1)
-    mounts = torch.eye(4, dtype=near.dtype).expand(len(near), 4, 4)
+    mounts = torch.eye(4).to(near).expand(len(near), 4, 4)
     return _lens(camera, read.windows, near.sum(2) / count, mounts)[..., 3:5]
 
 
@@ -168,7 +168,7 @@ def _lens(camera, windows, nearness, mounts):
 def _blur_px(camera, pixels, base, slope, base_step, slope_step, nearness):
     if not hasattr(camera, "rays_through"):
         return torch.zeros_like(nearness)
-    rim = RIM * torch.tensor([[1.0, 0.0], [-1, 0], [0, 1], [0, -1]], dtype=torch.float64)
+    rim = RIM * pixels.new_tensor([[1.0, 0.0], [-1, 0], [0, 1], [0, -1]])
     rays = camera.rays_through(pixels.repeat_interleave(4, 0), rim.repeat(len(pixels), 1))
     lit = (rays.weight.detach() > 0).double().reshape(-1, 4)
     along = torch.where(rays.weight.detach()[:, None] > 0, rays.direction, 1.0).double()

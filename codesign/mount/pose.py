@@ -135,7 +135,8 @@ class Mount(nn.Module):
             raise ShapeError(f"mount: poses are [..., 4, 4], got {tuple(T_body_cam.shape)}.")
         pose = check_finite(T_body_cam.detach().double(), "mount: T_body_cam")
         turn = self.start_attitude.mT @ pose[..., :3, :3]
-        vector = torch.from_numpy(Rotation.from_matrix(turn.reshape(-1, 3, 3).numpy()).as_rotvec())
+        turned = Rotation.from_matrix(turn.reshape(-1, 3, 3).cpu().numpy())
+        vector = torch.from_numpy(turned.as_rotvec()).to(pose.device)
         return (
             torch.cat([self._unbounded(pose[..., :3, 3]), vector.reshape(*pose.shape[:-2], 3)], -1)
             / self.unit

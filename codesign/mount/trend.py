@@ -124,7 +124,7 @@ class PrecisionTrend:
                 "the trend of precision has seen no readings; add some before it is followed."
             )
         weight = self._normal[0, 0].clamp_min(1)  # the number of points: the first term is 1
-        ridge = RIDGE * weight * torch.eye(len(self._normal), dtype=self._normal.dtype)
+        ridge = RIDGE * weight * torch.eye(len(self._normal)).to(self._normal)
         return torch.linalg.solve(self._normal + ridge, self._right)
 
 

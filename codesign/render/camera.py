@@ -4,6 +4,7 @@ import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any, Protocol
 
 import torch
@@ -85,7 +86,9 @@ class Camera:
             check_kind(film, Film, "camera: the film")
         self.samples_per_pixel = samples_per_pixel
         self.seed = check_seed(seed, "camera: seed")
-        self.film = (film or Film(width_px, height_px, width_px, height_px, pixel_pitch_mm)).check()
+        self._film = (
+            film or Film(width_px, height_px, width_px, height_px, pixel_pitch_mm)
+        ).check()
         check_memory(self.film, self.samples_per_pixel)
         self.spectrum = spectrum
         self.falloff = falloff
@@ -96,13 +99,18 @@ class Camera:
         vars(twin).update(changes)
         return twin
 
+    @property
+    def film(self) -> Film:
+        """Its pixels, with coordinates on the device of the lens."""
+        return replace(self._film, device=device_of(self.lens))
+
     def with_lens(self, lens: Lens) -> "Camera":
         """The same film and samples behind another lens."""
         return self._with(lens=lens)
 
     def with_film(self, film: Film) -> "Camera":
         """The same lens and samples before other pixels."""
-        return self._with(film=film.check())
+        return self._with(_film=film.check())
 
     def with_seed(self, seed: int) -> "Camera":
         """The same lens and film with other samples."""
@@ -142,10 +150,7 @@ class Camera:
         Raises: DomainError for a lens that does not say how it does."""
         light = rays.weight
         if self.spectrum is not None:
-            light = (
-                light
-                * torch.tensor([share for _, share in self.colours], dtype=light.dtype)[colour]
-            )
+            light = light * light.new_tensor([share for _, share in self.colours])[colour]
         if not self.falloff:
             return light
         if rays.irradiance is None:
@@ -163,7 +168,7 @@ class Camera:
         """
         every_px = max(1, math.ceil(max(self.film.width_px, self.film.height_px) / CHECKED_ACROSS))
         pixels = coarse_pixels(self.film, every_px)
-        _, pupil = film_pupil_pattern(CHECKED_RAYS, self.seed)
+        _, pupil = film_pupil_pattern(CHECKED_RAYS, self.seed, pixels.device)
         with torch.no_grad():
             rays = self.rays_through(
                 pixels.repeat_interleave(CHECKED_RAYS, 0), pupil.repeat(len(pixels), 1)
@@ -208,8 +213,8 @@ class Camera:
     def rays(self) -> Rays:
         """All rays of one frame, pixel after pixel, samples_per_pixel each: Rays with N = pixels x
         samples, in the lens's dtype. Gradient: to the lens."""
-        offset, pupil = film_pupil_pattern(self.samples_per_pixel, self.seed)
         pixels = self.film.pixels()
+        offset, pupil = film_pupil_pattern(self.samples_per_pixel, self.seed, pixels.device)
         points = pixels[:, None] + offset
         colours = len(self.colours)
         # samples of one colour stand side by side in every pixel, so no ray is looked up
@@ -255,8 +260,8 @@ class Camera:
     def slope_per_px(self) -> float:
         """Slope of a chief ray per pixel, near the axis; no gradient."""
         with torch.no_grad():
-            beside = torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64)
-            _, slope = lines(self.chief_rays(self.film.middle_px + beside))
+            middle = self.film.middle_px
+            _, slope = lines(self.chief_rays(middle + middle.new_tensor([[0.0, 0.0], [1.0, 0.0]])))
         return float(slope[1, 0] - slope[0, 0])
 
     def rays_through(
@@ -273,6 +278,12 @@ class Camera:
         through = torch.cat([pupil.new_zeros(1, 2), pupil])
         rays = self.lens.camera_rays(self.film_mm(at), through, aim=self.aim, **line)
         return _columns(lambda column: column[1:], rays)
+
+
+def device_of(lens: Any) -> torch.device:
+    """Where the tensors of a lens are; the processor for one of the user's own without any."""
+    tensors = chain(lens.parameters(), lens.buffers()) if isinstance(lens, torch.nn.Module) else ()
+    return next((tensor.device for tensor in tensors), torch.device("cpu"))
 
 
 def _columns(of, *rays):
@@ -327,7 +338,7 @@ def project(camera: Camera, points_cam_m: Tensor, pupil: Tensor | None = None) -
     )
     with torch.no_grad():
         straight = points_cam_m[:, :2] / points_cam_m[:, 2:] / camera.slope_per_px()
-        colour = torch.zeros(len(pupil), dtype=torch.long)
+        colour = torch.zeros_like(pupil[:, 0], dtype=torch.long)
         guess = camera.film.middle_px + straight
         apart_px = _STEP_MM / camera.film.pixel_pitch_mm
         one = camera.in_one_colour()
@@ -376,12 +387,12 @@ def images(
     towards the axis by ``shrink`` and tried again; 0 gives it up.
     """
     at = guess_px.clone()
-    m_per_px = torch.eye(2, dtype=at.dtype).repeat(len(at), 1, 1)
+    m_per_px = torch.eye(2, dtype=at.dtype, device=at.device).repeat(len(at), 1, 1)
     slope = torch.zeros_like(at)
     step_px = torch.full_like(at[:, 0], torch.inf)
     middle = camera.film.middle_px
-    shifts = apart_px * torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], dtype=at.dtype)
-    rows = torch.arange(len(at))
+    shifts = apart_px * at.new_tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    rows = torch.arange(len(at), device=at.device)
     for _ in range(_NEWTON_STEPS):
         film_px = (at[rows] + shifts[:, None]).reshape(-1, 2)
         rays = camera.coloured_rays(film_px, pupil[rows].repeat(3, 1), colour[rows].repeat(3))

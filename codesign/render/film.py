@@ -2,7 +2,8 @@
 all pixels, all frames and both sides of a difference share."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,7 +23,7 @@ class Film:
 
     windows_px: tuple of (left, top); each window has height_px rows and width_px columns. A pixel's
     coordinate is that of its centre: column 0 of the full sensor is x = 0, and the lens axis is at
-    the sensor's middle.
+    the sensor's middle. device: where its coordinates are; of ``Camera.film`` that of the lens.
     """
 
     sensor_width_px: int
@@ -31,6 +32,7 @@ class Film:
     height_px: int
     pixel_pitch_mm: float
     windows_px: tuple[tuple[int, int], ...] | None = None
+    device: Any = field(default="cpu", compare=False, repr=False)
 
     def check(self) -> "Film":
         """Raise DomainError unless there are pixels and every window lies on the sensor; returns
@@ -74,7 +76,10 @@ class Film:
     @property
     def sensor_px(self) -> Tensor:
         """Width and height of the sensor, [2] float64."""
-        return torch.tensor([self.sensor_width_px, self.sensor_height_px], dtype=torch.float64)
+        return self._tensor((self.sensor_width_px, self.sensor_height_px))
+
+    def _tensor(self, numbers):
+        return torch.tensor(numbers, dtype=torch.float64, device=self.device)
 
     @property
     def middle_px(self) -> Tensor:
@@ -93,20 +98,19 @@ class Film:
     def corners_px(self) -> Tensor:
         """First pixel (x, y) of every window, [W, 2] float64; that of the sensor without
         windows."""
-        return torch.tensor(self.windows_px or ((0, 0),), dtype=torch.float64)
+        return self._tensor(self.windows_px or ((0, 0),))
 
     def in_windows(self, rows: Tensor, columns: Tensor) -> Tensor:
         """Coordinates (x, y) of these rows and columns of every window, [W x rows x columns, 2], in
         image order."""
-        return (self.corners_px[:, None] + torch.cartesian_prod(rows, columns).flip(1)).reshape(
-            -1, 2
-        )
+        inside = torch.cartesian_prod(rows, columns).flip(1).to(self.device)
+        return (self.corners_px[:, None] + inside).reshape(-1, 2)
 
 
 def border_px(first_px: Tensor, size_px: Tensor, count: int) -> Tensor:
     """Coordinates [4 count, 2] along the border of a window of ``size_px`` [2] behind its
     ``first_px`` [2], half a pixel outside the outermost centres."""
-    share = torch.linspace(0, 1, count, dtype=torch.float64)
+    share = torch.linspace(0, 1, count, dtype=torch.float64, device=size_px.device)
     ends = [torch.full_like(share, end) for end in (0.0, 1.0)]
     sides = [torch.stack(pair, 1) for end in ends for pair in ((share, end), (end, share))]
     return first_px - 0.5 + torch.cat(sides) * size_px
@@ -129,16 +133,16 @@ def coarse_pixels(film: Film, every_px: int) -> Tensor:
     """Pixel coordinates [N, 2] on a grid over every window of the film, its last rows and columns
     included."""
     rows, columns = (
-        torch.linspace(0, n - 1, max(1, math.ceil((n - 1) / every_px)) + 1, dtype=torch.float64)
-        if n > 1
-        else torch.zeros(1, dtype=torch.float64)
+        torch.linspace(
+            0, n - 1, max(1, math.ceil((n - 1) / every_px)) + (n > 1), dtype=torch.float64
+        )
         for n in (film.height_px, film.width_px)
     )
     return film.in_windows(rows, columns)
 
 
-def film_pupil_pattern(samples, seed):
-    """Scrambled Sobol points over pixel x pupil.
+def film_pupil_pattern(samples, seed, device="cpu"):
+    """Scrambled Sobol points over pixel x pupil, the same on every device.
 
     Args: samples per pixel, seed.
     Returns: offset [samples, 2] in pixels, within [-1/2, 1/2); pupil [samples, 2] on the unit disc;
@@ -147,10 +151,10 @@ def film_pupil_pattern(samples, seed):
       pixel centre through the pupil centre.
     """
     if samples == 1:
-        return torch.zeros(1, 2, dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64)
-    points = torch.quasirandom.SobolEngine(4, scramble=True, seed=seed).draw(
-        samples, dtype=torch.float64
-    )
+        middle = torch.zeros(1, 2, dtype=torch.float64, device=device)
+        return middle, middle.clone()
+    points = torch.quasirandom.SobolEngine(4, scramble=True, seed=seed)
+    points = points.draw(samples, dtype=torch.float64).to(device)
     return points[:, :2] - 0.5, concentric_disc(points[:, 2:])
 
 

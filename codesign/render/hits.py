@@ -40,9 +40,9 @@ def first_hits(
     shape = (cameras.shape[1], *direction_cam.shape[-2:-1])
     origin_cam_m = origin_cam_m.double()
     direction_cam = direction_cam.double()
-    nearest = torch.full(shape, torch.inf, dtype=torch.float64)
-    local = normal = torch.zeros(*shape, 3, dtype=torch.float64)
-    part = torch.full(shape, -1)
+    nearest = direction_cam.new_full(shape, torch.inf)
+    local = normal = direction_cam.new_zeros(*shape, 3)
+    part = torch.full_like(nearest, -1, dtype=torch.long)
     for number, (surface, pose) in enumerate(
         zip(parts(scene), cameras.double()[:, :, None], strict=True)
     ):
@@ -77,7 +77,8 @@ def of_part(hits: Hits, transforms: Tensor) -> Tensor:
     [F, 1, 4, 4] where there is one part only."""
     if len(transforms) == 1:
         return transforms[0][:, None]
-    return transforms[hits.part.clamp_min(0), torch.arange(len(hits.part))[:, None]]
+    frame = torch.arange(len(hits.part), device=transforms.device)
+    return transforms[hits.part.clamp_min(0), frame[:, None]]
 
 
 def turned(transform: Tensor, vectors: Tensor) -> Tensor:

@@ -197,12 +197,12 @@ def views_of(scene: Any, T_world_cam: Poses, rays: Rays | None = None) -> Views:
     check_poses(T_world_cam)
     batch = tuple(T_world_cam.shape[:-2])
     cameras = T_world_cam.reshape(-1, 4, 4).double()
-    still = torch.eye(4, dtype=torch.float64).expand(len(cameras), 4, 4)
+    still = torch.eye(4, dtype=torch.float64, device=cameras.device).expand(len(cameras), 4, 4)
     if not isinstance(scene, MovingScene):
         return Views(scene, still[None], cameras[None], batch)
     scene = scene.in_one_row(batch)
-    objects = [poses.double() for poses in scene.T_world_object]
-    seen = [_product(inverse(poses.to(cameras.device)), cameras) for poses in objects]
+    objects = [poses.to(cameras) for poses in scene.T_world_object]
+    seen = [_product(inverse(poses), cameras) for poses in objects]
     return Views(scene, torch.stack([still, *objects]), torch.stack([cameras, *seen]), batch)
 
 

@@ -35,7 +35,7 @@ class ProjectionTable:
         self.camera = camera
         self.series = None
         film = camera.film
-        border = border_px(torch.zeros(2), film.sensor_px, 17)
+        border = border_px(torch.zeros_like(film.sensor_px), film.sensor_px, 17)
         rays = camera.chief_rays(torch.cat([border, film.middle_px[None]]))
         slope = lines(rays)[1].double()
         if not bool(slope.isfinite().all() & (rays.weight > 0).all()):
@@ -77,7 +77,7 @@ class ProjectionTable:
                 torch.full_like(straight, torch.nan),
                 torch.zeros_like(straight),
                 straight.clone(),
-                torch.zeros(len(straight), dtype=torch.bool),
+                torch.zeros_like(straight[:, 0], dtype=torch.bool),
             )
         slope = straight
         base = torch.zeros_like(straight)
@@ -105,7 +105,8 @@ class ProjectionTable:
         """Coefficients [degree + 1, degree + 1, 4] of pixel and base; None when a node lies outside
         the lens's field."""
         count = degree + 1
-        nodes = torch.cos(torch.pi * (torch.arange(count, dtype=torch.float64) + 0.5) / count)
+        k = torch.arange(count, dtype=torch.float64, device=self.middle.device)
+        nodes = torch.cos(torch.pi * (k + 0.5) / count)
         x, y = torch.meshgrid(nodes, nodes, indexing="ij")
         slope = self.middle + self.half * torch.stack([x.reshape(-1), y.reshape(-1)], 1)
         pixels = project(self.camera, torch.cat([slope, torch.ones_like(slope[:, :1])], 1) * FAR_M)
@@ -121,11 +122,11 @@ class ProjectionTable:
     def _error_px(self):
         """Largest error against traced rays, at points of a spiral over the table and three
         depths."""
-        k = torch.arange(96, dtype=torch.float64)
+        k = torch.arange(96, dtype=torch.float64, device=self.middle.device)
         radius = ((k + 0.5) / 96).sqrt() * 1.3
         angle = k * 2.399963
         at = (radius[:, None] * torch.stack([angle.cos(), angle.sin()], 1)).clamp(-0.98, 0.98)
-        depth = torch.tensor([0.3, 1.5, 20.0], dtype=torch.float64).repeat(32)[:, None]
+        depth = k.new_tensor([0.3, 1.5, 20.0]).repeat(32)[:, None]
         points = torch.cat([self.middle + self.half * at, torch.ones_like(depth)], 1) * depth
         pixels, _, _, inside = self._from_series(points)
         truth = project(self.camera, points)
@@ -135,7 +136,7 @@ class ProjectionTable:
 
 def _chebyshev(at, count):
     """T_0 .. T_(count - 1) at values [D, N] in [-1, 1]: [D, count, N]."""
-    terms = torch.ones(at.shape[0], count, at.shape[1], dtype=at.dtype)
+    terms = at.new_ones(at.shape[0], count, at.shape[1])
     terms[:, 1] = at
     for k in range(2, count):
         torch.sub(2 * at * terms[:, k - 1], terms[:, k - 2], out=terms[:, k])

@@ -175,7 +175,7 @@ def _transfer(psf, per_m, like, size):
     map."""
     key = (per_m, like.dtype, torch.is_grad_enabled())
     if key not in psf.transfers:
-        weights = psf.weights(torch.tensor([per_m], dtype=like.dtype))[0].flatten(1, 2)
+        weights = psf.weights(like.new_tensor([per_m]))[0].flatten(1, 2)
         psf.transfers[key] = torch.fft.rfft2(weights.unflatten(0, psf.grid).movedim(3, 0), s=size)
     return psf.transfers[key]
 

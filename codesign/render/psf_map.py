@@ -117,7 +117,8 @@ class PsfMap:
         Raises: DomainError for distances nearer than ``nearest_m``, or a size that does not hold
           the blur.
         """
-        offsets_px = self.offsets_px(1 / torch.as_tensor(distance_m, dtype=torch.float64))
+        distance_m = torch.as_tensor(distance_m, dtype=torch.float64, device=self.base_m.device)
+        offsets_px = self.offsets_px(1 / distance_m)
         needed = 2 * (self.radius_px - TAIL_PX) + 3
         size = needed if size_px is None else size_px
         if not size >= needed or size % 2 != 1:
@@ -140,7 +141,8 @@ class PsfMap:
         """
         dtype = per_m.dtype
         share = self.share.to(dtype)
-        spacings = torch.arange(-SIDE * self.radius_px, SIDE * (self.radius_px + 1), dtype=dtype)
+        reach = SIDE * self.radius_px
+        spacings = torch.arange(-reach, reach + SIDE, dtype=dtype, device=share.device)
         gathered = -SIDE * self._offsets_px(per_m).to(dtype)
         far = gathered[..., None] - (spacings - (SIDE - 1) / 2)
         spline = _quartic if self.fine == 1 else _cubic
@@ -242,9 +244,7 @@ def _nodes(camera, cell_px):
 
 def _around(nodes):
     """Every node and its neighbours in +x, -x, +y, -y: [5 N, 2] px."""
-    steps = torch.tensor(
-        [[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=nodes.dtype
-    )
+    steps = nodes.new_tensor([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     return (nodes[:, None] + APART_PX * steps).reshape(-1, 2)
 
 
@@ -253,9 +253,10 @@ def _through_pupil(camera, places, across):
     colour after
     colour: at the entrance pupil's plane and slopes [P, M, 2], and their light [P, M], 1 in all
       where nothing stops it."""
-    line = (torch.arange(across, dtype=torch.float64) + 0.5) / across
+    line = (torch.arange(across, dtype=torch.float64, device=places.device) + 0.5) / across
     pupil = concentric_disc(torch.cartesian_prod(line, line)).repeat(len(camera.colours), 1)
-    colour = torch.arange(len(camera.colours)).repeat_interleave(across**2).repeat(len(places))
+    colour = torch.arange(len(camera.colours), device=places.device)
+    colour = colour.repeat_interleave(across**2).repeat(len(places))
     rays = camera.coloured_rays(
         places.repeat_interleave(len(pupil), 0), pupil.repeat(len(places), 1), colour
     )
@@ -324,7 +325,8 @@ def _places(film, margin, fine):
     inside = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5).reshape(SIDE, fine)
     y, x = torch.broadcast_tensors(inside[:, None, :, None], inside[None, :, None, :])
     at = film.in_windows(*around)
-    return (at[:, None] + torch.stack([x.reshape(-1), y.reshape(-1)], 1)).reshape(-1, 2)
+    part = torch.stack([x.reshape(-1), y.reshape(-1)], 1).to(at)
+    return (at[:, None] + part).reshape(-1, 2)
 
 
 def _shared(at, share):

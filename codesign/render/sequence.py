@@ -18,7 +18,7 @@ from codesign.checks import check_choice, check_kind, check_positive
 from codesign.errors import DomainError
 from codesign.pose import Poses, inverse, se3_exp
 from codesign.render.aperture_edges import aperture_edge_term
-from codesign.render.camera import Camera
+from codesign.render.camera import Camera, device_of
 from codesign.render.moving import MovingScene, Scene, Views, scenes_and_poses, views_of
 from codesign.render.silhouettes.boundary import boundary_term, radiance_jumps
 from codesign.render.silhouettes.occlusion_check import reach_m
@@ -98,6 +98,11 @@ def frames(
         )
     rays = camera.given(rays)
     views = views_of(scene, T_world_cam, rays)
+    if gradient in ("boundary", "auto") and device_of(camera.lens).type != "cpu":
+        raise DomainError(
+            f"gradient {gradient!r}: silhouettes are found on the processor only; move lens, poses and scene "
+            "there, or choose 'interior' or 'difference'."
+        )
     if gradient == "auto":
         gradient = cheapest(camera, views)
     if gradient == "difference":
@@ -175,7 +180,7 @@ def _pose_numbers(rays, camera, views):
         return
     twist = _twist(views.T_world_cam).reshape(*views.batch, *[1] * len(camera.film.shape), 6)
     for k, size in enumerate(pose_steps(camera, views)):
-        way = torch.eye(6, dtype=torch.float64)[k : k + 1]
+        way = torch.eye(6, dtype=torch.float64, device=twist.device)[k : k + 1]
 
         def at(change, way=way):
             return image(

@@ -94,7 +94,7 @@ def view(camera: Camera, scene: Scene | MovingScene, T_world_cam: Poses, frame: 
     views = views_of(scene, T_world_cam, rays)
     *batch, count = views.batch
     check_whole(frame, "view: frame", -count, count - 1)
-    rows = torch.arange(frame % count, views.cameras.shape[1], count)
+    rows = torch.arange(frame % count, views.cameras.shape[1], count, device=views.cameras.device)
     hits = hits_of(rays, views.scene, views.cameras[:, rows])
     valid = hits.part >= 0
     T_world_part = views.T_world_part[:, rows]
@@ -201,8 +201,8 @@ def truth_of_frames(
         valid = found.valid
         hidden = _hidden(camera, scene, later, found)
     else:
-        flow = torch.zeros(0, dtype=torch.float64)
-        valid = hidden = torch.zeros(0, dtype=torch.bool)
+        flow = cameras.new_zeros(0)
+        valid = hidden = torch.zeros_like(flow, dtype=torch.bool)
     return FramesTruth(
         flow.reshape(pairs, 2, *shape),
         valid.reshape(pairs, *shape),
@@ -279,7 +279,7 @@ def later_points(rays: Rays, scene: Any, T_world_cam: Poses) -> tuple[Tensor, Te
     """
     views = views_of(scene, T_world_cam, rays)
     cameras, length = views.cameras, views.batch[-1]
-    first = torch.arange(0, cameras.shape[1], length)
+    first = torch.arange(0, cameras.shape[1], length, device=cameras.device)
     return _before(hits_of(rays, views.scene, cameras[:, first]), cameras[:, first + length - 1])
 
 
@@ -288,9 +288,7 @@ def _before(hits, later):
     before them."""
     points = carried(hits, inverse(later))
     in_front = (hits.part >= 0) & (points.detach()[..., 2] > NEAREST_M)
-    return torch.where(
-        in_front[..., None], points, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    ), in_front
+    return torch.where(in_front[..., None], points, points.new_tensor([0.0, 0.0, 1.0])), in_front
 
 
 @torch.no_grad()
@@ -333,7 +331,8 @@ def _flow_truth(camera, scene, T_world_cam, stride, occlusion):
     scene, cameras = views.scene, views.cameras
     *batch, length = views.batch
     check_whole(stride, "stride", 1, length - 1, "true flow over a stride needs more poses than it")
-    starts = torch.arange(cameras.shape[1]).reshape(-1, length)[:, : length - stride].reshape(-1)
+    starts = torch.arange(cameras.shape[1], device=cameras.device).reshape(-1, length)
+    starts = starts[:, : length - stride].reshape(-1)
     flows = []
     for some in starts.split(max(1, TOGETHER // len(pixels))):
         later = cameras[:, some + stride]

@@ -109,7 +109,8 @@ def look(
         arr, parts(scene), [[arr.Array3(v) for v in pair] for pair in rays]
     )
     dr.eval(light, distance)
-    light, distance = (torch.as_tensor(arr.Float(v).numpy()).double() for v in (light, distance))
+    found = (torch.as_tensor(arr.Float(v).numpy()) for v in (light, distance))
+    light, distance = (v.to(origin.device, torch.float64) for v in found)
     return light, distance
 
 

@@ -204,7 +204,7 @@ class MitsubaScene:
         shapes."""
         if self._bodies is None:
             self._bodies = Bodies.of(self._read())
-        return self._bodies.nearest_m(eye_m.detach().numpy())
+        return self._bodies.nearest_m(eye_m.detach().cpu().numpy())
 
     @exclusive
     def _read(self):
@@ -218,8 +218,9 @@ class MitsubaScene:
 
         mi = self.mi
         if origin_m.shape[0] == 0:  # a cast of no rays would end the process
-            return origin_m.detach(), origin_m.detach(), torch.zeros(0, dtype=torch.bool)
-        o, d = (part.detach().float().cpu().unbind(1) for part in (origin_m, direction))
+            nothing = origin_m.detach()
+            return nothing, nothing, torch.zeros_like(nothing[:, 0], dtype=torch.bool)
+        o, d = (part.detach().float().unbind(1) for part in (origin_m, direction))
         ray = mi.Ray3f(
             mi.Point3f(*[backend.load(mi.Float, v) for v in o]),
             mi.Vector3f(*[backend.load(mi.Float, v) for v in d]),
@@ -227,9 +228,10 @@ class MitsubaScene:
         found = self.scene.ray_intersect_preliminary(ray, coherent=True, active=self._ahead(ray))
         n = self._normal(ray, found)
         dr.eval(found.t, n)
-        valid = torch.as_tensor(found.is_valid().numpy()).reshape(-1)
-        t = torch.as_tensor(found.t.numpy()).double()
-        normal = torch.as_tensor(n.numpy()).double()
+        valid, t, normal = (
+            torch.as_tensor(v.numpy()).to(origin_m.device) for v in (found.is_valid(), found.t, n)
+        )
+        valid, t, normal = valid.reshape(-1), t.double(), normal.double()
         t = torch.where(valid, t, torch.ones_like(t))
         return origin_m.detach() + direction.detach() * t[:, None], normal.T, valid
 

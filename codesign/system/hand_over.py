@@ -67,7 +67,11 @@ def save_hand_over(path: str | Path, handed: HandOver) -> None:
     page["urdf_origin"] = {"xyz_m": pose[:3, 3].tolist(), "rpy_rad": [roll, pitch, yaw]}
     page["lens"] = _lens_page(camera.lens, path)
     page["camera"] = {
-        **{name: value for name, value in asdict(camera.film).items() if value is not None},
+        **{
+            name: value
+            for name, value in asdict(camera.film).items()
+            if value is not None and name != "device"
+        },
         **{name: getattr(camera, name) for name in ("samples_per_pixel", "seed", "falloff", "aim")},
     }
     if camera.spectrum is not None:
@@ -124,7 +128,7 @@ def _check_frame(name):
 
 def _transform(pose, handed):
     # x, y, z, w >= 0
-    quaternion = Rotation.from_matrix(pose[:3, :3].numpy()).as_quat(canonical=True)
+    quaternion = Rotation.from_matrix(pose[:3, :3].cpu().numpy()).as_quat(canonical=True)
     return {
         "parent_frame": handed.parent_frame,
         "child_frame": handed.child_frame,

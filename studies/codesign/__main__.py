@@ -112,8 +112,6 @@ class Config(StudyConfig):
 def study(run: Run[Config]) -> None:
     size = run.config
     checked(size)
-    if run.device.type != "cpu":
-        run.say("This study computes on the CPU; the device asked for stays unused.")
     family = None if size.family == THIN else size.family
     pair = str(size.robot) if size.robot else size.pair
     told = ("light", "speed", "worlds", "per_draw", "steps", "settling")

@@ -26,6 +26,8 @@ class StudyConfig:
     """What --quick sets those options to that were not given."""
     ANEW: ClassVar[tuple[str, ...]] = ()
     """Options that may change when a run is resumed: how it computes, not what."""
+    GPU: ClassVar[bool] = False
+    """Whether it computes on --device; what does not refuses another than the processor."""
 
     quick: bool = False
     """Smaller and shorter: shows that everything works, not the best result. Options given beside
@@ -36,7 +38,7 @@ class StudyConfig:
     seed: int = 0
     """Seed of everything random in the run."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to compute; auto takes CUDA when there is one."""
+    """Where to compute; auto takes CUDA where there is one and the study can use it."""
     resume: Path | None = None
     """Folder of an interrupted run of this study, to go on with its own configuration."""
 

@@ -294,8 +294,8 @@ def open_run(
         )
         _hold(config.resume, held)
         remove_unfinished(config.resume)
-        return Run(study, stored, config.resume, _device(stored.device), True, interruption)
-    device = _device(config.device)
+        return Run(study, stored, config.resume, _device(stored), True, interruption)
+    device = _device(config)
     # the same device when the run is resumed
     config = dataclasses.replace(config, device=device.type)
     text = to_json(study, config)
@@ -375,9 +375,12 @@ def _name(kind):
     return path.parent.name if shared else path.stem
 
 
-def _device(wanted):
+def _device(config):
+    wanted = config.device
+    if wanted == "cuda" and not config.GPU:
+        raise DomainError("this study computes on the processor; leave --device out.")
     if wanted == "auto":
-        wanted = "cuda" if torch.cuda.is_available() else "cpu"
+        wanted = "cuda" if config.GPU and torch.cuda.is_available() else "cpu"
     if wanted == "cuda":
         backend.check_version("cuda")
     return torch.device(wanted)

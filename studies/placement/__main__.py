@@ -73,8 +73,6 @@ def study(run: Run[Config]) -> None:
     size = run.config
     checked(size)
     available(size.searches)
-    if run.device.type != "cpu":
-        run.say("This study computes on the CPU; the device asked for stays unused.")
     pair = own_pair(size.robot) if size.robot else PAIRS[size.pair]()
     if size.robot:
         run.say(size_in_words(pair))

@@ -52,6 +52,7 @@ CAPTION = (
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    GPU: ClassVar = True
     QUICK: ClassVar = {
         "frames": 60,
         "steps": 8,

@@ -28,6 +28,7 @@ from studies.train_flow.watch import Watch
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    GPU: ClassVar = True
     QUICK: ClassVar = {
         "steps": 12,
         "batch": 2,

@@ -6,7 +6,7 @@ import re
 import typing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 
@@ -25,6 +25,7 @@ POSITIVE = (
 
 @dataclass(frozen=True)
 class Options(StudyConfig):
+    GPU: ClassVar = True
     """Options that do not belong to the sensor."""
 
     input: Path | None = None

@@ -212,7 +212,7 @@ def test_a_comparator_of_ones_own_fits():
 
 
 @pytest.mark.parametrize("name", LAYERS)
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.cuda
 def test_a_cuda_device_gives_the_same(name):
     frames, t_s = drifting(12, 10, frames=9)
     results = []

@@ -223,7 +223,7 @@ def test_a_second_derivative_is_refused(generator):
             torch.autograd.grad(first.sum(), flow)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.cuda
 def test_a_gpu_gives_what_the_processor_gives(generator):
     grid, cell, *given = drawn((2, 4, 33, 40, 1, 8), generator)
     found = everything(nullcontext, grid, cell, *(x.cuda() for x in given))

@@ -208,6 +208,9 @@ def test_wrong_options_exit_with_two_and_help_explains_them(command, capsys, mon
         assert option in shown
     said = "error: option --limit is inf; give a finite number, or leave the option out.\n"
     assert command("--limit", "inf") == (2, said)
+    said = "error: this study computes on the processor; leave --device out.\n"
+    assert command("--device", "cuda") == (2, said)
+    monkeypatch.setattr(Config, "GPU", True)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     code, complaint = command("--device", "cuda")
     assert code == 2

@@ -120,12 +120,8 @@ class SpikeEsim(nn.Module):
 
     def thetas(self) -> Tensor:
         """Thresholds ON and OFF as they are now: [2] float64, natural log units."""
-        return (
-            torch.tensor(
-                (self.settings["theta_on"], self.settings["theta_off"]), dtype=torch.float64
-            )
-            * self.log_gain.exp()
-        )
+        given = self.settings["theta_on"], self.settings["theta_off"]
+        return self.log_gain.new_tensor(given) * self.log_gain.exp()
 
     def refractory_s(self) -> Tensor | None:
         """Dead time as it is now, 0-dim tensor, or None when there is none."""

@@ -115,7 +115,7 @@ def traced_depth_of_field(
 
     @functools.cache
     def rms(vergence):
-        at_m = 1e-3 / torch.tensor(vergence, dtype=lens.dtype)
+        at_m = 1e-3 / per_vergence.new_tensor(vergence, dtype=lens.dtype)
         return float(rms_spot_mm(lens, [0.0], wavelength_um, grid, at_m))
 
     while True:  # aberrations, or a plate, may move the sharpest place far from the paraxial one

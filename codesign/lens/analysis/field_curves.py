@@ -283,7 +283,7 @@ def relative_illumination(lens: GeoLens, fields_rad: Sequence[float], grid: int 
     """
     dtype = lens.dtype
     lens = in_float64(lens)
-    pupil = pupil_grid(grid)
+    pupil = pupil_grid(grid, device=lens.curvature_per_mm.device)
     fields = [0.0, *map(float, fields_rad)]
     heights = torch.stack([_image_height(lens, field) for field in fields])
     film = torch.stack([torch.zeros_like(heights), heights], 1).repeat_interleave(pupil.shape[0], 0)

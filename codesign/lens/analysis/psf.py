@@ -105,7 +105,7 @@ def psf_on_pixels(
             )
         amplitude = pupil.amplitude(at)
         total = total + share * pixel_mm**2 * (amplitude.real.square() + amplitude.imag.square())
-    return Psf(total, torch.full((2,), pixel_mm, dtype=lens.dtype), reference)
+    return Psf(total, reference.new_full((2,), pixel_mm, dtype=lens.dtype), reference)
 
 
 def geometric_psf(
@@ -141,9 +141,8 @@ def geometric_psf(
         on = ((at >= 0) & (at < pixels)).all(1)
         pixel = at[:, 1] * pixels + at[:, 0]
         energy = energy.index_add(0, pixel[on], (weight * parts[0] * parts[1])[on])
-    return Psf(
-        energy.reshape(pixels, pixels), torch.full((2,), pixel_mm, dtype=lens.dtype), reference
-    )
+    pitch_mm = reference.new_full((2,), pixel_mm, dtype=lens.dtype)
+    return Psf(energy.reshape(pixels, pixels), pitch_mm, reference)
 
 
 def _pixels(pixel_mm, pixels):

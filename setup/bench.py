@@ -1,0 +1,380 @@
+"""Speed of what the project lives by, in two commands.
+
+    make bench-check                  times over those of plain torch work in the same run, against docs/bench.json
+    make bench-check ARGS=--write     measures anew and writes docs/bench.json
+    make cuda-check                   on a GPU: its tests, the same work there, training in bfloat16, two GPUs;
+                                      writes docs/speed_cuda.md; without one it says what is missing
+    make cuda-check ARGS="--device cpu --quick"    the same path on the processor: does the command work?
+
+A ratio is a median over rounds in which the work and its yardstick take turns, so that what else the
+machine does meets both; a yardstick is a copy of memory (what is near the limit of memory) or a
+convolution (what is near that of arithmetic).
+"""
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import drjit  # noqa: E402
+import torch  # noqa: E402
+
+from codesign import doctor, events, flow, lens, mount, pose, render  # noqa: E402
+from codesign.errors import CodesignError  # noqa: E402
+from codesign.system import Batch, System  # noqa: E402
+from codesign.train.batches import to_device  # noqa: E402
+from codesign.train.learner import Learner  # noqa: E402
+from codesign.types import EventVolume, FlowField, FlowWindows  # noqa: E402
+from scenes import textures, trajectories, worlds  # noqa: E402
+from studies.frame import machine  # noqa: E402
+
+KEPT = ROOT / "docs" / "bench.json"
+PAGE = ROOT / "docs" / "speed_cuda.md"
+WORSE = 1.2  # of the committed ratio fails
+TESTS = ("tests/test_devices.py", "tests/events/test_layers.py", "tests/flow/test_lk_kernels.py")
+SURFACES = 11  # of the double Gauss
+STEP = "robot step, 12 drives"
+
+
+@dataclass(frozen=True)
+class Work:
+    """call: one go. amount: how much of ``unit`` it does, in millions. beside: its yardstick.
+    least: what is asked of an H100-class GPU, millions of the unit a second."""
+
+    call: Callable[[], Any]
+    amount: float
+    unit: str
+    beside: str = "copy"
+    least: float | None = None
+
+
+def slopes(function: Callable[[], torch.Tensor], *leaves: torch.Tensor) -> Callable[[], Any]:
+    """A pass with gradients to the leaves."""
+    return lambda: torch.autograd.grad(function().square().mean(), leaves, allow_unused=True)
+
+
+def yardsticks(device: torch.device) -> dict[str, Callable[[], Any]]:
+    """A copy of 32 MiB; a convolution of 0.6 billion multiplications."""
+    memory = torch.ones(2**23, device=device)
+    image = torch.ones(1, 32, 256, 256, device=device)
+    taps = torch.ones(32, 32, 3, 3, device=device)
+    return {"copy": memory.clone, "convolution": lambda: torch.conv2d(image, taps, padding=1)}
+
+
+def works(device: torch.device, small: bool) -> dict[str, Work]:
+    """What is timed, by name."""
+    share = 16 if small else 1
+    return {**_of_lens(device, share), **_of_events(device, small), **_of_flow(device, small)}
+
+
+def _of_lens(device, share):
+    count = 2**20 // share
+    geo = lens.load("double-gauss", torch.float32).to(device)
+    curves = geo.curvature_per_mm
+    at = torch.rand(count, 2, device=device) - 0.5
+    origin = torch.cat([10 * at, torch.full_like(at[:, :1], -20.0)], 1)
+    ahead = torch.cat([0.1 * at.flip(1), torch.ones_like(at[:, :1])], 1)
+    ahead = ahead / ahead.norm(dim=1, keepdim=True)
+
+    def trace():
+        return geo.trace(origin, ahead).position_mm
+
+    @torch.no_grad()
+    def forward():
+        return trace()
+
+    rays = SURFACES * count / 1e6
+    return {
+        "tracing": Work(forward, rays, "ray-surfaces", least=20_000),
+        "tracing with gradient": Work(slopes(trace, curves), rays, "ray-surfaces"),
+    }
+
+
+def _of_events(device, small):
+    height, width, count = (65, 87, 20) if small else (260, 346, 100)
+    x = torch.linspace(0, 40, width, device=device)
+    y = torch.linspace(0, 30, height, device=device)[:, None]
+    t = torch.arange(count, device=device)[:, None, None] * 0.02
+    frames = 120 + 80 * torch.sin(x + t) * torch.cos(y + 0.5 * t)
+    t_s = torch.arange(count, dtype=torch.float64) * 1e-3
+    leaf = frames.clone().requires_grad_()
+    pixels = frames.numel() / 1e6
+
+    def layer(name):
+        made = events.layer(name, events.SensorModel(0.2, 0.2)).to(device)
+        return slopes(lambda: made(leaf, t_s), leaf)
+
+    return {
+        "hard events": Work(
+            lambda: events.simulate(frames, t_s, events.SensorModel()), pixels, "pixels", least=5000
+        ),
+        "memory layer with gradient": Work(layer("memory"), pixels, "pixels"),
+        "sigmoid with gradient": Work(layer("sigmoid"), pixels, "pixels"),
+    }
+
+
+def _of_flow(device, small):
+    side = 64 if small else 256
+    volume = _volume(1, side, device)
+    counts = volume.counts.clone().requires_grad_()
+    learnt = flow.load("refiner").to(device).eval()
+    pixels = side**2 / 1e6
+
+    def estimated(estimate):
+        return lambda: estimate(replace(volume, counts=counts)).flow_px
+
+    def forward(estimate):
+        @torch.no_grad()
+        def call():
+            return estimate(volume).flow_px
+
+        return call
+
+    return {
+        "closed form": Work(forward(flow.estimate_lk), pixels, "pixels", "convolution"),
+        "closed form with gradient": Work(
+            slopes(estimated(flow.estimate_lk), counts), pixels, "pixels", "convolution"
+        ),
+        "refiner": Work(forward(learnt), pixels, "pixels", "convolution"),
+        STEP: Work(_robot_step(device, 2 if small else 12), 1e-6, "steps", "convolution", 1e-4),
+    }
+
+
+def _volume(batch: int, side: int, device: torch.device) -> EventVolume:
+    """8 bins of counts that drift by a pixel from bin to bin."""
+    generator = torch.Generator().manual_seed(0)
+    still = torch.poisson(torch.rand(batch, 2, side, side, generator=generator), generator)
+    counts = torch.stack([still.roll(k, -1) for k in range(8)], 2).to(device)
+    t_s = torch.linspace(0, 0.02, 9, dtype=torch.float64)
+    empty = events.from_counts(torch.zeros(8, 2, 1, 1), t_s, 8)
+    return replace(to_device(empty, device), counts=counts)
+
+
+def _robot_step(device, drives):
+    """Lens, mount and thresholds to the velocity of a body: nine windows of 32 x 32, eight rays a
+    pixel, nine frames, forward and backward."""
+    geo = lens.load("cooke-triplet", torch.float32).scaled(0.22).to(device)
+    windows = tuple((64 * i, 64 * j) for i in range(3) for j in range(3))
+    film = render.Film(160, 160, 32, 32, 0.02, windows)
+    place = mount.Mount((0.0, 0.0, 0.4), (0.1, 0.1, 0.1), pitch_rad=0.9).to(device)
+    system = System(
+        camera=render.Camera(geo, 160, 160, 0.02, 8, film=film),
+        mount=place,
+        events=events.layer("memory", events.SensorModel(0.2, 0.2)).to(device),
+        flow=flow.estimate_lk,
+        estimate=mount.EgoVelocity(),
+        scene=worlds.ground(textures.speckle(0, 512), 0.01, device=device.type),
+        objectives={"speed": lambda estimate: estimate.velocity.square().sum()},
+    )
+    t_s = torch.linspace(0, 0.02, 9, dtype=torch.float64)
+    start = pose.look_at((0, 0, 0), (1, 0, 0)) * 0 + torch.eye(4, dtype=torch.float64)
+    paths = [trajectories.translation(start, (0.3 + 0.1 * k, 0, 0), t_s) for k in range(drives)]
+    batch = Batch(torch.stack(paths).to(device), t_s)
+    geo.requires_grad_()
+
+    def step():
+        system.zero_grad()
+        system(batch).backward()
+
+    return step
+
+
+def seconds(call: Callable[[], Any], device: torch.device) -> float:
+    """By the clock on a GPU, of the processor elsewhere."""
+    if device.type == "cpu":
+        begun = time.process_time()
+        call()
+        return time.process_time() - begun
+    torch.cuda.synchronize()
+    begun = time.perf_counter()
+    call()
+    torch.cuda.synchronize()
+    return time.perf_counter() - begun
+
+
+def timed(device: torch.device, rounds: int, small: bool) -> dict[str, dict[str, Any]]:
+    """Of every work its median time, its ratio to its yardstick, and how the second go compares
+    with the tenth."""
+    beside = yardsticks(device)
+    found = {}
+    for name, work in works(device, small).items():
+        yard = beside[work.beside]
+        first = [seconds(work.call, device) for _ in range(10)]
+        pairs = [(seconds(work.call, device), seconds(yard, device)) for _ in range(rounds)]
+        time_s = statistics.median(own for own, _ in pairs)
+        found[name] = {
+            "ms": 1e3 * time_s,
+            "over_yardstick": statistics.median(own / other for own, other in pairs),
+            "yardstick": work.beside,
+            "million_per_s": work.amount / time_s,
+            "unit": work.unit,
+            "second_over_tenth": first[1] / first[9],
+            "asked_million_per_s": work.least,
+        }
+        print(f"{name}: {found[name]['ms']:.3g} ms", flush=True)
+    return found
+
+
+def worse(found: dict[str, dict[str, Any]], kept: dict[str, Any]) -> list[str]:
+    """Sentences on ratios that are more than WORSE of the committed ones, and on work that is not
+    there."""
+    said = [f"{name}: no longer measured" for name in kept if name not in found]
+    for name, row in found.items():
+        if name not in kept:
+            said.append(f"{name}: not in docs/bench.json; measure with --write")
+        elif row["over_yardstick"] > WORSE * kept[name]["over_yardstick"]:
+            said.append(
+                f"{name}: {row['over_yardstick']:.3g} times its {row['yardstick']}, "
+                f"{kept[name]['over_yardstick']:.3g} when committed"
+            )
+    return said
+
+
+def bench_check(options: argparse.Namespace) -> int:
+    torch.set_num_threads(1)
+    drjit.set_thread_count(1)  # two spin while they wait for each other
+    found = timed(torch.device("cpu"), options.rounds, options.quick)
+    if options.write:
+        KEPT.write_text(
+            json.dumps({"machine": machine.hardware(), "works": found}, indent=1) + "\n"
+        )
+        return 0
+    said = worse(found, json.loads(KEPT.read_text())["works"])
+    print("\n".join(said) or f"{len(found)} works within {WORSE:g} times their committed ratios")
+    return bool(said)
+
+
+def training(device: torch.device, small: bool) -> dict[str, dict[str, Any]]:
+    """A training step of the refiner, in float32 and, on a GPU, under bfloat16; and whether memory
+    stays level over ten robot steps."""
+    side, count = (32, 2) if small else (128, 8)
+    flow_px = torch.ones(count, 2, side, side)
+    truth = FlowField(flow_px, torch.ones(count, side, side, dtype=torch.bool), 0.02)
+    windows = FlowWindows(_volume(count, side, device), to_device(truth, device), None)
+    found = {}
+    for name, mixed in (("float32", False), ("bfloat16", True)):
+        if mixed and device.type == "cpu":
+            continue
+        network = flow.load("refiner").to(device)
+        learner = Learner(
+            network,
+            lambda told, batch: flow.losses.laplace_loss(told, batch.truth),
+            mixed_precision=mixed,
+        )
+        times = [seconds(partial(learner.step, windows), device) for _ in range(6)]
+        found[f"training step, {name}"] = {"ms": 1e3 * statistics.median(times[1:])}
+    if device.type == "cuda":
+        step = _robot_step(device, 2)
+        held = [(step(), torch.cuda.memory_allocated())[1] for _ in range(12)]
+        found["memory that ten robot steps keep"] = {"MB": (held[-1] - held[1]) / 1e6}
+    return found
+
+
+def commands(device: torch.device) -> dict[str, str]:
+    """What the marked tests, and two processes of a training run, answer."""
+    asked = {"tests": [sys.executable, "-m", "pytest", "-q", "-m", "cuda", *TESTS]}
+    if torch.cuda.device_count() > 1:
+        asked["two GPUs"] = [
+            *(sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2"),
+            *("-m", "studies.train_flow", "--quick", "--device", device.type),
+        ]
+    found = {}
+    for name, command in asked.items():
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+        last = (done.stdout.strip().splitlines() or done.stderr.strip().splitlines() or [""])[-1]
+        found[name] = last if done.returncode == 0 else f"FAILED ({done.returncode}): {last}"
+        print(f"{name}: {found[name]}", flush=True)
+    if len(asked) == 1:
+        found["two GPUs"] = f"not run: {torch.cuda.device_count()} here"
+    return found
+
+
+def page(result: dict[str, Any]) -> str:
+    """docs/speed_cuda.md of the JSON."""
+    rows = []
+    for name, row in result["works"].items():
+        asked = row.get("asked_million_per_s")
+        rate = f"{row['million_per_s']:,.4g}" if row["unit"] != "steps" else ""
+        wanted = f"{asked:,.4g}" if asked and row["unit"] != "steps" else ""
+        if name == STEP:
+            wanted = f"{1e-3 / asked:.3g} ms"
+        rows.append(
+            f"| {name} | {row['ms']:.3g} | {rate} {row['unit'] if rate else ''} | {wanted} |"
+        )
+    more = [
+        f"| {name} | {' '.join(f'{value:.3g} {unit}' for unit, value in row.items())} |"
+        for name, row in result["training"].items()
+    ]
+    said = [f"- {name}: {text}" for name, text in result["commands"].items()]
+    head = (
+        f"# Speed on {result['device']}\n\nWritten by `make cuda-check`; torch {torch.__version__}, commit "
+        f"{result['commit']}. Medians by the clock, the device waited for; float32.\n\n"
+    )
+    table = "| work | ms | millions a second | asked |\n|---|---|---|---|\n"
+    return (
+        head
+        + table
+        + "\n".join(rows)
+        + "\n\n| | |\n|---|---|\n"
+        + "\n".join(more)
+        + "\n\n"
+        + "\n".join(said)
+        + "\n"
+    )
+
+
+def cuda_check(options: argparse.Namespace) -> int:
+    device = torch.device(options.device)
+    if doctor.main(device.type):
+        return 2
+    result = {
+        "device": torch.cuda.get_device_name(0) if device.type == "cuda" else "the processor",
+        "commit": machine.versions()["commit"],
+        "commands": commands(device) if device.type == "cuda" else {},
+        "works": timed(device, options.rounds, options.quick),
+        "training": training(device, options.quick),
+    }
+    out = options.out or ROOT / "runs" / "cuda_check"
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "speed.json").write_text(json.dumps(result, indent=1) + "\n")
+    target = PAGE if device.type == "cuda" and not options.out else out / PAGE.name
+    target.write_text(page(result))
+    print(f"{out / 'speed.json'}\n{target}")
+    return any(text.startswith("FAILED") for text in result["commands"].values())
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    kinds = parser.add_subparsers(required=True)
+    for name, function in (("check", bench_check), ("cuda", cuda_check)):
+        kind = kinds.add_parser(name)
+        kind.set_defaults(function=function)
+        kind.add_argument("--rounds", type=int, default=11, help="turns of each work")
+        kind.add_argument("--quick", action="store_true", help="small work: does the command work?")
+        if function is bench_check:
+            kind.add_argument("--write", action="store_true", help="commit these ratios")
+        else:
+            kind.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
+            kind.add_argument("--out", type=Path, help="folder instead of runs/cuda_check and docs")
+    options = parser.parse_args(arguments)
+    try:
+        return int(options.function(options))
+    except CodesignError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,89 @@
+"""A second device without one: tensors that nobody placed stand on a host of their own, and what a
+GPU refuses to compute with them, or to hand to numpy, is refused here too.
+
+    with second_device():
+        run()      # inputs made before count as on the device; values are those of the processor
+"""
+
+from contextlib import contextmanager
+from unittest import mock
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils._pytree import tree_leaves, tree_map_only
+
+from codesign import backend
+
+MAKERS = (
+    *(torch.zeros, torch.ones, torch.empty, torch.full, torch.eye, torch.arange, torch.linspace),
+    *(torch.tensor, torch.as_tensor, torch.from_numpy, torch.rand, torch.randn, torch.randint),
+    *(torch.randperm, torch.logspace, torch.tril_indices, torch.triu_indices, torch.hann_window),
+    *(torch.empty_strided, torch.asarray, torch.frombuffer, torch.scalar_tensor, torch.normal),
+)
+MOVES = (Tensor.to, Tensor.type_as)
+# take a tensor of the host beside one of the device: indices, and copies from one to the other
+MIXES = (Tensor.__getitem__, Tensor.__setitem__, Tensor.copy_)
+THERE = torch.device("cpu", 0)  # no tensor of the processor says so by itself
+TO_NUMPY = (Tensor.numpy, Tensor.__array__)
+
+
+class MixedDevices(RuntimeError):
+    """What a GPU would refuse."""
+
+
+class Host(Tensor):
+    """A tensor that stands on the host."""
+
+
+class _Second(TorchFunctionMode):
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        kwargs = dict(kwargs or {})
+        given = tree_leaves((args, kwargs))
+        hosts = [x for x in given if isinstance(x, Host)]
+        there = [x for x in given if isinstance(x, Tensor) and not isinstance(x, Host)]
+        named = [x for x in given if isinstance(x, torch.device | str)]
+        named = [torch.device(x) for x in named if str(x).startswith("cpu")]
+        name = getattr(func, "__name__", str(func))
+        with torch._C.DisableTorchFunctionSubclass():
+            found = func(*args, **kwargs)
+        if func == Tensor.device.__get__:
+            return torch.device("cpu") if hosts else THERE
+        if func in TO_NUMPY and there:
+            raise MixedDevices(f"{name} of a tensor on the device; .cpu() comes first")
+        if func is Tensor.cpu:
+            on_host = True
+        elif named:
+            on_host = named[-1] != THERE
+        elif func in MOVES:  # to a dtype, or to where another is
+            on_host = isinstance(([x for x in args if isinstance(x, Tensor)])[-1], Host)
+        elif func in MAKERS:  # one that is handed a tensor makes another beside it
+            on_host = not (args and isinstance(args[0], Tensor) and there)
+        else:
+            if hosts and there and func not in MIXES and any(x.ndim for x in hosts):
+                shapes = [tuple(x.shape) for x in hosts]
+                raise MixedDevices(f"{name} of tensors of both devices, {shapes} on the host")
+            on_host = bool(hosts) and not there
+        kind = Host if on_host else Tensor
+        if isinstance(found, torch.Size):
+            return found
+        with torch._C.DisableTorchFunctionSubclass():
+            return tree_map_only(
+                Tensor,
+                lambda x: x if on_host == isinstance(x, Host) else x.as_subclass(kind),
+                found,
+            )
+
+
+@contextmanager
+def second_device():
+    """Everything made before counts as on the device."""
+    load = backend.load
+
+    def loaded(array, tensor):
+        if isinstance(tensor, Host):
+            raise MixedDevices(f"a kernel reads {tuple(tensor.shape)} from the host")
+        return load(array, tensor)
+
+    with mock.patch.object(backend, "load", loaded), _Second():
+        yield
