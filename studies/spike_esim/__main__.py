@@ -52,7 +52,6 @@ CAPTION = (
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
-    GPU: ClassVar = True
     QUICK: ClassVar = {
         "frames": 60,
         "steps": 8,
