@@ -25,6 +25,7 @@ class Lanes:
         self.dr = dr
         self.arr = arrays(like.device.type, like.dtype)
         self.width = width
+        self.device = like.device
         self.lane = dr.arange(self.arr.UInt32, width)
         self.pixels = dr.opaque(self.arr.UInt32, width)
 

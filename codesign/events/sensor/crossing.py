@@ -23,6 +23,7 @@ import torch
 from codesign.backend import load
 from codesign.events.intensity import light_share
 from codesign.events.low_pass import coefficients, passed
+from codesign.exclusive import exclusive
 
 # of a pixel in one interval: beyond it a unit is wrong, and single precision would soon stop
 # counting
@@ -126,8 +127,10 @@ class EventKeys:
         return int(self._count[0])
 
     def sorted(self):
-        """[N] int64 keys in order."""
-        return np.sort(self._keys.numpy()[: self.found]).view(np.int64)
+        """[N] int64 keys in order, in the memory of the sink."""
+        keys = self._keys.numpy()[: self.found]
+        keys.sort()
+        return keys.view(np.int64)
 
 
 @dataclass(frozen=True)
@@ -153,16 +156,29 @@ class KeyLayout:
             (pixel % self.width_px) << np.uint64(1)
         )
 
-    def columns(self, keys):
-        """t_us, x, y, p of int64 keys: int64 [N] each."""
-        x = (keys >> 1) & ((1 << self.x_bits) - 1)
-        y = (keys >> (self.x_bits + 1)) & ((1 << (self.pixel_bits - self.x_bits - 1)) - 1)
-        t_us = keys >> self.pixel_bits
-        t_us += self.origin_us
-        p = keys & 1
-        p *= 2
-        p -= 1
-        return tuple(torch.from_numpy(column) for column in (t_us, x, y, p))
+    @exclusive
+    def columns(self, lanes, keys):
+        """t_us, x, y, p of int64 keys: int64 [N] each, where the frames are."""
+        if not len(keys):
+            like = torch.zeros(0, dtype=torch.int64, device=lanes.device)
+            return tuple(like.clone() for _ in range(4))
+        dr = lanes.dr
+        Int = dr.int64_array_t(lanes.arr.Float)
+        keys = Int(keys)
+
+        def low(shift, bits):
+            return (keys >> shift) & ((1 << bits) - 1)
+
+        y_bits = self.pixel_bits - self.x_bits - 1
+        columns = (
+            (keys >> self.pixel_bits) + dr.opaque(Int, self.origin_us),
+            low(1, self.x_bits),
+            low(self.x_bits + 1, y_bits),
+            2 * low(0, 1) - 1,
+        )
+        dr.eval(columns)
+        dr.sync_thread()
+        return tuple(column.torch() for column in columns)
 
 
 class DenseCounts:

@@ -28,7 +28,7 @@ from codesign.events.stream import concatenate, ordered
 from codesign.exclusive import exclusive
 from codesign.types import EventStream
 
-EVENTS_PER_PIXEL = 0.1  # room made at first
+EVENTS_PER_PIXEL = 1.0  # room made at first; memory that no event writes to costs nothing
 KEY_BITS = 63
 
 
@@ -104,8 +104,9 @@ def simulate(
             keys.append(
                 _interpolated_keys(*chunk, sensor, generator, moved, front_end, layout, density)
             )
-            density = 1.25 * len(keys[-1]) / chunk[0].numel()
-        t_us, x, y, p = layout.columns(keys[0] if len(keys) == 1 else np.concatenate(keys))
+            density = max(density, 1.25 * len(keys[-1]) / chunk[0].numel())
+        lanes = Lanes(frames, frames[0].numel())
+        t_us, x, y, p = layout.columns(lanes, keys[0] if len(keys) == 1 else np.concatenate(keys))
         stream = EventStream(t_us, x, y, p, height_px, width_px)
     if at_once is not None:
         # behind the interval before, as all others
