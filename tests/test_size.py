@@ -56,7 +56,7 @@ BUDGETS = {
     "tests/optimise": 3_500,
     "tests/render": 30_900,
     "tests/scenes": 21_700,
-    "tests/studies": 33_750,
+    "tests/studies": 34_100,
     "tests/system": 7_000,
     "tests/train": 4_500,
 }

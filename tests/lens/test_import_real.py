@@ -16,6 +16,7 @@ from studies import lens_files
 from studies.frame.run import main
 from studies.lens_files import ALLOWED, CLAIMS, examine
 from tests.lens.systems import close, f64
+from tests.studies.browser import check_page
 
 FOLDER = "data/lenses"
 EXTENSIONS = (".json", ".zmx", ".seq", ".txt")
@@ -211,6 +212,7 @@ def test_a_study_of_a_folder_counts_what_loads(tmp_path, capsys):
     assert "| bad.seq | refused |" in table
     assert "glass 'NOGLASS' is not in the catalogue" in table
     assert "| good.zmx | loads | 2 | 20 | 99.6" in table
+    check_page("lens_files", out)
     arguments = ["--out", str(tmp_path / "none"), "--folder", str(tmp_path / "nowhere")]
     assert main(lens_files.study, lens_files.Config, arguments) == 2
     assert "name another folder with --folder" in capsys.readouterr().err

@@ -35,6 +35,7 @@ from studies.lens_scratch.task import (
     residuals_of,
 )
 from tests.lens.systems import close, f64
+from tests.studies.browser import check_page
 
 D = torch.float64
 
@@ -202,6 +203,7 @@ def test_the_report_of_near_objects(tmp_path):
     )
     close(metrics["hyperfocal_m"], analysis.hyperfocal_m(geo, 0.02), 1e-12)
     assert "is focused on 0.5 m" in (tmp_path / "run" / "report.html").read_text()
+    check_page("lens_report", tmp_path / "run")
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from studies.gradient_flow import chain, silhouettes
 from studies.gradient_flow.events import case as scene
 from studies.gradient_flow.events import compare, topics
 from studies.gradient_flow.topic import Row
+from tests.studies.browser import check_page
 
 D = torch.float64
 T_S = torch.tensor([0.0, 0.01, 0.02], dtype=torch.float64)
@@ -45,6 +46,7 @@ def test_the_study_goes_on_where_it_was_cut(tmp_path, monkeypatch):
     short = sum(job[0] == "memory" for job in jobs)  # nothing is asked of the others
     assert 0 < short < len(jobs)
     assert f"layers: {short} of {short} rows" in page
+    check_page("gradient_flow", tmp_path / "run")
 
 
 @pytest.mark.parametrize("wrong", [["--cases", "none"], ["--cases"], ["--seeds", "1"]])

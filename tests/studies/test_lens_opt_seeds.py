@@ -8,6 +8,7 @@ import pytest
 
 from studies import lens_opt_seeds
 from studies.frame.run import main
+from tests.studies.browser import check_page
 
 LENSES = ("nominal", "detuned", "refocused", "spots", "edge", "optimised", "after_spots")
 # of flow errors, over those of the spot designer
@@ -49,6 +50,7 @@ def test_differences_of_all_seeds_are_pooled_and_the_page_says_who_wins(
     assert metrics["spots_log_ratio"] == pytest.approx(mean, rel=1e-9)
     assert metrics["spots_log_ratio_low"] < mean < metrics["spots_log_ratio_high"] < 0
     assert metrics["spots_seeds_better"] == 2
+    check_page("lens_opt_seeds", folder)
     assert metrics["after_spots_log_ratio"] == pytest.approx(math.log(0.97), rel=1e-9)
     assert capsys.readouterr().out.splitlines()[-1].startswith("The flow design wins")
 

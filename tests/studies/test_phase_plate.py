@@ -11,6 +11,7 @@ from codesign.lens.analysis import ideal_mtf
 from studies import phase_plate
 from studies.frame.config import configured
 from studies.frame.run import main
+from tests.studies.browser import check_page
 
 
 def perfect(diameter_mm):
@@ -52,6 +53,7 @@ def test_a_short_run_improves_the_plate(tmp_path):
     assert gain > 1.2
     assert f"the plate has {gain:.2f} times the contrast" in (out / "report.html").read_text()
     assert metrics["plate_equal_stop_light_8px"] == 0.25  # the only one tried
+    check_page("phase_plate", out)
 
 
 def test_ranges_that_are_none_are_refused(capsys, tmp_path):

@@ -30,6 +30,7 @@ from scenes.digits import (
 from studies.frame.run import main
 from studies.spike_esim import __main__ as study
 from studies.spike_esim import classes, judge, train
+from tests.studies.browser import check_page
 
 D = torch.float64
 DT_S = 2e-3
@@ -333,6 +334,7 @@ def test_a_classification_that_was_stopped_goes_on_with_what_is_left(tmp_path, m
     assert main(study.study, study.Config, ["--resume", str(folder)]) == 0
     again = json.loads((folder / "metrics.json").read_text())
     assert all(again[name] == value for name, value in first.items() if not isinstance(value, dict))
+    check_page("spike_esim", folder)
 
 
 @pytest.mark.parametrize("options", [["--steps", "1"], ["--classes", "--seeds", "1"]])
