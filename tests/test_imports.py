@@ -33,6 +33,7 @@ MITSUBA = {
     "codesign.render": "makes pictures with it",
     "scenes": "describe worlds to it",
     "studies.speed_error.frames": "compares with its sensors",
+    "studies.speed_error.growth": "times worlds of as many objects and faces as it wants",
     "studies.stability.render_cases": "mirrors shapes by its transforms",
 }
 

@@ -38,7 +38,7 @@ BUDGETS = {
     "studies/make_dataset": 4_000,
     "studies/placement": 7_950,
     "studies/sensor_fit": 2_000,
-    "studies/speed_error": 8_400,
+    "studies/speed_error": 9_250,
     "studies/spike_esim": 5_100,
     "studies/stability": 8_250,
     "studies/train_flow": 5_100,

@@ -6,7 +6,17 @@ from typing import ClassVar, Literal
 from studies.frame.config import StudyConfig
 
 Name = Literal[
-    "chain", "select", "lens", "render", "psf", "light", "events", "spiking", "flow", "placement"
+    "chain",
+    "select",
+    "lens",
+    "render",
+    "growth",
+    "psf",
+    "light",
+    "events",
+    "spiking",
+    "flow",
+    "placement",
 ]
 
 
@@ -16,8 +26,9 @@ class Config(StudyConfig):
     stages: tuple[Name, ...] = ("chain",)
     """What is measured: chain (every stage's cheaper and finer levels, and whole chains of them, on
     one small scene); select (what codesign.select picks on six scenes); lens (ray tracing beside
-    optiland), render, psf (frames by point spread functions), light (emissive, baked, path),
-    events, spiking (beside snnTorch and norse), flow (estimators), placement (a step of it)."""
+    optiland), render, growth (rendering and outlines over objects and faces), psf (frames by point
+    spread functions), light (emissive, baked, path), events, spiking (beside snnTorch and norse),
+    flow (estimators), placement (a step of it)."""
     repeats: int = 7
     """Timed repeats of each thing; at least 3."""
     rounds: int = 2

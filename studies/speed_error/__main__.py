@@ -14,13 +14,14 @@ import sys
 from codesign.errors import DomainError
 from studies.frame.run import Run, main
 from studies.frame.show import asked
-from studies.speed_error import Config, chain, events, flow, frames, lens, placement, select
+from studies.speed_error import Config, chain, events, flow, frames, growth, lens, placement, select
 
 STAGES = {
     "chain": chain.stage,
     "select": select.stage,
     "lens": lens.stage,
     "render": frames.render_stage,
+    "growth": growth.stage,
     "psf": frames.psf_stage,
     "light": frames.light_stage,
     "events": events.stage,

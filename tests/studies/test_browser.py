@@ -22,7 +22,7 @@ ALONE = {
     "hero": "--quick --tolerance 1",
     "lens_scratch": "--quick --seeds 1",
     "lens_tolerance": "--trials 3",
-    "speed_error": "--quick --stages light",
+    "speed_error": "--quick --stages growth",
     "stability": "",
     "viewer": "--quick",
 }
