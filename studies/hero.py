@@ -9,6 +9,7 @@ import io
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -21,6 +22,8 @@ from torch import Tensor
 from codesign import events, flow, lens, render
 from codesign.atomic import write_atomic
 from codesign.errors import DomainError
+from codesign.fidelity import Task
+from codesign.fidelity.levels import camera_at
 from codesign.pose import se3_exp
 from codesign.report.chain_figures import draw_image
 from codesign.report.flow_colours import flow_colours
@@ -31,7 +34,8 @@ from studies.codesign.cells import space_of
 from studies.codesign.design import Space, Whole
 from studies.codesign.problem import Drawn
 from studies.codesign.race import answers
-from studies.frame.run import Run, StudyConfig, main
+from studies.frame.fidelity import Tolerant, chosen
+from studies.frame.run import Run, main
 from studies.placement.figures import draw_pair
 from studies.placement.problem import Samples
 
@@ -42,7 +46,7 @@ COLOURS = ("#7f7f7f", "#d62728")
 
 
 @dataclass(frozen=True)
-class Config(StudyConfig):
+class Config(Tolerant):
     QUICK: ClassVar = {"pictures": 2, "rays": 1}
     answers: Path = Path("docs/joint_race_outdoors.jsonl")
     """Answers of a joint race (answers.jsonl of a run of studies.codesign)."""
@@ -83,7 +87,7 @@ def study(run: Run[Config]) -> None:
     films = {}
     with run.progress(len(titles), "designs") as bar:
         for title, arm in zip(titles, ("default", config.arm), strict=True):
-            films[title] = filmed(drawn, *median(rows, arm, drawn.space), config)
+            films[title] = filmed(run, title, drawn, *median(rows, arm, drawn.space))
             bar.advance(error=films[title].error)
     pictures = [drawn_at(films, k) for k in range(config.pictures)]
     write_atomic(run.path("hero.webp"), looped(pictures))
@@ -126,8 +130,9 @@ def median(rows: list[dict[str, Any]], arm: str, space: Space) -> tuple[Whole, f
 
 
 @torch.no_grad()
-def filmed(drawn: Drawn, whole: Whole, error: float, config: Config) -> Film:
+def filmed(run: Run[Config], title: str, drawn: Drawn, whole: Whole, error: float) -> Film:
     """The whole sensor in every picture, and the velocities that its nine windows tell."""
+    config = run.config
     looked = drawn.looked(
         whole, Samples((config.world,), tuple(range(config.pictures)), config.seed), "sensor"
     )
@@ -137,10 +142,15 @@ def filmed(drawn: Drawn, whole: Whole, error: float, config: Config) -> Film:
     exposed = Exposed(stage, whole.space.costs.gain(whole.numbers["fno"]), None, 1)
     batch = looked.batch
     poses = batch.T_world_body[0] @ whole.T_body_cam
+    estimate = partial(flow.estimate_lk, prior_px=whole.numbers["prior_px"])
+    if config.tolerance:
+        task = Task(camera, whole.sensor, poses, batch.t_s, estimate)
+        found = chosen(run, batch.scene[0].static, task, "hard", robot_pair.BINS, title)
+        camera = camera_at(camera, found)
     frames = render.frames(camera, batch.scene[0], poses)
     generator = torch.Generator().manual_seed(config.seed)
     volume = exposed.volume(frames, batch.t_s, robot_pair.BINS, generator)
-    flow_px = flow.estimate_lk(volume, prior_px=whole.numbers["prior_px"]).flow_px
+    flow_px = estimate(volume).flow_px
     velocity = looked.run["estimate"].velocity
     middle = frames[:, robot_pair.FRAMES // 2]
     return Film(whole, error, middle, volume.counts.sum(2), flow_px, velocity, batch.twist)

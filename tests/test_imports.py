@@ -32,6 +32,7 @@ DOOR = "codesign"  # the package itself, which names its rooms and imports them 
 MITSUBA = {
     "codesign.render": "makes pictures with it",
     "scenes": "describe worlds to it",
+    "studies.speed_error.growth": "times worlds of as many objects and faces as it wants",
     "studies.stability.render_cases": "mirrors shapes by its transforms",
 }
 

@@ -12,7 +12,7 @@ import math
 import sys
 import time
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -22,6 +22,8 @@ from codesign import lens
 from codesign.atomic import write_atomic
 from codesign.errors import DomainError
 from codesign.events import SensorModel, SensorState, simulate
+from codesign.fidelity import Task
+from codesign.flow import estimate_lk
 from codesign.flow.files import write_flow
 from codesign.lens import catalogue
 from codesign.optional import require
@@ -33,7 +35,8 @@ from scenes.dataset_motion import FAMILIES, LEAD_S, make_world, motion
 from scenes.trajectories import times
 from scenes.tum import write_tum
 from studies.frame.bench import resident_mb as resident_mb_now
-from studies.frame.run import Run, StudyConfig, main
+from studies.frame.fidelity import Tolerant, chosen
+from studies.frame.run import Run, main
 from studies.make_dataset import page as pages
 from studies.make_dataset import store
 from studies.make_dataset.segments import Segments
@@ -42,11 +45,13 @@ FIELD_SHARE = 0.95  # of the lens's field that the picture's diagonal takes
 # fewer frames than asked for are worked on together where pictures are large
 PIXELS_PER_CHUNK = 2**19
 PIXELS_PER_TRUTH = 2**16  # worked on together in float64
+WINDOW = 9  # frames of what --tolerance is judged on
+BINS = 4
 LONGEST_S = 4000.0  # event times are 32-bit microseconds
 
 
 @dataclass(frozen=True)
-class Config(StudyConfig):
+class Config(Tolerant):
     QUICK: ClassVar = {"trajectories": 2, "frames": 40, "size": 64, "samples": 4}
     trajectories: int = 5
     """Number of sequences; the families orbital, radial, vertical, driving, flying take turns."""
@@ -102,6 +107,8 @@ def study(run: Run[Config]) -> None:
     start = time.perf_counter()
     config = checked(run.config)
     maker = Maker(config)
+    if config.tolerance:
+        maker = Maker(cheapest(run, maker))
     names = [
         f"sequence_{index:03d}_{FAMILIES[index % len(FAMILIES)]}"
         for index in range(config.trajectories)
@@ -184,6 +191,19 @@ def make_camera(config):
     )
 
 
+def cheapest(run, maker):
+    """The configuration with the lens and the samples that --tolerance allows, chosen on windows
+    from the middle of the paths of the first sequences."""
+    config = maker.config
+    count = min(config.trajectories, len(FAMILIES))
+    t_s = times(min(WINDOW, config.frames), config.rate_hz)
+    since_s = LEAD_S + (config.frames - len(t_s)) // 2 / config.rate_hz
+    poses = torch.stack([maker.path(index)(since_s + t_s).detach() for index in range(count)])
+    task = Task(maker.camera, maker.sensor, poses, t_s, flow=estimate_lk)
+    found = chosen(run, maker.scene, task, "hard", BINS, "the data set")
+    return replace(config, level=found.camera, samples=found.samples)
+
+
 class Maker:
     """What all sequences share: world, camera, sensor, the tables of truth, and the clock."""
 
@@ -202,6 +222,17 @@ class Maker:
         self.chief = self.camera.chief_rays(self.camera.film.pixels())
         self.segments = Segments(self.scene)
         self.clock = Clock()
+
+    def path(self, index):
+        """Trajectory of a sequence."""
+        family = FAMILIES[index % len(FAMILIES)]
+        duration_s = float(times(self.config.frames, self.config.rate_hz)[-1])
+        draw = self.drawn(2 * index)
+        return motion(family, self.stage, self.scene, self.camera, duration_s, draw)
+
+    def drawn(self, number):
+        """A generator of the run's seed."""
+        return torch.Generator().manual_seed(1_000_003 * self.config.seed + number)
 
     def frames(self, poses, first, last):
         """Images [last - first, H, W]."""
@@ -277,11 +308,8 @@ class Sequence:
         (folder / store.PARTS).mkdir(parents=True, exist_ok=True)
         (folder / "flow" / "forward").mkdir(parents=True, exist_ok=True)
         self.t_s = times(config.frames, config.rate_hz)
-        draw, self.noise = (
-            torch.Generator().manual_seed(1_000_003 * config.seed + 2 * index + k) for k in (0, 1)
-        )
-        duration_s = float(self.t_s[-1])
-        self.path = motion(self.family, maker.stage, maker.scene, maker.camera, duration_s, draw)
+        self.noise = maker.drawn(2 * index + 1)
+        self.path = maker.path(index)
         self.poses = self.path(LEAD_S + self.t_s).detach()
         self.state = None
 

@@ -127,7 +127,7 @@ def searches(run: Run[Any], outcome: Outcome) -> None:
 
 def seen(run: Run[Any], outcome: Outcome) -> None:
     """The robot with its camera before and after, what it sees, and what it is blind to."""
-    problem, unseen, mount = outcome.race.problem, outcome.unseen, outcome.pose
+    unseen, mount = outcome.unseen, outcome.pose
     run.section("Before and after")
     run.figure(
         figures.before_and_after(unseen, mount),
@@ -135,9 +135,9 @@ def seen(run: Run[Any], outcome: Outcome) -> None:
         "The robot with its default mount (above) and that of the answer (below): frame of an "
         "unseen drive with the windows read, events of the hard sensor in them, flow.",
     )
-    verdicts = judge(problem.requirements, mount, problem.camera)
+    verdicts = judge(unseen.requirements, mount, unseen.camera)
     run.text("Requirements: " + "; ".join(map(str, verdicts)) + ".")
-    what_it_tells(run, problem.pair, problem.camera, mount, "answer")
+    what_it_tells(run, unseen.pair, unseen.camera, mount, "answer")
 
 
 def left(run: Run[Any], outcome: Outcome) -> None:
@@ -160,17 +160,17 @@ def left(run: Run[Any], outcome: Outcome) -> None:
 
 def handed(run: Run[Any], outcome: Outcome) -> VelocityErrors:
     """Write the mount, read it back, and see that it has the same score; returns its errors."""
-    problem, unseen, pose = outcome.race.problem, outcome.unseen, outcome.pose
-    mount = robot_pair.mount_at(problem.ranges, pose)
+    unseen, pose = outcome.unseen, outcome.pose
+    mount = robot_pair.mount_at(unseen.ranges, pose)
     path = run.path("mount.yaml")
     notes = {
-        "pair": problem.pair.name,
+        "pair": unseen.pair.name,
         "found_by": outcome.found_by,
         "error_unseen": outcome.error,
         "error_unseen_default": outcome.default_error,
     }
     handed_over = HandOver(
-        mount, problem.camera, robot_pair.SENSOR, problem.pair.frame, "camera_optical_frame", notes
+        mount, unseen.camera, robot_pair.SENSOR, unseen.pair.frame, "camera_optical_frame", notes
     )
     save_hand_over(path, handed_over)
     back = load_hand_over(path)

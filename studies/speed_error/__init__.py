@@ -5,7 +5,7 @@ from typing import ClassVar, Literal
 
 from studies.frame.config import StudyConfig
 
-Name = Literal["chain", "select", "lens", "render", "events", "spiking", "flow"]
+Name = Literal["chain", "select", "lens", "render", "growth", "events", "spiking", "flow"]
 
 
 @dataclass(frozen=True)
@@ -14,7 +14,8 @@ class Config(StudyConfig):
     stages: tuple[Name, ...] = ("chain",)
     """What is measured: chain (every stage's cheaper and finer levels, and whole chains of them, on
     one small scene); select (what codesign.select picks on six scenes); lens (ray tracing beside
-    optiland), render, events, spiking (beside snnTorch and norse), flow (estimators)."""
+    optiland), render, growth (rendering and outlines over objects and faces), events, spiking
+    (beside snnTorch and norse), flow (estimators)."""
     repeats: int = 7
     """Timed repeats of each thing; at least 3."""
     rounds: int = 2

@@ -14,13 +14,14 @@ import sys
 from codesign.errors import DomainError
 from studies.frame.run import Run, main
 from studies.frame.show import asked
-from studies.speed_error import Config, chain, events, flow, frames, lens, select
+from studies.speed_error import Config, chain, events, flow, frames, growth, lens, select
 
 STAGES = {
     "chain": chain.stage,
     "select": select.stage,
     "lens": lens.stage,
     "render": frames.render_stage,
+    "growth": growth.stage,
     "events": events.stage,
     "spiking": events.spiking_stage,
     "flow": flow.stage,

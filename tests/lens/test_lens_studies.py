@@ -20,6 +20,7 @@ from codesign.report.lens_layout import ray_paths
 from studies.frame.run import main
 from studies.lens_report import __main__ as lens_report
 from tests.lens.systems import close, f64
+from tests.studies.browser import check_page
 
 D = torch.float64
 
@@ -187,6 +188,7 @@ def test_the_report_of_near_objects(tmp_path):
     )
     close(metrics["hyperfocal_m"], analysis.hyperfocal_m(geo, 0.02), 1e-12)
     assert "is focused on 0.5 m" in (tmp_path / "run" / "report.html").read_text()
+    check_page("lens_report", tmp_path / "run")
 
 
 @pytest.mark.parametrize(

@@ -34,10 +34,11 @@ function faults() {
   for (const { node, box } of all)
     if (box.right > innerWidth + 1 && !scrolls(node.parentElement))
       found.push(`'${node.textContent.slice(0, 30)}' ends at ${Math.round(box.right)} of ${innerWidth} px`);
-  all.forEach((a, k) => {
-    for (const b of all.slice(k + 1)) {
+  all.sort((a, b) => a.box.top - b.box.top).forEach((a, k) => {
+    for (let other = k + 1; other < all.length && all[other].box.top < a.box.bottom - 3; other++) {
+      const b = all[other];
       const across = Math.min(a.box.right, b.box.right) - Math.max(a.box.left, b.box.left);
-      const down = Math.min(a.box.bottom, b.box.bottom) - Math.max(a.box.top, b.box.top);
+      const down = Math.min(a.box.bottom, b.box.bottom) - b.box.top;
       if (a.node !== b.node && across > 3 && down > 3)
         found.push(`'${a.node.textContent.slice(0, 30)}' under '${b.node.textContent.slice(0, 30)}'`);
     }
@@ -48,5 +49,5 @@ function faults() {
 onload = () => {
   const found = faults();
   for (const each of document.querySelectorAll("details")) each.open = true;
-  parent.postMessage(JSON.stringify([...found, ...faults()].slice(0, 20)), "*");
+  parent.postMessage([...found, ...faults()].slice(0, 20).map(fault => `${innerWidth} px: ${fault}`), "*");
 };

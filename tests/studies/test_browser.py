@@ -1,11 +1,7 @@
-"""Pages as a browser shows them, wide and on a phone: nothing on the console, nothing beside the
-screen but what scrolls, no text on text."""
+"""The page of every study as a browser shows it, and the faults that a browser would find."""
 
-import html
-import json
+import importlib
 import re
-import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -13,43 +9,24 @@ import pytest
 from matplotlib.figure import Figure
 
 from codesign.report import page, prose
-from studies.flow_recording import __main__ as flow_recording
+from studies.frame.listing import studies
 from studies.frame.run import main
-from studies.placement import __main__ as placement
+from studies.stability import __main__ as stability
+from tests.processes import ROOT
+from tests.studies.browser import BROWSER, WIDTHS_PX, check_page, faults
 
-BROWSER = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
-pytestmark = pytest.mark.skipif(BROWSER is None, reason="no chromium is installed")
-WIDTHS_PX = (1280, 390)
-MEASURE = (Path(__file__).parent / "browser_faults.js").read_text(encoding="utf-8")
-
-
-def faults(report: Path, width_px: int, folder: Path) -> list[str]:
-    """What the browser finds wrong with a page in a frame of that width, as it opens and with all that
-    unfolds unfolded; and what it writes to its console."""
-    inside, outside = folder / "inside.html", folder / "outside.html"
-    text = report.read_text(encoding="utf-8")
-    inside.write_text(
-        text.replace("</body>", f"<script>{MEASURE}</script></body>"), encoding="utf-8"
-    )
-    outside.write_text(
-        f"<iframe src='inside.html' style='border:0;width:{width_px}px;height:900px'></iframe><p id='found'></p>"
-        "<script>onmessage = said => { document.getElementById('found').textContent = said.data; };</script>",
-        encoding="utf-8",
-    )
-    flags = (
-        "--headless --no-sandbox --disable-gpu --enable-logging=stderr --virtual-time-budget=20000"
-    )
-    size = f"--window-size={width_px + 100},1000"
-    command = [BROWSER, *flags.split(), size, f"--user-data-dir={folder / 'profile'}", "--dump-dom"]
-    shown = subprocess.run(
-        [*command, outside.as_uri()], capture_output=True, text=True, timeout=100
-    )
-    found = re.search(r"<p id=\"found\">(.+?)</p>", shown.stdout, flags=re.S)
-    assert found is not None, shown.stderr[-2000:]
-    said = [line for line in shown.stderr.splitlines() if "CONSOLE" in line]
-    return [*json.loads(html.unescape(found[1])), *said]
+TESTS = Path(__file__).parents[1]
+# studies that no other test runs to their page
+ALONE = {
+    "chain_picture": "--width-px 64 --height-px 48 --samples 2",
+    "hero": "--quick --tolerance 1",
+    "lens_tolerance": "--trials 3",
+    "speed_error": "--quick --stages growth",
+    "spike_esim": "--quick --frames 40 --steps 4",
+    "stability": "",
+    "viewer": "--quick",
+}
+WITH_BROWSER = pytest.mark.skipif(BROWSER is None, reason="no chromium is installed")
 
 
 def worst_page(folder: Path, wide: str = "") -> Path:
@@ -80,32 +57,43 @@ def worst_page(folder: Path, wide: str = "") -> Path:
     return report
 
 
-@pytest.mark.parametrize("width_px", WIDTHS_PX)
-def test_the_worst_page(width_px, tmp_path):
-    assert faults(worst_page(tmp_path), width_px, tmp_path) == []
+@WITH_BROWSER
+def test_the_worst_page(tmp_path):
+    assert faults(worst_page(tmp_path)) == []
 
 
+@WITH_BROWSER
 def test_faults_are_seen(tmp_path):
     """A box of 2000 px, text on text, and a call that fails."""
     wrong = (
         "<div style='width:2000px'>wide</div><p style='margin:0'>one text</p><p style='margin:-1.4em 0 0'>on another</p>"
         "<script>console.log('said')</script>"
     )
-    found = " ".join(faults(worst_page(tmp_path, wrong), 390, tmp_path))
-    assert "DIV ends at 20" in found
-    assert "'one text' under 'on another'" in found
+    found = " ".join(faults(worst_page(tmp_path, wrong)))
+    for width_px in WIDTHS_PX:
+        assert f"{width_px} px: DIV ends at 2" in found
+        assert f"{width_px} px: 'one text' under 'on another'" in found
     assert "CONSOLE" in found
 
 
+def test_the_page_of_every_study_is_looked_at():
+    said = "".join(path.read_text(encoding="utf-8") for path in TESTS.rglob("test_*.py"))
+    looked_at = set(re.findall(r'check_page\("(\w+)"', said))
+    assert sorted([*looked_at, *ALONE]) == list(studies())
+
+
+def uncounted(case, tries, seed):
+    """Rows of a case of `studies.stability`, whose page is asked for and not its minutes."""
+    row = {"stage": case.stage, "expected": "0.123", "seen": "0.125", "off": 2e-3, "allowed": 1e-3}
+    return [{**row, "kind": kind, "passed": kind != "value"} for kind in case.kinds]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("module", "given"),
-    [(placement, ["--look"]), (flow_recording, [])],
-    ids=["placement", "flow_recording"],
-)
-def test_pages_of_studies(module, given, tmp_path):
+@pytest.mark.parametrize("name", ALONE)
+def test_pages_of_studies_that_no_other_test_runs(name, tmp_path, monkeypatch):
+    path = f"studies.{name}" + ".__main__" * (ROOT / "studies" / name).is_dir()
+    module = importlib.import_module(path)
+    monkeypatch.setattr(stability, "cells", uncounted)
     out = tmp_path / "run"
-    assert main(module.study, module.Config, [*given, "--quick", "--out", str(out)]) == 0
-    assert (out / "report.html").stat().st_size < 2e6
-    for width_px in WIDTHS_PX:
-        assert faults(out / "report.html", width_px, tmp_path) == []
+    assert main(module.study, module.Config, [*ALONE[name].split(), "--out", str(out)]) == 0
+    check_page(name, out)

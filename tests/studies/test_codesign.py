@@ -22,6 +22,7 @@ from studies.codesign.page import every_ratio
 from studies.codesign.problem import Drawn
 from studies.codesign.race import compared, kept, start
 from studies.frame.run import main
+from tests.studies.browser import check_page
 
 F = torch.float64
 
@@ -313,6 +314,7 @@ def test_a_small_race_says_that_it_decides_nothing(here):
     code, folder, _ = here
     assert code == 0
     assert "decides nothing" in (folder / "report.html").read_text()
+    check_page("codesign", folder)
     numbers = json.loads((folder / "metrics.json").read_text())
     ratio = numbers["race_joint_median"] / numbers["race_default_median"]
     for name, value in (("joint_over_default", ratio), ("default_over_joint", 1 / ratio)):

@@ -25,6 +25,7 @@ from studies.flow_quality.measures import (
     warp_loss,
 )
 from studies.frame.run import main
+from tests.studies.browser import check_page
 
 
 def one_window(error_px, confidence=None, variance_px2=None, truth_px=2.0):
@@ -134,7 +135,7 @@ def test_quick_form(tmp_path, monkeypatch):
     # (docs/flow_closed_form.md)
     cell = "mixed_theta_0.2_noise_0.002"
     assert found[f"{cell}_closed_form_affine_ratio"] < 0.5 * found[f"{cell}_plain_ratio"]
-    assert (tmp_path / "report.html").exists()
+    check_page("flow_quality", tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from studies.flow_recording import __main__ as study
 from studies.flow_recording import made, video
 from studies.frame.run import main
 from tests.recording_case import poses
+from tests.studies.browser import check_page
 
 SIZE = (45, 60)
 
@@ -81,6 +82,7 @@ def test_figures_of_a_run(recording, tmp_path):
     page = (tmp_path / "run" / "report.html").read_text()
     assert "rotation alone" in page
     assert "The recording is synthetic" not in page
+    check_page("flow_recording", tmp_path / "run")
     assert (tmp_path / "run" / "packet_01.png").is_file()
 
 

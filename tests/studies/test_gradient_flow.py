@@ -12,6 +12,7 @@ from studies.frame.run import main
 from studies.gradient_flow import __main__ as study
 from studies.gradient_flow import chain, silhouettes
 from studies.gradient_flow.topic import Row
+from tests.studies.browser import check_page
 
 D = torch.float64
 
@@ -40,6 +41,7 @@ def test_the_study_goes_on_where_it_was_cut(tmp_path, monkeypatch):
     short = sum(job[0] == "cubes" for job in jobs)
     assert 0 < short < len(jobs)
     assert f"silhouettes: {short} of {len(jobs)} rows" in page
+    check_page("gradient_flow", tmp_path / "run")
 
 
 @pytest.mark.parametrize("wrong", [["--cases", "none"], ["--cases"], ["--seeds", "1"]])

@@ -12,6 +12,7 @@ from studies import joint_controls
 from studies.codesign.design import Space
 from studies.codesign.problem import Drawn
 from studies.frame.run import main
+from tests.studies.browser import check_page
 
 F = torch.float64
 SETTING = {"pair": "outdoors", "family": None, "light": 1.0, "speed": 1.0, "free": [], "held": {}}
@@ -91,6 +92,7 @@ def test_ratios_are_those_of_the_errors_under_each_control(tmp_path, monkeypatch
     numbers = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert numbers["as_designed_joint_over_book"] == pytest.approx(0.25)
     assert numbers["worse_for_the_one_joint_over_book"] == pytest.approx(0.5)
+    check_page("joint_controls", tmp_path / "run")
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from studies.codesign import cells, couplings
 from studies.codesign.design import BLOCKS
 from studies.codesign.race import start
 from studies.frame.run import main
+from tests.studies.browser import check_page
 
 F = torch.float64
 SMALL = [
@@ -92,6 +93,7 @@ def test_a_map_says_which_cells_are_won_and_what_their_valleys_foretell(tmp_path
     assert numbers[f"{day}_at_the_bottom"] == pytest.approx(expected)
     assert numbers["rank_of_foretold"] > 0.8
     assert "in 3, loses in 3, and is undecided in 0" in (tmp_path / "map/report.html").read_text()
+    check_page("joint_map", tmp_path / "map")
 
 
 def test_parts_that_act_by_themselves_have_their_own_factors(tmp_path, monkeypatch):
@@ -117,6 +119,7 @@ def test_parts_that_act_by_themselves_have_their_own_factors(tmp_path, monkeypat
     for part, factor in factors.items():
         assert numbers[f"share_{joint_levers.NAMES[part]}"] == pytest.approx(factor)
     assert "The lens brings most" in (tmp_path / "levers" / "report.html").read_text()
+    check_page("joint_levers", tmp_path / "levers")
 
 
 def test_cells_are_raced_judged_and_taken_up_again(tmp_path):

@@ -20,6 +20,7 @@ from studies.lens_motion.motions import HEIGHT_PX, SPEED_PX, Motion, flow_px
 from studies.lens_opt import __main__ as lens_opt
 from studies.lens_opt.spots import SpotRays
 from studies.lens_opt.task import DISTANCE_M, PITCH_MM
+from tests.studies.browser import check_page
 
 
 def cloud(x_px, y_px):
@@ -151,6 +152,7 @@ def test_a_quick_run_is_reached_from_the_main_job_and_says_that_it_decides_nothi
         low, value, high = (metrics[f"log_ratio_{name}{end}"] for end in ("_low", "", "_high"))
         assert low <= value <= high
     assert "decides nothing" in (out / "report.html").read_text()
+    check_page("lens_motion", out)
     rows = [json.loads(line) for line in (out / "judged.jsonl").read_text().splitlines()]
     own, other = (
         [row["error_mrad"] for _, case in rows for row in case if row["lens"] == name]

@@ -22,6 +22,7 @@ from studies.lens_opt.page import verdict
 from studies.lens_opt.spots import spot_rays
 from studies.lens_opt.stages import estimator, weights_of
 from studies.lens_opt.task import DISTANCE_M, LIGHT, PITCH_MM, LensTask, make_task
+from tests.studies.browser import check_page
 
 SMALL = ["--quick", *(f"--{name}=1" for name in ("after-steps", "cases", "scored", "spot-steps"))]
 SMALL += ["--steps=2", "--judged=2", "--samples=4"]
@@ -194,7 +195,7 @@ def test_a_run_killed_while_it_judges_goes_on_there_and_ends_with_the_same_figur
     (folder / "report.html").unlink()
     assert main(lens_opt.study, lens_opt.Config, ["--resume", str(folder)]) == 0
     again = json.loads((folder / "metrics.json").read_text())
-    assert (folder / "report.html").exists()
+    check_page("lens_opt", folder)
     for name in (
         "flow_error_mrad_hard_optimised",
         "rms_spot_um_optimised",

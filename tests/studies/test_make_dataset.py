@@ -35,6 +35,7 @@ from studies.make_dataset import __main__ as study
 from studies.make_dataset import store
 from studies.make_dataset.segments import Segments
 from tests.rounding_case import RoundsByPlace
+from tests.studies.browser import check_page
 
 D = torch.float64
 ROOT = Path(__file__).resolve().parents[2]
@@ -150,6 +151,7 @@ def names(folder):
 
 
 def test_the_manifest_holds_the_hash_of_every_file(dataset):
+    check_page("make_dataset", dataset)
     manifest = json.loads((dataset / "manifest.json").read_text())
     assert manifest["sequences"] == ["sequence_000_orbital", "sequence_001_radial"]
     own = {"camera.h5", "events.h5", "frames.h5", "lens.json", "poses.txt", "sequence.json"}

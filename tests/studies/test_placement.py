@@ -22,6 +22,7 @@ from studies.placement.page import answer
 from studies.placement.problem import Problem, traced_camera
 from studies.placement.race import FINAL_DRAWS, Race, check_same, feasible, fingerprints, kept
 from studies.placement.searches import descend
+from tests.studies.browser import check_page
 
 F = torch.float64
 
@@ -322,3 +323,4 @@ def test_the_whole_study_and_its_resumption(tmp_path):
     assert not any(name.endswith("90") for name in found)
     assert ("stays at" in page) == (found["chosen_start"] < 0)
     assert "tensor(" not in page
+    check_page("placement", out)

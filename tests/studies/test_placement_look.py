@@ -10,6 +10,7 @@ from codesign.report import robot_figures
 from scenes import robots
 from studies.frame.run import main
 from studies.placement import __main__ as placement
+from tests.studies.browser import check_page
 
 
 def test_the_page_shows_the_robot_and_counts_its_body_in_view(tmp_path):
@@ -32,6 +33,7 @@ def test_the_page_shows_the_robot_and_counts_its_body_in_view(tmp_path):
     assert 0 < metrics["downward_forward_m_s"] < metrics["forward_forward_m_s"]
     for name in ("report.html", "robot.png", "sight.png"):
         assert (out / name).is_file()
+    check_page("placement", out)
 
 
 def test_the_drawn_view_is_that_of_the_camera():

@@ -15,6 +15,7 @@ from studies.frame.run import main
 from studies.sensor_fit import __main__ as study
 from studies.sensor_fit.recording import load
 from studies.sensor_fit.sensor import Fit, FittedSensor, match
+from tests.studies.browser import check_page
 
 D = torch.float64
 
@@ -218,3 +219,4 @@ def test_the_study_records_what_the_files_say(tmp_path, capsys):
     assert metrics["fitted_rate_factor"] < metrics["ideal_rate_factor"]
     page = (tmp_path / "b" / "report.html").read_text()
     assert "A sensor fitted to a recording" in page
+    check_page("sensor_fit", tmp_path / "b")

@@ -1,31 +1,13 @@
-"""The Spike-ESIM study: figures of judgement, thesis variants, digits and saccades against closed
-forms and values worked out by hand."""
+"""The Spike-ESIM study: figures of judgement, thesis variants, against closed forms and values
+worked out by hand."""
 
 import math
-from pathlib import Path
 
-import matplotlib
-import numpy as np
 import pytest
 import torch
-from matplotlib.font_manager import FontProperties
-from matplotlib.textpath import TextPath
 
 from codesign import events
 from codesign.events import SensorModel, SpikeEsim
-from scenes.digits import (
-    BLUR_PX,
-    FONTS,
-    LEG_S,
-    PHOTOS,
-    SIDE_PX,
-    coverage,
-    draw_pictures,
-    frame_times,
-    frames,
-    position_px,
-    softened,
-)
 from studies.frame.run import main
 from studies.spike_esim import __main__ as study
 from studies.spike_esim import judge, train
@@ -161,82 +143,6 @@ def test_the_objective_is_zero_for_the_target_and_one_and_a_tenth_for_silence():
     target = noise(1)
     assert float(train.objective(target, target, DT_S)) == 0
     assert float(train.objective(torch.zeros_like(target), target, DT_S)) == pytest.approx(1.1)
-
-
-def test_saccades_go_round_an_equilateral_triangle_at_the_speed_of_their_closed_form():
-    corners = position_px(torch.tensor([0, LEG_S, 2 * LEG_S, 3 * LEG_S], dtype=D))
-    assert corners[0].tolist() == [0, 0]
-    assert torch.allclose(corners[3], corners[0], atol=1e-12)
-    assert (corners[1:] - corners[:-1]).norm(dim=1).tolist() == pytest.approx(
-        [SIDE_PX] * 3, abs=1e-12
-    )
-    # half of the way after half of the time, at 15/8 of the mean speed; central differences of 1 us
-    # err by h^2 s'''/6 = 2e-8 px/s
-    for leg in range(3):
-        middle_s = (leg + 0.5) * LEG_S
-        before, at, after = position_px(middle_s + torch.tensor([-1e-6, 0, 1e-6], dtype=D))
-        assert torch.allclose(at, (corners[leg] + corners[leg + 1]) / 2, atol=1e-12)
-        assert float((after - before).norm()) / 2e-6 == pytest.approx(
-            15 / 8 * SIDE_PX / LEG_S, rel=1e-6
-        )
-    still = position_px(LEG_S + torch.tensor([-1e-5, 1e-5], dtype=D))
-    # at rest at the corners: 10 u^3 of 4 px with u = 1.7e-4 is 2e-10 px
-    assert float((still[1] - still[0]).norm()) < 1e-9
-
-
-def test_frames_of_waves_are_those_waves_moved():
-    # 5 and 3 periods across and down a tile of 64 px: band-limited, so every sub-pixel shift has a
-    # closed form
-    at = torch.arange(64, dtype=D)
-
-    def wave(x, y):
-        return 50 + 20 * torch.sin(2 * math.pi * (5 * x + 3 * y) / 64 + 0.4)
-
-    t_s = frame_times(100.0)
-    found = frames(wave(at, at[:, None])[None], t_s)
-    assert found.shape == (19, 1, 32, 32)
-    seen = at[16:48]
-    for frame, (dx, dy) in zip(found[:, 0], position_px(t_s).tolist(), strict=True):
-        assert float((frame - wave(seen - dx, seen[:, None] - dy)).abs().max()) < 1e-10
-
-
-@pytest.mark.parametrize("label", [0, 8])
-def test_the_area_of_a_digit_is_that_of_its_outlines(label):
-    for font in FONTS[::2]:
-        file = Path(matplotlib.get_data_path()) / "fonts" / "ttf" / f"{font}.ttf"
-        outlines = TextPath(
-            (0, 0), str(label), size=100, prop=FontProperties(fname=file)
-        ).to_polygons()
-        low, high = (end(np.concatenate(outlines)[:, 1]) for end in (np.min, np.max))
-        # signed areas: holes run the other way round than what they are holes of
-        area = abs(
-            sum(
-                0.5 * np.sum(p[:-1, 0] * p[1:, 1] - p[1:, 0] * p[:-1, 1])
-                for p in (np.asarray(o) for o in outlines)
-            )
-        )
-        truth_px = area * (20 / (high - low)) ** 2
-        # a raster of quarter pixels errs by about the square root of the edge cells, some 400 of
-        # 1/16 px each: 1 px; areas are 60 to 150 px
-        assert coverage(label, font, 20.0, 10.0, (0.3, -0.7)).sum() == pytest.approx(
-            truth_px, abs=2.5
-        )
-
-
-def test_pictures_come_from_their_seed_and_the_lens_fades_a_wave_as_a_gaussian():
-    (first, labels), (again, _), (other, _) = (
-        draw_pictures(12, "training", (0, k)) for k in (1, 1, 2)
-    )
-    assert torch.equal(first, again)
-    assert not torch.equal(first, other)
-    assert labels.tolist() == [*range(10), 0, 1]
-    assert not set(PHOTOS["training"]) & set(PHOTOS["test"])
-    assert float(first.min()) > 0
-    at = np.arange(64)
-    wave = np.sin(2 * np.pi * 8 * at / 64) * np.ones((1, 64, 1))
-    assert np.allclose(
-        softened(wave), wave * math.exp(-2 * (math.pi * BLUR_PX / 8) ** 2), atol=1e-13
-    )
 
 
 def test_too_small_a_study_is_refused(tmp_path, capsys):

@@ -27,6 +27,7 @@ from tests.flow_training_case import (
     train,
     undraw,
 )
+from tests.studies.browser import check_page
 
 
 @pytest.fixture(autouse=True)
@@ -50,6 +51,7 @@ def test_training_finds_the_known_answer(tmp_path):
     1e-2 of weights of order 1."""
     options = "--steps 250 --learning-rate 0.05 --weight-decay 0 --clip 10 --average 0 --reuse 1"
     assert train(tmp_path, options) == 0
+    check_page("train_flow", tmp_path)
     assert torch.allclose(weight_of(tmp_path)[:, :, 0, 0], TRUE_WEIGHTS, atol=1e-2)
     found = metrics_of(tmp_path)
     expected = {"steps": 250, "windows_shown": 1000, "weights": 8, "unseen_windows": 8}
@@ -219,6 +221,7 @@ def test_a_race_trains_every_network_with_every_seed_and_judges_them_alike(tmp_p
         f"--race --own {own} --seeds 0 1 --cpu-minutes 3 --learning-rate 0.01 --final-windows 6"
     )
     assert train(tmp_path / "run", options) == 0
+    check_page("train_flow", tmp_path / "run")
     assert sorted(commands) == [("refiner", "0"), ("refiner", "1"), (own, "0"), (own, "1")]
     assert commands[own, "1"]["--learning-rate"] == "0.01"
     assert commands["refiner", "0"]["--learning-rate"] == "0.002"

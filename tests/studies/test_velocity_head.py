@@ -11,6 +11,7 @@ from scenes.robots.pairs import PAIRS
 from studies import velocity_head
 from studies.frame.run import main
 from studies.velocity_head import designs
+from tests.studies.browser import check_page
 
 D = torch.float64
 WINDOWS = 4
@@ -72,6 +73,7 @@ def test_a_little_training_lowers_the_error_on_worlds_kept_from_it_and_what_it_s
     out = tmp_path / "run"
     arguments += ["--pair", "corridor", "--out", str(out)]
     assert main(velocity_head.study, velocity_head.Config, arguments) == 0
+    check_page("velocity_head", out)
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["corridor_head_error"] < 0.6 * metrics["corridor_plain_error"]
     head = VelocityHead.load(EgoVelocity(tuple(range(6)), (1.0,) * 6), out / "head.safetensors")

@@ -22,6 +22,7 @@ from studies.video_to_events import __main__ as study
 from studies.video_to_events.input import Light, read_times
 from studies.video_to_events.options import chosen_sensor
 from studies.video_to_events.state import RECORD, EventLog, Progress
+from tests.studies.browser import check_page
 
 FIELDS = ("t_us", "x", "y", "p")
 IDEAL = ("--preset", "ideal", "--events", "e.npz")
@@ -186,6 +187,7 @@ def test_everything_is_drawn_and_shown(tmp_path):
     assert page.count("data:video/mp4") == 2
     assert "sRGB gamma is undone" in page
     assert "stretched to 20 x 10" in page
+    check_page("video_to_events", tmp_path / "run")
     # 11 ms at 100 times slower and 30 pictures a second
     assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "run" / "events.mp4"))[0] == 33
     metrics = metrics_of(tmp_path / "run")
