@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -105,7 +106,7 @@ class MitsubaScene:
         )
         met = found.is_valid()
         number = self._number(found)
-        shown = [self._shown(shape) for shape in self.scene.shapes()] + [self._beyond]
+        shown = [*map(self._shown, self.scene.shapes(), self._geometric), self._beyond]
         if not dr.grad_enabled(ray.o, ray.d):
             return dr.switch(number, shown, still.o, still.d, found)[0], found.t
         sloped = [with_slopes(each) for each in shown]
@@ -132,12 +133,16 @@ class MitsubaScene:
         crossed, _, leaves = self._box.ray_intersect(ray)
         return crossed & (leaves > 0)
 
-    def _shown(self, shape):
-        """What a shape shows to rays that meet it, and its normal there."""
+    @cached_property
+    def _geometric(self):
+        return [are_geometric(self.mi, shape) for shape in self.scene.shapes()]
+
+    def _shown(self, shape, geometric):
+        """What a shape shows to rays that meet it, and its normal there; geometric: as
+        ``are_geometric`` says."""
         import drjit as dr
 
         mi = self.mi
-        geometric = are_geometric(mi, shape)
         asked = mi.RayFlags.UV | (mi.RayFlags.Minimal if geometric else mi.RayFlags.ShadingFrame)
 
         def shown(origin, direction, found):
