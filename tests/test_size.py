@@ -24,7 +24,7 @@ BUDGETS = {
     "scenes/robots": 9_500,
     "scenes/trajectories": 3_100,
     "scenes/windows": 8_700,
-    "setup": 4_950,
+    "setup": 5_050,
     "studies": 7_600,
     "studies/codesign": 14_150,
     "studies/flow_quality": 5_400,
