@@ -5,7 +5,8 @@ GPU refuses to compute with them, or to hand to numpy, is refused here too.
         run()      # inputs made before count as on the device; values are those of the processor
 """
 
-from contextlib import contextmanager
+import sys
+from contextlib import ExitStack, contextmanager
 from unittest import mock
 
 import torch
@@ -49,6 +50,8 @@ class _Second(TorchFunctionMode):
             found = func(*args, **kwargs)
         if func == Tensor.device.__get__:
             return torch.device("cpu") if hosts else THERE
+        if func is Tensor.__getitem__ and isinstance(args[0], Host) and there:
+            raise MixedDevices("a tensor on the host at places on the device")
         if func in TO_NUMPY and there:
             raise MixedDevices(f"{name} of a tensor on the device; .cpu() comes first")
         if func is Tensor.cpu:
@@ -87,5 +90,9 @@ def second_device():
 
     from_numpy = torch.from_numpy  # asks no mode
     made = mock.patch.object(torch, "from_numpy", lambda x: from_numpy(x).as_subclass(Host))
-    with mock.patch.object(backend, "load", loaded), made, _Second():
+    with ExitStack() as patched:
+        for module in [m for m in sys.modules.values() if getattr(m, "load", None) is load]:
+            patched.enter_context(mock.patch.object(module, "load", loaded))
+        patched.enter_context(made)
+        patched.enter_context(_Second())
         yield

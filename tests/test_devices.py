@@ -2,6 +2,7 @@
 nothing is computed that a GPU would refuse."""
 
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ import torch
 from codesign import backend, events, flow, lens, mount, pose, render
 from codesign.errors import DomainError
 from codesign.events import from_counts, from_stream
+from codesign.events.kernels import Lanes
 from codesign.system import Batch, System
 from codesign.train.batches import to_device
 from codesign.train.learner import Learner
@@ -183,7 +185,13 @@ def hard(device):
     given, draw = pictures(device), seeded(1)
 
     def run():
-        stream = events.simulate(given, times(), NOISY, draw)
+        state = events.SensorState()
+        parts = given[:5], given[5:]
+        first = events.simulate(parts[0], times()[:5], NOISY, draw, state)
+        finer = replace(NOISY, theta_on=0.05)  # what stands beyond fires at once
+        stream = events.concatenate(
+            [first, events.simulate(parts[1], times()[5:], finer, draw, state)]
+        )
         return [events.to_counts(stream, times()), from_stream(stream, 0, 16_000, 5).counts]
 
     return run
@@ -376,6 +384,8 @@ def test_what_a_gpu_refuses_is_refused():
             lambda: there.numpy(),
             lambda: backend.run_kernel(lambda arr, x: (x,), (here,), [(3,)]),
             lambda: there @ torch.eye(3, device="cpu"),
+            lambda: here[there.long()],
+            lambda: Lanes(there, 3).load(here),
         ):
             with pytest.raises(MixedDevices):
                 wrong()

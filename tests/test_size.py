@@ -43,7 +43,7 @@ BUDGETS = {
     "studies/train_flow": 5_100,
     "studies/viewer": 3_450,
     "studies/video_to_events": 4_300,
-    "tests": 16_400,
+    "tests": 16_550,
     "tests/data": 1_000,
     "tests/events": 32_400,
     "tests/flow": 29_450,

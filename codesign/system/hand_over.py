@@ -220,7 +220,7 @@ def _digest(file):
 
 
 def _camera(page, lens):
-    names = render.Film.__dataclass_fields__
+    names = set(render.Film.__dataclass_fields__) - {"device"}
     film = {name: value for name, value in page.items() if name in names}
     if film.get("windows_px") is not None:
         film["windows_px"] = tuple(tuple(window) for window in film["windows_px"])

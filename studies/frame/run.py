@@ -294,7 +294,9 @@ def open_run(
         )
         _hold(config.resume, held)
         remove_unfinished(config.resume)
-        return Run(study, stored, config.resume, _device(stored), True, interruption)
+        # earlier versions stored what "auto" found, whether the study used it or not
+        device = _device(stored) if stored.GPU else torch.device("cpu")
+        return Run(study, stored, config.resume, device, True, interruption)
     device = _device(config)
     # the same device when the run is resumed
     config = dataclasses.replace(config, device=device.type)

@@ -25,8 +25,9 @@ POSITIVE = (
 
 @dataclass(frozen=True)
 class Options(StudyConfig):
-    GPU: ClassVar = True
     """Options that do not belong to the sensor."""
+
+    GPU: ClassVar = True
 
     input: Path | None = None
     """Video (.mp4, .avi, .mov, .mkv, .gif …), folder of pictures (PNG, JPEG, TIFF, BMP, 8 or 16

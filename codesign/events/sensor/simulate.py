@@ -28,7 +28,7 @@ from codesign.events.stream import concatenate, ordered
 from codesign.exclusive import exclusive
 from codesign.types import EventStream
 
-EVENTS_PER_PIXEL = 1.0  # room made at first; memory that no event writes to costs nothing
+EVENTS_PER_PIXEL = 1.0  # room made at first; on a processor, what no event writes to is no memory
 KEY_BITS = 63
 
 
@@ -96,18 +96,7 @@ def simulate(
     else:
         layout = KeyLayout(start_us, height_px, width_px)
         _check_range(layout, times_s[-1])
-        keys = []
-        size = backend.frames_per_kernel(height_px * width_px)
-        density = EVENTS_PER_PIXEL
-        for first in range(0, len(frames), size):
-            chunk = frames[first : first + size], times_s[first : first + size]
-            keys.append(
-                _interpolated_keys(*chunk, sensor, generator, moved, front_end, layout, density)
-            )
-            density = max(density, 1.25 * len(keys[-1]) / chunk[0].numel())
-        lanes = Lanes(frames, frames[0].numel())
-        t_us, x, y, p = layout.columns(lanes, keys[0] if len(keys) == 1 else np.concatenate(keys))
-        stream = EventStream(t_us, x, y, p, height_px, width_px)
+        stream = _interpolated(frames, times_s, sensor, generator, moved, front_end, layout)
     if at_once is not None:
         # behind the interval before, as all others
         stream = concatenate([_fired(at_once, start_us + 1), stream])
@@ -187,7 +176,7 @@ def _fired(counts, t_us):
     """Stream of whole counts [2, H, W] at one time."""
     polarity, y, x = counts.nonzero(as_tuple=True)
     many = counts[polarity, y, x].long()
-    x, y, p = (column.repeat_interleave(many).cpu() for column in (x, y, 1 - 2 * polarity))
+    x, y, p = (column.repeat_interleave(many) for column in (x, y, 1 - 2 * polarity))
     return ordered(torch.full_like(x, t_us), x, y, p, *counts.shape[1:])
 
 
@@ -200,6 +189,24 @@ def _v2e_events(frames, times_s, sensor, generator, state, front_end):
         parts.append(v2e.interval(intensity, level, time_s, sensor, generator, state))
     t_us, x, y, p = (torch.cat(column) for column in zip(*parts, strict=True))
     return ordered(t_us, x, y, p, *frames.shape[1:])
+
+
+@exclusive
+def _interpolated(frames, times_s, sensor, generator, state, front_end, layout):
+    """Stream of the events between frames; keys are views of drjit's memory, which nobody else may
+    use meanwhile."""
+    keys = []
+    size = backend.frames_per_kernel(frames[0].numel())
+    density = EVENTS_PER_PIXEL
+    for first in range(0, len(frames), size):
+        chunk = frames[first : first + size], times_s[first : first + size]
+        keys.append(
+            _interpolated_keys(*chunk, sensor, generator, state, front_end, layout, density)
+        )
+        density = max(density, 1.25 * len(keys[-1]) / chunk[0].numel())
+    together = keys[0] if len(keys) == 1 else np.concatenate(keys)
+    columns = layout.columns(Lanes(frames, frames[0].numel()), together)
+    return EventStream(*columns, layout.height_px, layout.width_px)
 
 
 @exclusive
@@ -223,7 +230,7 @@ def _interpolated_keys(frames, times_s, sensor, generator, state, front_end, lay
 def _random_keys(count, sensor, state, generator):
     """One random number per interval, where something is drawn per frame."""
     if not (sensor.photoreceptor_noise or sensor.leak_jitters):
-        return torch.zeros(count, dtype=torch.int32)
+        return torch.zeros(count, dtype=torch.int32, device=state.level.device)
     # one at a time, so that chunks draw what the whole draws
     return torch.stack([draw_keys((), generator) for _ in range(count)]).to(state.level.device)
 

@@ -146,7 +146,7 @@ def reach_m(camera: Camera, scene: Any, cameras: Tensor) -> float:
         return 1.0
     pixels = coarse_pixels(camera.film, 8)
     rays = camera.rays_through(pixels, torch.zeros_like(pixels))
-    first = torch.zeros(len(pixels), dtype=torch.long)
+    first = torch.zeros_like(pixels[:, 0], dtype=torch.long)
     _, distance = look(scene, cameras, first, rays.origin_m.double(), rays.direction.double())
     met = distance[distance.isfinite()]
     return float(met.median()) if len(met) else 1.0
