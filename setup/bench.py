@@ -30,7 +30,7 @@ import drjit  # noqa: E402
 import torch  # noqa: E402
 
 from codesign import doctor, events, flow, lens, mount, pose, render  # noqa: E402
-from codesign.errors import CodesignError  # noqa: E402
+from codesign.errors import CodesignError, DomainError  # noqa: E402
 from codesign.system import Batch, System  # noqa: E402
 from codesign.train.batches import to_device  # noqa: E402
 from codesign.train.learner import Learner  # noqa: E402
@@ -249,9 +249,13 @@ def worse(found: dict[str, dict[str, Any]], kept: dict[str, Any]) -> list[str]:
 
 
 def bench_check(options: argparse.Namespace) -> int:
+    if options.quick and options.write:
+        raise DomainError("--quick measures small works; leave it out to --write.")
     torch.set_num_threads(1)
     drjit.set_thread_count(1)  # two spin while they wait for each other
     found = timed(torch.device("cpu"), options.rounds, options.quick)
+    if options.quick:
+        return 0  # nothing to compare with
     if options.write:
         KEPT.write_text(
             json.dumps({"machine": machine.hardware(), "works": found}, indent=1) + "\n"
@@ -289,8 +293,8 @@ def training(device: torch.device, small: bool) -> dict[str, dict[str, Any]]:
         found[f"training step, {name}"] = {"ms": 1e3 * statistics.median(times[1:])}
     if device.type == "cuda":
         step = _robot_step(device, 2)
-        held = [(step(), torch.cuda.memory_allocated())[1] for _ in range(12)]
-        found["memory that ten robot steps keep"] = {"MB": (held[-1] - held[1]) / 1e6}
+        free = [(step(), torch.cuda.mem_get_info()[0])[1] for _ in range(12)]  # of drjit and torch
+        found["memory that ten robot steps keep"] = {"MB": (free[1] - free[-1]) / 1e6}
     return found
 
 

@@ -23,6 +23,7 @@ from codesign.atomic import write_atomic
 from codesign.errors import DomainError
 from codesign.events import SensorModel, SensorState, simulate
 from codesign.fidelity import Task
+from codesign.fidelity.levels import camera_at
 from codesign.flow import estimate_lk
 from codesign.flow.files import write_flow
 from codesign.lens import catalogue
@@ -108,7 +109,7 @@ def study(run: Run[Config]) -> None:
     config = checked(run.config)
     maker = Maker(config)
     if config.tolerance:
-        maker = Maker(cheapest(run, maker))
+        maker = Maker(*cheapest(run, maker))
     names = [
         f"sequence_{index:03d}_{FAMILIES[index % len(FAMILIES)]}"
         for index in range(config.trajectories)
@@ -192,8 +193,8 @@ def make_camera(config):
 
 
 def cheapest(run, maker):
-    """The configuration with the lens and the samples that --tolerance allows, chosen on windows
-    from the middle of the paths of the first sequences."""
+    """The configuration and the camera that --tolerance allows, chosen on windows from the middle
+    of the paths of the first sequences."""
     config = maker.config
     count = min(config.trajectories, len(FAMILIES))
     t_s = times(min(WINDOW, config.frames), config.rate_hz)
@@ -201,16 +202,17 @@ def cheapest(run, maker):
     poses = torch.stack([maker.path(index)(since_s + t_s).detach() for index in range(count)])
     task = Task(maker.camera, maker.sensor, poses, t_s, flow=estimate_lk)
     found = chosen(run, maker.scene, task, "hard", BINS, "the data set")
-    return replace(config, level=found.camera, samples=found.samples)
+    config = replace(config, level=found.camera, samples=found.samples)
+    return config, camera_at(maker.camera, found)
 
 
 class Maker:
     """What all sequences share: world, camera, sensor, the tables of truth, and the clock."""
 
-    def __init__(self, config):
+    def __init__(self, config, camera=None):
         self.config = config
         self.scene, self.stage = make_world(config.world, config.light)
-        self.camera = make_camera(config)
+        self.camera = camera or make_camera(config)
         self.sensor = SensorModel(
             config.theta, config.theta, config.theta_sigma, shot_rate_hz=config.shot_rate_hz
         )
