@@ -16,7 +16,6 @@ import json
 import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from functools import partial
@@ -29,7 +28,7 @@ sys.path.insert(0, str(ROOT))
 import drjit  # noqa: E402
 import torch  # noqa: E402
 
-from codesign import doctor, events, flow, lens, mount, pose, render  # noqa: E402
+from codesign import doctor, events, flow, lens, mount, render  # noqa: E402
 from codesign.errors import CodesignError, DomainError  # noqa: E402
 from codesign.system import Batch, System  # noqa: E402
 from codesign.train.batches import to_device  # noqa: E402
@@ -37,6 +36,7 @@ from codesign.train.learner import Learner  # noqa: E402
 from codesign.types import EventVolume, FlowField, FlowWindows  # noqa: E402
 from scenes import textures, trajectories, worlds  # noqa: E402
 from studies.frame import machine  # noqa: E402
+from studies.frame.bench import measure  # noqa: E402
 
 KEPT = ROOT / "docs" / "bench.json"
 PAGE = ROOT / "docs" / "speed_cuda.md"
@@ -181,7 +181,7 @@ def _robot_step(device, drives):
         objectives={"speed": lambda estimate: estimate.velocity.square().sum()},
     )
     t_s = torch.linspace(0, 0.02, 9, dtype=torch.float64)
-    start = pose.look_at((0, 0, 0), (1, 0, 0)) * 0 + torch.eye(4, dtype=torch.float64)
+    start = torch.eye(4, dtype=torch.float64)
     paths = [trajectories.translation(start, (0.3 + 0.1 * k, 0, 0), t_s) for k in range(drives)]
     batch = Batch(torch.stack(paths).to(device), t_s)
     geo.requires_grad_()
@@ -193,17 +193,17 @@ def _robot_step(device, drives):
     return step
 
 
-def seconds(call: Callable[[], Any], device: torch.device) -> float:
-    """By the clock on a GPU, of the processor elsewhere."""
+def seconds(call: Callable[[], Any], device: torch.device, repeats: int) -> tuple[float, ...]:
+    """Of every go: by the clock on a GPU, which is waited for, of the processor elsewhere."""
     if device.type == "cpu":
-        begun = time.process_time()
+        return measure(call, repeats, warm=0).cpu_s
+
+    def waited():
         call()
-        return time.process_time() - begun
+        torch.cuda.synchronize()
+
     torch.cuda.synchronize()
-    begun = time.perf_counter()
-    call()
-    torch.cuda.synchronize()
-    return time.perf_counter() - begun
+    return measure(waited, repeats, warm=0).wall_s
 
 
 def timed(
@@ -217,12 +217,15 @@ def timed(
         if only and name not in only:
             continue
         yard = beside[work.beside]
-        first = [seconds(work.call, device) for _ in range(10)]
-        pairs = [(seconds(work.call, device), seconds(yard, device)) for _ in range(rounds)]
-        time_s = statistics.median(own for own, _ in pairs)
+        first = seconds(work.call, device, 10)
+        own, other = [], []
+        for _ in range(rounds):
+            own += seconds(work.call, device, 1)
+            other += seconds(yard, device, 1)
+        time_s = statistics.median(own)
         found[name] = {
             "ms": 1e3 * time_s,
-            "over_yardstick": min(own for own, _ in pairs) / min(other for _, other in pairs),
+            "over_yardstick": min(own) / min(other),
             "yardstick": work.beside,
             "million_per_s": work.amount / time_s,
             "unit": work.unit,
@@ -233,14 +236,18 @@ def timed(
     return found
 
 
+def is_worse(row: dict[str, Any], kept: dict[str, Any]) -> bool:
+    """Whether a ratio is more than WORSE of the committed one."""
+    return row["over_yardstick"] > WORSE * kept["over_yardstick"]
+
+
 def worse(found: dict[str, dict[str, Any]], kept: dict[str, Any]) -> list[str]:
-    """Sentences on ratios that are more than WORSE of the committed ones, and on work that is not
-    there."""
+    """Sentences on ratios that are worse, and on work that is not there."""
     said = [f"{name}: no longer measured" for name in kept if name not in found]
     for name, row in found.items():
         if name not in kept:
             said.append(f"{name}: not in docs/bench.json; measure with --write")
-        elif row["over_yardstick"] > WORSE * kept[name]["over_yardstick"]:
+        elif is_worse(row, kept[name]):
             said.append(
                 f"{name}: {row['over_yardstick']:.3g} times its {row['yardstick']}, "
                 f"{kept[name]['over_yardstick']:.3g} when committed"
@@ -262,9 +269,7 @@ def bench_check(options: argparse.Namespace) -> int:
         )
         return 0
     kept = json.loads(KEPT.read_text())["works"]
-    if slow := [
-        name for name in found if name in kept and worse({name: found[name]}, {name: kept[name]})
-    ]:
+    if slow := [name for name in found.keys() & kept.keys() if is_worse(found[name], kept[name])]:
         for name, row in timed(torch.device("cpu"), options.rounds, options.quick, slow).items():
             found[name] = min(found[name], row, key=lambda each: each["over_yardstick"])
     said = worse(found, kept)
@@ -289,7 +294,7 @@ def training(device: torch.device, small: bool) -> dict[str, dict[str, Any]]:
             lambda told, batch: flow.losses.laplace_loss(told, batch.truth),
             mixed_precision=mixed,
         )
-        times = [seconds(partial(learner.step, windows), device) for _ in range(6)]
+        times = seconds(partial(learner.step, windows), device, 6)
         found[f"training step, {name}"] = {"ms": 1e3 * statistics.median(times[1:])}
     if device.type == "cuda":
         step = _robot_step(device, 2)

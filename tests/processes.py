@@ -1,5 +1,6 @@
-"""Python in a process of its own."""
+"""Python in a process of its own, and the scripts of setup/ as modules."""
 
+import importlib.util
 import os
 import subprocess
 import sys
@@ -20,3 +21,13 @@ def python(*arguments, cwd=ROOT, **environment):
         cwd=cwd,
         env={**os.environ, **environment},
     )
+
+
+def script(name):
+    """setup/<name>.py as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "setup" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

@@ -18,7 +18,7 @@ from codesign import backend
 
 MAKERS = (
     *(torch.zeros, torch.ones, torch.empty, torch.full, torch.eye, torch.arange, torch.linspace),
-    *(torch.tensor, torch.as_tensor, torch.from_numpy, torch.rand, torch.randn, torch.randint),
+    *(torch.tensor, torch.as_tensor, torch.rand, torch.randn, torch.randint),
     *(torch.randperm, torch.logspace, torch.tril_indices, torch.triu_indices, torch.hann_window),
     *(torch.empty_strided, torch.asarray, torch.frombuffer, torch.scalar_tensor, torch.normal),
 )

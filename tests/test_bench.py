@@ -1,20 +1,14 @@
 """The commands of setup/bench.py, on the processor: a slowdown fails, a missing GPU is said, and the
 page is of its JSON."""
 
-import importlib.util
 import json
-import sys
+import time
 
 import torch
 
-from tests.processes import ROOT, python
+from tests.processes import python, script
 
-SPEC = importlib.util.spec_from_file_location("bench", ROOT / "setup" / "bench.py")
-assert SPEC is not None
-assert SPEC.loader is not None
-bench = importlib.util.module_from_spec(SPEC)
-sys.modules["bench"] = bench
-SPEC.loader.exec_module(bench)
+bench = script("bench")
 
 
 def test_a_slowdown_fails_and_says_of_what():
@@ -39,7 +33,7 @@ def test_a_ratio_is_that_of_work_and_yardstick(monkeypatch):
     def spend(seconds):
         passed[0] += seconds
 
-    monkeypatch.setattr(bench.time, "process_time", lambda: passed[0])
+    monkeypatch.setattr(time, "process_time", lambda: passed[0])
     monkeypatch.setattr(bench, "yardsticks", lambda device: {"copy": lambda: spend(2.0)})
     work = bench.Work(lambda: spend(3.0), 6.0, "rays")
     monkeypatch.setattr(bench, "works", lambda device, small: {"trace": work})

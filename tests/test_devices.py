@@ -25,7 +25,7 @@ NOISY = events.SensorModel(0.15, 0.2, 0.03, 60.0, leak_rate_hz=3.0, shot_rate_hz
 
 def times():
     """As callers give them, on the host."""
-    return torch.linspace(0, 0.02, 9, dtype=torch.float64)
+    return T_S.cpu()
 
 
 def triplet(device, dtype=torch.float32):
@@ -53,7 +53,7 @@ def pictures(device):
 
 
 def volume():
-    """Event volume of 4 bins of what the memory layer sees."""
+    """Event volume of 8 bins of what the memory layer sees."""
     sensor = events.SensorModel(0.1, 0.1)
     counts = events.layer("memory", sensor)(pictures("cpu"), T_S).detach().float()
     return from_counts(counts, T_S, 8)
@@ -79,14 +79,14 @@ def tracing(device):
     return run
 
 
-def frames(make, **how):
+def frames(make, shown=render.frames, **how):
     """Frames of a lens, with slopes to it and to the poses."""
 
     def of(device):
         geo, scene, at = make(device), wall(device), poses(device).requires_grad_()
 
         def run():
-            seen = render.frames(camera(geo), scene, at, **how)
+            seen = shown(camera(geo), scene, at, **how)
             return [seen, *slopes(seen.square().mean(), *geo.parameters(), at)]
 
         return run
@@ -98,20 +98,10 @@ def thin(device):
     return lens.ThinLens(11.0, 4.0).focus_at(1.0).to(device).requires_grad_()
 
 
-def blurred(device):
-    geo, scene, at = thin(device), wall(device), poses(device).requires_grad_()
-
-    def run():
-        seen = render.psf_frames(camera(geo), scene, at)
-        return [seen, *slopes(seen.square().mean(), *geo.parameters(), at)]
-
-    return run
-
-
 def moving(device):
     """A board that moves before a wall, true flow and occlusion, and a view of one frame."""
     geo, at = triplet(device), poses(device).requires_grad_()
-    board = worlds.checkerboard(0.05, device=str(torch.device(device)).split(":")[0])
+    board = worlds.checkerboard(0.05, device=device)
     back = wall(device)
     turn = torch.eye(4, dtype=torch.float64, device=device).repeat(len(T_S), 1, 1)
     turn[:, 1, 3] = 0.2
@@ -268,10 +258,10 @@ def design(device):
 
 
 def upsampled(device):
-    given = pictures(device)[:, None].expand(-1, 3, -1, -1)[:, 0]
+    given = pictures(device).float()
 
     def run():
-        finer, times_s = events.upsample(given.float(), times(), max_displacement_px=0.5)
+        finer, times_s = events.upsample(given, times(), max_displacement_px=0.5)
         return [finer, times_s.to(finer.device)]
 
     return run
@@ -336,7 +326,7 @@ STAGES = {
     "traced frames": frames(triplet),
     "thin frames": frames(thin),
     "frames by differences": frames(thin, gradient="difference"),
-    "frames by point spread": blurred,
+    "frames by point spread": frames(thin, render.psf_frames),
     "moving parts": moving,
     "robot": robot,
     "hard": hard,

@@ -1,19 +1,14 @@
 """Figures in README and docs are those that docs/evidence.json has, and say when they are old."""
 
-import importlib.util
 import math
 import re
 import subprocess
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
-SPEC = importlib.util.spec_from_file_location("evidence", ROOT / "setup" / "evidence.py")
-assert SPEC is not None
-assert SPEC.loader is not None
-evidence = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(evidence)
+from tests.processes import ROOT, script
+
+evidence = script("evidence")
 
 
 def figures():

@@ -1,22 +1,15 @@
 """The commands that `make try-all` finds: those of the pages, none of a study that is not there."""
 
-import importlib.util
 import re
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+from tests.processes import ROOT, script
 
 
 @pytest.fixture(scope="module")
 def try_all():
-    spec = importlib.util.spec_from_file_location("try_all", ROOT / "setup" / "try_all.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return script("try_all")
 
 
 def test_every_study_that_a_page_names_is_there_and_is_tried(try_all):

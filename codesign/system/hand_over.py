@@ -23,6 +23,8 @@ FORMAT = "codesign mount 1"
 MOST_BYTES = 50_000_000  # of a lens file
 # metres, and entries of the rotation, between the transform and the mount's own numbers
 AGREES = 1e-9
+# what a film says of itself; where its coordinates are computed is not a part of it
+FILM = tuple(name for name in render.Film.__dataclass_fields__ if name != "device")
 COMMENT = """Pose of a camera on a robot, p_parent = R p_child + t: metres, unit quaternion (x, y, z, w).
 Axes of the parent as in REP 103: x forward, y left, z up. The child is an optical frame (suffix _optical_frame): z along
 the view, x right, y down in the image; its origin is the centre of the lens's entrance pupil. urdf_origin has the same
@@ -67,11 +69,7 @@ def save_hand_over(path: str | Path, handed: HandOver) -> None:
     page["urdf_origin"] = {"xyz_m": pose[:3, 3].tolist(), "rpy_rad": [roll, pitch, yaw]}
     page["lens"] = _lens_page(camera.lens, path)
     page["camera"] = {
-        **{
-            name: value
-            for name, value in asdict(camera.film).items()
-            if value is not None and name != "device"
-        },
+        **{name: value for name in FILM if (value := getattr(camera.film, name)) is not None},
         **{name: getattr(camera, name) for name in ("samples_per_pixel", "seed", "falloff", "aim")},
     }
     if camera.spectrum is not None:
@@ -220,11 +218,10 @@ def _digest(file):
 
 
 def _camera(page, lens):
-    names = set(render.Film.__dataclass_fields__) - {"device"}
-    film = {name: value for name, value in page.items() if name in names}
+    film = {name: value for name, value in page.items() if name in FILM}
     if film.get("windows_px") is not None:
         film["windows_px"] = tuple(tuple(window) for window in film["windows_px"])
-    rest = {name: value for name, value in page.items() if name not in names}
+    rest = {name: value for name, value in page.items() if name not in FILM}
     for name in ("falloff", "aim"):
         if not isinstance(rest.get(name, False), bool):
             raise DomainError(f"{name} is {rest[name]!r}; true or false is needed.")

@@ -29,6 +29,7 @@ from studies.codesign.design import Space
 from studies.codesign.landscape import landscape
 from studies.codesign.problem import Drawn
 from studies.codesign.race import SPACE, Judge, compared, racing, start, taken_up, training
+from studies.frame.config import check_least
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.sweep import Row, sweep
 from studies.placement.look import size_in_words
@@ -217,11 +218,7 @@ def checked(size: Config) -> None:
             f"--worlds is {size.worlds} and --designs {size.designs}; at most {MOST_WORLDS} worlds (others are for calibration) and "
             "at least 2 designs are needed."
         )
-    for name in ("worlds", "per_draw", "judged_worlds", "judged_drives", "settling"):
-        if getattr(size, name) < 1:
-            raise DomainError(
-                f"--{name.replace('_', '-')} is {getattr(size, name)}; at least 1 is needed."
-            )
+    check_least(size, 1, "worlds", "per_draw", "judged_worlds", "judged_drives", "settling")
     if size.grid < 2 or size.slopes == 1 or min(size.slopes, size.couplings, size.read_outs) < 0:
         raise DomainError(
             f"--grid needs 2 or more, --slopes 0, or 2 and more, --couplings and --read-outs 0 or more; they are "

@@ -14,6 +14,7 @@ from scenes.robots.pairs import PAIRS
 from studies.codesign import couplings
 from studies.codesign.design import Space
 from studies.codesign.race import SPACE, Judge, racing, training
+from studies.frame.config import check_least
 from studies.frame.run import Run, StudyConfig
 from studies.frame.sweep import Row, select, sweep
 
@@ -58,11 +59,8 @@ def setting(
     """
     if config.pair not in PAIRS:
         raise DomainError(f"--pair {config.pair}: choose from {', '.join(PAIRS)}.")
-    for name in ("seeds", "steps", "worlds", "per_draw", "judged_worlds", "judged_drives"):
-        if getattr(config, name) < 1:
-            raise DomainError(
-                f"--{name.replace('_', '-')} is {getattr(config, name)}; at least 1 is needed."
-            )
+    counts = ("seeds", "steps", "worlds", "per_draw", "judged_worlds", "judged_drives")
+    check_least(config, 1, *counts)
     told = {
         "pair": config.pair,
         "family": "retrofocus-4",

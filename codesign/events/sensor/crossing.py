@@ -23,7 +23,6 @@ import torch
 from codesign.backend import load
 from codesign.events.intensity import light_share
 from codesign.events.low_pass import coefficients, passed
-from codesign.exclusive import exclusive
 
 # of a pixel in one interval: beyond it a unit is wrong, and single precision would soon stop
 # counting
@@ -156,7 +155,6 @@ class KeyLayout:
             (pixel % self.width_px) << np.uint64(1)
         )
 
-    @exclusive
     def columns(self, lanes, keys):
         """t_us, x, y, p of int64 keys: int64 [N] each, where the frames are."""
         if not len(keys):

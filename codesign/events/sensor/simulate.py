@@ -196,24 +196,24 @@ def _interpolated(frames, times_s, sensor, generator, state, front_end, layout):
     """Stream of the events between frames; keys are views of drjit's memory, which nobody else may
     use meanwhile."""
     keys = []
-    size = backend.frames_per_kernel(frames[0].numel())
+    lanes = Lanes(frames, frames[0].numel())
+    size = backend.frames_per_kernel(lanes.width)
     density = EVENTS_PER_PIXEL
     for first in range(0, len(frames), size):
         chunk = frames[first : first + size], times_s[first : first + size]
         keys.append(
-            _interpolated_keys(*chunk, sensor, generator, state, front_end, layout, density)
+            _interpolated_keys(lanes, *chunk, sensor, generator, state, front_end, layout, density)
         )
         density = max(density, 1.25 * len(keys[-1]) / chunk[0].numel())
     together = keys[0] if len(keys) == 1 else np.concatenate(keys)
-    columns = layout.columns(Lanes(frames, frames[0].numel()), together)
-    return EventStream(*columns, layout.height_px, layout.width_px)
+    return EventStream(*layout.columns(lanes, together), layout.height_px, layout.width_px)
 
 
-@exclusive
-def _interpolated_keys(frames, times_s, sensor, generator, state, front_end, layout, density):
+def _interpolated_keys(
+    lanes, frames, times_s, sensor, generator, state, front_end, layout, density
+):
     """Sorted keys of the events of one chunk; a chunk busier than the room made for it is run again
     with the room it needs."""
-    lanes = Lanes(frames, frames[0].numel())
     random_keys = _random_keys(len(frames), sensor, state, generator)
     starts_s = [state.time_s, *times_s[:-1]]
     capacity = 4096 + int(density * frames.numel())
