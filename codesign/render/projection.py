@@ -8,9 +8,12 @@ U and B are Chebyshev series in both components of s, interpolated at their node
 against traced rays.
 """
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
+from codesign import backend
 from codesign.render.camera import Camera, lines, project
 from codesign.render.film import border_px
 
@@ -19,7 +22,7 @@ DEGREES = (8, 12, 16, 20)
 TOLERANCE_PX = 1e-6
 MARGINS = (0.2, 0.1, 0.03, 0.0)  # of the film's field, beyond its border
 STEPS = 3
-BLOCK = 2048  # points at a time: their series stay in the cache
+NEGLIGIBLE = 1e-12  # of the largest coefficient: symmetry makes most of them nothing but rounding
 
 
 class ProjectionTable:
@@ -70,36 +73,58 @@ class ProjectionTable:
         return pixels, base, slope
 
     def _from_series(self, points_cam_m):
-        straight = points_cam_m[:, :2] / points_cam_m[:, 2:]
-        near = 1 / points_cam_m[:, 2:]
-        if self.series is None:
+        count = len(points_cam_m)
+        if self.series is None or not count:  # a kernel needs a point
+            straight = points_cam_m[:, :2] / points_cam_m[:, 2:]
             return (
                 torch.full_like(straight, torch.nan),
                 torch.zeros_like(straight),
-                straight.clone(),
+                straight,
                 torch.zeros_like(straight[:, 0], dtype=torch.bool),
             )
-        slope = straight
-        base = torch.zeros_like(straight)
-        change = torch.full_like(near[:, 0], torch.inf)
-        for _ in range(STEPS):
-            base = self._series_at(slope, self.series[:, :, 2:])
-            before = slope
-            slope = straight - base * near
-        change = (slope - before).abs().amax(1)
-        inside = (((slope - self.middle) / self.half).abs() <= 1).all(1) & (change < 1e-9)
-        return self._series_at(slope, self.series[:, :, :2]), base, slope, inside
+        found = backend.run_kernel(
+            self._solved, points_cam_m.T.contiguous().unbind(), [(count,)] * 7
+        )
+        pixels, base, slope = (torch.stack(found[k : k + 2], 1) for k in (0, 2, 4))
+        return pixels, base, slope, found[6] > 0
 
-    def _series_at(self, slope, series):
-        at = ((slope - self.middle) / self.half).clamp(-1, 1).T.contiguous()
-        count, _, kinds = series.shape
-        return torch.cat(
-            [
-                ((series.reshape(count, -1).T @ x).reshape(count, kinds, -1) * y[:, None]).sum(0)
-                for x, y in (_chebyshev(part, count) for part in at.split(BLOCK, 1))
-            ],
-            1,
-        ).T
+    def _solved(self, arr, x, y, z):
+        """Kernel: pixel, base and slope of points, two components each, and 1 where they are in the
+        table. A point's bits do not depend on those beside it."""
+        import drjit as dr
+
+        slope = straight = [x / z, y / z]
+        for _ in range(STEPS):
+            base = self._series_at(arr, slope, (2, 3))
+            before = slope
+            slope = [s - b / z for s, b in zip(straight, base, strict=True)]
+        inside = arr.Bool(True)
+        for s, b, middle, half in zip(slope, before, *self._span(), strict=True):
+            inside &= (dr.abs((s - middle) / half) <= 1) & (dr.abs(s - b) < 1e-9)
+        pixels = self._series_at(arr, slope, (0, 1))
+        return *pixels, *base, *slope, dr.select(inside, arr.Float(1), 0)
+
+    def _series_at(self, arr, slope, kinds):
+        """Values of the series of some kinds at slopes, as literals: a table has a kernel of its
+        own, which leaves out what is 0."""
+        import drjit as dr
+
+        count = len(self.series)
+        across, down = (
+            _chebyshev(dr.clip((s - middle) / half, -1, 1), count)
+            for s, middle, half in zip(slope, *self._span(), strict=True)
+        )
+        values = []
+        for kind in kinds:
+            value = arr.Float(0)
+            for coefficients, term in zip(self.series[..., kind].tolist(), across, strict=True):
+                row = [c * each for c, each in zip(coefficients, down, strict=True) if c]
+                value = value + term * sum(row[1:], row[0]) if row else value
+            values.append(value)
+        return values
+
+    def _span(self):
+        return self.middle.tolist(), self.half.tolist()
 
     def _fitted(self, degree):
         """Coefficients [degree + 1, degree + 1, 4] of pixel and base; None when a node lies outside
@@ -115,9 +140,11 @@ class ProjectionTable:
         base, _ = lines(self.camera.chief_rays(pixels))
         values = torch.cat([pixels, base], 1).double().reshape(count, count, 4)
         # interpolation at the nodes: discrete orthogonality
-        basis = _chebyshev(nodes[None], count)[0].T * (2 / count)
+        basis = torch.stack(_chebyshev(nodes, count), 1) * (2 / count)
         basis[:, 0] /= 2
-        return torch.einsum("ik,jl,ijc->klc", basis, basis, values).contiguous()
+        series = torch.einsum("ik,jl,ijc->klc", basis, basis, values)
+        least = NEGLIGIBLE * series.abs().amax((0, 1))
+        return torch.where(series.abs() < least, 0.0, series)
 
     def _error_px(self):
         """Largest error against traced rays, at points of a spiral over the table and three
@@ -134,10 +161,9 @@ class ProjectionTable:
         return float((pixels - truth)[both].abs().max()) if bool(both.any()) else float("inf")
 
 
-def _chebyshev(at, count):
-    """T_0 .. T_(count - 1) at values [D, N] in [-1, 1]: [D, count, N]."""
-    terms = at.new_ones(at.shape[0], count, at.shape[1])
-    terms[:, 1] = at
-    for k in range(2, count):
-        torch.sub(2 * at * terms[:, k - 1], terms[:, k - 2], out=terms[:, k])
+def _chebyshev(at: Any, count: int) -> list[Any]:
+    """T_0 .. T_(count - 1) at values in [-1, 1]."""
+    terms = [at * 0 + 1, at]
+    for _ in range(2, count):
+        terms.append(2 * at * terms[-1] - terms[-2])
     return terms
