@@ -22,21 +22,31 @@ from codesign.atomic import write_atomic
 from codesign.errors import DomainError
 from scenes.robots import pair as robot_pair
 from scenes.robots.check import check_pair
+from scenes.robots.pair import RobotPair
 from scenes.robots.pairs import PAIRS
 from studies.codesign import couplings, page, read_outs, slopes
 from studies.codesign.arms import ARMS
 from studies.codesign.design import Space
 from studies.codesign.landscape import landscape
 from studies.codesign.problem import Drawn
-from studies.codesign.race import SPACE, Judge, compared, racing, start, taken_up, training
+from studies.codesign.race import (
+    SPACE,
+    Judge,
+    check_sizes,
+    compared,
+    racing,
+    start,
+    taken_up,
+    training,
+)
 from studies.frame.config import check_least
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.sweep import Row, sweep
 from studies.placement.look import size_in_words
+from studies.placement.race import check_same, fingerprints
 from studies.placement.searches import SEARCHES, available
 
 THIN = "thin"
-MOST_WORLDS = 200  # from 500 on are those of the landscape, from 700 on those of the read-outs
 LEAST_STEPS = 16  # of which an eighth is left to each block of eight sweeps
 
 
@@ -126,6 +136,9 @@ def study(run: Run[Config]) -> None:
     }
     space = Space.of(**{name: setting[name] for name in SPACE})
     setting["page"] = space.pair.page
+    same_robot(run, space.pair)
+    if size.raw is not None:
+        taken_up(size.raw, setting)  # before hours of the rest
     if size.robot:
         run.say(size_in_words(space.pair))
         check_pair(space.pair, space.made(space.start).camera, (0, robot_pair.UNSEEN_FROM))
@@ -158,6 +171,15 @@ def study(run: Run[Config]) -> None:
         page.designs(run, space, rows)
     run.record(seconds=run.seconds)
     run.finish("Lens, mount, sensor and estimator together", said)
+
+
+def same_robot(run: Run[Config], pair: RobotPair) -> None:
+    """Raise DomainError where a run that goes on is of another robot than the one that it was
+    begun with."""
+    now, stored = fingerprints(pair), run.load_state()
+    if stored:
+        check_same(stored.numbers, now)
+    run.save_state({}, now)
 
 
 def around(run: Run[Config], drawn: Drawn, at: torch.Tensor, rows: Sequence[Row]) -> None:
@@ -213,20 +235,12 @@ def checked(size: Config) -> None:
         lens.family(size.family)
     if size.seeds < 0:
         raise DomainError(f"--seeds is {size.seeds}; 0 or more are needed.")
-    if size.worlds > MOST_WORLDS or size.designs < 2:
-        raise DomainError(
-            f"--worlds is {size.worlds} and --designs {size.designs}; at most {MOST_WORLDS} worlds (others are for calibration) and "
-            "at least 2 designs are needed."
-        )
-    check_least(size, 1, "worlds", "per_draw", "judged_worlds", "judged_drives", "settling")
+    check_least(size, 2, "designs")
+    check_sizes(size)
     if size.grid < 2 or size.slopes == 1 or min(size.slopes, size.couplings, size.read_outs) < 0:
         raise DomainError(
             f"--grid needs 2 or more, --slopes 0, or 2 and more, --couplings and --read-outs 0 or more; they are "
             f"{size.grid}, {size.slopes}, {size.couplings} and {size.read_outs}."
-        )
-    if size.per_draw % min(size.worlds, size.per_draw):
-        raise DomainError(
-            f"--per-draw {size.per_draw} drives cannot be spread evenly over --worlds {size.worlds}; give a multiple."
         )
     if size.steps < LEAST_STEPS or size.steps % LEAST_STEPS:
         raise DomainError(f"--steps is {size.steps}; a multiple of {LEAST_STEPS} is needed.")

@@ -13,7 +13,7 @@ from codesign.errors import DomainError
 from scenes.robots.pairs import PAIRS
 from studies.codesign import couplings
 from studies.codesign.design import Space
-from studies.codesign.race import SPACE, Judge, racing, training
+from studies.codesign.race import SPACE, Judge, check_sizes, racing, training
 from studies.frame.config import check_least
 from studies.frame.run import Run, StudyConfig
 from studies.frame.sweep import Row, select, sweep
@@ -59,8 +59,8 @@ def setting(
     """
     if config.pair not in PAIRS:
         raise DomainError(f"--pair {config.pair}: choose from {', '.join(PAIRS)}.")
-    counts = ("seeds", "steps", "worlds", "per_draw", "judged_worlds", "judged_drives")
-    check_least(config, 1, *counts)
+    check_least(config, 1, "seeds")
+    check_sizes(config)
     told = {
         "pair": config.pair,
         "family": "retrofocus-4",

@@ -19,30 +19,35 @@ from codesign.mount.requirements import first_missed
 from scenes.robots import pair as robot_pair
 from studies.codesign.arms import ARMS, Task, read_out
 from studies.codesign.calibration import Calibration
-from studies.codesign.design import Space, Whole
+from studies.codesign.design import BLOCKS, Space, Whole
 from studies.codesign.objective import Objective
 from studies.codesign.problem import Drawn
+from studies.frame import workers
 from studies.frame.compare import Interval, crossed, holm, sign_flip
+from studies.frame.config import check_least
+from studies.placement.problem import check_drives
 
 EDGE = 0.1  # of the cube, that starts keep from its walls
 TRIES = 10_000
 SPACE = ("pair", "family", "light", "speed", "free", "held")  # of a setting (``Space.of``)
+MOST_WORLDS = 200  # from 500 on are those of the landscape, from 700 on those of the read-outs
 JUDGED = 7_700_000  # number of the judge's draw
 
 
 def start(space: Space, seed: int) -> Tensor:
     """Shares [V] at random, sensor and estimator as they are by default, that keep what is
-    required.
+    required. All numbers of a design are drawn, whichever are free: spaces that share some are
+    asked to begin alike in them.
 
     Raises: DomainError where none of TRIES does.
     """
     generator = torch.Generator().manual_seed(1000 + seed)
     requirements = space.pair.requirements()
     held = space.part("read-out")
+    names = [name for block in BLOCKS.values() for name in block]
     for _ in range(TRIES):
-        share = EDGE + (1 - 2 * EDGE) * torch.rand(
-            len(space.free), generator=generator, dtype=torch.float64
-        )
+        drawn = torch.rand(len(names), generator=generator, dtype=torch.float64)
+        share = EDGE + (1 - 2 * EDGE) * drawn[[names.index(name) for name in space.free]]
         share[held] = space.start[held]
         if kept(space, share, requirements):
             return share
@@ -167,6 +172,24 @@ def spread_over(worlds: int, drives: int) -> tuple[int, int]:
     """Worlds of a draw, and drives in each."""
     each = min(worlds, drives)
     return each, drives // each
+
+
+def check_sizes(size: Any) -> None:
+    """Raise DomainError for sizes of a configuration that no race can have."""
+    if size.worlds > MOST_WORLDS:
+        raise DomainError(
+            f"--worlds is {size.worlds}; at most {MOST_WORLDS} (others are for calibration)."
+        )
+    check_least(
+        size, 1, "steps", "worlds", "per_draw", "judged_worlds", "judged_drives", "settling"
+    )
+    if size.per_draw % min(size.worlds, size.per_draw):
+        raise DomainError(
+            f"--per-draw {size.per_draw} drives cannot be spread evenly over --worlds {size.worlds}; give a multiple."
+        )
+    _, each = spread_over(size.worlds, size.per_draw)
+    check_drives(per_draw=each, judged_drives=size.judged_drives)
+    workers.check_cluster(size.cluster)
 
 
 class Judge:

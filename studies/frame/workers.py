@@ -7,6 +7,7 @@ import socket
 import sys
 from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed, wait
+from contextlib import contextmanager
 from threading import Event
 from typing import Any, TypeVar
 
@@ -65,6 +66,35 @@ def on_cluster(
     Raises: MissingPackageError without Ray; CodesignError where there is no cluster, or as
       ``in_processes``.
     """
+    with _connected(address) as ray:
+        name = f"{function.__module__}:{function.__qualname__}"
+        ask = ray.remote(num_cpus=1, max_retries=TRIES - 1, max_calls=1)(_asked)
+        waiting = {ask.remote(name, json.dumps(dict(given))): key for key, given in calls.items()}
+        while waiting:
+            done, _ = ray.wait(list(waiting))
+            for each in done:
+                try:
+                    yield waiting.pop(each), json.loads(ray.get(each))
+                except ray.exceptions.RayError as error:
+                    last = str(error).strip().splitlines()[-1][:300]
+                    raise CodesignError(
+                        f"a call of {name} failed on the cluster: {last}"
+                    ) from error
+
+
+def check_cluster(address: str) -> None:
+    """Raise what ``on_cluster`` does where there is no such cluster, before anything is computed;
+    "" is none to ask for."""
+    if address == HERE:
+        require("ray", "cluster", "a sweep over a cluster")
+    elif address:
+        with _connected(address):
+            pass
+
+
+@contextmanager
+def _connected(address):
+    """Ray, connected to a cluster."""
     ray = require("ray", "cluster", "a sweep over a cluster")
     environment = {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
     alone = address == HERE
@@ -82,19 +112,7 @@ def on_cluster(
     except (OSError, ValueError, RuntimeError) as error:
         raise CodesignError(f"there is no Ray cluster at '{address}' ({error}).") from error
     try:
-        name = f"{function.__module__}:{function.__qualname__}"
-        ask = ray.remote(num_cpus=1, max_retries=TRIES - 1, max_calls=1)(_asked)
-        waiting = {ask.remote(name, json.dumps(dict(given))): key for key, given in calls.items()}
-        while waiting:
-            done, _ = ray.wait(list(waiting))
-            for each in done:
-                try:
-                    yield waiting.pop(each), json.loads(ray.get(each))
-                except ray.exceptions.RayError as error:
-                    last = str(error).strip().splitlines()[-1][:300]
-                    raise CodesignError(
-                        f"a call of {name} failed on the cluster: {last}"
-                    ) from error
+        yield ray
     finally:
         ray.shutdown()
 

@@ -32,7 +32,7 @@ from studies.frame.run import Run, main
 from studies.placement.look import look, size_in_words
 from studies.placement.outcome import Outcome
 from studies.placement.page import report
-from studies.placement.problem import DRIVES, Problem, traced_camera
+from studies.placement.problem import DRIVES, Problem, check_drives, traced_camera
 from studies.placement.race import Race, feasible
 from studies.placement.searches import SEARCHES, available
 
@@ -127,11 +127,7 @@ def checked(size: Config) -> None:
             f"--pair {size.pair}: choose from {', '.join(PAIRS)}, or give --robot and a .yaml file."
         )
     check_least(size, 1, "seeds", "steps", "worlds", "per_world", "judged_worlds", "judged_drives")
-    for name in ("per_world", "judged_drives"):
-        if getattr(size, name) > DRIVES:
-            raise DomainError(
-                f"--{name.replace('_', '-')} is {getattr(size, name)}; a world has {DRIVES} drives."
-            )
+    check_drives(per_world=size.per_world, judged_drives=size.judged_drives)
     if len(set(size.searches)) < len(size.searches):
         raise DomainError(f"--searches {' '.join(size.searches)} names one twice; name each once.")
     if not 0 <= size.seed <= HIGHEST_SEED:

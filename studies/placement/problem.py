@@ -28,6 +28,15 @@ from scenes.robots.pair import Drives, RobotPair, times
 DRIVES = 48  # of every world that draws are made from
 
 
+def check_drives(**told: int) -> None:
+    """Raise DomainError for an option that asks for more drives of a world than there are."""
+    for name, count in told.items():
+        if count > DRIVES:
+            raise DomainError(
+                f"--{name.replace('_', '-')} asks for {count} drives of a world; a world has {DRIVES}."
+            )
+
+
 @dataclass(frozen=True)
 class Samples:
     """Drives in ``numbers`` of worlds, the same ``which`` of each, and the seed of film samples and

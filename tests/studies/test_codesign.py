@@ -187,6 +187,18 @@ def test_starts_keep_what_is_required(space):
     assert kept(space, other, requirements)
 
 
+def test_spaces_with_other_numbers_free_begin_alike_in_those_they_share(space):
+    held = Space.of("outdoors", None, held={"fno": 2.0})
+    shared = [name for name in space.free if name in held.free]
+    assert len(shared) == len(space.free) - 1
+    for seed in range(3):
+        one, other = (
+            [float(start(each, seed)[each.free.index(name)]) for name in shared]
+            for each in (space, held)
+        )
+        assert one == other
+
+
 def test_the_book_takes_the_longest_lens_that_sees_ahead_and_focuses_it_hyperfocally(space):
     found = chosen_by_the_book(space, space.pair.requirements())
     # full light makes 70 at f/1.2, the knee is at 20: f/1.2 sqrt(70 / 20)
@@ -240,11 +252,16 @@ def test_the_comparison_is_of_pairs():
         (["--arms", "joint"], "another one"),
         (["--processes", "-1"], "0 or more"),
         (["--raw", "nowhere.jsonl"], "no such file"),
+        (["--judged-drives", "100"], "a world has 48"),
+        (["--worlds", "1", "--per-draw", "60"], "a world has 48"),
+        (["--worlds", "300", "--per-draw", "300"], "at most 200"),
+        (["--cluster", "127.0.0.1:1"], "no Ray cluster at '127.0.0.1:1'"),
     ],
 )
 def test_wrong_command_lines_end_with_a_sentence(wrong, said, tmp_path, capsys):
     assert main(codesign.study, codesign.Config, [*wrong, "--out", str(tmp_path / "run")]) == 2
     assert said in capsys.readouterr().err
+    assert not list((tmp_path / "run").glob("*.jsonl"))  # nothing was looked at before
 
 
 def test_a_way_keeps_the_last_rounds_that_were_recorded():
@@ -329,6 +346,13 @@ def test_a_small_race_says_that_it_decides_nothing(here):
     before = (folder / "race.jsonl").read_bytes()
     assert main(codesign.study, codesign.Config, ["--resume", str(folder)]) == 0
     assert (folder / "race.jsonl").read_bytes() == before
+
+
+def test_a_race_of_another_robot_is_not_gone_on_with(here, monkeypatch, capsys):
+    _, folder, _ = here
+    monkeypatch.setattr(codesign, "fingerprints", lambda pair: {"the robot's page": "another"})
+    assert main(codesign.study, codesign.Config, ["--resume", str(folder)]) == 2
+    assert "the robot's page changed since this run was begun" in capsys.readouterr().err
 
 
 def test_designs_are_carried_together_as_each_alone(drawn, space):
