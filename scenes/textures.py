@@ -90,9 +90,9 @@ def decoded(data: bytes, what: str) -> np.ndarray:
 def stored_values(image: PIL.Image.Image) -> np.ndarray:
     """Values of a picture as they are stored: [H, W] or [H, W, 3]. Raises: ValueError where white
     is not known."""
-    if image.mode == "I":
-        raise ValueError("it holds whole numbers of 32 bits, whose white is not known")
-    gray = image.mode in ("L", "F") or image.mode.startswith("I;16")
+    if image.mode in ("I", "F"):
+        raise ValueError("it holds numbers of 32 bits, whose white is not known")
+    gray = image.mode == "L" or image.mode.startswith("I;16")
     return np.asarray(image if gray else image.convert("RGB"))
 
 
@@ -262,6 +262,11 @@ def picture(
             raise DomainError(
                 f"an array coded by sRGB has pixels [H, W] or [H, W, 3], uint8, uint16 or 0..1, not {pixels.dtype} "
                 f"{pixels.shape}; numbers of 0 to 255 become so by .astype(np.uint8)."
+            )
+        if pixels.dtype.kind == "f" and pixels.max() > 1:
+            raise DomainError(
+                f"an array coded by sRGB has a {pixels.max():g}, and floating-point pixels go from 0 to 1; divide by "
+                "white."
             )
         return _radiance(linear(pixels), "given as an array")
     else:

@@ -29,6 +29,8 @@ LONGEST_LINE = 400
 UNIT_TOLERANCE = 1e-3  # of a quaternion's length: files with four digits stay within 1e-4
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,4})?")
 NAMES = re.compile(r"(timestamp|time|t)(_s)? t?x(_m)? t?y(_m)? t?z(_m)? qx qy qz qw")
+FOREIGN = re.compile(r"\[ns\]|q\w*w\b.*q\w*x\b")  # of EuRoC and TUM-VI
+LATEST_S = 1e11  # milliseconds since 1970 are beyond
 HEADER = "# timestamp tx ty tz qx qy qz qw"
 
 
@@ -65,6 +67,11 @@ def read_tum(path: str | Path) -> tuple[torch.Tensor, torch.Tensor]:
     for number, line in enumerate(read_text(path, MOST_BYTES).split("\n"), start=1):
         line = line.strip(" \t\r")
         if not line or line.startswith("#"):
+            if FOREIGN.search(line):
+                raise FileFormatError(
+                    f"{path}, line {number}: {line[:60]!r} has nanoseconds or quaternions that begin with w; write "
+                    "seconds, and qx qy qz qw."
+                )
             continue
         words = _words(line) if len(line) <= LONGEST_LINE else []
         if not rows and NAMES.fullmatch(" ".join(words)):
@@ -92,6 +99,7 @@ def read_tum(path: str | Path) -> tuple[torch.Tensor, torch.Tensor]:
             f"the quaternion qx qy qz qw has not length 1 (to {UNIT_TOLERANCE:g}), so it is no rotation",
         ),
         (np.diff(table[:, 0], prepend=-np.inf) <= 0, "the timestamp is not after the one before"),
+        (table[:, 0] > LATEST_S, "the timestamp is no time in seconds"),
     ):
         if bad.any():
             at = int(np.flatnonzero(bad)[0])

@@ -180,6 +180,15 @@ def check_level(state: Tensor, level: Tensor) -> Tensor:
     return check(state, tuple(level.shape[1:]), "the state", (level.dtype,), finite=True)
 
 
+def check_begun(state: Any, generator: Any) -> None:
+    """Raise DomainError where a later chunk is given a generator beside its state."""
+    if state is not None and generator is not None:
+        raise DomainError(
+            "a generator and a state are given; the state carries the generator of its first chunk on: "
+            "leave the generator out."
+        )
+
+
 def check_state(state: object, kind: type) -> None:
     """Raise DomainError for a state that is neither None nor of its kind."""
     if state is not None:

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from codesign.errors import CodesignError
+from codesign.errors import CodesignError, DomainError
 from codesign.events import SensorModel
 from codesign.fidelity.levels import (
     Fidelity,
@@ -115,6 +115,10 @@ def change(found: Tensor, reference: Tensor) -> float:
     from draw to draw, leaves their mean alone.
     """
     off = found.double() - reference.double()
+    if not bool(off.isfinite().all()):
+        raise DomainError(
+            "what is judged is not finite on every draw; judge by numbers that a drive without motion has too."
+        )
     count = len(off)
     square = off[0].square()
     if count > 1:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from codesign.render.hits import Hits, first_hits
-from codesign.render.moving import MovingScene, views_of
+from codesign.render.moving import MovingScene, at_frames, views_of
 from codesign.types import ChiefRayCamera
 
 LEVEL = 1e-6  # metres that a ray must fall per metre of depth to meet the ground
@@ -110,6 +110,13 @@ def _on_surfaces(rays, pixels, T_world_cam, scene):
     )
     ahead = origin[..., 2] + direction[..., 2] * hits.distance_m
     return hits, torch.where(hits.part == 0, ahead, torch.inf)
+
+
+def at_frame(scene: Any, frame: int) -> Any:
+    """A scene, or each of a tuple of them, with its objects where they are at a frame."""
+    if isinstance(scene, tuple | list):
+        return tuple(at_frame(world, frame) for world in scene)
+    return at_frames(scene, [frame])
 
 
 def _scenes(scene):

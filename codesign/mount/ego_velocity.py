@@ -19,7 +19,7 @@ from torch import Tensor
 from codesign.checks import check_finite, check_positive, check_whole
 from codesign.errors import DomainError
 from codesign.mount import unknown_depth
-from codesign.mount.depth import ground_and_scene_depth, ground_depth, scene_depth
+from codesign.mount.depth import at_frame, ground_and_scene_depth, ground_depth, scene_depth
 from codesign.mount.observability import PLANAR, body_flow, flow_precision
 from codesign.mount.unknown_depth import UnknownDepth
 from codesign.types import ChiefRayCamera, FlowField
@@ -178,7 +178,7 @@ class EgoVelocity:
             .reshape(-1, 4, 4)
         )
         known = depth or self.depth
-        depth_m = known(camera, middle, poses[:, frame], scene)
+        depth_m = known(camera, middle, poses[:, frame], at_frame(scene, frame))
         rows, on_surface = self._rows(camera, depth_m, mounts, middle, field.interval_s)
         parallax = None
         if isinstance(known, UnknownDepth):

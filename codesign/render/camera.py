@@ -84,6 +84,12 @@ class Camera:
         self.lens: Any = lens
         if film is not None:
             check_kind(film, Film, "camera: the film")
+            sizes = (film.width_px, film.height_px), tuple(film.sensor_px.int().tolist())
+            if (width_px, height_px) not in sizes or pixel_pitch_mm != film.pixel_pitch_mm:
+                raise DomainError(
+                    f"camera: {width_px} x {height_px} px of {pixel_pitch_mm:g} mm are given beside a film of "
+                    f"{film.width_px} x {film.height_px} px of {film.pixel_pitch_mm:g} mm; give the film's own."
+                )
         self.samples_per_pixel = samples_per_pixel
         self.seed = check_seed(seed, "camera: seed")
         self._film = (

@@ -80,6 +80,11 @@ def exposed_frames(
     check_number(exposure_s, "exposure_s", 0.0)
     check_number(line_s, "line_s", remedy="the seconds from one row of the sensor to the next")
     samples = check_whole(samples, "time samples of an exposure")
+    if (exposure_s or line_s) and isinstance(scene, MovingScene) and scene.names:
+        raise DomainError(
+            "the objects of a MovingScene stand still during an exposure and from line to line; give a function "
+            "of time that returns one, see codesign.render.time."
+        )
     nodes_s = [((k + 0.5) / samples - 0.5) * exposure_s for k in range(samples)]
     if not line_s:
         return _exposed(camera, scene, trajectory, t_s, nodes_s, gradient, per_px)

@@ -35,7 +35,8 @@ class MitsubaScene:
 
     Args:
       description: a Mitsuba scene dictionary; every shape carries an area emitter (of radiance 0
-        where it is black). Also an mi.Scene that is loaded already.
+        where it is black). Also an mi.Scene that is loaded already. Shapes, their places and their
+        pictures' uv are remembered: after an update of these make a new MitsubaScene.
       device: "cpu" or "cuda".
       merge: whether Mitsuba may join meshes that look alike into one.
       emissive: whether every shape must have an emitter; False for a scene whose geometry alone is
@@ -140,19 +141,26 @@ class MitsubaScene:
     def _shown(self, shape, geometric):
         """What a shape shows to rays that meet it, and its normal there; geometric: as
         ``are_geometric`` says."""
-        import drjit as dr
-
         mi = self.mi
-        asked = mi.RayFlags.UV | (mi.RayFlags.Minimal if geometric else mi.RayFlags.ShadingFrame)
 
         def shown(origin, direction, found):
             ray = mi.Ray3f(origin, direction)
-            si = shape.compute_surface_interaction(ray, found, asked)
-            if not geometric:
-                si.n = dr.mulsign(si.n, dr.dot(si.n, si.sh_frame.n))
+            si = self._met(shape, geometric, ray, found, mi.RayFlags.UV)
             return self.leaving(shape, si, ray), si.n
 
         return shown
+
+    def _met(self, shape, geometric, ray, found, asked):
+        """Where a ray meets a shape, its normal on the side that the shape's own normals say:
+        mirrored rectangles and cubes have theirs on the other one."""
+        import drjit as dr
+
+        flags = self.mi.RayFlags
+        asked |= flags.Minimal if geometric else flags.ShadingFrame
+        si = shape.compute_surface_interaction(ray, found, asked)
+        if not geometric:
+            si.n = dr.mulsign(si.n, dr.dot(si.n, si.sh_frame.n))
+        return si
 
     def _beyond(self, origin, direction, found):
         """What is seen where nothing is met."""
@@ -250,12 +258,10 @@ class MitsubaScene:
         if any(shape.class_name() == "Instance" for shape in shapes):
             return found.compute_surface_interaction(ray, mi.RayFlags.Minimal).n
 
-        def of(shape):
-            return lambda ray, found: (
-                shape.compute_surface_interaction(ray, found, mi.RayFlags.Minimal).n
-            )
+        def of(shape, geometric):
+            return lambda ray, found: self._met(shape, geometric, ray, found, mi.RayFlags.Minimal).n
 
-        across = [*map(of, shapes), lambda ray, found: mi.Normal3f(0, 0, 0)]
+        across = [*map(of, shapes, self._geometric), lambda ray, found: mi.Normal3f(0, 0, 0)]
         return dr.switch(self._number(found), across, ray, found)
 
 

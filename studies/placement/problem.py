@@ -33,7 +33,7 @@ def check_drives(**told: int) -> None:
     for name, count in told.items():
         if count > DRIVES:
             raise DomainError(
-                f"--{name.replace('_', '-')} asks for {count} drives of a world; a world has {DRIVES}."
+                f"--{name.replace('_', '-')} is {count}; a world has {DRIVES} drives."
             )
 
 

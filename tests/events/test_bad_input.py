@@ -3,6 +3,7 @@ one sentence that names what was given. Plain types and signs of single argument
 (``tests/test_doors.py``)."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -219,3 +220,38 @@ def test_what_a_layer_leaves_out_of_its_sensor_is_named(name):
         layer(name, events.PRESETS["default"])
     # warns of nothing: warnings are errors here
     layer(name, SensorModel(theta_sigma=0.03, shot_rate_hz=1.0))
+
+
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        SensorModel(theta_sigma=0.03, leak_rate_hz=5.0, leak_jitter=0.5, shot_rate_hz=50.0),
+        SensorModel(timing="v2e", refractory_s=2e-3, theta_sigma=0.03, shot_rate_hz=50.0),
+    ],
+    ids=["interpolated", "v2e"],
+)
+def test_a_refused_chunk_leaves_state_and_generator_as_they_were(sensor):
+    bad = FRAMES.clone()
+    bad[-1, 0, 0] = NAN
+    streams = []
+    for refused in (False, True):
+        state = events.SensorState(generator=torch.Generator().manual_seed(0))
+        if refused:  # the first chunk
+            with pytest.raises(DomainError):
+                events.simulate(bad, T_S, sensor, state=state)
+        events.simulate(FRAMES, T_S, sensor, state=state)
+        if refused:  # a later one
+            with pytest.raises(DomainError):
+                events.simulate(bad, T_S + 1, sensor, state=state)
+        streams.append(events.simulate(FRAMES, T_S + 1, sensor, state=state))
+    one, other = streams
+    assert len(one.t_us) > 20
+    for name in ("t_us", "x", "y", "p"):
+        assert torch.equal(getattr(one, name), getattr(other, name))
+
+
+def test_a_changed_noise_rate_is_drawn_anew():
+    noisy = layer("memory", SensorModel(theta_on=9.0, theta_off=9.0, shot_rate_hz=20.0))
+    few = noisy(FRAMES, T_S).sum()
+    noisy.sensor = replace(noisy.sensor, shot_rate_hz=2000.0)
+    assert noisy(FRAMES, T_S).sum() > 20 * few > 0

@@ -18,6 +18,7 @@ from codesign.mount import (
     scene_depth,
     velocity_errors,
 )
+from codesign.render.charts import glowing
 from codesign.types import FlowField
 from scenes import worlds
 
@@ -186,3 +187,22 @@ def test_scores_by_hand():
     assert float(errors.bounded()[3]) == pytest.approx(1.0, abs=1e-3)
     assert errors.table()["left"]["bias_m_s"] == pytest.approx((9 - 0.15) / 4)
     assert errors.table()["yaw"]["p50_rad_s"] == pytest.approx(0.15)
+
+
+def test_a_plate_on_the_camera_has_no_depth_whenever_the_interval_ends(camera):
+    """It moves with the camera, and covers the same pixels in every frame."""
+    corners = torch.tensor([[-1, -1, 5], [1, -1, 5], [1, 1, 5], [-1, 1, 5]], dtype=D) * 0.04
+    plate = glowing(corners[torch.tensor([[0, 1, 2], [0, 2, 3]])])
+    t_s = torch.linspace(0, 0.04, 9, dtype=D)
+    start = pose.look_at((0, 0, 1.0), (0, 0.001, 0.0))
+    step = torch.tensor([2.0, 0, 0, 0, 0, 0], dtype=D)
+    path = start @ pose.se3_exp(t_s[:, None] * step)
+    scene = render.MovingScene(worlds.smooth_plane(), {"plate": (plate, path)})
+    flow = torch.zeros(1, 2, *camera.film.shape)
+    covered = []
+    for interval_s in (0.04, 0.02):
+        field = replace(field_of(flow), interval_s=interval_s)
+        read = EgoVelocity(depth="ground").read(field, camera, scene, torch.eye(4), path[None], t_s)
+        covered.append(read.depth_m.isinf())
+    assert torch.equal(*covered)
+    assert 0.2 < float(covered[0].double().mean()) < 0.8

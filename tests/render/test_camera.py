@@ -8,6 +8,7 @@ import torch
 from scipy.special import j1
 
 from codesign import lens, render
+from codesign.errors import DomainError
 from codesign.pose import look_at
 from codesign.render import Camera, Film, TexturedPlane, angular_miss_rad, project
 from scenes import worlds
@@ -179,6 +180,13 @@ def test_windows_equal_the_crops_of_the_full_frame():
         whole = tell(full)
         crops = [whole[..., top : top + 9, left : left + 12] for left, top in corners]
         torch.testing.assert_close(tell(part), torch.stack(crops, -3), rtol=0, atol=1e-10)
+
+
+def test_a_film_beside_other_sizes_is_refused():
+    with pytest.raises(
+        DomainError, match=r"640 x 480 px of 0\.01 mm are given beside a film of 32"
+    ):
+        Camera(lens.Pinhole(8.0), 640, 480, 0.01, film=Film(32, 24, 32, 24, 0.1))
 
 
 def test_pixels_are_in_image_order_with_the_axis_in_the_middle():

@@ -152,6 +152,15 @@ def test_a_line_time_without_end_is_refused():
         render.exposed_frames(camera(), grating(9.0), still, [0.0], 0.0, line_s=math.inf)
 
 
+def test_objects_that_would_stand_still_within_an_exposure_are_refused():
+    scene = sweeping(100.0)(torch.zeros(1, dtype=D))
+    for exposure_s, line_s in ((0.01, 0.0), (0.0, 1e-3)):
+        with pytest.raises(DomainError, match="stand still during an exposure"):
+            render.exposed_frames(camera(), scene, still, [0.0], exposure_s, line_s=line_s)
+    frame = render.frames(camera(), scene, still([0.0]))
+    assert torch.equal(render.exposed_frames(camera(), scene, still, [0.0], 0.0, 1), frame)
+
+
 # ---- adaptive times
 
 

@@ -135,6 +135,16 @@ def test_points_of_a_view_project_to_their_pixels(name):
     assert float((back - cam.film.pixels()[found.valid.reshape(-1)]).detach().abs().max()) <= 1e-9
 
 
+@pytest.mark.parametrize("kind", ["rectangle", "cube"])
+def test_the_normal_of_a_mirrored_shape_is_on_the_side_that_glows(kind):
+    mirrored = backend.mitsuba().ScalarTransform4f().scale([-1, 1, 1])
+    scene = emitting(type=kind, to_world=mirrored)
+    cam = Camera(lens.Pinhole(8.0), 3, 3, 0.1, 1)
+    assert float(render.frames(cam, scene, above())[0, 1, 1]) == pytest.approx(100)
+    normal = view(cam, scene, above(), 0).normal[1, 1]
+    torch.testing.assert_close(normal, torch.tensor([0.0, 0.0, 1.0], dtype=D), rtol=0, atol=1e-6)
+
+
 def test_pixels_that_meet_nothing_are_zero_and_without_object():
     found = view(Camera(lens.Pinhole(8.0), 33, 21, 0.1, 1), sphere(0.2), above(), 0)
     assert 0 < int(found.valid.sum()) < 33 * 21

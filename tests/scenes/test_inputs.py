@@ -52,6 +52,7 @@ def test_a_damaged_hdr_ends_in_a_sentence(tmp_path, damage):
         (lambda: worlds.room(photos=[np.full((4, 4), 99)]), "int64 may hold pixels"),
         (lambda: textures.picture(EVEN.astype(int), encoding="srgb"), r"not int64 .*np.uint8"),
         (lambda: textures.picture(EVEN.astype(np.uint32), encoding="srgb"), "not uint32"),
+        (lambda: textures.picture(200 * EVEN, encoding="srgb"), "go from 0 to 1; divide by white"),
         (lambda: textures.picture(np.array([["a"]])), "holds no numbers"),
         (lambda: textures.picture(np.empty((0, 0))), r"shape \(0, 0\)"),
         (lambda: textures.picture(1e39 * EVEN), "NaN or infinite"),
@@ -82,6 +83,9 @@ def test_an_array_of_bytes_says_how_it_is_coded(tmp_path):
         textures.picture(tmp_path / "grey.png"),
         rtol=1e-6,
     )
+    imageio.imwrite(tmp_path / "float.tiff", pixels / np.float32(255))
+    with pytest.raises(FileFormatError, match="numbers of 32 bits, whose white is not known"):
+        textures.picture(tmp_path / "float.tiff")
     for whole in (np.uint8, np.int32, np.int64):
         assert float(textures.picture(pixels.astype(whole), encoding="linear").max()) == 188
 

@@ -96,6 +96,9 @@ def test_four_digit_quaternions_become_rotations(tmp_path):
         (f"t_s,x,y,z,qw,qx,qy,qz\n{LINE}\n", "line 1: .* is not"),
         (f"{LINE}\nt x y z qx qy qz qw\n", "line 2: .* is not"),
         ("t x y z qx qy qz qw\n", "holds no pose"),
+        (f"#timestamp [ns],px,py,pz,qx,qy,qz,qw\n{LINE}\n", "line 1: .* nanoseconds"),
+        (f"# t, p_x, p_y, p_z, q_RS_w, q_RS_x, q_RS_y, q_RS_z\n{LINE}\n", "begin with w"),
+        (f"1520530308199447626 {LINE[4:]}\n", "line 1: the timestamp is no time in seconds"),
     ],
 )
 def test_hostile_files_are_refused_with_the_line(text, sentence, tmp_path):

@@ -37,12 +37,15 @@ def test_changes_are_root_mean_squares_less_the_noise_of_the_sensor():
     """Of flow off by (3, 4) px everywhere the length is 5; independent noise of 2 px beside it
     leaves 5 within four deviations: a mean of products over 20000 pixels and 6 pairs of draws."""
     truth = torch.zeros(1, 5, 2, 40, 100)
-    bias = torch.tensor([3.0, 4.0])[:, None, None].expand(1, 5, 2, 40, 100)
+    bias = torch.tensor([3.0, 4.0])[:, None, None].expand(1, 5, 2, 40, 100).clone()
     assert change(bias, truth) == pytest.approx(5)
     draws = 2 * torch.randn(4, 5, 2, 40, 100, generator=torch.Generator().manual_seed(0))
     deviation = (5 * 2 * 2 / 2 / 20000**0.5 + 4 / (6 * 10000) ** 0.5) / 10
     assert change(bias + draws, truth.expand_as(draws)) == pytest.approx(5, abs=4 * deviation)
     assert change(bias + draws, truth.expand_as(draws)) < change((bias + draws)[:1], truth) - 0.5
+    bias[0, 0, 0, 0, 0] = torch.nan
+    with pytest.raises(DomainError, match="not finite on every draw"):
+        change(bias, truth)
 
 
 def test_levels_share_the_ends_of_the_drive_and_colours_their_samples():

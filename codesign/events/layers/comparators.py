@@ -302,7 +302,9 @@ class ComparatorLayer(EventLayer):
         draws_thetas = self.sensor.theta_sigma > 0 and state.deviates is None
         if not draws_thetas and not self.sensor.has_shots:
             return state.deviates, None
-        asked = (frames.shape, frames.dtype, frames.device, interval_s.tolist(), draws_thetas)
+        rate_hz = self.sensor.shot_rate_hz
+        of_frames = frames.shape, frames.dtype, frames.device
+        asked = (*of_frames, interval_s.tolist(), draws_thetas, rate_hz)
         deviates, shots = self._last_draw(
             asked,
             state.generators,

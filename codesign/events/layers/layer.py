@@ -11,7 +11,7 @@ from torch import Generator, Tensor, nn
 
 from codesign.checks import FLOATS, check, check_kind, check_number, check_positive
 from codesign.errors import DomainError, ShapeError, shown
-from codesign.events.entry import check_times
+from codesign.events.entry import check_begun, check_times
 from codesign.events.intensity import FrontEnd
 from codesign.events.level_path import finer, parts
 from codesign.events.sensor.model import (
@@ -144,11 +144,7 @@ class EventLayer(nn.Module):
           with its graph.
         """
         check_axes(frames)
-        if state is not None and generator is not None:
-            raise DomainError(
-                "a generator and a state are given; the state carries the generator of its first chunk on: "
-                "leave the generator out."
-            )
+        check_begun(state, generator)
         frames = frames.movedim(-3, 0)
         check(frames, "T>=2 ..." if state is None else "T ...", "frames", FLOATS)
         counts, state = self._count(frames, t_s, state, _generators(generator, frames.shape[1:-2]))

@@ -8,7 +8,14 @@ import torch
 from torch import Generator, Tensor
 
 from codesign.errors import ShapeError
-from codesign.events.entry import Times, check_frames, check_later, check_state, check_times
+from codesign.events.entry import (
+    Times,
+    check_begun,
+    check_frames,
+    check_later,
+    check_state,
+    check_times,
+)
 from codesign.events.intensity import FrontEnd
 from codesign.events.layers import dead_time, dead_time_limits
 from codesign.events.layers.layer import EventLayer
@@ -83,6 +90,7 @@ def sensor_counts(
       and as ``simulate``.
     """
     check_state(state, PhysicalState)
+    check_begun(state, generator)
     front_end = FrontEnd(log_input)
     hard_sensor = with_design(sensor, design)
     value: dict[str, Any] = {name: design.get(name, getattr(sensor, name)) for name in DESIGN}
@@ -155,11 +163,12 @@ class PhysicalLayer(EventLayer):
             raise ShapeError(
                 f"{len(samples)} samples follow {len(state)}; a batch keeps its samples over the chunks."
             )
-        befores = state or [None] * len(samples)
+        none = [None] * len(samples)
+        befores, own = (state, none) if state else (none, generators)
         options = {"log_input": self.log_input, **{name: self.value(name) for name in self.learnt}}
         found = [
             sensor_counts(sample, t_s, self.sensor, generator=generator, state=before, **options)
-            for sample, generator, before in zip(samples, generators, befores, strict=True)
+            for sample, generator, before in zip(samples, own, befores, strict=True)
         ]
         counts, states = zip(*found, strict=True)
         return torch.stack(counts, 2).reshape(-1, 2, *frames.shape[1:]), states

@@ -1,5 +1,6 @@
 """Hard events: single timestamped events of a sensor that looks at frames."""
 
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -86,20 +87,21 @@ def simulate(
     check(frames, "T H W", "frames", FLOATS)
     front_end = FrontEnd(log_input)
     state = SensorState() if state is None else state
-    moved, frames, times_s, generator, at_once = _open(
-        frames, t_s, sensor, generator, state, front_end
-    )
-    start_us = round(moved.time_s * 1e6)
-    height_px, width_px = frames.shape[1:]
-    if sensor.timing == "v2e":
-        stream = _v2e_events(frames, times_s, sensor, generator, moved, front_end)
-    else:
-        layout = KeyLayout(start_us, height_px, width_px)
-        _check_range(layout, times_s[-1])
-        stream = _interpolated(frames, times_s, sensor, generator, moved, front_end, layout)
-    if at_once is not None:
-        # behind the interval before, as all others
-        stream = concatenate([_fired(at_once, start_us + 1), stream])
+    with _drawn_in_vain(generator, state):
+        moved, frames, times_s, generator, at_once = _open(
+            frames, t_s, sensor, generator, state, front_end
+        )
+        start_us = round(moved.time_s * 1e6)
+        height_px, width_px = frames.shape[1:]
+        if sensor.timing == "v2e":
+            stream = _v2e_events(frames, times_s, sensor, generator, moved, front_end)
+        else:
+            layout = KeyLayout(start_us, height_px, width_px)
+            _check_range(layout, times_s[-1])
+            stream = _interpolated(frames, times_s, sensor, generator, moved, front_end, layout)
+        if at_once is not None:
+            # behind the interval before, as all others
+            stream = concatenate([_fired(at_once, start_us + 1), stream])
     state.__dict__.update(moved.__dict__)
     return stream
 
@@ -127,18 +129,32 @@ def dense_counts(
         )
     front_end = FrontEnd(log_input)
     state = SensorState() if state is None else state
-    moved, frames, times_s, generator, at_once = _open(
-        frames, t_s, sensor, generator, state, front_end
-    )
-    lanes = Lanes(frames, frames[0].numel())
-    sink = DenseCounts(lanes, len(frames))
-    keys = _random_keys(len(frames), sensor, moved, generator)
-    _advance(lanes, frames, times_s, keys, sensor, moved, front_end, sink)
+    with _drawn_in_vain(generator, state):
+        moved, frames, times_s, generator, at_once = _open(
+            frames, t_s, sensor, generator, state, front_end
+        )
+        lanes = Lanes(frames, frames[0].numel())
+        sink = DenseCounts(lanes, len(frames))
+        keys = _random_keys(len(frames), sensor, moved, generator)
+        _advance(lanes, frames, times_s, keys, sensor, moved, front_end, sink)
     state.__dict__.update(moved.__dict__)
     counts = sink.tensor((len(frames), 2, *frames.shape[1:]))
     if at_once is not None:
         counts[0] += at_once
     return counts
+
+
+@contextmanager
+def _drawn_in_vain(generator, state):
+    """Within it, what fails leaves the generator as it was."""
+    own = state.generator if generator is None else generator
+    before = own.get_state() if isinstance(own, torch.Generator) else None
+    try:
+        yield
+    except BaseException:
+        if before is not None:
+            own.set_state(before)
+        raise
 
 
 def _open(frames, t_s, sensor, generator, state, front_end):

@@ -122,7 +122,7 @@ def _with_dead_time(on, off, times, refractory_s, state):
     kept_on = torch.zeros_like(on)
     kept_off = torch.zeros_like(off)
     found = []
-    last = state.last_event_s.to(times.dtype)
+    last = state.last_event_s.to(times.dtype, copy=True)  # the caller's stays if this fails
     for index, time in enumerate(times):
         ready = time - last > refractory_s
         for fired, kept, p in ((on > index, kept_on, 1), (off > index, kept_off, -1)):
