@@ -124,9 +124,9 @@ def laplace_loss(
 def relative_unit(truth: FlowField) -> Tensor:
     """[B] 1 / sqrt(mean squared length of the valid true flow + 1 px^2): turns an error in px into
     a share of the sample's motion. Gradient: none."""
-    squared = _known(truth).detach().square().sum(1).flatten(1).sum(1) / truth.valid.flatten(1).sum(
+    squared = _full(_known(truth).detach()).square().sum(1).flatten(1).sum(1) / truth.valid.flatten(
         1
-    ).clamp_min(1)
+    ).sum(1).clamp_min(1)
     return (squared + SLOWEST_PX**2).rsqrt()
 
 

@@ -29,7 +29,8 @@ def _check(flow, truth):
         raise ShapeError(
             f"flows must both be [..., 2, H, W]; got {tuple(flow.shape)} and {tuple(truth.shape)}."
         )
-    wider = torch.promote_types(flow.dtype, truth.dtype)
+    # squares in half precision overflow
+    wider = torch.promote_types(torch.promote_types(flow.dtype, truth.dtype), torch.float32)
     return flow.to(wider), truth.to(wider)
 
 

@@ -292,6 +292,7 @@ class Tracker:
 
 def _takes_start(estimate):
     """Whether an estimator has a parameter ``start_px``."""
+    estimate = getattr(estimate, "_orig_mod", estimate)  # of torch.compile
     function = estimate.forward if isinstance(estimate, torch.nn.Module) else estimate
     try:
         return "start_px" in inspect.signature(function).parameters

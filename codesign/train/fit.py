@@ -14,7 +14,7 @@ from codesign.errors import DomainError
 from codesign.interrupt import Interruption
 from codesign.train import checkpoint, loop
 from codesign.train.batches import Batches, Source, probe
-from codesign.train.learner import Learner
+from codesign.train.learner import Learner, modes_kept
 from codesign.train.loop import Budget, Cosine, Progress
 from codesign.train.objectives import Supervised, flow_predictions
 from codesign.train.parallel import ALONE, Ranks
@@ -138,15 +138,12 @@ def fit(
             interruption.requested = ranks.sum(float(interruption.requested))[0] > 0
         interruption.safe_point()
 
-    training = network.training
-    network.train()
-    try:
-        with Interruption() as interruption:
-            interruption.in_loop = True
-            interruption.save = save
-            loop.run(learner, batches, made, Budget(steps), schedule, after_step=after_step)
-    finally:
-        network.train(training)
+    with modes_kept(network), Interruption() as interruption:
+        if not network.training:  # of one that trains, parts in evaluation stay there
+            network.train()
+        interruption.in_loop = True
+        interruption.save = save
+        loop.run(learner, batches, made, Budget(steps), schedule, after_step=after_step)
     learner.settle()
     return made
 

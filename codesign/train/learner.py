@@ -3,7 +3,8 @@ seen."""
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,6 +58,17 @@ def adamw(
     return torch.optim.AdamW([group for group in groups if group["params"]], lr=learning_rate)
 
 
+@contextmanager
+def modes_kept(network: nn.Module) -> Iterator[None]:
+    """Every part of a network is afterwards in training or evaluation as it was."""
+    modes = {module: module.training for module in network.modules()}
+    try:
+        yield
+    finally:
+        for module, training in modes.items():
+            module.training = training
+
+
 class Learner:
     """A network with its optimiser, its loss and, where asked, a running average of its weights.
 
@@ -91,6 +103,8 @@ class Learner:
         seed: int = 0,
         mixed_precision: bool = False,
     ):
+        if ranks.count > 1:  # gradients are averaged, so all begin with the same weights
+            network.load_state_dict(ranks.tell(network.state_dict()))
         self.network = network
         self.loss = loss
         self.predict = predict
@@ -126,7 +140,7 @@ class Learner:
         loss = self._loss(batch)
         self.optimiser.zero_grad(set_to_none=False)
         loss.backward()
-        for parameter in self.parameters:
+        for parameter in self.parameters if self.ranks.count > 1 else ():
             if parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
         self.ranks.average_gradients(self.parameters)
@@ -157,10 +171,8 @@ class Learner:
         if self._judge is None:
             raise DomainError("this learner has nothing to judge by; give it validate=.")
         network = self.delivered
-        training = network.training
-        with torch.no_grad():
+        with torch.no_grad(), modes_kept(network):
             score = float(self._judge(network.eval()))
-        network.train(training)
         if not math.isfinite(score):
             raise NonFiniteError(
                 f"step {self.steps}: the validation gave {score}; lower the learning rate."
@@ -203,6 +215,8 @@ class Learner:
             found["best/score"] = torch.tensor(self.best.score, dtype=torch.float64)
             found["best/step"] = torch.tensor(self.best.step)
         found["steps"] = torch.tensor(self.steps)
+        rates = [float(group["lr"]) for group in self.optimiser.param_groups]
+        found["rates"] = torch.tensor(rates, dtype=torch.float64)
         found["kind"] = torch.tensor(
             list(type(self.optimiser).__name__.encode()), dtype=torch.uint8
         )
@@ -233,7 +247,15 @@ class Learner:
         checkpoint.fill(self.network, parts["weights"], path)
         if self.averaged is not None:
             checkpoint.fill(self.averaged, parts["average"], path)
+        elif parts["average"]:
+            raise FileFormatError(
+                f"'{path}' has a running average of the weights, this learner keeps none; give it average=."
+            )
         self._fill_optimiser(parts["optimiser"], path)
+        for group, rate in zip(
+            self.optimiser.param_groups, tensors.get("rates", torch.empty(0)).tolist(), strict=False
+        ):
+            group["lr"] = rate
         try:
             self.steps = int(tensors["steps"])
             best = parts["best"]
@@ -271,9 +293,11 @@ class Learner:
         if self.averaged is None:
             return
         decay = min(self.average, (1 + self.steps) / (10 + self.steps))
-        for held, now in zip(
+        pairs = zip(
             self.averaged.state_dict().values(), self.network.state_dict().values(), strict=True
-        ):
+        )
+        # a weight under two names moves once
+        for held, now in {held.data_ptr(): (held, now) for held, now in pairs}.values():
             held.copy_(held + (1 - decay) * (now - held) if held.is_floating_point() else now)
 
     def _fill_optimiser(self, tensors, path):

@@ -75,7 +75,7 @@ def score(
         valid = windows.truth.valid
         pixels = valid.sum((1, 2)).double()
         error, zero = (
-            (endpoint_error(each, truth).double() * valid).sum((1, 2))
+            torch.where(valid, endpoint_error(each, truth).double(), 0.0).sum((1, 2))
             for each in (flow, torch.zeros_like(truth))
         )
         sums += torch.stack([error.sum(), zero.sum(), pixels.sum()]).cpu()

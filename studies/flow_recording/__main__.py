@@ -8,7 +8,7 @@ says so.
 """
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -105,7 +105,7 @@ def study(run: Run[Config]) -> None:
         for number, packet in enumerate(packets):
             fields = {}
             for name, (estimate, bins) in estimators.items():
-                fields[name], found = measured(packet, estimate, bins)
+                fields[name], found = measured(packet, estimate, bins or config.bins)
                 rows.append((packet, name, found))
                 progress.advance()
             if number < SHOWN:
@@ -171,7 +171,7 @@ def options(config):
 @torch.no_grad()
 def measured(packet, estimate, bins):
     """(FlowField, {figure: value}) of a packet; only figures that are defined (truth, events)."""
-    volume = events.from_stream(packet.stream, packet.t0_us, packet.t1_us, bins or 8)
+    volume = events.from_stream(packet.stream, packet.t0_us, packet.t1_us, bins)
     field = estimate(volume)
     found = {}
     span = (packet.t0_us, packet.t1_us)
@@ -188,12 +188,22 @@ def measured(packet, estimate, bins):
             found |= errors(field.flow_px, truth, packet.truth.valid, both)
         elif bool(both.any()):
             found["rotation_difference_px"] = float(metrics.aee(field.flow_px, truth, both))
-        if len(packet.stream):
-            found["truth_fwl"] = float(metrics.fwl(packet.stream, truth, *span))
+        known = _where(packet.stream, packet.truth.valid[0])
+        if len(known):
+            found["truth_fwl"] = float(metrics.fwl(known, truth, *span))
+            found["fwl_where_known"] = float(metrics.fwl(known, field.flow_px, *span))
     if len(packet.stream):
         found["fwl"] = float(metrics.fwl(packet.stream, field.flow_px, *span))
         found["rsat"] = float(metrics.rsat(packet.stream, field.flow_px, *span))
     return field, found
+
+
+def _where(stream, valid):
+    """The events on pixels [H, W] that are valid."""
+    kept = valid.to(stream.x.device)[stream.y.long(), stream.x.long()]
+    return replace(
+        stream, **{name: getattr(stream, name)[kept] for name in ("t_us", "x", "y", "p")}
+    )
 
 
 def errors(flow_px, truth, valid, both):

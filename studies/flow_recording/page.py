@@ -200,7 +200,7 @@ def _sharper(rows, name):
         for packet, one, figures in rows
         if one == name
         and "truth_fwl" in figures
-        and figures["fwl"] > SHARPER * figures["truth_fwl"]
+        and figures["fwl_where_known"] > SHARPER * figures["truth_fwl"]
     ]
 
 

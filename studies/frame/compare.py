@@ -3,6 +3,7 @@ paired errors.
 
     student(accuracies)                             # mean over seeds, Student's t
     bootstrap(lambda x: x.median(-1).values, errors)    # any statistic of units that can be redrawn
+    grouped(logs, textures)                         # mean over cases that share textures
     ratio_of_means(ours, zero_flow)                 # same windows, redrawn together
     log_ratio(ours, theirs).percent()               # "-3.1 % (-5.0 to -1.2 %)": paired cases
 
@@ -166,6 +167,28 @@ def crossed(logs: Any, level: float = LEVEL, draws: int = DRAWS, seed: int = 0) 
     ends = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
     low, high = torch.quantile(drawn, ends).tolist()
     return Interval(float(logs.mean(1).quantile(0.5)), low, high, seeds)
+
+
+def grouped(
+    values: Any, groups: Sequence[Any], level: float = LEVEL, draws: int = DRAWS, seed: int = 0
+) -> Interval:
+    """Mean of values [N] that share groups, such as cases their textures, and its percentile
+    interval when groups are redrawn, and the values of each."""
+    values = _units(values)
+    generator = torch.Generator().manual_seed(seed)
+    names = list(dict.fromkeys(groups))
+    of = [values[[k for k, name in enumerate(groups) if name == own]] for own in names]
+    picked = torch.randint(len(of), (len(of), draws), generator=generator)
+    total, count = torch.zeros(2, draws, dtype=torch.float64)
+    for row in picked:
+        for number, mine in enumerate(of):
+            at = row == number
+            again = torch.randint(len(mine), (int(at.sum()), len(mine)), generator=generator)
+            total[at] += mine[again].sum(1)
+            count[at] += len(mine)
+    ends = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
+    low, high = torch.quantile(total / count, ends).tolist()
+    return Interval(float(values.mean()), low, high, len(of))
 
 
 def sign_flip(differences: Any, draws: int = 20_000, seed: int = 0) -> float:

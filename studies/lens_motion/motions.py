@@ -115,7 +115,7 @@ class Motion:
     def case(self, pool: list, seed: int) -> Batch:
         """A world out of ``pool``, a place before it and a drive, all from one seed."""
         generator = torch.Generator().manual_seed(seed)
-        world = pool[int(torch.randint(len(pool), (1,), generator=generator))]
+        world = pool[drawn_world(len(pool), generator)]
         x_m, z_m = (2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1).tolist()
         start = pose.look_at((x_m, -DISTANCE_M, z_m), (x_m, 0.0, z_m))
         t_s = torch.linspace(0, DURATION_S, FRAMES, dtype=torch.float64)
@@ -131,6 +131,11 @@ class Motion:
         moved = flow_px(at, twists, self.efl_mm)
         radius = torch.atan2(at[:, 1], at[:, 0])
         return torch.atan2(moved[..., 1], moved[..., 0]) - radius[:, None]
+
+
+def drawn_world(count: int, generator: torch.Generator) -> int:
+    """Number of a case's world, the first thing that is drawn of it."""
+    return int(torch.randint(count, (1,), generator=generator))
 
 
 def flow_px(at_px: Tensor, twists: Tensor, efl_mm: float) -> Tensor:

@@ -1,13 +1,11 @@
 """Words and pictures of a lens_motion page."""
 
 import math
-from dataclasses import replace
 
 import matplotlib.pyplot as plt
 import torch
 from matplotlib.figure import Figure
 
-from studies.frame.compare import Interval
 from studies.lens_motion.rivals import rays_at
 from studies.lens_opt.task import PITCH_MM
 
@@ -30,11 +28,6 @@ IMAGES = (
     "grey: a pixel."
 )
 REACH_PX = 8.0
-
-
-def as_ratio(pair: Interval) -> Interval:
-    """A log ratio as the ratio it is."""
-    return replace(pair, **{end: math.exp(getattr(pair, end)) for end in ("value", "low", "high")})
 
 
 def point_images(lenses, motion) -> Figure:

@@ -61,7 +61,7 @@ def statistics(folder):
         "mean_flow_px": float(np.mean(mean_px)),
         "largest_flow_px": float(max(largest_px)),
         "valid_share": float(np.mean(valid)),
-        "occluded_share": occluded / pixels,
+        "occluded_share": occluded / (pixels - pixels // count),  # of frames with flow
         "nearest_m": min(nearest, default=0.0),
         "farthest_m": max(farthest),
         "mean_radiance": light / pixels,

@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import fields
 
 from codesign import flow
 from codesign.errors import CodesignError, DomainError
@@ -30,6 +31,11 @@ NAMES = {
 # for ECN and IDNet of one processor minute (1e-3, 2e-3; IDNet also 4e-3)
 RATES = {"refiner": 2e-3, "flownet-events": 2e-3, "spike-flownet": 3e-3, "ecn": 1e-3, "idnet": 2e-3}
 ASKED = 0.6  # of a rival's error, at most
+# to every training, or of the race itself
+PASSED = (
+    *("mix", "batch", "learning_rate", "steps", "cpu_minutes", "weights", "final_windows"),
+    *("race", "own", "seeds", "jobs", "seed", "device", "out", "resume", "quick"),
+)
 SEED = 55  # of what is judged here
 
 
@@ -40,6 +46,17 @@ def race(run):
     if not config.seeds or config.jobs < 1 or config.final_windows < 3:
         raise DomainError(
             "a race needs at least one of --seeds, one of --jobs, and three of --final-windows."
+        )
+    plain = type(config)()
+    lost = [
+        field.name
+        for field in fields(config)
+        if field.name not in PASSED and getattr(config, field.name) != getattr(plain, field.name)
+    ]
+    if lost and not config.quick:
+        raise DomainError(
+            f"a race trains on windows that are made, with every network's own settings; leave --{lost[0].replace('_', '-')} "
+            "out."
         )
     names = NAMES | {name: name.partition(":")[2] for name in config.own}
     kinds = {name: named_class(name) for name in config.own}
@@ -98,6 +115,7 @@ def _command(run, network, seed):
     options = {
         "network": network,
         "seed": seed,
+        "device": config.device,
         "mix": config.mix,
         "batch": config.batch,
         "learning-rate": RATES.get(network, config.learning_rate),

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from codesign.errors import CodesignError
-from codesign.flow import losses
+from codesign.flow import losses, metrics
 from codesign.types import EventVolume, FlowField
 
 D = torch.float64
@@ -76,6 +76,11 @@ def test_supervised_loss_by_hand(predictions, options, right):
 def test_the_relative_unit_by_hand():
     # mean squared true lengths 1/2 and 4, and the floor of 1 px
     assert losses.relative_unit(TRUTH).tolist() == pytest.approx([1.5**-0.5, 5**-0.5])
+    half = FlowField(torch.full((1, 2, 64, 64), 6.0).half(), torch.ones(1, 64, 64).bool(), 1.0)
+    assert float(losses.relative_unit(half)) == pytest.approx(73**-0.5)
+    far = torch.tensor([300.0, 30.0]).half()[:, None, None]
+    angle = metrics.angular_error_deg(far, torch.tensor([300.0, 0.0]).half()[:, None, None])
+    assert float(angle) == pytest.approx(math.degrees(math.atan2(30, math.hypot(300, 1))), rel=1e-3)
 
 
 def test_samples_without_truth_count_zero_and_may_hold_anything():

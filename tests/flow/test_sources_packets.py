@@ -221,3 +221,18 @@ def test_folders_without_events_and_damaged_archives(tmp_path):
     ):
         with pytest.raises(CodesignError, match=reason):
             read_packets(tmp_path / name)
+
+
+def test_flows_without_times_share_the_recording_whatever_the_window(place, tmp_path):
+    """Windows of 20 ms begin where the fifths of half a second do, which the flows are of."""
+    (t_us, *_) = made(4000, start_s=100.0, duration_s=0.5)
+    np.save(tmp_path / "flow.npy", np.stack([field(k).numpy() for k in range(5)]))
+    packets = read_packets(place, tmp_path / "flow.npy", PacketOptions(window_s=0.02))
+    assert starts_ms(packets, t_us) == [0, 100, 200, 300, 400]
+    for k, packet in enumerate(packets):
+        share = 20_000 / ((t_us[-1] - t_us[0]) / 5)
+        torch.testing.assert_close(packet.truth.flow_px[0], field(k) * share, rtol=1e-4, atol=0)
+    later = PacketOptions(window_s=0.02, start_s=0.15)
+    assert starts_ms(read_packets(place, tmp_path / "flow.npy", later), t_us)[0] == 150
+    with pytest.raises(CodesignError, match="say nothing of windows of 500 events"):
+        read_packets(place, tmp_path / "flow.npy", PacketOptions(events=500))

@@ -2,6 +2,7 @@
 figures against known cases, its errors."""
 
 import json
+from dataclasses import replace
 
 import imageio_ffmpeg
 import numpy as np
@@ -101,7 +102,13 @@ def test_the_true_flow_is_sharper_than_none_and_without_error(recording):
     assert right["fwl"] > 1.2
     assert right["rsat"] < 1
     assert none["fwl"] == 1  # by definition
-    assert none["aee_px"] == none["zero_aee_px"]
+    # truth that is known on the left half is as sharp there as the same estimate
+    known = torch.zeros(1, *SIZE, dtype=torch.bool)
+    known[..., : SIZE[1] // 2] = True
+    _, half = study.measured(
+        replace(packet, truth=replace(true(packet), valid=known)), lambda _: packet.truth, 8
+    )
+    assert half["truth_fwl"] == half["fwl_where_known"] > 1.2
 
 
 def test_a_recording_without_truth_has_its_sharpness_only(tmp_path):
@@ -114,6 +121,18 @@ def test_a_recording_without_truth_has_its_sharpness_only(tmp_path):
     assert metrics["packets_without_truth"] == metrics["packets"] == 1
     assert "lk_aee_px" not in metrics
     assert metrics["lk_fwl"] > 0
+
+
+def test_bins_are_those_asked_for(recording, tmp_path, monkeypatch):
+    seen = []
+
+    def estimate(volume):
+        seen.append(volume.counts.shape[2])
+        return flow.estimate_lk(volume)
+
+    monkeypatch.setattr(study, "load", lambda name: {"lk": (estimate, None)})
+    assert run(tmp_path / "run", recording[0], "--window-ms 20 --packets 1 --bins 3")[0] == 0
+    assert set(seen) == {3}
 
 
 def test_a_video_of_all_windows(recording, tmp_path):

@@ -217,6 +217,25 @@ def test_log_ratios_say_who_wins():
     assert compare.log_ratio([1.0], [2.0]).percent() == "-50.0 % (-100.0 to inf %)"
 
 
+def test_units_that_share_groups_count_as_their_groups():
+    values = torch.randn(400, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    # a group each: the interval of a mean
+    alone, mean = compare.grouped(values, range(400)), student(values)
+    assert alone.value == mean.value
+    assert alone.high - alone.low == pytest.approx(mean.high - mean.low, rel=0.1)
+    # all alike within a group: as many units as groups
+    groups = [k % 20 for k in range(400)]
+    shared = compare.grouped(values[:20].repeat(20), groups)
+    few = bootstrap(lambda x: x.mean(-1), values[:20])
+    assert shared.count == 20
+    assert (shared.low, shared.high) == pytest.approx((few.low, few.high), abs=0.06)
+
+
+def test_drawn_signs_have_those_that_were_found_among_them():
+    assert compare.sign_flip([1.0] * 60) == pytest.approx(1 / 20_000)
+    assert compare.sign_flip([1.0] * 3) == pytest.approx(2 / 8)
+
+
 def test_intervals_print_and_record():
     assert f"{Interval(0.5, 0.25, 1, 3):.2f}" == "0.50 (0.25 to 1.00)"
     assert str(Interval(0.5, 0.25, 1, 3)) == "0.5 (0.25 to 1)"

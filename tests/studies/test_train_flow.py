@@ -10,6 +10,8 @@ import pytest
 import torch
 
 from codesign.flow import checkpoint, losses
+from studies.frame.run import main
+from studies.train_flow import __main__ as train_flow
 from studies.train_flow import race as races
 from studies.train_flow import setup as train_flow_setup
 from tests.flow_training_case import (
@@ -220,7 +222,8 @@ def test_a_race_trains_every_network_with_every_seed_and_judges_them_alike(tmp_p
     options = (
         f"--race --own {own} --seeds 0 1 --cpu-minutes 3 --learning-rate 0.01 --final-windows 6"
     )
-    assert train(tmp_path / "run", options) == 0
+    given = ["--out", str(tmp_path / "run"), *options.split()]
+    assert main(train_flow.study, train_flow.Config, given) == 0
     check_page("train_flow", tmp_path / "run")
     assert sorted(commands) == [("refiner", "0"), ("refiner", "1"), (own, "0"), (own, "1")]
     assert commands[own, "1"]["--learning-rate"] == "0.01"
@@ -279,6 +282,7 @@ def test_a_checkpoint_that_does_not_fit_is_named(tmp_path, capsys, damage, sente
         ("--mixed-precision", "--mixed-precision needs CUDA"),
         ("--start nowhere.safetensors", "no file lies at nowhere.safetensors"),
         ("--race --jobs 0", "one of --jobs"),
+        ("--race", "leave --network out"),
         ("--steps 2 --options gain=1e30", "step 0: loss inf"),
     ],
 )

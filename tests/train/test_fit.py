@@ -199,6 +199,7 @@ def before(indices):
         signal.raise_signal(signal.SIGINT)
 def run():
     network = linear()
+    network.layer.weight.data += ranks.rank  # the first process's weights count
     judge = nearness if ranks.rank == 0 else lambda network: 1 / 0
     made = train.fit(network, Made(before=before), steps=6, batch=4, optimiser=adam(network, 0.01),
         average=0.5, ranks=ranks, validate=judge, validate_every=2, save_to=sys.argv[1])
@@ -233,3 +234,22 @@ def test_two_processes_interrupted_and_resumed_learn_what_one_does(tmp_path):
         assert asked == [1, 2, 2, 2] * 2, "one look and three steps on half a batch, twice"
     assert found[0][3] == 3
     assert [path.name for path in folder.glob("*.json")] == ["checkpoint.json"]
+
+
+def test_parts_that_are_in_evaluation_stay_there():
+    class Normed(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.norm = nn.BatchNorm2d(4).requires_grad_(False).eval()
+            self.inner = linear()
+
+        def forward(self, volume):
+            self.norm(volume.counts.flatten(1, 2))
+            return self.inner(volume)
+
+    network = Normed()
+    weights = adam(network.inner)
+    train.fit(network, Made(), steps=3, batch=2, optimiser=weights, validate=lambda _: 1.0)
+    assert not network.norm.training
+    assert network.inner.training
+    assert float(network.norm.running_mean.abs().max()) == 0

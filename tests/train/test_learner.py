@@ -230,3 +230,38 @@ def test_biases_do_not_decay():
     groups = adamw(nn.Linear(3, 2), 0.01, 0.5).param_groups
     shown = [(group["weight_decay"], [p.ndim for p in group["params"]]) for group in groups]
     assert shown == [(0.5, [2]), (0.0, [1])]
+
+
+def test_a_weight_without_gradient_does_not_decay():
+    network: Any = nn.ModuleDict({"seen": line(), "unseen": line()})
+    optimiser = torch.optim.AdamW(network.parameters(), 0.1, weight_decay=0.5)
+    made = Learner(network, mean, optimiser, predict=lambda network, x: network["seen"](x))
+    made.step(X)
+    assert network["unseen"].weight.tolist() == [[1.0, 1.0]]
+
+
+def test_a_weight_under_two_names_has_one_average():
+    class Tied(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.one = self.other = line()
+
+        def forward(self, x):
+            return self.one(x)
+
+    tied, alone = learner(Tied(), average=0.5), learner(average=0.5)
+    for made in (tied, alone):
+        made.step(X)
+    assert torch.equal(tied.delivered.one.weight, alone.delivered.weight)
+
+
+def test_learning_rates_are_part_of_the_state():
+    made = learner()
+    falling = torch.optim.lr_scheduler.StepLR(made.optimiser, 1, 0.1)
+    made.step(X)
+    falling.step()
+    again = learner()
+    again.load_state_dict(made.state_dict())
+    assert again.optimiser.param_groups[0]["lr"] == pytest.approx(0.01)
+    with pytest.raises(FileFormatError, match=r"has a running average .* give it average="):
+        learner().load_state_dict(learner(average=0.5).state_dict())

@@ -33,6 +33,8 @@ def test_scores_are_those_worked_out_by_hand():
     assert found.ratio == pytest.approx((16 + math.sqrt(10)) / 21)
     assert found.worse_percent == pytest.approx(100 / 3)
     assert found.windows == 3
+    flow[1, :, 0, 0] = torch.nan  # what is not valid means nothing
+    assert score(guessed, [windows(2), windows(1)]) == found
 
 
 class Short(Made):

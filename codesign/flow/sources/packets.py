@@ -201,8 +201,8 @@ def _cut(file, truth_path, options):
 
 
 def _cut_by_flows(one, flows, start_us):
-    """Windows of one event file with a flow for each: those of the flows' own times, or one after
-    the other."""
+    """Windows of one event file with a flow for each: those of the flows' own times; without, the
+    flows share the recording equally, or follow each other by ``truth_interval_s``."""
     options = one.options
     whole = one.whole
     left_out = {}
@@ -223,19 +223,14 @@ def _cut_by_flows(one, flows, start_us):
         if options.window_s:
             length_us = round(options.window_s * 1e6)
             pairs = [(k, (t0_us, t0_us + length_us)) for k, (t0_us, _) in pairs]
-    elif options.window_s is not None or options.events is not None or options.start_s is not None:
-        unlimited = replace(options, skip=(), count=options.count or len(flows))
-        # one flow says nothing of a second window
-        cut = windows(one.events, whole, start_us, unlimited, in_turn=True)[0]
-        pairs = list(enumerate(cut[: len(flows)]))
     else:
         edges = np.rint(np.linspace(whole[0], whole[1], len(flows) + 1)).astype(np.int64).tolist()
         if options.truth_interval_s is not None:
             edges = [
                 whole[0] + round(k * options.truth_interval_s * 1e6) for k in range(len(flows) + 1)
             ]
-        pairs = list(enumerate(pairwise(edges)))[: options.count]
         over = edges[:2]
+        pairs = _parts(one, list(pairwise(edges)), start_us)[: options.count]
     kept, more = without([window for _, window in pairs], one.events, options.skip)
     found = [
         one.packet(f"{one.file.name} {k}", window, flows[k], over, left_out | more)
@@ -243,6 +238,25 @@ def _cut_by_flows(one, flows, start_us):
         if window in kept
     ]
     return spread(found, options.count)
+
+
+def _parts(one, spans, start_us):
+    """The window (from, to) us asked for in each span of a flow, beside its number: of a length or
+    a number of events it begins where the span does, or at the start asked for."""
+    options = one.options
+    if options.events is not None:
+        if len(spans) > 1:
+            raise DomainError(
+                f"{len(spans)} flows without times say nothing of windows of {options.events} events; give their "
+                "times, or windows in seconds."
+            )
+        first = replace(options, skip=(), count=1)  # one flow says nothing of a second window
+        return list(enumerate(windows(one.events, one.whole, start_us, first, in_turn=True)[0]))
+    found = [(k, (max(t0, start_us), t1)) for k, (t0, t1) in enumerate(spans) if t1 > start_us]
+    if options.window_s is None:
+        return found
+    length_us = round(options.window_s * 1e6)
+    return [(k, (t0, t0 + length_us)) for k, (t0, _) in found]
 
 
 def _with_truth_somewhere(packets: Sequence[Packet]) -> list[Packet]:
