@@ -7,6 +7,9 @@
 A page names a figure as <!--fig:NAME-->text<!--/-->; the text is what this writes. A part that was
 cut is taken up where it stopped (runs/evidence/PART); one that was finished begins anew.
 
+Some parts draw what was run once from a raw table (--raw FILE): their figures are of the code of
+the commit that brought the table, and they are drawn again where they are named.
+
 evidence.json: {"schema": 1, "parts": {PART: {"command", "commit", "seconds", "machine", "measured":
 {folder: its tree in git}, "figures": {NAME: text}, "pictures": [FILE in docs]}}}.
 """
@@ -117,11 +120,19 @@ def share_of(passed: str, total: str) -> Callable[[Metrics], str]:
 
 ORDERS = '"lens > mount > read-out" "mount > lens > read-out"'
 PARTS = {
-    "chain": Part("chain_picture", ("codesign", "scenes"), pictures={"chain.png": "chain.png"}),
-    "hero": Part("hero", ("codesign", "scenes"), pictures={"hero.webp": "hero.webp"}),
+    "chain": Part(
+        "chain_picture",
+        ("codesign", "scenes", "studies/chain_picture.py"),
+        pictures={"chain.png": "chain.png"},
+    ),
+    "hero": Part(
+        "hero",
+        ("codesign", "scenes", "studies/hero.py", "studies/codesign"),
+        pictures={"hero.webp": "hero.webp"},
+    ),
     "gallery-lens": Part(
         "lens_opt --quick",
-        ("codesign", "studies/lens_opt"),
+        ("codesign", "scenes", "studies/lens_opt"),
         pictures={
             f"gallery/lens_{name}.png": f"{made}.png"
             for name, made in {
@@ -155,7 +166,7 @@ PARTS = {
     ),
     "lens-motion": Part(
         "lens_motion --raw docs/lens_motion.csv",
-        ("codesign/lens", "studies/lens_motion"),
+        ("codesign", "scenes", "studies/lens_motion"),
         {"lens-motion.spots": gains("mtf_along_spots")},
     ),
     "joint-outdoors": joint(
@@ -168,7 +179,7 @@ PARTS = {
     "joint-flight": joint("flight", f"--designs 64 --arms joint {ORDERS} book nested default"),
     "joint-controls": Part(
         'joint_controls --arms nested "lens > mount > read-out"',
-        ("codesign", "scenes", "studies/codesign"),
+        ("codesign", "scenes", "studies/codesign", "studies/joint_controls.py"),
         {
             f"joint.controls.{name.replace('_', '-')}": control(name)
             for name in (
@@ -185,15 +196,22 @@ def kept() -> dict[str, Any]:
     return json.loads(KEPT.read_text(encoding="utf-8"))["parts"] if KEPT.exists() else {}
 
 
-def trees(folders: tuple[str, ...]) -> dict[str, str]:
-    """The tree that git has of each folder at the present commit."""
-    said = [
-        subprocess.run(
-            ["git", "rev-parse", f"HEAD:{folder}"], cwd=ROOT, capture_output=True, text=True
-        ).stdout.strip()
-        for folder in folders
-    ]
-    return dict(zip(folders, said, strict=True))
+def trees(folders: tuple[str, ...], commit: str = "HEAD") -> dict[str, str]:
+    """The tree that git has of each folder or file at a commit."""
+    return {folder: _git("rev-parse", f"{commit}:{folder}") for folder in folders}
+
+
+def run_at(command: str) -> str:
+    """The commit whose code made the figures of a command: that of its raw table, or the present
+    one."""
+    words = shlex.split(command)
+    if "--raw" not in words:
+        return "HEAD"
+    return _git("log", "-1", "--format=%H", "--", words[words.index("--raw") + 1])
+
+
+def _git(*words: str) -> str:
+    return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True).stdout.strip()
 
 
 def stale(part: Mapping[str, Any]) -> list[str]:
@@ -222,7 +240,7 @@ def measured(name: str) -> dict[str, Any]:
         "commit": metrics["versions"]["commit"],
         "seconds": round(time.monotonic() - since),
         "machine": f"{metrics['hardware']['cpu']}, {metrics['hardware']['cores']} cores",
-        "measured": trees(part.measured),
+        "measured": trees(part.measured, run_at(part.command)),
         "figures": {figure: text(metrics) for figure, text in part.figures.items()},
         "pictures": list(part.pictures),
     }
@@ -259,7 +277,11 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {unknown[0]} is no part; choose from {', '.join(PARTS)}.", file=sys.stderr)
         return 2
     known = kept()
-    old = [name for name in PARTS if name not in known or stale(known[name])]
+    old = [
+        name
+        for name, part in PARTS.items()
+        if name not in known or stale(known[name]) and "--raw" not in part.command
+    ]
     for name in [] if asked.write else asked.parts or old:
         known[name] = measured(name)
         text = json.dumps({"schema": 1, "parts": known}, indent=1, ensure_ascii=False)

@@ -52,4 +52,15 @@ def test_figures_are_of_this_code(name):
         pytest.skip("this is no checkout of git")
     old = evidence.stale(evidence.kept()[name])
     if old:
-        pytest.xfail(f"{', '.join(old)} changed since its figures: make evidence ARGS={name}")
+        command = evidence.PARTS[name].command
+        anew = "to be raced anew" if "--raw" in command else f"make evidence ARGS={name}"
+        pytest.xfail(f"{', '.join(old)} changed since its figures: {anew}")
+
+
+def test_what_is_drawn_from_a_raw_table_is_of_the_code_that_made_the_table():
+    assert evidence.run_at("lens_opt --quick") == "HEAD"
+    table = "docs/lens_motion.csv"
+    commit = evidence.run_at(f"lens_motion --raw {table}")
+    if not commit:
+        pytest.skip("this is no checkout of git")
+    assert evidence.trees((table,), commit) == evidence.trees((table,))
