@@ -280,7 +280,7 @@ def main(arguments: list[str] | None = None) -> int:
     old = [
         name
         for name, part in PARTS.items()
-        if name not in known or stale(known[name]) and "--raw" not in part.command
+        if name not in known or (stale(known[name]) and "--raw" not in part.command)
     ]
     for name in [] if asked.write else asked.parts or old:
         known[name] = measured(name)
