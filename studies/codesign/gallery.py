@@ -61,7 +61,7 @@ def handed(run: Run[Any], judge: Judge, whole: Whole, error: float) -> None:
     run.section(
         "Hand-over",
         f"`design.yaml` has the transform, camera and sensor, and the estimator's prior among its notes; the lens stands beside "
-        f"it (`codesign.lens.load` reads it, `codesign.lens.save` makes a .zmx of it). Read back it scores "
+        f"it, a traced one as `design.zmx` too (`codesign.lens.load` reads both). Read back it scores "
         f"{sum(again) / len(again):.4f} where the answer had {error:.4f}.",
     )
 
@@ -74,6 +74,8 @@ def save(path: Path, whole: Whole, error: float) -> None:
     save_hand_over(
         path, HandOver(mount, whole.camera, whole.sensor, pair.frame, "camera_optical_frame", notes)
     )
+    if isinstance(whole.camera.lens, lens.GeoLens):
+        lens.save(whole.camera.lens, path.with_suffix(".zmx"))
 
 
 def loaded(path: Path, like: Whole) -> Whole:

@@ -9,18 +9,19 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from codesign import lens
 from codesign.errors import DomainError
 from scenes.robots import pair as robot_pair
 from scenes.robots.costs import Costs
 from scenes.robots.pairs import PAIRS
 from studies.codesign import __main__ as codesign
-from studies.codesign import couplings, slopes
+from studies.codesign import couplings, gallery, slopes
 from studies.codesign.arms import Task, Way, chosen_by_the_book, read_out
 from studies.codesign.design import Space
 from studies.codesign.objective import Objective
 from studies.codesign.page import every_ratio
 from studies.codesign.problem import Drawn
-from studies.codesign.race import compared, kept, start
+from studies.codesign.race import Judge, compared, kept, start
 from studies.frame.run import main
 from tests.studies.browser import check_page
 
@@ -346,6 +347,18 @@ def test_a_small_race_says_that_it_decides_nothing(here):
     before = (folder / "race.jsonl").read_bytes()
     assert main(codesign.study, codesign.Config, ["--resume", str(folder)]) == 0
     assert (folder / "race.jsonl").read_bytes() == before
+
+
+def test_a_traced_design_is_handed_over_with_its_lens(tmp_path):
+    space = Space.of("outdoors", "retrofocus-4")
+    whole = space.made(start(space, 0))
+    judge = Judge(space, 1, 1)
+    (error,) = judge.of(whole)["errors"]
+    gallery.save(tmp_path / "design.yaml", whole, error)
+    again = judge.of(gallery.loaded(tmp_path / "design.yaml", whole))["errors"]
+    assert again == [pytest.approx(error, rel=1e-9)]
+    drawn = lens.load(tmp_path / "design.zmx").freeze().first_order()
+    assert float(drawn.efl_mm) == pytest.approx(whole.numbers["efl_mm"], rel=1e-6)
 
 
 def test_a_race_of_another_robot_is_not_gone_on_with(here, monkeypatch, capsys):
