@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import tempfile
+import warnings
 from pathlib import Path
 
 BROWSER = next(
@@ -24,14 +25,17 @@ onmessage = from => {
 
 def check_page(study: str, folder: Path) -> None:
     """The page of a run of ``study`` is whole in one small file, and a browser finds no fault with
-    it; where there is no browser, its size alone is looked at.
+    it; where there is no browser, a warning says that its size alone was looked at.
 
     A test that runs a study calls this with the study's name as a literal, which test_browser looks
     for.
     """
     assert json.loads((folder / "config.json").read_text())["study"] == study
     assert (folder / "report.html").stat().st_size < LARGEST_BYTES
-    assert BROWSER is None or faults(folder / "report.html") == []
+    if BROWSER is None:
+        warnings.warn(f"no chromium: the page of {study} was not looked at", stacklevel=2)
+    else:
+        assert faults(folder / "report.html") == []
 
 
 def faults(report: Path) -> list[str]:

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from codesign import events
 from codesign.report import page, prose
 from studies.frame.listing import studies
 from studies.frame.run import main
 from studies.stability import __main__ as stability
 from tests.processes import ROOT
+from tests.studies import browser
 from tests.studies.browser import BROWSER, WIDTHS_PX, check_page, faults
 
 TESTS = Path(__file__).parents[1]
@@ -76,10 +78,33 @@ def test_faults_are_seen(tmp_path):
     assert "CONSOLE" in found
 
 
+@WITH_BROWSER
+def test_a_video_plays_by_itself(tmp_path):
+    black = np.zeros((20, 32, 32), dtype=np.uint8)
+    events.write_video(tmp_path / "loop.mp4", black, fps=10)
+    section = page.Section("Loop", [("picture", page.picture(tmp_path / "loop.mp4", "Black."))])
+    ask = "console.log(`still: ${document.querySelector('video').paused}`)"
+    text = page.render_page("Loop", "", [], [section], {}).replace(
+        "</main>", f"<script>setTimeout(() => {ask}, 2000)</script></main>"
+    )
+    (tmp_path / "report.html").write_text(text, encoding="utf-8")
+    found = " ".join(faults(tmp_path / "report.html"))
+    assert "still: false" in found
+    assert "still: true" not in found
+
+
 def test_the_page_of_every_study_is_looked_at():
     said = "".join(path.read_text(encoding="utf-8") for path in TESTS.rglob("test_*.py"))
     looked_at = set(re.findall(r'check_page\("(\w+)"', said))
     assert sorted([*looked_at, *ALONE]) == list(studies())
+
+
+def test_a_page_that_no_browser_saw_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(browser, "BROWSER", None)
+    (tmp_path / "config.json").write_text('{"study": "lens_opt"}')
+    (tmp_path / "report.html").write_text("<p>")
+    with pytest.warns(UserWarning, match="no chromium: the page of lens_opt"):
+        browser.check_page("lens_opt", tmp_path)
 
 
 def uncounted(case, tries, seed):
