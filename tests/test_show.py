@@ -71,9 +71,51 @@ def test_a_lens_is_drawn_with_rays_to_its_field_and_a_notebook_shows_it():
     assert figure._repr_png_().startswith(b"\x89PNG")
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float64])
+def test_arrays_are_drawn_as_tensors(dtype):
+    frames = np.arange(4 * 6 * 8).reshape(4, 6, 8)
+    given = codesign.show(frames.astype(dtype)).axes
+    for axis, other in zip(given, codesign.show(torch.tensor(frames)).axes, strict=True):
+        np.testing.assert_allclose(picture(axis), picture(other), rtol=1e-6)
+
+
+def rays_drawn(figure):
+    """[fields, rays, 3, 2]: the (z, y) of each ray before a thin lens, in it and on the film."""
+    lines = [line.get_xydata() for line in figure.axes[0].lines if len(line.get_xdata()) == 3]
+    return np.array(lines).reshape(3, -1, 3, 2)
+
+
+def test_light_through_a_thin_lens_meets_where_geometry_has_it():
+    """Parallel light meets a focal length behind the lens, f tan(field) off the axis; on a film
+    beyond it fills the pupil's shadow, D (d / f - 1). The ray through the middle goes straight."""
+    efl_mm, wide_mm = 8.0, 4.0
+    corner_mm = 0.05 * np.hypot(60, 80) / 2
+    heights_mm = np.array([0, 0.7, 1])
+    sharp = rays_drawn(codesign.show(lens.ThinLens(efl_mm, wide_mm)))
+    slopes = np.tan(np.radians(10 * heights_mm))
+    assert np.ptp(sharp[:, :, 1, 1], axis=1) == pytest.approx(wide_mm)
+    assert sharp[:, :, 2] == pytest.approx(
+        np.broadcast_to(np.stack([0 * slopes + efl_mm, efl_mm * slopes], 1)[:, None], (3, 5, 2)),
+        abs=1e-12,
+    )
+    away = lens.ThinLens(efl_mm, wide_mm, 10.0)
+    blurred = rays_drawn(codesign.show(render.Camera(away, 60, 80, 0.05)))
+    assert np.ptp(blurred[:, :, 2, 1], axis=1) == pytest.approx(wide_mm * (10.0 / efl_mm - 1))
+    pinhole = render.Camera(lens.Pinhole(efl_mm), 60, 80, 0.05)
+    for middle, film_mm in (
+        (blurred[:, 2], 10.0),
+        (rays_drawn(codesign.show(pinhole))[:, 0], efl_mm),
+    ):
+        assert middle[:, 1] == pytest.approx(0 * middle[:, 1])
+        assert middle[-1, 2] == pytest.approx([film_mm, corner_mm])
+        before, behind = np.diff(middle, axis=1).transpose(1, 2, 0)
+        assert before[1] / before[0] == pytest.approx(behind[1] / behind[0])
+
+
 @pytest.mark.parametrize(
     ("given", "error", "sentence"),
     [
+        (np.array(["a"]), DomainError, "nothing is known of how to draw ndarray"),
         (3, DomainError, "nothing is known of how to draw int"),
         (torch.tensor(1.0), ShapeError, "frames have shape"),
         (codesign.mount.Mount((0, 0, 0.4), (0.1, 0.1, 0.1)), DomainError, "give camera= and body="),

@@ -17,6 +17,7 @@ from codesign.errors import FileFormatError
 from codesign.lens.analysis.rays import field_rays
 from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
+from codesign.lens.pinhole import ThinLens
 from codesign.lens.surface import sag_mm
 from codesign.lens.trace import at_surfaces
 
@@ -119,13 +120,36 @@ def draw_layout(
             highest = max(highest, abs(path[-1, 1]))
     film_height = 1.1 * highest if highest > 0.05 * tallest else 0.5 * tallest
     axis.plot([film, film], [-film_height, film_height], color="k", lw=1.5)
+    _finish(axis)
+    if any(lens.mirrors):
+        note = "mirrors (thick) along the unfolded axis"
+        axis.text(1.0, 1.02, note, transform=axis.transAxes, ha="right", fontsize=8, color=MIRROR)
+
+
+def _finish(axis):
+    """The optical axis, what the axes are, and which colour is which field."""
     axis.axhline(0, color="0.6", lw=0.5, ls=(0, (8, 3, 1, 3)), zorder=0)
     axis.set(xlabel="z (mm)", ylabel="y (mm)", aspect="equal")
     place = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
     axis.legend(frameon=False, fontsize=8, title="field", title_fontsize=8, **place)
-    if any(lens.mirrors):
-        note = "mirrors (thick) along the unfolded axis"
-        axis.text(1.0, 1.02, note, transform=axis.transAxes, ha="right", fontsize=8, color=MIRROR)
+
+
+def draw_thin(axis: Axes, lens: ThinLens, fields_rad: Sequence[float], rays: int = 5) -> None:
+    """Draw an ideal lens as a line as tall as its pupil, its film, and parallel light of each
+    field, refracted paraxially, into a matplotlib axis. Lengths in mm."""
+    efl, film = float(lens.efl_mm.detach()), float(lens.image_distance_mm.detach())
+    radius = lens.entrance_pupil_diameter_mm / 2
+    q = np.linspace(-radius, radius, rays) if radius else np.zeros(1)
+    start, highest = -0.5 * film, max(radius, 0.05 * film)
+    for field, colour in coloured(fields_rad):
+        slope = math.tan(field)
+        ends = q + film * (slope - q / efl)
+        lines = axis.plot([start, 0, film], [q + start * slope, q, ends], color=colour, lw=0.6)
+        lines[0].set_label(degrees(field))
+        highest = max(highest, np.abs(ends).max())
+    axis.plot([0, 0], [-radius, radius], color=OUTLINE, lw=2, marker="o", ms=2)
+    axis.plot([film, film], [-1.1 * highest, 1.1 * highest], color="k", lw=1.5)
+    _finish(axis)
 
 
 @torch.no_grad()

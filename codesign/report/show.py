@@ -19,10 +19,11 @@ from codesign.atomic import write_atomic
 from codesign.checks import check_number
 from codesign.errors import CodesignError, DomainError, ShapeError
 from codesign.events import picture, to_counts
+from codesign.lens.pinhole import ThinLens
 from codesign.mount import Mount
 from codesign.report.chain_figures import draw_image
 from codesign.report.flow_colours import flow_colours
-from codesign.report.lens_layout import draw_layout
+from codesign.report.lens_layout import draw_layout, draw_thin
 from codesign.report.robot_figures import draw_robot, view_lines
 from codesign.system.run import Pass
 from codesign.types import EventStream, EventVolume, FlowField
@@ -63,9 +64,9 @@ def show(
     In a notebook the figure shows itself; elsewhere give ``path``, or use ``figure.savefig``.
 
     Args:
-      x: lens (``GeoLens``) or camera: cross-section with rays to the middle, 0.7 and the corner of
-        the field. Frames [..., H, W], linear light: at most four of them over time, with the
-        screen's gamma. ``EventStream`` and ``EventVolume``: ON red, OFF blue, both purple.
+      x: lens (traced, thin or a pinhole) or camera: cross-section with rays to the middle, 0.7 and
+        the corner of the field. Frames [..., H, W], tensor or array of numpy, linear light: at most
+        four of them over time, with the screen's gamma. ``EventStream`` and ``EventVolume``: ON red, OFF blue, both purple.
         ``FlowField``: hue the direction, saturation the length, with a wheel that says how far.
         ``Mount``, with the camera that it carries and the meshes of its robot. What
         ``System.begin`` returns: all of the chain in a row.
@@ -81,6 +82,8 @@ def show(
     >>> len(figure.axes)
     1
     """
+    if isinstance(x, np.ndarray) and x.dtype.kind in "buif":
+        x = torch.from_numpy(x.astype(np.float32))
     if isinstance(x, Mount):
         figure = _mount(x, camera, list(body))
     elif isinstance(x, EventStream):
@@ -106,7 +109,7 @@ def show(
         figure = _row([(f"frame {k}", (films[k], films[picked]), _frame) for k in picked])
     elif isinstance(x, Pass):
         figure = _chain(x)
-    elif hasattr(getattr(x, "lens", x), "to_surfaces"):
+    elif _has_section(x):
         figure = _row([("", x, _lens)])
     else:
         raise DomainError(f"nothing is known of how to draw {type(x).__name__}; give {HANDLED}.")
@@ -116,6 +119,12 @@ def show(
     if path is not None:
         write_atomic(Path(path), figure.image(Path(path).suffix[1:] or "png", 150))
     return figure
+
+
+def _has_section(x):
+    """Whether it is a lens, or a camera with one, whose cross-section is known."""
+    lens = getattr(x, "lens", x)
+    return isinstance(lens, ThinLens) or hasattr(lens, "to_surfaces")
 
 
 def _sample(field, k):
@@ -168,12 +177,14 @@ def _flow(axis, flow_and_full):
 def _lens(axis, x):
     """Of a lens, or of a camera, whose film's corner is the field."""
     lens = getattr(x, "lens", x)
-    half_rad = math.radians(lens.half_field_deg or 10.0)
+    thin = isinstance(lens, ThinLens)
+    half_rad = math.radians(getattr(lens, "half_field_deg", None) or 10.0)
     if hasattr(x, "film"):
         across_mm = math.hypot(x.film.sensor_width_px, x.film.sensor_height_px)
         across_mm *= x.film.pixel_pitch_mm
-        half_rad = math.atan(across_mm / 2 / abs(float(lens.first_order().efl_mm.detach())))
-    draw_layout(axis, lens, [share * half_rad for share in FIELDS])
+        reach = lens.image_distance_mm if thin else lens.first_order().efl_mm
+        half_rad = math.atan(across_mm / 2 / abs(float(reach.detach())))
+    (draw_thin if thin else draw_layout)(axis, lens, [share * half_rad for share in FIELDS])
 
 
 def _mount(mount, camera, body):
@@ -196,8 +207,7 @@ def _chain(run):
     """Lens, middle frame, events and flow of the first sample of a pass."""
     with torch.no_grad():
         camera = run["camera"]
-        traced = hasattr(getattr(camera, "lens", None), "to_surfaces")
-        parts = [("lens", camera, _lens)] if traced else []
+        parts = [("lens", camera, _lens)] if _has_section(camera) else []
         frames = run["frames"].detach()
         films = frames.reshape(-1, *frames.shape[-3:])[0]
         parts.append(("frame", (films[len(films) // 2], films), _frame))
