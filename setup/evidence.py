@@ -122,8 +122,16 @@ ORDERS = '"lens > mount > read-out" "mount > lens > read-out"'
 PARTS = {
     "chain": Part(
         "chain_picture",
-        ("codesign", "scenes", "studies/chain_picture.py"),
-        pictures={"chain.png": "chain.png"},
+        ("codesign", "scenes", "studies/chain_picture"),
+        pictures={"chain.png": "chain.png"}
+        | {
+            f"gallery/{made}": made
+            for made in (
+                *("lens_edge_energy.png", "events_decay.webp", "events_sigmoid.png"),
+                *("events_filtered.png", "events_smoothing.png", "events_thresholds.png"),
+                "flow_overlay.png",
+            )
+        },
     ),
     "hero": Part(
         "hero",

@@ -14,7 +14,12 @@ from codesign.report import prose
 
 TEMPLATE = Path(__file__).with_name("page.html.jinja")
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-MEDIA = {".png": "image/png", ".gif": "image/gif", ".mp4": "video/mp4"}
+MEDIA = {
+    ".png": "image/png",
+    ".gif": "image/gif",
+    ".webp": "image/webp",
+    ".mp4": "video/mp4",
+}
 
 
 @dataclass(frozen=True)
@@ -58,7 +63,7 @@ class Section:
 def picture(path: str | Path, caption: str) -> Picture:
     """Inline the image or video at ``path``.
 
-    Raises: FileFormatError when it is missing or not PNG, GIF or MP4.
+    Raises: FileFormatError when it is missing or not PNG, GIF, WebP or MP4.
     """
     path = Path(path)
     media = MEDIA.get(path.suffix.lower())

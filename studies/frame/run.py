@@ -217,7 +217,7 @@ class Run(Generic[Config]):
         return path
 
     def video(self, path: str | Path, caption: str):
-        """Show an MP4, GIF or PNG file; a relative path is taken inside the run's folder."""
+        """Show an MP4, GIF, WebP or PNG file; a relative path is taken inside the run's folder."""
         self._show("picture", page.picture(self.folder / path, caption))
 
     def path(self, name: str):
