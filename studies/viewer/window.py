@@ -29,11 +29,13 @@ class Window:
     """A setting in a browser; ``serve`` follows the sliders.
 
     setting: what is shown. port: where it is served; of 0 the system chooses.
+    update_s: seconds by the clock of every update so far.
     Raises: DomainError when the port is taken; MissingPackageError without viser.
     """
 
     def __init__(self, setting: Setting, port: int = 8080) -> None:
         self.setting = setting
+        self.update_s: list[float] = []
         self._shown: dict[str, Any] = {}
         self._changed = threading.Event()
         self._asked = threading.Event()
@@ -108,9 +110,12 @@ class Window:
         values = {name: slider.value for name, slider in self.sliders.items()}
         moved = {name: value for name, value in values.items() if value != self._taken[name]}
         self._taken = values
+        began = time.perf_counter()
         try:
             self.setting = self.setting.at(**moved)
-            return self.show()
+            spent = self.show()
+            self.update_s.append(time.perf_counter() - began)
+            return spent
         except CodesignError as error:
             self.words.content = f"error: {error}"
             return {}

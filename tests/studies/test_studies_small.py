@@ -49,3 +49,25 @@ def test_the_convolution_of_the_bench_is_the_layer_up_to_its_cut_kernel():
     agree = (events.convolution(drive) == events.ours(drive)).double().mean()
     assert float(events.ours(drive).sum()) > 50
     assert float(agree) > 0.97
+
+
+@pytest.mark.parametrize(
+    ("seconds", "within"),
+    [
+        (
+            (4.0, 1.0, 0.5, 0.1),
+            ("4.00 times as fast as the finest (b)", "8.00 times as fast as the finest (c)"),
+        ),
+        ((0.4, 1.0, 0.3, 0.1), ("the finest itself", "1.33 times as fast as the finest (c)")),
+    ],
+)
+def test_the_first_line_names_the_cheapest_chain_within_1_and_10_percent(seconds, within):
+    cases = zip("abcd", seconds, (0.0, 0.01, 0.09, 0.11), strict=True)
+    finest, *coarser = (
+        {"levels": name, "cpu_s": cpu_s, "share": share, "faster": f"{seconds[0] / cpu_s:.2f}"}
+        for name, cpu_s, share in cases
+    )
+    assert chain.headline([*coarser, finest]) == (
+        f"Held against the finest chain, within 1 % of its flow the cheapest is {within[0]}; "
+        f"within 10 % of its flow the cheapest is {within[1]}."
+    )

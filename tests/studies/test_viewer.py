@@ -153,6 +153,20 @@ def test_a_slider_moves_the_camera_by_as_many_metres(window, setting):
     enlarged = window_of.ENLARGED
     shown = window.pictures["frame"].image[::enlarged, ::enlarged, 0]
     np.testing.assert_array_equal(shown, window.setting.frame())
+    assert len(window.update_s) == 1
+
+
+def test_the_first_line_says_what_was_seen_and_how_many_updates_a_second(tmp_path, monkeypatch):
+    pytest.importorskip("viser")
+    assert viewer.headline("12 events", [0.1, 0.5, 4.0]) == (
+        "The camera sees 12 events; 2.0 updates a second (median of 3)."
+    )
+    seen = []
+    monkeypatch.setattr(Window, "serve", lambda window: seen.append(window.setting.words()))
+    given = ["--size", str(SIZE), "--frames", "3", "--port", "0", "--out", str(tmp_path / "run")]
+    assert main(viewer.study, viewer.Config, given) == 0
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert f"The camera sees {seen[0]}; no slider was moved." in page
 
 
 def test_the_button_shows_the_verdict_of_the_certificate(window, monkeypatch):
