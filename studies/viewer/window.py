@@ -23,6 +23,11 @@ STEPS = 200  # of a slider
 ENLARGED = 2  # pixels of a picture, a side
 VIEW_M = 0.25  # size of the camera's cone
 RAY_COLOUR = (220, 60, 40)
+KINKS = (  # of pose and focus, which move rays over texels
+    "Pose or focus that does not pass is not yet proof of a wrong gradient: where texels are finer "
+    "than a pixel and rays few, the slope changes within a step; certify again before textures "
+    "without fine detail, with more rays (`--rays`)."
+)
 
 
 class Window:
@@ -177,7 +182,9 @@ class Window:
             for row in rows
         ]
         heads = "| gradient of | verdict | error | noise |\n|---|---|---|---|\n"
-        self.verdict.content = f"At {self.setting.whole}:\n\n{heads}" + "\n".join(lines)
+        doubted = any(row.verdict != "pass" for row in rows if row.name != "threshold")
+        table = f"At {self.setting.whole}:\n\n{heads}" + "\n".join(lines)
+        self.verdict.content = f"{table}\n\n{KINKS}" if doubted else table
 
 
 def _placed(T: Tensor) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ import torch
 
 from codesign import render
 from codesign.errors import FileFormatError, MissingPackageError
-from codesign.grad import certify
+from codesign.grad import Row, certify
 from codesign.system import HandOver, save_hand_over
 from scenes.robots import pair as robot_pair
 from scenes.robots.costs import Costs
@@ -178,6 +178,33 @@ def test_the_button_shows_the_verdict_of_the_certificate(window, monkeypatch):
     window.certify()
     assert "| right | **pass** |" in window.verdict.content
     assert "| wrong | **fail** |" in window.verdict.content
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "said"),
+    [
+        ({"pose": "pass", "threshold": "pass", "focus": "pass"}, False),
+        ({"pose": "fail", "threshold": "pass", "focus": "pass"}, True),
+        ({"pose": "pass", "threshold": "pass", "focus": "noise"}, True),
+        ({"pose": "pass", "threshold": "fail"}, False),  # no ray moves over a texel
+    ],
+)
+def test_a_result_that_kinks_may_have_made_says_so_and_what_to_do(
+    window, monkeypatch, verdicts, said
+):
+    numbers = {"autograd": (1.0,), "difference": (1.0,), "relative_error": 0.1, "cosine": 1.0}
+    numbers |= {"signed_bias": 0.1, "noise_floor": 0.01, "step_plateau": (0.1,)}
+    rows = [Row(name, **numbers, verdict=verdict) for name, verdict in verdicts.items()]
+    monkeypatch.setattr(window_of, "certificate", lambda _: rows)
+    window.certify()
+    *_, table, last = window.verdict.content.split("\n\n")
+    lines = [f"| {name} | **{verdict}** |" for name, verdict in verdicts.items()]
+    shown = last if not said else table
+    assert [
+        line[: len(each)] for each, line in zip(lines, shown.splitlines()[2:], strict=True)
+    ] == lines
+    assert ("not yet proof of a wrong gradient" in last) == said
+    assert ("without fine detail, with more rays (`--rays`)" in last) == said
 
 
 def test_a_port_in_use_and_a_missing_viser_are_one_sentence(tmp_path, capsys, monkeypatch, setting):
