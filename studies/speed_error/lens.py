@@ -64,11 +64,7 @@ def stage(run: Run[Config]) -> list[Asked] | list[str]:
     rows = sweep(run, tracing, "tracers", processes=1, turns=config.rounds, given=given, **axes)
     tabulate(run, f"{count:,} rays, medians", rows, *axes, prefix="trace")
     if not peer:
-        best = max(rows, key=lambda row: row["million_ray_surfaces_per_s"])
-        said = "Rays meet {million_ray_surfaces_per_s:.3g} million surfaces a second, {error_mm:.2g} mm off at most"
-        return [
-            f"{said.format(**best)} ({best['precision']}); optiland is not installed, hence not compared."
-        ]
+        return [alone(rows)]
     figures = []
     for (precision, kind), least in ASKED_SPEED.items():
         wall_s, peak_mb = (
@@ -84,6 +80,15 @@ def stage(run: Run[Config]) -> list[Asked] | list[str]:
     tabulate(run, "Analyses against optiland, medians", rows, "work", "backend", prefix="analysis")
     what = "least CPU time of an analysis by optiland over ours"
     return [*figures, Asked(what, min(column(rows, "ratio")), least=ASKED_ANALYSIS)]
+
+
+def alone(rows: list[dict[str, Any]]) -> str:
+    """One sentence of the quickest of our traces, where there is no peer."""
+    best = max(rows, key=lambda row: row["million_ray_surfaces_per_s"])
+    return (
+        f"Rays meet {best['million_ray_surfaces_per_s']:.3g} million surfaces a second, {best['error_mm']:.2g} mm "
+        f"off at most ({best['precision']}); optiland is not installed, hence not compared."
+    )
 
 
 def tracing(
