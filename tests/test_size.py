@@ -55,7 +55,7 @@ BUDGETS = {
     "tests/optimise": 3_500,
     "tests/render": 30_350,
     "tests/scenes": 21_750,
-    "tests/studies": 32_600,
+    "tests/studies": 33_000,
     "tests/system": 7_050,
     "tests/train": 4_800,
 }
