@@ -26,6 +26,9 @@ PAGES = (
     "docs/lens_files.md",
     "docs/lens_design.md",
     *(f"docs/{name}.md" for name in ("flow", "events", "flow_closed_form", "srm", "silhouettes")),
+    *(f"docs/flow_{name}.md" for name in ("metrics", "recordings", "training")),
+    *(f"docs/{name}.md" for name in ("event_files", "event_views", "sensor_fit", "upsampling")),
+    "docs/run_many.md",
 )
 
 

@@ -2,8 +2,9 @@
 random numbers, by case.
 
 scenes: every junction and every group on five scenes, each right, wrong or not judgeable; its
-count is the first line of the page. chain, joint: more precisely, junction by junction, and the
-whole graph with lens, mount, thresholds and network. silhouettes: where objects hide one another.
+count is the first line of the page, without it that of the other cases. chain, joint: more
+precisely, junction by junction, and the whole graph with lens, mount, thresholds and network.
+silhouettes: where objects hide one another.
 """
 
 import json
@@ -89,9 +90,8 @@ def report(run: Run[Config], cases: list[str], interrupted: bool = False) -> Non
     """The page of what is measured so far."""
     rows = {name: found for name in cases if (found := stored(run, name))}
     missed = [short for name, found in rows.items() for short in show(run, name, found)]
-    lead = []
-    if "scenes" in rows:
-        lead.append(certificates.headline(rows["scenes"]))
+    count = certificates.headline(rows["scenes"]) if "scenes" in rows else headline(rows)
+    lead = [count]
     if interrupted:
         lead.append("**Interrupted**: the rows below are those that were done.")
     lead.append(
@@ -99,6 +99,21 @@ def report(run: Run[Config], cases: list[str], interrupted: bool = False) -> Non
     )
     run.say(lead[0])
     run.finish("Gradients beside differences", "\n\n".join(lead))
+
+
+def headline(rows: dict[str, list[Row]]) -> str:
+    """One sentence: how many gradients of the cases are judged, and how many of those are right.
+    rows: by case."""
+    asked = [
+        bound.missed(row)
+        for name, found in rows.items()
+        for row in found
+        if (bound := CASES[name].asked(row))
+    ]
+    return (
+        f"{len(asked)} of {sum(map(len, rows.values()))} gradients ({', '.join(rows) or 'none yet'}) are "
+        f"judged, and {asked.count(False)} of these are right within what is asked."
+    )
 
 
 def measured(run: Run[Config], name: str) -> None:

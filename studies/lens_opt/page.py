@@ -29,6 +29,7 @@ LENSES = {
     "detuned": "detuned, in focus: the start",
     "after_spots": "flow steps after the spot designer",
 }
+OUTCOMES = {"wins": "wins", "loses": "loses", "ties": "is undecided"}  # as the page says them
 
 
 def label(name, objective):
@@ -39,15 +40,15 @@ def label(name, objective):
 
 
 def verdict(design: str, rivals: Mapping[str, Interval]) -> str:
-    """One sentence that says first who wins: the rivals that do, those that tie, or the design
-    where it beats all.
+    """One sentence that says first who wins: the rivals that do, those that are undecided, or the
+    design where it beats all.
 
     Args:
       design: what it is called, "the flow design".
       rivals: what each is called -> log ratio of the design over it.
     """
     said = []
-    for outcome, words in (("loses", ("wins", "win")), ("ties", ("ties", "tie"))):
+    for outcome, words in (("loses", ("wins", "win")), ("ties", ("is undecided", "are undecided"))):
         found = {name: pair for name, pair in rivals.items() if pair.outcome == outcome}
         if found:
             several = len(found) > 1
@@ -89,7 +90,7 @@ def write(run, course, lenses, junctions):
         pair = log_ratio(errors["after_spots"], errors["spots"])
         run.text(
             f"{config.after_steps} steps of the flow objective from the spot designer's lens "
-            f"change its flow error by {pair.percent()}: by its interval, it {pair.outcome}."
+            f"change its flow error by {pair.percent()}: by its interval, it {OUTCOMES[pair.outcome]}."
         )
     _by_window(run, course.found, names, rivals)
     _settings(run, course)
@@ -136,7 +137,7 @@ def _who_wins(run, names, pairs, rivals):
         "Who wins",
         "Hard events from the physical sensor, textures and motions never optimised on, the same "
         f"cases for every lens. A change below 0 says that the {design} errs less than the lens of "
-        "the row; where the interval holds 0, the two tie. All lenses have the same free "
+        "the row; where the interval holds 0, it is undecided. All lenses have the same free "
         "variables, focal length, f-number and floors of thickness; the published lens is a "
         "yardstick that no design here knows.",
     )
@@ -146,7 +147,9 @@ def _who_wins(run, names, pairs, rivals):
             m[f"{key}_{name}"]
             for key in ("flow_error_mrad_hard", "rms_spot_um", "edge_below_floor_mm")
         )
-        change = (pairs[name].percent(), pairs[name].outcome) if name in pairs else ("", "")
+        change = (
+            (pairs[name].percent(), OUTCOMES[pairs[name].outcome]) if name in pairs else ("", "")
+        )
         rows.append([title, *figures, *change])
     run.table(
         "Lenses on held-out cases",

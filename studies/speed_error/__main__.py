@@ -35,18 +35,17 @@ def study(run: Run[Config]) -> None:
             f"repeats {config.repeats}, rounds {config.rounds}, stages {config.stages}: give at least 3, 1 "
             "and one."
         )
+    said = []
     figures = []
     for name in dict.fromkeys(config.stages):
         stage = STAGES[name]
         run.say(name)
         run.section(name.capitalize(), stage.__doc__ or "")
-        figures += stage(run)
-    lead = (
-        asked(run, figures)
-        if figures
-        else "Time against error of every level and of the whole chain."
-    )
-    run.finish("Speed and error", lead)
+        for found in stage(run):
+            (said if isinstance(found, str) else figures).append(found)
+    if figures:
+        said.append(asked(run, figures))
+    run.finish("Speed and error", " ".join(said))
 
 
 if __name__ == "__main__":

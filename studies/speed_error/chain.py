@@ -18,7 +18,7 @@ from scenes import worlds
 from studies.frame.bench import Timing, turns
 from studies.frame.compare import median_ratio
 from studies.frame.run import Run
-from studies.frame.show import Asked, Panel, panels, tabulate
+from studies.frame.show import Panel, panels, tabulate
 from studies.frame.sweep import select, sweep
 from studies.speed_error import Config
 from studies.speed_error.select import Case, once, triplet
@@ -31,6 +31,7 @@ WALL = Case(
     (0.4, 0.25, 0.5, 0.0, 0.0, 0.0),
 )
 TOLERANCES_PX = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12, 0.08)  # of the whole chain
+SHARES = (0.01, 0.1)  # of the flow, within which the cheapest chain is named
 LEAST_PX = 1e-3  # what is drawn of a change that is 0
 MADE = {"frames": "frames", "events": "volume"}  # at the junctions that stages start from
 
@@ -77,7 +78,7 @@ MEASURES = {
 }
 
 
-def stage(run: Run[Config]) -> list[Asked]:
+def stage(run: Run[Config]) -> list[str]:
     """Every level of every stage, all else finest: its own processor time and its error where it
     ends. Then whole chains, those that are chosen for tolerances from coarse to fine: time and
     change of the flow against the finest chain. All times are medians of turns; ratios are medians
@@ -94,14 +95,26 @@ def stage(run: Run[Config]) -> list[Asked]:
         found = select(rows, stage=name)
         caption = f"Error: {measure.what}; {measure.tolerated:g} is tolerated."
         tabulate(run, name.capitalize(), found, "stage", "level", caption=caption)
-    chains = sweep(run, lambda: of_chains(world, task, levels, run.config), "chains")
+    chains = sweep(run, lambda: of_chains(world, task, levels, run.config), "whole_chains")
     tabulate(run, "Whole chains", chains, "levels", prefix="chain")
     lines = {"found": ("cpu_s", "change"), "forecast": ("forecast_s", "forecast")}
     series = {name: _front(chains, *columns) for name, columns in lines.items()}
     chart = Panel(series, "processor time of the chain, ms", "change of the flow, px", "xy")
     caption = "Whole chains that no other of them is both faster and nearer to the finest than."
     run.figure(panels(chart, width=7), "speed_error_chain", caption)
-    return []
+    return [headline(chains)]
+
+
+def headline(chains: list[dict[str, Any]]) -> str:
+    """One sentence: the cheapest whole chain within each of SHARES of the finest chain's flow, and
+    how many times as fast as the finest it is. chains: rows of ``of_chains``, the finest last."""
+    said = []
+    for share in SHARES:
+        found = min((row for row in chains if row["share"] <= share), key=lambda row: row["cpu_s"])
+        which = f"is {found['faster']} times as fast as the finest ({found['levels']})"
+        which = "is the finest itself" if found is chains[-1] else which
+        said.append(f"within {100 * share:g} % of its flow the cheapest {which}")
+    return f"Held against the finest chain, {'; '.join(said)}."
 
 
 def _front(rows, seconds, change_px):
@@ -171,13 +184,15 @@ def of_chains(world: Any, task: Task, levels: Levels, config: Config) -> list[di
     known = survey(world, task, levels, config.seed)
     finest = Fidelity.finest(known.levels)
     picks = [cheapest_combination(known, task, tolerance) for tolerance in TOLERANCES_PX]
-    tried = list(dict.fromkeys([*picks, finest]))
+    tried = [*(pick for pick in dict.fromkeys(picks) if pick != finest), finest]
     timed = turns({each: once(world, task, each) for each in tried}, config.repeats)
     reference = outcome(world, task, finest).judged
+    changes = {each: change(outcome(world, task, each).judged, reference) for each in tried}
     return [
         {
             "levels": str(each),
-            "change": change(outcome(world, task, each).judged, reference),
+            "change": changes[each],
+            "share": changes[each] / change(reference, torch.zeros_like(reference)),
             "forecast": known.predicted(each),
             "cpu_s": timed[each].cpu,
             "forecast_s": known.cpu_s(each),

@@ -69,8 +69,17 @@ def study(run: Run[Config]) -> None:
         window.server.stop()
     setting = window.setting
     run.record(**{name: setting.whole.numbers[name] for name in drive.names})
-    run.text(setting.words() + ".")
-    run.finish("The viewer's last setting", str(setting.whole))
+    run.text(f"{setting.whole}.")
+    run.finish("The viewer's last setting", headline(setting.words(), window.update_s))
+
+
+def headline(seen: str, update_s: list[float]) -> str:
+    """One sentence: what was seen at the last setting, and how many updates a second there were.
+    update_s: seconds of every update."""
+    pace = "no slider was moved"
+    if update_s:
+        pace = f"{1 / statistics.median(update_s):.1f} updates a second (median of {len(update_s)})"
+    return f"The camera sees {seen}; {pace}."
 
 
 def chosen(size: Config) -> Whole:

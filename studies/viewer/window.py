@@ -23,17 +23,24 @@ STEPS = 200  # of a slider
 ENLARGED = 2  # pixels of a picture, a side
 VIEW_M = 0.25  # size of the camera's cone
 RAY_COLOUR = (220, 60, 40)
+KINKS = (  # of pose and focus, which move rays over texels
+    "Pose or focus that does not pass is not yet proof of a wrong gradient: where texels are finer "
+    "than a pixel and rays few, the slope changes within a step; certify again before textures "
+    "without fine detail, with more rays (`--rays`)."
+)
 
 
 class Window:
     """A setting in a browser; ``serve`` follows the sliders.
 
     setting: what is shown. port: where it is served; of 0 the system chooses.
+    update_s: seconds by the clock of every update so far.
     Raises: DomainError when the port is taken; MissingPackageError without viser.
     """
 
     def __init__(self, setting: Setting, port: int = 8080) -> None:
         self.setting = setting
+        self.update_s: list[float] = []
         self._shown: dict[str, Any] = {}
         self._changed = threading.Event()
         self._asked = threading.Event()
@@ -108,9 +115,12 @@ class Window:
         values = {name: slider.value for name, slider in self.sliders.items()}
         moved = {name: value for name, value in values.items() if value != self._taken[name]}
         self._taken = values
+        began = time.perf_counter()
         try:
             self.setting = self.setting.at(**moved)
-            return self.show()
+            spent = self.show()
+            self.update_s.append(time.perf_counter() - began)
+            return spent
         except CodesignError as error:
             self.words.content = f"error: {error}"
             return {}
@@ -172,7 +182,9 @@ class Window:
             for row in rows
         ]
         heads = "| gradient of | verdict | error | noise |\n|---|---|---|---|\n"
-        self.verdict.content = f"At {self.setting.whole}:\n\n{heads}" + "\n".join(lines)
+        doubted = any(row.verdict != "pass" for row in rows if row.name != "threshold")
+        table = f"At {self.setting.whole}:\n\n{heads}" + "\n".join(lines)
+        self.verdict.content = f"{table}\n\n{KINKS}" if doubted else table
 
 
 def _placed(T: Tensor) -> tuple[np.ndarray, np.ndarray]:

@@ -41,6 +41,10 @@ def test_the_study_goes_on_where_it_was_cut(tmp_path, monkeypatch):
     short = sum(job[0] == "cubes" for job in jobs)
     assert 0 < short < len(jobs)
     assert f"silhouettes: {short} of {len(jobs)} rows" in page
+    first = (
+        f"{len(jobs)} of {len(jobs)} gradients (silhouettes) are judged, and {len(jobs) - short} of"
+    )
+    assert first in page[: page.index("Below what is asked")]
     check_page("gradient_flow", tmp_path / "run")
 
 
@@ -55,6 +59,23 @@ def test_a_silhouette_makes_a_row_that_is_judged():
     assert row.numbers["with_boundary"] < 0.1 < row.numbers["interior_only"]
     worse = Row(row.names, {**row.numbers, "with_boundary": 0.04})
     assert study.CASES["silhouettes"].asked(row).missed(worse)
+
+
+def test_the_first_line_counts_what_is_judged_and_what_is_right_of_it():
+    """Of the chain all rows are asked for something, of the scenes none that is not judgeable."""
+    errors = {"relative_error": 1e-7, "cosine": 0.95}
+    rows = {
+        "chain": [
+            Row((chain.RAYS, "conic"), errors),
+            Row((chain.RAYS, "index"), {**errors, "relative_error": 1e-5}),
+            Row((chain.HARD, "pose"), errors),
+            Row((chain.HARD, "all"), {**errors, "cosine": 0.8}),
+            Row((chain.HARD, "lens"), {**errors, "cosine": math.nan}),
+        ],
+        "scenes": [Row(("room", "events", "theta"), errors, "not judgeable")],
+    }
+    said = study.headline(rows)
+    assert said.startswith("5 of 6 gradients (chain, scenes) are judged, and 2 of these are")
 
 
 # ---- silhouettes

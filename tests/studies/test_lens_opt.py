@@ -108,7 +108,7 @@ def test_the_first_words_say_who_wins():
     assert said.startswith(
         "The flow design wins: its flow error against its best rival, the spot designer, is -20"
     )
-    # all that win or tie are named, those that win first
+    # all that win or are undecided are named, those that win first
     design = [0.60, 0.62, 0.59]
     rows |= {"refocusing alone": [0.59, 0.62, 0.60], "the edge": design}
     said = verdict("the flow design", {name: log_ratio(design, row) for name, row in rows.items()})
@@ -116,7 +116,7 @@ def test_the_first_words_say_who_wins():
         "The spot designer wins: the flow error of the flow design against it is +20"
     )
     assert (
-        "; refocusing alone and the edge tie: the flow error of the flow design against them is +0"
+        "; refocusing alone and the edge are undecided: the flow error of the flow design against them is +0"
         in said
     )
     assert said.endswith("and +0.0 % (+0.0 to +0.0 %) on 3 unseen cases.")

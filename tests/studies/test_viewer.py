@@ -15,7 +15,7 @@ import torch
 
 from codesign import render
 from codesign.errors import FileFormatError, MissingPackageError
-from codesign.grad import certify
+from codesign.grad import Row, certify
 from codesign.system import HandOver, save_hand_over
 from scenes.robots import pair as robot_pair
 from scenes.robots.costs import Costs
@@ -153,6 +153,20 @@ def test_a_slider_moves_the_camera_by_as_many_metres(window, setting):
     enlarged = window_of.ENLARGED
     shown = window.pictures["frame"].image[::enlarged, ::enlarged, 0]
     np.testing.assert_array_equal(shown, window.setting.frame())
+    assert len(window.update_s) == 1
+
+
+def test_the_first_line_says_what_was_seen_and_how_many_updates_a_second(tmp_path, monkeypatch):
+    pytest.importorskip("viser")
+    assert viewer.headline("12 events", [0.1, 0.5, 4.0]) == (
+        "The camera sees 12 events; 2.0 updates a second (median of 3)."
+    )
+    seen = []
+    monkeypatch.setattr(Window, "serve", lambda window: seen.append(window.setting.words()))
+    given = ["--size", str(SIZE), "--frames", "3", "--port", "0", "--out", str(tmp_path / "run")]
+    assert main(viewer.study, viewer.Config, given) == 0
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert f"The camera sees {seen[0]}; no slider was moved." in page
 
 
 def test_the_button_shows_the_verdict_of_the_certificate(window, monkeypatch):
@@ -164,6 +178,33 @@ def test_the_button_shows_the_verdict_of_the_certificate(window, monkeypatch):
     window.certify()
     assert "| right | **pass** |" in window.verdict.content
     assert "| wrong | **fail** |" in window.verdict.content
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "said"),
+    [
+        ({"pose": "pass", "threshold": "pass", "focus": "pass"}, False),
+        ({"pose": "fail", "threshold": "pass", "focus": "pass"}, True),
+        ({"pose": "pass", "threshold": "pass", "focus": "noise"}, True),
+        ({"pose": "pass", "threshold": "fail"}, False),  # no ray moves over a texel
+    ],
+)
+def test_a_result_that_kinks_may_have_made_says_so_and_what_to_do(
+    window, monkeypatch, verdicts, said
+):
+    numbers = {"autograd": (1.0,), "difference": (1.0,), "relative_error": 0.1, "cosine": 1.0}
+    numbers |= {"signed_bias": 0.1, "noise_floor": 0.01, "step_plateau": (0.1,)}
+    rows = [Row(name, **numbers, verdict=verdict) for name, verdict in verdicts.items()]
+    monkeypatch.setattr(window_of, "certificate", lambda _: rows)
+    window.certify()
+    *_, table, last = window.verdict.content.split("\n\n")
+    lines = [f"| {name} | **{verdict}** |" for name, verdict in verdicts.items()]
+    shown = last if not said else table
+    assert [
+        line[: len(each)] for each, line in zip(lines, shown.splitlines()[2:], strict=True)
+    ] == lines
+    assert ("not yet proof of a wrong gradient" in last) == said
+    assert ("without fine detail, with more rays (`--rays`)" in last) == said
 
 
 def test_a_port_in_use_and_a_missing_viser_are_one_sentence(tmp_path, capsys, monkeypatch, setting):
