@@ -50,6 +50,12 @@ def draw_curves(
     axis.set(xlabel=xlabel, ylabel=ylabel)
     axis.set_xscale("log" if "x" in log else "linear")
     axis.set_yscale("log" if "y" in log else "linear")
+    for side in (axis.xaxis, axis.yaxis):
+        if side.axis_name in log:  # plain numbers; between powers of ten 2 and 5 alone
+            side.set_major_formatter(lambda value, _: f"{value:g}")
+            side.set_minor_formatter(
+                lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "25" else ""
+            )
     axis.grid(alpha=0.3)
 
 
