@@ -222,6 +222,7 @@ def test_what_a_layer_leaves_out_of_its_sensor_is_named(name):
     layer(name, SensorModel(theta_sigma=0.03, shot_rate_hz=1.0))
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize(
     "sensor",
     [

@@ -35,7 +35,8 @@ def one_by_one(function, poses):
 
 
 def camera(film=None, optics=None):
-    return Camera(optics or lens.Pinhole(8.0), 12, 8, 0.1, 4, seed=3, film=film)
+    size = (film.width_px, film.height_px) if film else (12, 8)
+    return Camera(optics or lens.Pinhole(8.0), *size, 0.1, 4, seed=3, film=film)
 
 
 def beside(poses, own=True):

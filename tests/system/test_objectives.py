@@ -22,7 +22,8 @@ def wall():
 
 
 def camera(film=None):
-    return render.Camera(lens.Pinhole(EFL_MM), 32, 32, PITCH_MM, 1, film=film)
+    size = (film.width_px, film.height_px) if film else (32, 32)
+    return render.Camera(lens.Pinhole(EFL_MM), *size, PITCH_MM, 1, film=film)
 
 
 def drives():
