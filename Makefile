@@ -58,7 +58,7 @@ gradcheck: ## every gradient against differences, right, wrong or not judgeable:
 gradcheck: STUDY := gradient_flow
 
 docs: .venv/with-docs.stamp ## the docs as a site with search and API: open site/index.html
-	@NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet && echo "site/index.html"
+	@NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict
 
 evidence: setup ## the figures of README and docs whose code has changed, measured again: make evidence ARGS="lens-motion"
 	@$(RUN) setup/evidence.py $(ARGS)

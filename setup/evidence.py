@@ -90,7 +90,7 @@ def control(name: str) -> Callable[[Metrics], str]:
 def joint(pair: str, more: str) -> Part:
     """The race of whole designs on a robot, from its committed answers."""
     return Part(
-        f"codesign --pair {pair} --grid 2 --slopes 0 --couplings 3 --read-outs 0 --processes 2 "
+        f"codesign --pair {pair} --grid 2 --slopes 0 --couplings 3 --processes 2 "
         f"--raw docs/joint_race_{pair}.jsonl {more}",
         ("codesign", "scenes", "studies/codesign"),
         {
@@ -111,6 +111,23 @@ def joint(pair: str, more: str) -> Part:
         },
         {f"joint_race_{pair}.png": "ratios.png", f"joint_designs_{pair}.png": "designs.png"},
     )
+
+
+def within(stem: str, end: str = "", digits: int = 0) -> Callable[[Metrics], str]:
+    """The least and the largest of the metrics whose names begin and end so."""
+
+    def text(metrics: Metrics) -> str:
+        found = [
+            value for name, value in metrics.items() if name.startswith(stem) and name.endswith(end)
+        ]
+        return f"{min(found):.{digits}f} to {max(found):.{digits}f}"
+
+    return text
+
+
+def times(name: str) -> Callable[[Metrics], str]:
+    """A rounded factor."""
+    return lambda metrics: f"{metrics[name]:.0f}"
 
 
 def share_of(passed: str, total: str) -> Callable[[Metrics], str]:
@@ -171,6 +188,34 @@ PARTS = {
         ("codesign", "studies/stability"),
         {"stability.cells": share_of("cells_passed", "cells_total")},
         {"stability.png": "matrix.png"},
+    ),
+    "gradients": Part(
+        "gradient_flow --cases scenes --draws 8 --film-samples 128 --directions 1",
+        ("codesign", "scenes", "studies/gradient_flow"),
+        {
+            "gradients.judged": share_of("judged_scenes", "rows_scenes"),
+            "gradients.wrong": lambda metrics: f"{metrics['missed_scenes'] or 'none'}",
+        },
+    ),
+    "select": Part(
+        "speed_error --stages select",
+        ("codesign", "scenes", "studies/speed_error/select.py"),
+        {
+            "select.faster": within("select_", "_faster", 1),
+            "select.holds": times("picks_that_hold"),
+            "select.over-best": within("select_", "_over_best", 2),
+        },
+    ),
+    "tracing": Part(
+        "speed_error --stages lens",
+        ("codesign/lens", "studies/speed_error/lens.py"),
+        {
+            f"tracing.{precision}.{kind}": times(
+                f"{precision}_{kind}_optiland_with_torch_time_over_ours"
+            )
+            for precision in ("float32", "float64")
+            for kind in ("forward", "forward_backward")
+        },
     ),
     "lens-motion": Part(
         "lens_motion --raw docs/lens_motion.csv",

@@ -6,6 +6,7 @@ import re
 from contextlib import nullcontext
 from pathlib import Path
 
+import drjit
 import pytest
 
 import codesign  # noqa: F401  (first: it sets OpenMP's wait policy before torch is imported)
@@ -15,12 +16,9 @@ import torch  # isort: skip
 from tests.rounding_case import RoundsByPlace  # isort: skip
 
 os.environ.setdefault("MPLBACKEND", "Agg")
-# small tensors: a second thread costs more than it gives
+# small tensors: a second thread costs more than it gives, and drjit's spin while they wait
 torch.set_num_threads(int(os.environ.get("CODESIGN_TEST_THREADS", "1")))
-if "CODESIGN_TEST_THREADS" in os.environ:
-    import drjit
-
-    drjit.set_thread_count(torch.get_num_threads())
+drjit.set_thread_count(torch.get_num_threads())
 # modules that extras of pyproject.toml bring
 EXTRAS = {
     "h5py",

@@ -57,11 +57,13 @@ def test_the_readme_is_short_and_names_every_study():
 def test_the_site_builds_without_a_warning(tmp_path):
     """Every link and anchor of the pages leads somewhere, every page has its place, the API reads."""
     pytest.importorskip("mkdocs", reason="the site needs codesign[docs]")
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet"]
+    # with --quiet there is no warning that --strict could refuse
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict"]
     command += ["--config-file", str(ROOT / "mkdocs.yml"), "--site-dir", str(tmp_path / "site")]
     quiet = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
     built = subprocess.run(command, capture_output=True, text=True, env=quiet, cwd=ROOT)
     assert built.returncode == 0, built.stdout + built.stderr
     page = (tmp_path / "site/api/events/index.html").read_text(encoding="utf-8")
     assert 'id="codesign.events.simulate"' in page
+    assert '<span class="gp">&gt;&gt;&gt; </span>' in page  # doctests are code
     assert (tmp_path / "site/search/search_index.json").stat().st_size > 100_000

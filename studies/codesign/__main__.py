@@ -24,7 +24,7 @@ from scenes.robots import pair as robot_pair
 from scenes.robots.check import check_pair
 from scenes.robots.pair import RobotPair
 from scenes.robots.pairs import PAIRS
-from studies.codesign import couplings, page, read_outs, slopes
+from studies.codesign import couplings, page, slopes
 from studies.codesign.arms import ARMS
 from studies.codesign.design import Space
 from studies.codesign.landscape import landscape
@@ -63,7 +63,6 @@ class Config(StudyConfig):
         "settling": 6,
         "slopes": 0,
         "couplings": 0,
-        "read_outs": 0,
     }
     ANEW: ClassVar = ("processes", "cluster")
     pair: str = "outdoors"
@@ -84,6 +83,8 @@ class Config(StudyConfig):
     """Ways to a design that race."""
     seeds: int = 12
     """Paired starting designs; 0 looks at the landscape and races nothing."""
+    near: bool = False
+    """Start within a tenth of the bounds of the best design looked at, instead of all over them."""
     steps: int = 16
     """Steps of every descent, looks of every search: the budget."""
     worlds: int = 12
@@ -104,9 +105,6 @@ class Config(StudyConfig):
     couplings: int = 4
     """Draws by which the couplings of the parts are measured around the best joint answer; 0: they
     are not."""
-    read_outs: int = 24
-    """Read-outs of the best joint answer by which it is asked what should settle them; 0: it is
-    not."""
     settling: int = 24
     """Designs of sensor and estimator tried on recorded frames, wherever they are settled."""
     processes: int = 0
@@ -146,6 +144,7 @@ def study(run: Run[Config]) -> None:
         start(space, seed)
     gates = landscape(run, space, size.designs)
     setting["calibration"] = list(astuple(gates.calibration))
+    setting["near"] = gates.best.tolist() if size.near else None
     drawn = training(setting)
     if size.raw is not None and not run.path("race.jsonl").exists():
         for name, known in zip(("race", "answers"), taken_up(size.raw, setting), strict=True):
@@ -153,20 +152,12 @@ def study(run: Run[Config]) -> None:
     judge = Judge(space, size.judged_worlds, size.judged_drives)
     rows = raced(run, judge, setting) if size.seeds else []
     said = page.lead(run, space, rows, judge)
-    best = gates.best
-    if rows and (size.couplings or size.read_outs):
-        shares = [
-            torch.tensor(row["share"], dtype=torch.float64) for row in rows if row["arm"] == "joint"
-        ]
-        best = couplings.best_of(drawn, shares)
     if rows and size.couplings:
-        around(run, drawn, best, rows)
+        around(run, drawn, rows, setting["near"])
     page.looked(run, space, gates)
     if size.slopes:
-        places = {"best": gates.best, "start": start(space, size.seed)}
+        places = {"best": gates.best, "start": start(space, size.seed, setting["near"])}
         slopes.show(run, space, slopes.slopes(run, space, drawn, places, size.slopes))
-    if size.read_outs:
-        read_outs.show(run, read_outs.looked(run, space, drawn, best, size.read_outs))
     if rows:
         page.designs(run, space, rows)
     run.record(seconds=run.seconds)
@@ -182,10 +173,17 @@ def same_robot(run: Run[Config], pair: RobotPair) -> None:
     run.save_state({}, now)
 
 
-def around(run: Run[Config], drawn: Drawn, at: torch.Tensor, rows: Sequence[Row]) -> None:
-    """Couplings around a joint answer, and what the orders would leave by them."""
-    at = at.clamp(couplings.STEP, 1 - couplings.STEP)
-    starts = [start(drawn.space, seed) for seed in dict.fromkeys(row["seed"] for row in rows)]
+def around(
+    run: Run[Config], drawn: Drawn, rows: Sequence[Row], near: Sequence[float] | None
+) -> None:
+    """Couplings around the joint answer of which least is expected, and what the orders would leave
+    by them."""
+    shares = [
+        torch.tensor(row["share"], dtype=torch.float64) for row in rows if row["arm"] == "joint"
+    ]
+    at = couplings.best_of(drawn, shares).clamp(couplings.STEP, 1 - couplings.STEP)
+    seeds = dict.fromkeys(row["seed"] for row in rows)
+    starts = [start(drawn.space, seed, near) for seed in seeds]
     measured = {arm: math.exp(-over.value) for arm, (over, _) in compared(rows).items()}
     pulls = sweep(
         run,
@@ -237,10 +235,10 @@ def checked(size: Config) -> None:
         raise DomainError(f"--seeds is {size.seeds}; 0 or more are needed.")
     check_least(size, 2, "designs")
     check_sizes(size)
-    if size.grid < 2 or size.slopes == 1 or min(size.slopes, size.couplings, size.read_outs) < 0:
+    if size.grid < 2 or size.slopes == 1 or min(size.slopes, size.couplings) < 0:
         raise DomainError(
-            f"--grid needs 2 or more, --slopes 0, or 2 and more, --couplings and --read-outs 0 or more; they are "
-            f"{size.grid}, {size.slopes}, {size.couplings} and {size.read_outs}."
+            f"--grid needs 2 or more, --slopes 0, or 2 and more, --couplings 0 or more; they are "
+            f"{size.grid}, {size.slopes} and {size.couplings}."
         )
     if size.steps < LEAST_STEPS or size.steps % LEAST_STEPS:
         raise DomainError(f"--steps is {size.steps}; a multiple of {LEAST_STEPS} is needed.")

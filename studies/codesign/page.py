@@ -56,10 +56,9 @@ def answer(
         ways["nested"] = "Lens and mount together, with sensor and estimator solved at every step,"
     for arm, way in ways.items():
         over, p = compared(rows, arm)[name]
-        verdict = {"wins": "wins", "loses": "loses", "ties": "is undecided"}[over.outcome]
         ends = [math.exp(value) for value in (over.value, over.low, over.high)]
         said.append(
-            f"{way} {verdict}: {ends[0]:.2f} ({ends[1]:.2f} to {ends[2]:.2f}) times its error in "
+            f"{way} {over.outcome}: {ends[0]:.2f} ({ends[1]:.2f} to {ends[2]:.2f}) times its error in "
             f"unseen worlds (p = {p:.2g} after Holm)."
         )
     return " ".join(said)

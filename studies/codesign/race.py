@@ -28,16 +28,17 @@ from studies.frame.config import check_least
 from studies.placement.problem import check_drives
 
 EDGE = 0.1  # of the cube, that starts keep from its walls
+NEAR = 0.1  # of the cube, that near starts lie away at most
 TRIES = 10_000
 SPACE = ("pair", "family", "light", "speed", "free", "held")  # of a setting (``Space.of``)
-MOST_WORLDS = 200  # from 500 on are those of the landscape, from 700 on those of the read-outs
+MOST_WORLDS = 200  # from 500 on are those of the landscape
 JUDGED = 7_700_000  # number of the judge's draw
 
 
-def start(space: Space, seed: int) -> Tensor:
+def start(space: Space, seed: int, near: Sequence[float] | None = None) -> Tensor:
     """Shares [V] at random, sensor and estimator as they are by default, that keep what is
-    required. All numbers of a design are drawn, whichever are free: spaces that share some are
-    asked to begin alike in them.
+    required; those of ``near`` [V], each moved by NEAR at most, where it is given. All numbers of
+    a design are drawn, whichever are free: spaces that share some are asked to begin alike in them.
 
     Raises: DomainError where none of TRIES does.
     """
@@ -46,9 +47,12 @@ def start(space: Space, seed: int) -> Tensor:
     held = space.part("read-out")
     names = [name for block in BLOCKS.values() for name in block]
     for _ in range(TRIES):
-        drawn = torch.rand(len(names), generator=generator, dtype=torch.float64)
-        share = EDGE + (1 - 2 * EDGE) * drawn[[names.index(name) for name in space.free]]
+        every = torch.rand(len(names), generator=generator, dtype=torch.float64)
+        drawn = every[[names.index(name) for name in space.free]]
+        share = EDGE + (1 - 2 * EDGE) * drawn
         share[held] = space.start[held]
+        if near is not None:
+            share = (torch.tensor(near) + NEAR * (2 * drawn - 1)).clamp(0, 1)
         if kept(space, share, requirements):
             return share
     raise DomainError(
@@ -62,12 +66,19 @@ def kept(space: Space, share: Tensor, requirements: Sequence[Any]) -> bool:
     return first_missed(requirements, whole.T_body_cam, whole.camera) is None
 
 
-def run_arm(drawn: Drawn, arm: str, seed: int, steps: int, settling: int) -> dict[str, Any]:
+def run_arm(
+    drawn: Drawn,
+    arm: str,
+    seed: int,
+    steps: int,
+    settling: int,
+    near: Sequence[float] | None = None,
+) -> dict[str, Any]:
     """One arm from one start: its answer, sensor and estimator settled once more on the drives
     recorded last; or the last design on its way that keeps what is required."""
     begun, rendered = time.process_time(), drawn.rendered
     space = drawn.space
-    task = Task(Objective(drawn), start(space, seed), steps, 10_000 * seed, seed, settling)
+    task = Task(Objective(drawn), start(space, seed, near), steps, 10_000 * seed, seed, settling)
     answer, way = ARMS[arm](task)
     answer = read_out(task, answer, way)
     candidates = [answer, *reversed(way.shares), task.start]
@@ -92,7 +103,8 @@ def racing(seed: int, arm: str, setting: Mapping[str, Any], threads: int = 0) ->
     if threads:
         torch.set_num_threads(threads)
         drjit.set_thread_count(threads)
-    found = run_arm(training(setting), arm, seed, setting["steps"], setting["settling"])
+    sizes = setting["steps"], setting["settling"], setting.get("near")
+    found = run_arm(training(setting), arm, seed, *sizes)
     return {**found, "setting": dict(setting)}
 
 

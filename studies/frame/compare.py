@@ -51,10 +51,10 @@ class Interval:
     @property
     def outcome(self) -> str:
         """Of a log ratio of errors: "wins" or "loses" (ours) where the interval leaves out 0,
-        "ties" otherwise."""
+        "is undecided" otherwise."""
         if self.high < 0:
             return "wins"
-        return "loses" if self.low > 0 else "ties"
+        return "loses" if self.low > 0 else "is undecided"
 
     def ratio(self) -> "Interval":
         """A log ratio as the ratio it is."""

@@ -142,7 +142,8 @@ def show(run: Run[Config], name: str, rows: list[Row]) -> list[str]:
     topic = CASES[name]
     short = [row for row in rows if (asked := topic.asked(row)) and asked.missed(row)]
     judged = sum(topic.asked(row) is not None for row in rows)
-    run.record(**{f"missed_{name}": len(short), f"judged_{name}": judged})
+    counts = {"missed": len(short), "judged": judged, "rows": len(rows)}
+    run.record(**{f"{word}_{name}": count for word, count in counts.items()})
     run.card(topic.title, f"{judged - len(short)} of {judged}", "rows that reach what is asked")
     run.section(topic.title, topic.text)
     numbers = list(rows[0].numbers)

@@ -20,7 +20,7 @@ LABELS = {
 EXPLAINED = (
     "Hard events from the physical sensor, textures and motions that nothing was designed or chosen on, the same "
     "cases for every lens. A change below 0 says that the design errs less than the lens of the row; where the "
-    "interval holds 0, the two tie. Smallest detectable: the change that so many cases would have shown four times in "
+    "interval holds 0, it is undecided. Smallest detectable: the change that so many cases would have shown four times in "
     "five. Turned: the same lenses, every flow vector turned by 90 degrees."
 )
 IMAGES = (

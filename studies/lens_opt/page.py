@@ -29,7 +29,6 @@ LENSES = {
     "detuned": "detuned, in focus: the start",
     "after_spots": "flow steps after the spot designer",
 }
-OUTCOMES = {"wins": "wins", "loses": "loses", "ties": "is undecided"}  # as the page says them
 
 
 def label(name, objective):
@@ -48,7 +47,8 @@ def verdict(design: str, rivals: Mapping[str, Interval]) -> str:
       rivals: what each is called -> log ratio of the design over it.
     """
     said = []
-    for outcome, words in (("loses", ("wins", "win")), ("ties", ("is undecided", "are undecided"))):
+    undecided = ("is undecided", "are undecided")
+    for outcome, words in (("loses", ("wins", "win")), (undecided[0], undecided)):
         found = {name: pair for name, pair in rivals.items() if pair.outcome == outcome}
         if found:
             several = len(found) > 1
@@ -90,7 +90,7 @@ def write(run, course, lenses, junctions):
         pair = log_ratio(errors["after_spots"], errors["spots"])
         run.text(
             f"{config.after_steps} steps of the flow objective from the spot designer's lens "
-            f"change its flow error by {pair.percent()}: by its interval, it {OUTCOMES[pair.outcome]}."
+            f"change its flow error by {pair.percent()}: by its interval, it {pair.outcome}."
         )
     _by_window(run, course.found, names, rivals)
     _settings(run, course)
@@ -147,9 +147,7 @@ def _who_wins(run, names, pairs, rivals):
             m[f"{key}_{name}"]
             for key in ("flow_error_mrad_hard", "rms_spot_um", "edge_below_floor_mm")
         )
-        change = (
-            (pairs[name].percent(), OUTCOMES[pairs[name].outcome]) if name in pairs else ("", "")
-        )
+        change = (pairs[name].percent(), pairs[name].outcome) if name in pairs else ("", "")
         rows.append([title, *figures, *change])
     run.table(
         "Lenses on held-out cases",

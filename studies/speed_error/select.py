@@ -130,7 +130,11 @@ def stage(run: Run[Config]) -> list[Asked]:
     rows = sweep(run, partial(judged, rounds=run.config.repeats), "select", scene=cases)
     shown = ("flow_px", "tolerance_px", "here_px", "fresh_px", "faster", "over_best")
     tabulate(
-        run, "Picks", [{k: row[k] for k in ("scene", *shown, "holds")} for row in rows], "scene"
+        run,
+        "Picks",
+        [{k: row[k] for k in ("scene", *shown, "holds")} for row in rows],
+        "scene",
+        prefix="select",
     )
     run.table(
         "What was picked",

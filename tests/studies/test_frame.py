@@ -210,7 +210,7 @@ def test_log_ratios_say_who_wins():
     assert (found.value, found.low, found.high) == pytest.approx(
         (-0.05, -0.05 - half, -0.05 + half), rel=1e-6
     )
-    assert (found.count, found.outcome) == (4, "ties")
+    assert (found.count, found.outcome) == (4, "is undecided")
     assert compare.log_ratio([1.0, 1.1], [2.0, 2.2]).outcome == "wins"
     assert compare.log_ratio([2.0, 2.2], [1.0, 1.1]).outcome == "loses"
     # one case says nothing

@@ -82,7 +82,7 @@ picture by about a tenth of a pixel, behind it it is the length of the parameter
 Scenes with silhouettes (occluders, robot in view, dark room) take the gradient with the boundary
 term; their noise is that of film samples. True flow is compared away from silhouettes, where it
 jumps. Stages behind the frames are certified in float64, in their smooth forms, on the frames of
-the scene with a grain of 1 %. Hard events are the case `layers`, dead times the case `sensors`.
+the scene with a grain of 1 %.
 """
 TOPIC = Topic(
     "Every junction on five scenes",
