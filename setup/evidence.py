@@ -78,6 +78,12 @@ def foretold(arm: str) -> Callable[[Metrics], str]:
     )
 
 
+def share(part: str) -> Callable[[Metrics], str]:
+    """A part's Shapley value with its interval."""
+    names = [f"share_{part}{end}" for end in ("", "_low", "_high")]
+    return lambda metrics: "{:.2f} ({:.2f} to {:.2f})".format(*(metrics[name] for name in names))
+
+
 def control(name: str) -> Callable[[Metrics], str]:
     """Median error of nested under a control, and its ratio to the best order."""
     stem = f"{name}_nested_over_lens_mount_read_out"
@@ -230,6 +236,12 @@ PARTS = {
         "corridor", f"--seeds 20 --designs 64 --arms joint {ORDERS} book nested default"
     ),
     "joint-flight": joint("flight", f"--designs 64 --arms joint {ORDERS} book nested default"),
+    "joint-levers": Part(
+        "joint_levers --processes 2",
+        ("codesign", "scenes", "studies/codesign", "studies/joint_levers.py"),
+        {f"joint.levers.{part}": share(part) for part in ("lens", "mount", "sensor", "estimator")},
+        {"joint_levers.png": "shares.png"},
+    ),
     "joint-controls": Part(
         'joint_controls --arms nested "lens > mount > read-out"',
         ("codesign", "scenes", "studies/codesign", "studies/joint_controls.py"),

@@ -66,12 +66,15 @@ def study(run: Run[Config]) -> None:
         over, rest = (
             crossed(of - logs[other]).ratio() for other in (frozenset(), frozenset(BLOCKS))
         )
+        alone = sum(logs[frozenset({part})] - logs[frozenset()] for part in parts)
+        beyond = crossed(of - logs[frozenset()] - alone).ratio()
         lines.append(
             {
                 "designed": told(parts),
                 "error": float(of.exp().mean(1).quantile(0.5)),
                 "over the default": f"{over:.2f}" if parts else "",
                 "over the whole": f"{rest:.2f}" if parts != frozenset(BLOCKS) else "",
+                "over its parts' own gains": f"{beyond:.2f}" if len(parts) > 1 else "",
             }
         )
     brought = {NAMES[part]: of for part, of in shapley(logs).items()}
@@ -89,17 +92,17 @@ def study(run: Run[Config]) -> None:
     run.section(
         "Every subset",
         "One descent along the numbers of these parts, the others as the pair has them: errors in unseen worlds, median over "
-        "starts, and their ratios.",
+        "starts, and their ratios; the last one is over what its parts would leave if each brought what it brings alone.",
     )
     tabulate(run, "Subsets", lines, "designed", prefix="designed")
     order = sorted(shares, key=lambda name: shares[name].value)
     said = "; ".join(f"{name} {shares[name]:.2f}" for name in order)
     lead = crossed(brought[order[0]] - brought[order[1]])
-    most = f"{order[0]} brings most" if lead.high < 0 else f"{order[0]} is ahead, undecided,"
+    sure = "" if lead.high < 0 else ", though that is undecided"
     few = " So few starts decide nothing." if config.seeds < ENOUGH else ""
     run.finish(
         "What each part of a design brings",
-        f"Of what designing all parts of '{config.pair}' gains the {most} (first over second {lead.ratio():.2f}). "
+        f"Of the parts of '{config.pair}' the {order[0]} brings most{sure} ({order[0]} over {order[1]} {lead.ratio():.2f}). "
         f"Factors of the error: {said}.{few}",
     )
 
