@@ -101,6 +101,8 @@ def look(
     cameras [parts, F, 4, 4]; float64 without gradient."""
     import drjit as dr
 
+    if not len(frame):
+        return origin.new_zeros(2, 0, dtype=torch.float64).unbind()
     arr, fine = (arrays(origin.device.type, dtype) for dtype in (scene.dtype, torch.float64))
     at = fine.UInt32(load(fine.Int32, frame.int()))
     o, d = (fine.Array3(*[load(fine.Float, c) for c in v.unbind(1)]) for v in (origin, direction))

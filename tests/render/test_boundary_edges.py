@@ -50,6 +50,21 @@ def moved(camera, scene, **more):
     )
 
 
+def test_edges_that_are_all_hidden_change_nothing():
+    T = backend.mitsuba().ScalarTransform4f
+    scene = MitsubaScene(
+        {
+            name: {
+                "type": "rectangle",
+                "to_world": T().translate([0, 0, z]).rotate([0, 1, 0], 180).scale([half, half, 1]),
+                "emitter": area(RADIANCE),
+            }
+            for name, z, half in (("near", 1.0, 5.0), ("far", 2.0, 0.05))
+        }
+    )
+    assert sideways(render.Camera(Pinhole(11.0), 8, 8, 0.25, 1), scene) == 0.0
+
+
 @pytest.mark.parametrize("tilt_deg", [0.0, 50.0, -65.0])
 def test_an_edge_that_recedes_sweeps_by_its_depth_at_every_point(tilt_deg):
     """Seen at x_f = f X / Z, y_f = f Y / Z, a point of the edge moves by -f / Z per metre; what the
