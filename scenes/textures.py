@@ -263,12 +263,12 @@ def picture(
                 f"an array coded by sRGB has pixels [H, W] or [H, W, 3], uint8, uint16 or 0..1, not {pixels.dtype} "
                 f"{pixels.shape}; numbers of 0 to 255 become so by .astype(np.uint8)."
             )
-        if pixels.dtype.kind == "f" and pixels.max() > 1:
+        if pixels.dtype.kind == "f" and pixels.max() > 1 + 1e-6:
             raise DomainError(
                 f"an array coded by sRGB has a {pixels.max():g}, and floating-point pixels go from 0 to 1; divide by "
                 "white."
             )
-        return _radiance(linear(pixels), "given as an array")
+        return _radiance(linear(pixels).clip(max=1), "given as an array")
     else:
         values = np.asarray(source)
         return check_texture(

@@ -29,8 +29,10 @@ LONGEST_LINE = 400
 UNIT_TOLERANCE = 1e-3  # of a quaternion's length: files with four digits stay within 1e-4
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,4})?")
 NAMES = re.compile(r"(timestamp|time|t)(_s)? t?x(_m)? t?y(_m)? t?z(_m)? qx qy qz qw")
-FOREIGN = re.compile(r"\[ns\]|q\w*w\b.*q\w*x\b")  # of EuRoC and TUM-VI
-LATEST_S = 1e11  # milliseconds since 1970 are beyond
+# headers of EuRoC and TUM-VI: nanoseconds, w before x, y and z
+TITLES = re.compile(r"#?\W*(timestamp|time|t)\b")
+FOREIGN = re.compile(r"[\[(]n(s|ano\w*)[\])]|\b(q\w*)?w\W+(q\w*)?x\W+(q\w*)?y\W+(q\w*)?z\b")
+LATEST_S = 1e10  # nanoseconds of a recording and milliseconds since 1970 are beyond
 HEADER = "# timestamp tx ty tz qx qy qz qw"
 
 
@@ -67,7 +69,7 @@ def read_tum(path: str | Path) -> tuple[torch.Tensor, torch.Tensor]:
     for number, line in enumerate(read_text(path, MOST_BYTES).split("\n"), start=1):
         line = line.strip(" \t\r")
         if not line or line.startswith("#"):
-            if FOREIGN.search(line):
+            if not rows and TITLES.match(line) and FOREIGN.search(line):
                 raise FileFormatError(
                     f"{path}, line {number}: {line[:60]!r} has nanoseconds or quaternions that begin with w; write "
                     "seconds, and qx qy qz qw."

@@ -153,7 +153,9 @@ def _answer(run: Run[Config], ratios: Mapping[str, Interval], foretold: Mapping[
         # equal values share their mean rank
         one, other = (torch.from_numpy(rankdata(each, axis=-1)) for each in (measured, told))
         one, other = (each - each.mean(-1, keepdim=True) for each in (one, other))
-        return (one * other).sum(-1) / (one.norm(dim=-1) * other.norm(dim=-1))
+        # equal values alone rank nothing
+        size = one.norm(dim=-1) * other.norm(dim=-1)
+        return torch.where(size > 0, (one * other).sum(-1) / size.clamp_min(1e-300), 0.0)
 
     measured = [ratios[cell].value for cell in foretold]
     found: Interval = bootstrap(rank, measured, list(foretold.values()))

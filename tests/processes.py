@@ -17,7 +17,7 @@ def python(*arguments, cwd=ROOT, **environment):
         capture_output=True,
         text=True,
         check=False,
-        timeout=300,
+        timeout=900,
         cwd=cwd,
         env={**os.environ, **environment},
     )

@@ -1,18 +1,14 @@
 """The notebooks run from their first cell to their last, as somebody without a checkout reads them."""
 
 import json
-import os
 import re
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
 from codesign import backend
 from codesign.errors import BackendError
+from tests.processes import ROOT, python
 
-ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 MOST_CELLS = 12
 
@@ -26,15 +22,7 @@ def cells(path, kind):
 def run(path, folder, **environment):
     """All code cells in one fresh process, as a notebook without its pictures."""
     (folder / "cells.py").write_text("\n".join(cells(path, "code")), encoding="utf-8")
-    return subprocess.run(
-        [sys.executable, "cells.py"],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=900,
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
-    )
+    return python("cells.py", cwd=folder, PYTHONPATH=str(ROOT), **environment)
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

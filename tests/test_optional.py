@@ -2,13 +2,10 @@
 named in a sentence."""
 
 import ast
-import os
 import re
-import subprocess
 import sys
 import tomllib
 from importlib.metadata import packages_distributions
-from pathlib import Path
 
 import pytest
 import torch
@@ -17,8 +14,8 @@ from codesign import events
 from codesign.errors import CodesignError, MissingPackageError
 from codesign.optional import optional, require
 from codesign.types import EventStream
+from tests.processes import ROOT, python
 
-ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = {
     extra: {re.split(r"[^A-Za-z0-9_-]", line)[0] for line in lines}
@@ -74,15 +71,7 @@ def test_without_the_extras_all_is_imported_and_a_missing_package_is_one_sentenc
         events.write(tmp_path / f"a.{ending}", EventStream(zero, zero, zero, zero + 1, 2, 2))
     (tmp_path / "a.mp4").write_bytes(b"no video")
     before = sorted(tmp_path.iterdir())
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )
+    done = python("-c", SCRIPT, cwd=tmp_path, PYTHONPATH=str(ROOT))
     assert done.returncode == 0, done.stderr
     for said, (package, extra) in zip(done.stdout.splitlines(), CALLS.values(), strict=True):
         assert re.fullmatch(

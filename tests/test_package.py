@@ -2,19 +2,17 @@
 
 import importlib
 import pickle
-import subprocess
 import sys
 import tomllib
 from importlib.metadata import version
-from pathlib import Path
 
 import pytest
 import yaml
 
 import codesign
 from codesign import mount
+from tests.processes import ROOT, python
 
-ROOT = Path(__file__).resolve().parents[1]
 # for the toolkit itself
 PRIVATE = {
     "arrays",
@@ -39,14 +37,7 @@ def test_the_import_alone_loads_nothing_heavy():
         "import sys, codesign; heavy = ('torch', 'numpy', 'drjit', 'mitsuba', 'kornia', 'matplotlib'); "
         "print([name for name in heavy if name in sys.modules])"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=60,
-    )
+    done = python("-c", script)
     assert done.stdout == "[]\n"
 
 
@@ -63,14 +54,7 @@ def test_every_room_is_reachable_from_the_package():
     script = (
         "import codesign; print(codesign.errors.DomainError.__name__, codesign.lens.load.__name__)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=120,
-    )
+    done = python("-c", script)
     assert done.stdout == "DomainError load\n"
 
 

@@ -1,16 +1,12 @@
 """The pages that a newcomer copies from: every block of Python on them runs, top to bottom."""
 
-import os
 import re
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
 from studies.frame.listing import studies
+from tests.processes import ROOT, python
 
-ROOT = Path(__file__).resolve().parents[1]
 PAGES = (
     "README.md",
     "docs/start.md",
@@ -58,10 +54,8 @@ def test_the_site_builds_without_a_warning(tmp_path):
     """Every link and anchor of the pages leads somewhere, every page has its place, the API reads."""
     pytest.importorskip("mkdocs", reason="the site needs codesign[docs]")
     # with --quiet there is no warning that --strict could refuse
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict"]
-    command += ["--config-file", str(ROOT / "mkdocs.yml"), "--site-dir", str(tmp_path / "site")]
-    quiet = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
-    built = subprocess.run(command, capture_output=True, text=True, env=quiet, cwd=ROOT)
+    site = str(tmp_path / "site")
+    built = python("-m", "mkdocs", "build", "--strict", "-d", site, NO_MKDOCS_2_WARNING="1")
     assert built.returncode == 0, built.stdout + built.stderr
     page = (tmp_path / "site/api/events/index.html").read_text(encoding="utf-8")
     assert 'id="codesign.events.simulate"' in page

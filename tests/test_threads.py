@@ -1,14 +1,10 @@
 """Threads that compute gradients at once give what one after the other gives; what was forked says
 what to do."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+from tests.processes import ROOT, python
+
 FORKED = """
 import os, torch
 from codesign import lens, render
@@ -50,28 +46,14 @@ if __name__ == "__main__":
 def test_many_threads_with_gradients_equal_serial_ones():
     kinds = "('traced', 'estimated', 'counted')"
     script = f"from tests.hostile.threads import *; k = {kinds}; found = run(8, 1, k); print(max(found[n] for n in k))"
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    done = python("-c", script)
     assert done.returncode == 0, done.stderr[-2000:]
     # sums of doubles, in an order that drjit's own threads choose
     assert float(done.stdout) < 1e-9
 
 
 def test_a_process_forked_after_the_first_kernel_is_told_to_spawn():
-    done = subprocess.run(
-        [sys.executable, "-c", FORKED],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    done = python("-c", FORKED)
     assert done.stdout.strip() == "7", done.stderr[-2000:]
 
 
@@ -79,14 +61,6 @@ def test_a_process_forked_after_the_first_kernel_is_told_to_spawn():
 def test_workers_of_a_loader_with_gradients_equal_serial_work(context, tmp_path):
     script = tmp_path / "workers.py"
     script.write_text(WORKERS)
-    done = subprocess.run(
-        [sys.executable, script, context],
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    done = python(script, context, PYTHONPATH=str(ROOT))
     assert done.returncode == 0, done.stderr[-2000:]
     assert float(done.stdout) < 1e-9

@@ -112,13 +112,17 @@ def change(found: Tensor, reference: Tensor) -> float:
     sensor's noise taken out.
 
     Of several draws the products of every two stand for the square: noise, which is independent
-    from draw to draw, leaves their mean alone.
+    from draw to draw, leaves their mean alone. Infinite for what is not finite itself.
+
+    Raises: DomainError where the reference is not.
     """
     off = found.double() - reference.double()
-    if not bool(off.isfinite().all()):
+    if not bool(reference.isfinite().all()):
         raise DomainError(
             "what is judged is not finite on every draw; judge by numbers that a drive without motion has too."
         )
+    if not bool(off.isfinite().all()):
+        return math.inf
     count = len(off)
     square = off[0].square()
     if count > 1:
@@ -188,9 +192,12 @@ def survey(scene: Any, task: Task, levels: Levels, seed: int = 0) -> Survey:
         except CodesignError as error:
             refused[stage, level] = str(error)
             continue
+        off = change(new.judged, best.judged)
+        if off == math.inf:
+            refused[stage, level] = "what is judged is not finite on every draw"
+            continue
         known[stage] += (level,)
         cpu_s = best.cpu_s | {part: new.cpu_s[part] for part in TAKES[stage]}
         ratios[stage, level] = {part: cpu_s[part] / best.cpu_s[part] for part in PARTS}
-        off = change(new.judged, best.judged)
         rows.append({"stage": stage, "level": level, "change": off, "cpu_s": sum(cpu_s.values())})
     return Survey(known, rows, best.cpu_s, ratios, refused, best.judged)

@@ -22,6 +22,7 @@ from codesign.mount import unknown_depth
 from codesign.mount.depth import at_frame, ground_and_scene_depth, ground_depth, scene_depth
 from codesign.mount.observability import PLANAR, body_flow, flow_precision
 from codesign.mount.unknown_depth import UnknownDepth
+from codesign.render.moving import MovingScene
 from codesign.types import ChiefRayCamera, FlowField
 
 INDEPENDENT = 3.0  # points that a window counts as
@@ -171,6 +172,9 @@ class EgoVelocity:
         poses = T_world_cam.reshape(-1, *T_world_cam.shape[-3:])
         pixels, flow, precision, confidence = self._measured(field, camera, len(poses))
         frame, over = _middle(poses.shape[1], t_s, field.interval_s)
+        for world in scene if isinstance(scene, tuple | list) else (scene,):
+            if isinstance(world, MovingScene):
+                world.check_length(poses.shape[1])
         middle = pixels + over * flow.detach()  # where the points are at that frame
         mounts = (
             T_body_cam.to(poses.device, torch.float64)

@@ -85,7 +85,8 @@ class Camera:
         if film is not None:
             check_kind(film, Film, "camera: the film")
             sizes = (film.width_px, film.height_px), tuple(film.sensor_px.int().tolist())
-            if (width_px, height_px) not in sizes or pixel_pitch_mm != film.pixel_pitch_mm:
+            same = math.isclose(pixel_pitch_mm, film.pixel_pitch_mm, rel_tol=1e-9)
+            if (width_px, height_px) not in sizes or not same:
                 raise DomainError(
                     f"camera: {width_px} x {height_px} px of {pixel_pitch_mm:g} mm are given beside a film of "
                     f"{film.width_px} x {film.height_px} px of {film.pixel_pitch_mm:g} mm; give the film's own."

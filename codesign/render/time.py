@@ -80,7 +80,9 @@ def exposed_frames(
     check_number(exposure_s, "exposure_s", 0.0)
     check_number(line_s, "line_s", remedy="the seconds from one row of the sensor to the next")
     samples = check_whole(samples, "time samples of an exposure")
-    if (exposure_s or line_s) and isinstance(scene, MovingScene) and scene.names:
+    worlds = scene if isinstance(scene, tuple | list) else (scene,)
+    moving = any(isinstance(world, MovingScene) and world.names for world in worlds)
+    if moving and (line_s or (exposure_s and samples > 1)):
         raise DomainError(
             "the objects of a MovingScene stand still during an exposure and from line to line; give a function "
             "of time that returns one, see codesign.render.time."

@@ -138,11 +138,8 @@ class Learner:
         """
         batch = to_device(batch, self.device)
         loss = self._loss(batch)
-        self.optimiser.zero_grad(set_to_none=False)
+        self.optimiser.zero_grad()  # a weight that the loss does not reach has none and stays
         loss.backward()
-        for parameter in self.parameters if self.ranks.count > 1 else ():
-            if parameter.grad is None:
-                parameter.grad = torch.zeros_like(parameter)
         self.ranks.average_gradients(self.parameters)
         norm = float(torch.nn.utils.clip_grad_norm_(self.parameters, self.clip))
         (mean,) = self.ranks.sum(float(loss.detach()) / self.ranks.count)
@@ -297,7 +294,8 @@ class Learner:
             self.averaged.state_dict().values(), self.network.state_dict().values(), strict=True
         )
         # a weight under two names moves once
-        for held, now in {held.data_ptr(): (held, now) for held, now in pairs}.values():
+        of = {(held.data_ptr(), held.shape, held.stride()): (held, now) for held, now in pairs}
+        for held, now in of.values():
             held.copy_(held + (1 - decay) * (now - held) if held.is_floating_point() else now)
 
     def _fill_optimiser(self, tensors, path):

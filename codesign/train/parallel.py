@@ -34,10 +34,18 @@ class Ranks:
         return total.tolist()
 
     def average_gradients(self, parameters: Sequence[Tensor]) -> None:
-        """Replace every gradient by its mean over all processes; each has the same ones."""
+        """Replace every gradient by its mean over all processes, 0 where one has none; what none has
+        a gradient of stays without."""
         if self.count == 1:
             return
-        gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+        reached = parameters[0].new_tensor([parameter.grad is not None for parameter in parameters])
+        dist.all_reduce(reached)
+        gradients = []
+        for parameter, count in zip(parameters, reached.tolist(), strict=True):
+            if count:
+                if parameter.grad is None:
+                    parameter.grad = torch.zeros_like(parameter)
+                gradients.append(parameter.grad)
         flat = torch.cat([gradient.reshape(-1) for gradient in gradients])
         dist.all_reduce(flat)
         flat /= self.count

@@ -46,7 +46,7 @@ def answer(
     where = f"'{pair}', {size.light:g} of daylight" + (
         f", {size.speed:g} of the speed" if size.speed != 1 else ""
     )
-    where += "".join(f", {each}" for each in size.hold)
+    where += "".join(f", {each}" for each in size.hold) + ", near starts" * size.near
     if size.seeds < ENOUGH:
         return f"{counted(size.seeds, 'start')} shows that everything works, and decides nothing ({where})."
     name = best_order(found)

@@ -25,7 +25,7 @@ from studies.codesign.problem import Drawn
 from studies.frame import workers
 from studies.frame.compare import Interval, crossed, holm, sign_flip
 from studies.frame.config import check_least
-from studies.placement.problem import check_drives
+from studies.placement.problem import DRIVES, check_drives
 
 EDGE = 0.1  # of the cube, that starts keep from its walls
 NEAR = 0.1  # of the cube, that near starts lie away at most
@@ -52,7 +52,7 @@ def start(space: Space, seed: int, near: Sequence[float] | None = None) -> Tenso
         share = EDGE + (1 - 2 * EDGE) * drawn
         share[held] = space.start[held]
         if near is not None:
-            share = (torch.tensor(near) + NEAR * (2 * drawn - 1)).clamp(0, 1)
+            share = (torch.tensor(near, dtype=torch.float64) + NEAR * (2 * drawn - 1)).clamp(0, 1)
         if kept(space, share, requirements):
             return share
     raise DomainError(
@@ -199,8 +199,12 @@ def check_sizes(size: Any) -> None:
         raise DomainError(
             f"--per-draw {size.per_draw} drives cannot be spread evenly over --worlds {size.worlds}; give a multiple."
         )
-    _, each = spread_over(size.worlds, size.per_draw)
-    check_drives(per_draw=each, judged_drives=size.judged_drives)
+    spread, each = spread_over(size.worlds, size.per_draw)
+    if each > DRIVES:
+        raise DomainError(
+            f"--per-draw {size.per_draw} over --worlds {spread} are {each} drives in each; a world has {DRIVES}."
+        )
+    check_drives(judged_drives=size.judged_drives)
     workers.check_cluster(size.cluster)
 
 

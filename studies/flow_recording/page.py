@@ -21,7 +21,8 @@ UNITS = {
     "angular_error_deg": "angular error, degrees",
     "fwl": "FWL",
     "rsat": "RSAT",
-    "truth_fwl": "FWL of the true flow",
+    "fwl_where_known": "FWL where flow is known",
+    "truth_fwl": "FWL of the true flow there",
 }
 
 

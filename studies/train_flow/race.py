@@ -47,16 +47,16 @@ def race(run):
         raise DomainError(
             "a race needs at least one of --seeds, one of --jobs, and three of --final-windows."
         )
-    plain = type(config)()
+    plain = type(config)(**(config.QUICK if config.quick else {}), quick=config.quick)
     lost = [
         field.name
         for field in fields(config)
         if field.name not in PASSED and getattr(config, field.name) != getattr(plain, field.name)
     ]
-    if lost and not config.quick:
+    if lost:
         raise DomainError(
-            f"a race trains on windows that are made, with every network's own settings; leave --{lost[0].replace('_', '-')} "
-            "out."
+            "a race trains every network with its own settings on windows that are made; leave "
+            f"--{lost[0].replace('_', '-')} out."
         )
     names = NAMES | {name: name.partition(":")[2] for name in config.own}
     kinds = {name: named_class(name) for name in config.own}

@@ -236,3 +236,8 @@ def test_flows_without_times_share_the_recording_whatever_the_window(place, tmp_
     assert starts_ms(read_packets(place, tmp_path / "flow.npy", later), t_us)[0] == 150
     with pytest.raises(CodesignError, match="say nothing of windows of 500 events"):
         read_packets(place, tmp_path / "flow.npy", PacketOptions(events=500))
+    long = read_packets(place, tmp_path / "flow.npy", PacketOptions(window_s=0.3))
+    assert starts_ms(long, t_us) == [0, 100, 200]  # those behind run past the end
+    for options in (PacketOptions(window_s=1.0), PacketOptions(window_s=0.02, start_s=10.0)):
+        with pytest.raises(CodesignError, match="fits behind the start"):
+            read_packets(place, tmp_path / "flow.npy", options)

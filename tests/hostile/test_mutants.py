@@ -3,8 +3,6 @@ of ``make fuzz``."""
 
 import json
 import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -16,6 +14,7 @@ from codesign.reading import check_room, open_regular, read_json
 from tests.hostile import fuzz, seeds_events
 from tests.hostile.mutate import changed_bytes
 from tests.hostile.reader import judged, seed_of
+from tests.processes import python
 
 MUTANTS = 80  # of every seed
 SEEDS = fuzz.seeds()
@@ -23,14 +22,7 @@ SEEDS = fuzz.seeds()
 
 @pytest.mark.parametrize("module", sorted({module for module, _ in SEEDS}))
 def test_mutants_end_in_a_sentence_or_a_value_with_a_meaning(module):
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.hostile.reader", module, "all", "1", "1", str(MUTANTS)],
-        cwd=fuzz.ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=600,
-    )
+    done = python("-m", "tests.hostile.reader", module, "all", "1", "1", str(MUTANTS))
     said = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
     assert said, done.stderr[-2000:]
     assert "done" in said[-1], f"the process ended at {said[-1]}: {done.stderr[-2000:]}"

@@ -155,10 +155,16 @@ def test_a_line_time_without_end_is_refused():
 def test_objects_that_would_stand_still_within_an_exposure_are_refused():
     scene = sweeping(100.0)(torch.zeros(1, dtype=D))
     for exposure_s, line_s in ((0.01, 0.0), (0.0, 1e-3)):
-        with pytest.raises(DomainError, match="stand still during an exposure"):
-            render.exposed_frames(camera(), scene, still, [0.0], exposure_s, line_s=line_s)
+        for given, path in (
+            (scene, still),
+            ((scene, scene), lambda t: still(t).repeat(2, 1, 1, 1)),
+        ):
+            with pytest.raises(DomainError, match="stand still during an exposure"):
+                render.exposed_frames(camera(), given, path, [0.0], exposure_s, 2, line_s=line_s)
     frame = render.frames(camera(), scene, still([0.0]))
-    assert torch.equal(render.exposed_frames(camera(), scene, still, [0.0], 0.0, 1), frame)
+    for exposure_s in (0.0, 0.01):  # one sample is in the middle
+        exposed = render.exposed_frames(camera(), scene, still, [0.0], exposure_s, 1)
+        assert torch.equal(exposed, frame)
 
 
 # ---- adaptive times

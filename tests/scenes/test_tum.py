@@ -57,7 +57,14 @@ def test_comments_tabs_and_line_ends_do_not_matter(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "header", ["", "t_s,x,y,z,qx,qy,qz,qw\n", "timestamp, tx, ty, tz, qx, qy, qz, qw\r\n"]
+    "header",
+    [
+        "",
+        "t_s,x,y,z,qx,qy,qz,qw\n",
+        "timestamp, tx, ty, tz, qx, qy, qz, qw\r\n",
+        "# timestamp tx ty tz qx qy qz qw (Hamilton, qx first)\n",
+        "# converted from EuRoC, qw qx qy qz reordered to qx qy qz qw\n# times were [ns], now seconds\n",
+    ],
 )
 def test_tables_with_commas_are_read_alike(header, tmp_path):
     rows = "0.5,1,2,3,0,0,0,1\n1.5, -1, 2.5e-1, 3, 0, 0, 1, 0\n"
@@ -97,6 +104,13 @@ def test_four_digit_quaternions_become_rotations(tmp_path):
         (f"{LINE}\nt x y z qx qy qz qw\n", "line 2: .* is not"),
         ("t x y z qx qy qz qw\n", "holds no pose"),
         (f"#timestamp [ns],px,py,pz,qx,qy,qz,qw\n{LINE}\n", "line 1: .* nanoseconds"),
+        (f"# time(ns),x,y,z,qx,qy,qz,qw\n{LINE}\n", "line 1: .* nanoseconds"),
+        (f"# timestamp[nanosec] x y z qx qy qz qw\n{LINE}\n", "line 1: .* nanoseconds"),
+        (
+            f"# timestamp, p_x [m], p_y, p_z, q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []\n{LINE}\n",
+            "begin with w",
+        ),
+        (f"# t x y z w x y z\n{LINE}\n", "begin with w"),
         (f"# t, p_x, p_y, p_z, q_RS_w, q_RS_x, q_RS_y, q_RS_z\n{LINE}\n", "begin with w"),
         (f"1520530308199447626 {LINE[4:]}\n", "line 1: the timestamp is no time in seconds"),
     ],

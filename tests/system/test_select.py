@@ -44,8 +44,9 @@ def test_changes_are_root_mean_squares_less_the_noise_of_the_sensor():
     assert change(bias + draws, truth.expand_as(draws)) == pytest.approx(5, abs=4 * deviation)
     assert change(bias + draws, truth.expand_as(draws)) < change((bias + draws)[:1], truth) - 0.5
     bias[0, 0, 0, 0, 0] = torch.nan
+    assert change(bias, truth) == torch.inf
     with pytest.raises(DomainError, match="not finite on every draw"):
-        change(bias, truth)
+        change(truth, bias)
 
 
 def test_levels_share_the_ends_of_the_drive_and_colours_their_samples():

@@ -190,7 +190,7 @@ SHARED = """
 import signal, sys, torch
 from codesign import train
 from tests.flow_training_case import Made
-from tests.train.test_fit import adam, linear, nearness
+from tests.train.test_fit import linear, nearness
 ranks = train.join()
 asked = []
 def before(indices):
@@ -200,9 +200,12 @@ def before(indices):
 def run():
     network = linear()
     network.layer.weight.data += ranks.rank  # the first process's weights count
+    network.unseen = torch.nn.Parameter(torch.ones(2))  # stays, though it is to decay
+    groups = [{"params": network.layer.parameters()}, {"params": [network.unseen], "weight_decay": 0.5}]
     judge = nearness if ranks.rank == 0 else lambda network: 1 / 0
-    made = train.fit(network, Made(before=before), steps=6, batch=4, optimiser=adam(network, 0.01),
+    made = train.fit(network, Made(before=before), steps=6, batch=4, optimiser=torch.optim.AdamW(groups, 0.01, weight_decay=0),
         average=0.5, ranks=ranks, validate=judge, validate_every=2, save_to=sys.argv[1])
+    assert network.unseen.tolist() == [1, 1]
     return network.layer.weight, made.loss, made.norm, len(made.validation)
 try:
     run()

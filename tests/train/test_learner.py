@@ -240,6 +240,30 @@ def test_a_weight_without_gradient_does_not_decay():
     assert network["unseen"].weight.tolist() == [[1.0, 1.0]]
 
 
+def test_heads_that_take_turns_go_on_as_if_never_stopped():
+    """A head that a step does not reach stays, before a stop and after it."""
+
+    def made():
+        network: Any = nn.ModuleDict({"a": line(), "b": line()})
+        optimiser = torch.optim.AdamW(network.parameters(), 0.1, weight_decay=0.1)
+        turn = lambda network, x: network["ab"[round(float(x[0, 0]))]](x)  # noqa: E731
+        return Learner(network, mean, optimiser, predict=turn)
+
+    batches = [torch.full_like(X, k % 2) for k in range(5)]
+    through, stopped, resumed = made(), made(), made()
+    for k, batch in enumerate(batches):
+        held = through.network["ba"[k % 2]].weight.detach().clone()
+        through.step(batch)
+        assert torch.equal(through.network["ba"[k % 2]].weight, held)
+    for batch in batches[:2]:
+        stopped.step(batch)
+    resumed.load_state_dict(stopped.state_dict())
+    for batch in batches[2:]:
+        resumed.step(batch)
+    for one, other in zip(through.network.parameters(), resumed.network.parameters(), strict=True):
+        assert torch.equal(one, other)
+
+
 def test_a_weight_under_two_names_has_one_average():
     class Tied(nn.Module):
         def __init__(self):

@@ -163,16 +163,21 @@ def windows(
         length_us = round((options.window_s or min(WINDOW_S, (whole[1] - whole[0]) * 1e-6)) * 1e6)
         number = (whole[1] - start_us) // length_us if length_us > 0 else 0
         if number < 1:
-            raise DomainError(
-                f"the recording lasts {(whole[1] - whole[0]) * 1e-6:.6f} s; no window of {length_us * 1e-6:g} s "
-                "fits behind the start."
-            )
+            raise none_fits(whole, length_us)
         possible = [
             (start_us + k * length_us, start_us + (k + 1) * length_us) for k in range(number)
         ]
     kept, left_out = without(possible, held, options.skip)
     count = options.count or PACKETS
     return (kept[:count] if in_turn else spread(kept, count)), left_out
+
+
+def none_fits(whole: Window, length_us: int) -> DomainError:
+    """What to raise where no window of a length lies within a recording behind the start."""
+    return DomainError(
+        f"the recording lasts {(whole[1] - whole[0]) * 1e-6:.6f} s; no window of {length_us * 1e-6:g} s fits behind the "
+        "start."
+    )
 
 
 def without(

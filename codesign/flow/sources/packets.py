@@ -19,6 +19,7 @@ from codesign.flow.sources.packet import (
     PacketOptions,
     check_options,
     covers,
+    none_fits,
     spread,
     windows,
     without,
@@ -253,10 +254,14 @@ def _parts(one, spans, start_us):
         first = replace(options, skip=(), count=1)  # one flow says nothing of a second window
         return list(enumerate(windows(one.events, one.whole, start_us, first, in_turn=True)[0]))
     found = [(k, (max(t0, start_us), t1)) for k, (t0, t1) in enumerate(spans) if t1 > start_us]
-    if options.window_s is None:
-        return found
-    length_us = round(options.window_s * 1e6)
-    return [(k, (t0, t0 + length_us)) for k, (t0, _) in found]
+    length_us = spans[0][1] - spans[0][0]
+    if options.window_s is not None:
+        length_us = round(options.window_s * 1e6)
+        found = [(k, (t0, t0 + length_us)) for k, (t0, _) in found]
+    found = [(k, span) for k, span in found if covers(one.whole, span)]
+    if not found:
+        raise none_fits(one.whole, length_us)
+    return found
 
 
 def _with_truth_somewhere(packets: Sequence[Packet]) -> list[Packet]:
