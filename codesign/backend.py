@@ -6,7 +6,8 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import version
@@ -169,6 +170,20 @@ def mitsuba(device: str = "cpu") -> Any:
     if mi.variant() != variant(device):  # the user's own code may have chosen another meanwhile
         mi.set_variant(variant(device))
     return mi
+
+
+@contextmanager
+def two_threads() -> Iterator[None]:
+    """drjit with two threads at least: with one, Mitsuba waits without end for another that reads
+    or writes OpenEXR."""
+    import drjit as dr
+
+    count = dr.thread_count()
+    dr.set_thread_count(max(count, 2))
+    try:
+        yield
+    finally:
+        dr.set_thread_count(count)
 
 
 @dataclass(frozen=True)

@@ -320,10 +320,11 @@ def _check_variants(mi, entry, place):
 
 @contextmanager
 def _quiet(mi) -> Iterator[None]:
-    """Without its warnings about sensors, which are left out."""
+    """Without its warnings about sensors, which are left out; reading what there is to read."""
     level = mi.logger().log_level()
     mi.set_log_level(mi.LogLevel.Error)
     try:
-        yield
+        with backend.two_threads():
+            yield
     finally:
         mi.set_log_level(level)

@@ -18,7 +18,8 @@ MOST_BYTES = 1 << 30
 LONGEST_S = 120.0
 # run by a process of its own: a library in C++ that meets damaged bytes may end the process that it
 # runs in
-APART = """import sys, numpy, mitsuba
+APART = """import sys, numpy, drjit, mitsuba
+drjit.set_thread_count(max(2, drjit.thread_count()))  # one alone waits for another to read OpenEXR
 mitsuba.set_variant("scalar_rgb")
 rgb, number = mitsuba.Bitmap.PixelFormat.RGB, mitsuba.Struct.Type.Float32
 numpy.save(sys.stdout.buffer, numpy.array(mitsuba.Bitmap(sys.argv[1]).convert(rgb, number, False)))"""

@@ -19,7 +19,8 @@ LONGEST_S = 600.0
 SURVIVED: set[tuple[Any, ...]] = set()  # what was tried, with size and time of every file
 SOURCES = ("filename", "bitmap", "data")  # of which a bitmap has one
 # errors end well: they come again, in words, where the scene is loaded for use
-TRIAL = """import sys, json, mitsuba
+TRIAL = """import sys, json, drjit, mitsuba
+drjit.set_thread_count(max(2, drjit.thread_count()))  # one alone waits for another to read OpenEXR
 variant, file, parameters, named = json.loads(sys.argv[1])
 mitsuba.set_variant(variant)
 for kind, name in named:

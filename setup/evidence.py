@@ -50,24 +50,34 @@ class Part:
     pictures: Mapping[str, str] = field(default_factory=dict)
 
 
+def interval(*names: str) -> Callable[[Metrics], str]:
+    """A value with its interval."""
+    return lambda metrics: "{:.2f} ({:.2f} to {:.2f})".format(*(metrics[name] for name in names))
+
+
 def ratio(stem: str, pair: str) -> Callable[[Metrics], str]:
     """A median ratio with its interval."""
-    names = [f"{stem}_{end}_{pair}" for end in ("median", "low95", "high95")]
-    return lambda metrics: "{:.2f} ({:.2f} to {:.2f})".format(*(metrics[name] for name in names))
+    return interval(*(f"{stem}_{end}_{pair}" for end in ("median", "low95", "high95")))
+
+
+def within(
+    stem: str, end: str, form: str, of: Callable[[float], float] = float
+) -> Callable[[Metrics], str]:
+    """The least and the largest of what is made of the metrics whose names begin and end so."""
+
+    def text(metrics: Metrics) -> str:
+        names = [name for name in metrics if name.startswith(stem) and name.endswith(end)]
+        found = [of(metrics[name]) for name in names]
+        return form.format(min(found), max(found))
+
+    return text
 
 
 def gains(comparison: str) -> Callable[[Metrics], str]:
     """The least and the largest gain over settings, in per cent."""
-
-    def text(metrics: Metrics) -> str:
-        found = [
-            100 * (1 - math.exp(value))
-            for name, value in metrics.items()
-            if name.endswith(f"as_it_is_{comparison}")
-        ]
-        return f"{min(found):.0f} to {max(found):.0f} %"
-
-    return text
+    return within(
+        "", f"as_it_is_{comparison}", "{:.0f} to {:.0f} %", lambda log: 100 * (1 - math.exp(log))
+    )
 
 
 def foretold(arm: str) -> Callable[[Metrics], str]:
@@ -76,12 +86,6 @@ def foretold(arm: str) -> Callable[[Metrics], str]:
     return lambda metrics: "{:.2f}, {:.2f}".format(
         *(metrics[f"{stem}_{name}"] for name in ("at_budget", "measured"))
     )
-
-
-def share(part: str) -> Callable[[Metrics], str]:
-    """A part's Shapley value with its interval."""
-    names = [f"share_{part}{end}" for end in ("", "_low", "_high")]
-    return lambda metrics: "{:.2f} ({:.2f} to {:.2f})".format(*(metrics[name] for name in names))
 
 
 def control(name: str) -> Callable[[Metrics], str]:
@@ -117,18 +121,6 @@ def joint(pair: str, more: str) -> Part:
         },
         {f"joint_race_{pair}.png": "ratios.png", f"joint_designs_{pair}.png": "designs.png"},
     )
-
-
-def within(stem: str, end: str = "", digits: int = 0) -> Callable[[Metrics], str]:
-    """The least and the largest of the metrics whose names begin and end so."""
-
-    def text(metrics: Metrics) -> str:
-        found = [
-            value for name, value in metrics.items() if name.startswith(stem) and name.endswith(end)
-        ]
-        return f"{min(found):.{digits}f} to {max(found):.{digits}f}"
-
-    return text
 
 
 def times(name: str) -> Callable[[Metrics], str]:
@@ -207,9 +199,9 @@ PARTS = {
         "speed_error --stages select",
         ("codesign", "scenes", "studies/speed_error/select.py"),
         {
-            "select.faster": within("select_", "_faster", 1),
+            "select.faster": within("select_", "_faster", "{:.1f} to {:.1f}"),
             "select.holds": times("picks_that_hold"),
-            "select.over-best": within("select_", "_over_best", 2),
+            "select.over-best": within("select_", "_over_best", "{:.2f} to {:.2f}"),
         },
     ),
     "tracing": Part(
@@ -239,7 +231,12 @@ PARTS = {
     "joint-levers": Part(
         "joint_levers --processes 2",
         ("codesign", "scenes", "studies/codesign", "studies/joint_levers.py"),
-        {f"joint.levers.{part}": share(part) for part in ("lens", "mount", "sensor", "estimator")},
+        {
+            f"joint.levers.{part}": interval(
+                *(f"share_{part}{end}" for end in ("", "_low", "_high"))
+            )
+            for part in ("lens", "mount", "sensor", "estimator")
+        },
         {"joint_levers.png": "shares.png"},
     ),
     "joint-controls": Part(

@@ -79,7 +79,8 @@ def exr() -> bytes:
 
     mi = backend.mitsuba()
     stream = mi.MemoryStream()
-    mi.Bitmap(LIGHT.astype(np.float32)).write(stream, mi.Bitmap.FileFormat.OpenEXR)
+    with backend.two_threads():
+        mi.Bitmap(LIGHT.astype(np.float32)).write(stream, mi.Bitmap.FileFormat.OpenEXR)
     stream.seek(0)
     return stream.read(stream.size())
 

@@ -1,6 +1,8 @@
 """What users bring into worlds: pictures in linear light against Mitsuba's reader, and one sentence
 for what has no meaning."""
 
+import os
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +13,7 @@ from codesign.pose import look_at
 from codesign.render.charts import emissive_mesh
 from scenes import build, rgbe, textures, worlds
 from tests.hostile import seeds_scenes
+from tests.processes import python
 
 HEAD = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 4\n"
 FLAT = HEAD + bytes([9, 8, 7, 130] * 3 + [5, 6, 7, 120])
@@ -21,10 +24,26 @@ EVEN = np.ones((4, 4))
 def test_pictures_in_linear_light_hold_what_mitsuba_reads(tmp_path, name):
     made = {"new.hdr": seeds_scenes.hdr(), "flat.hdr": FLAT, "sky.exr": seeds_scenes.exr()}
     (tmp_path / name).write_bytes(made[name])
-    theirs = np.array(backend.mitsuba().Bitmap(str(tmp_path / name)))[..., :3]
+    with backend.two_threads():
+        theirs = np.array(backend.mitsuba().Bitmap(str(tmp_path / name)))[..., :3]
     np.testing.assert_array_equal(
         rgbe.read(tmp_path / name).astype(np.float32), theirs.astype(np.float32)
     )
+
+
+ONE_CORE = """import os, sys
+os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
+from scenes import foreign, textures
+print(textures.environment(sys.argv[1]).shape)
+foreign.from_mitsuba({"sky": {"type": "envmap", "filename": sys.argv[1]}, "ball": {"type": "sphere"}})
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="a process is kept on one core")
+def test_pictures_of_openexr_are_read_on_one_core(tmp_path):
+    (tmp_path / "sky.exr").write_bytes(seeds_scenes.exr())
+    done = python("-c", ONE_CORE, str(tmp_path / "sky.exr"))
+    assert (done.returncode, done.stdout) == (0, "(6, 12)\n"), done.stderr
 
 
 WHOLE = seeds_scenes.hdr()
