@@ -111,8 +111,8 @@ class Changed(Whole):
 
     stage: Callable[[nn.Module], nn.Module] = lambda stage: stage
 
-    def events(self, kind: str) -> nn.Module:
-        return self.stage(super().events(kind))
+    def events(self, kind: str, bins: int = robot_pair.BINS) -> nn.Module:
+        return self.stage(super().events(kind, bins))
 
 
 class Shuffled(nn.Module):

@@ -231,11 +231,11 @@ class Whole:
             robot_pair.SENSOR, self.numbers["theta"], self.numbers["cutoff_hz"]
         )
 
-    def events(self, kind: str) -> nn.Module:
-        """Event stage: "memory" (hard counts) or "sensor" (single events)."""
+    def events(self, kind: str, bins: int = robot_pair.BINS) -> nn.Module:
+        """Event stage: "memory" (hard counts) or "sensor" (single events, in so many bins)."""
         costs = self.space.costs
         if kind == "sensor":
-            stage: nn.Module = events.HardSensor(self.sensor, robot_pair.BINS, robot_pair.LEAD_S)
+            stage: nn.Module = events.HardSensor(self.sensor, bins, robot_pair.LEAD_S)
         else:
             stage = events.Settled(events.layer("memory", self.sensor, learn=()), robot_pair.LEAD_S)
         most = costs.bus_hz * robot_pair.DURATION_S * OF_SENSOR

@@ -1,0 +1,95 @@
+"""Designs and the refiner's weights in one optimiser: the slope that weights get, and what is left
+of it where one of the two does not move."""
+
+import json
+from copy import deepcopy
+
+import pytest
+import torch
+
+from codesign import flow
+from scenes.robots import pair as robot_pair
+from studies import joint_refiner
+from studies.codesign.design import Space
+from studies.codesign.refined import Refined, descended
+from studies.frame.run import main
+from tests.studies.browser import check_page
+
+SETTING = {"steps": 2, "updates": 2, "rate": 1e-4, "settling": 6}
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    space = Space.of("outdoors", None, free=("efl_mm", "z_m", "theta"))
+    made = Refined(space, robot_pair.training(1), 1, 2)
+    made.network = flow.load("refiner")
+    return made
+
+
+@pytest.mark.slow
+def test_weights_get_the_slope_of_the_velocity_error(drawn):
+    looked = drawn.looked(drawn.space.made(drawn.space.start), drawn.draw(0))
+    plain = drawn.network
+    drawn.network = network = deepcopy(plain).double()
+    generator = torch.Generator().manual_seed(0)
+    ways = [
+        weight.detach().abs().mean() * torch.randn(weight.shape, generator=generator).double()
+        for weight in network.parameters()
+    ]
+
+    @torch.no_grad()
+    def error(step):
+        moved = deepcopy(network)
+        for weight, way in zip(moved.parameters(), ways, strict=True):
+            weight += step * way
+        drawn.network = moved
+        return float(drawn.error(looked))
+
+    drawn.error(looked).backward()
+    slope = sum(
+        float((weight.grad * way).sum())
+        for weight, way in zip(network.parameters(), ways, strict=True)
+    )
+    by_differences = (error(1e-4) - error(-1e-4)) / 2e-4
+    drawn.network = plain
+    assert abs(slope) > 1e-4
+    assert slope == pytest.approx(by_differences, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_one_optimiser_moves_what_it_is_given_and_nothing_else(drawn):
+    start, delivered = drawn.space.start, drawn.network
+
+    def ended(design, weights, rate=1e-4):
+        drawn.network = deepcopy(delivered)
+        given = {**SETTING, "rate": rate}
+        share, seen = descended(drawn, start, 0, given, design, weights)
+        moved = any(
+            not torch.equal(one, other)
+            for one, other in zip(drawn.network.parameters(), delivered.parameters(), strict=True)
+        )
+        assert len(seen) == SETTING["steps"]
+        drawn.network = delivered
+        return share, moved
+
+    alone, moved = ended(design=True, weights=False)
+    assert not moved
+    assert not torch.equal(alone, start)
+    held, moved = ended(design=False, weights=True)
+    assert moved
+    assert torch.equal(held, start)
+    # weights that take no steps leave the design to itself
+    together, moved = ended(design=True, weights=True, rate=0.0)
+    assert not moved
+    assert torch.equal(together, alone)
+
+
+@pytest.mark.slow
+def test_the_page_says_that_one_start_decides_nothing(tmp_path):
+    assert main(joint_refiner.study, joint_refiner.Config, ["--quick", "--out", str(tmp_path)]) == 0
+    check_page("joint_refiner", tmp_path)
+    assert "decide nothing" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    numbers = json.loads((tmp_path / "metrics.json").read_text())
+    assert numbers["joint_over_design_alone"] == pytest.approx(
+        numbers["arm_joint_refiner"] / numbers["arm_design_alone_refiner"], rel=0.3
+    )
