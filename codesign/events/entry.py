@@ -152,10 +152,14 @@ def check_times(t_s: Times, count: int | None = None) -> Tensor:
     return times_s
 
 
-def check_dtype(dtype: torch.dtype) -> None:
-    """Raise DomainError for what is no real type of tensors."""
-    if not any(dtype is one for one in REAL):
-        raise DomainError(f"dtype is {shown(dtype)}; a real type is needed, such as torch.float32.")
+def check_dtype(dtype: torch.dtype, fractions: bool = False) -> None:
+    """Raise DomainError for what is no real type of tensors, and, for values with ``fractions``, for
+    one of whole numbers."""
+    if not any(dtype is one and (one.is_floating_point or not fractions) for one in REAL):
+        kind = "floating" if fractions else "real"
+        raise DomainError(
+            f"dtype is {shown(dtype)}; a {kind} type is needed, such as torch.float32."
+        )
 
 
 def check_room(values: float, what: str) -> None:

@@ -10,7 +10,7 @@ from codesign.errors import FileFormatError
 from codesign.events.columns import LIMIT_PX, EventColumns
 from codesign.events.formats.aedat import read_aedat2, read_aedat4, write_aedat2, write_aedat4
 from codesign.events.formats.arrays import read_arrays, write_npz
-from codesign.events.formats.arrival import Asked, check_asked
+from codesign.events.formats.arrival import Asked, check_asked, check_nothing_told
 from codesign.events.formats.hdf5 import read_hdf5, write_hdf5
 from codesign.events.formats.prophesee import read_dat, read_raw, write_dat, write_raw
 from codesign.events.formats.text import read_text, write_csv
@@ -93,11 +93,8 @@ def read_columns(path: Path, asked: Asked) -> EventColumns:
     files."""
     reader = _choose(READERS, path, "read")
     check_asked(path, asked)
-    if path.suffix.lower() not in TABLES and (asked.columns, asked.time_unit) != ("auto", "auto"):
-        raise FileFormatError(
-            f"{path} has one order of columns and one clock by its format; leave columns and time_unit "
-            f"away (they are for {', '.join(TABLES)})."
-        )
+    if path.suffix.lower() not in TABLES:
+        check_nothing_told(path, asked, f"they are for {', '.join(TABLES)}")
     with reading(check_regular(path)):
         columns = reader(path, asked)
     if not max(columns.height_px, columns.width_px) <= LIMIT_PX:

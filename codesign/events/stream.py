@@ -31,8 +31,9 @@ def ordered(
         if not isinstance(values, Tensor) or values.is_complex():
             given = values.dtype if isinstance(values, Tensor) else type(values).__name__
             raise DomainError(f"{name} is {given}; a tensor of whole numbers is needed.")
-        if values.is_floating_point() and bool((values != values.round()).any()):
-            first = float(values[values != values.round()][0])
+        parted = values.is_floating_point() and (values != values.round()) | values.isinf()
+        if values.is_floating_point() and bool(parted.any()):
+            first = float(values[parted][0])
             raise DomainError(
                 f"{name} holds {first!r}; whole numbers are needed: round them first."
             )

@@ -34,6 +34,15 @@ def _check(flow, truth):
     return flow.to(wider), truth.to(wider)
 
 
+def _known(flow, truth, mask):
+    """Both, the truth as the flow where it is masked: NaN there would reach the gradient."""
+    flow, truth = _check(flow, truth)
+    if mask is not None:
+        check(mask, (*truth.shape[:-3], *truth.shape[-2:]), "the mask", (torch.bool,))
+        truth = torch.where(mask[..., None, :, :], truth, flow.detach())
+    return flow, truth
+
+
 def _masked(values, mask):
     """The values under the mask, flat; a non-finite one would count as no outlier, so it is
     refused."""
@@ -60,7 +69,7 @@ def aee(flow: Tensor, truth: Tensor, mask: Tensor | None = None) -> Tensor:
     >>> float(aee(torch.zeros(2, 8, 8), truth))
     5.0
     """
-    return _masked(endpoint_error(flow, truth), mask).mean()
+    return _masked(endpoint_error(*_known(flow, truth, mask)), mask).mean()
 
 
 def zero_flow_error(truth: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -86,7 +95,7 @@ def outlier_percent(
     error = endpoint_error(flow, truth)
     check_number(pixels, "pixels", 0.0)
     check_number(share, "share", 0.0)
-    length = truth.square().sum(-3).sqrt()
+    length = _check(flow, truth)[1].square().sum(-3).sqrt()
     error = _masked(error, mask)
     length = _masked(length, mask)
     return 100 * ((error > pixels) & (error > share * length)).to(error.dtype).mean()
@@ -113,7 +122,7 @@ def angular_error_deg(flow: Tensor, truth: Tensor, mask: Tensor | None = None) -
     >>> round(float(angular_error_deg(flow, torch.zeros(2, 8, 8))), 3)
     45.0
     """
-    flow, truth = _check(flow, truth)
+    flow, truth = _known(flow, truth, mask)
     one = torch.ones_like(flow[..., :1, :, :])
     return _masked(
         torch.rad2deg(_angle(torch.cat([flow, one], -3), torch.cat([truth, one], -3))), mask

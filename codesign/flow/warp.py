@@ -48,6 +48,8 @@ def chained(flows_px: Tensor, valid: Tensor, hidden: Tensor | None = None) -> tu
     Gradient: flows_px.
     """
     height, width = flows_px.shape[2:]
+    # NaN beside a place would reach what is read there with weight 0
+    flows_px = torch.where(valid[:, None], flows_px, 0)
     total = flows_px[0]
     seen = valid[0]
     place = pixel_grid(height, width, flows_px)

@@ -14,7 +14,7 @@ from studies.codesign.cells import space_of
 from studies.codesign.design import PARTS, Whole
 from studies.codesign.objective import Objective
 from studies.codesign.problem import Drawn, Looked
-from studies.codesign.race import JUDGED, spread_over, start
+from studies.codesign.race import JUDGED, kept, spread_over, start
 from studies.frame.sweep import Row
 
 FIRST, LAST = 0.08, 0.01  # of the cube, a step of a number of the design
@@ -51,8 +51,8 @@ def descended(
     design: bool,
     weights: bool,
 ) -> tuple[Tensor, list[Looked]]:
-    """Shares [V] after all steps, sensor settled, and what was rendered on the way; the weights of
-    ``drawn.network`` change in place."""
+    """Shares [V] after all steps, sensor settled, or the last on the way that keep what is required;
+    and what was rendered on the way. The weights of ``drawn.network`` change in place."""
     objective, share = Objective(drawn), begun.clone().requires_grad_(design)
     groups = [{"params": [share], "lr": FIRST}] if design else []
     if weights:
@@ -80,7 +80,9 @@ def descended(
     if not design:
         return begun, seen
     answer = torch.stack(way[-max(1, round(END * len(way))) :]).mean(0)
-    return objective.settled(answer, seen[-RECORDED:], setting["settling"]), seen
+    answer = objective.settled(answer, seen[-RECORDED:], setting["settling"])
+    candidates = (answer, *reversed(way), begun)
+    return next(s for s in candidates if kept(drawn.space, s, drawn.requirements)), seen
 
 
 def trained(

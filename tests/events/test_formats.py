@@ -408,7 +408,9 @@ def test_streams_a_format_cannot_hold_leave_the_earlier_file(
         ("mvsec.hdf5", {"width_px": 11}, "width_px 10 by its frames, but 11"),
         ("seconds.csv", {"columns": "abcd"}, "four letters"),
         ("seconds.csv", {"time_unit": "h"}, "time unit 'h'"),
-        ("e.raw", {"columns": "xytp"}, "one order of columns"),
+        ("e.raw", {"columns": "xytp"}, "has these by its format"),
+        ("dsec.hdf5", {"time_unit": "ns"}, "has these by its format"),
+        ("own.npz", {"columns": "yxtp"}, "leave columns away"),
         ("none.csv", {}, "no file lies at"),
     ],
 )

@@ -1,6 +1,7 @@
 """What every event layer keeps: it is its function, batches are their samples, chunks are the
 whole, values and gradients; noise, learnt values, and the same on a CUDA device."""
 
+import itertools
 import math
 
 import pytest
@@ -229,3 +230,40 @@ def test_a_cuda_device_gives_the_same(name):
         )
     for first, second in zip(*results, strict=True):
         torch.testing.assert_close(first, second.cpu(), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["memory", "sigmoid", "counts", "dense", "physical"])
+def test_chunks_read_into_one_buffer_are_the_whole(name):
+    made = layer(name, SensorModel(0.15, 0.2, cutoff_hz=0.0 if name == "sigmoid" else 60.0))
+    frames, t_s = drifting(5, 6, frames=9)
+    whole = made(frames, t_s)
+    buffer, state, parts = torch.empty(3, 5, 6, dtype=D), None, []
+    for first in (0, 3, 6):
+        chunk = slice(first, first + 3)
+        counts, state = made.advance(buffer.copy_(frames[chunk]), t_s[chunk], state)
+        parts.append(counts)
+    torch.testing.assert_close(torch.cat(parts), whole, rtol=1e-12, atol=1e-15)
+
+
+def test_a_leak_has_the_slope_of_the_whole_in_chunks():
+    """A still scene under a leak: a larger threshold has as many events, as the leak is a share of
+    it; to the event under way."""
+    frames, t_s = torch.full((101, 2, 2), 3.0, dtype=D), torch.linspace(0, 2, 101, dtype=D)
+    slopes = []
+    for cuts in ([0, 101], [0, *range(11, 101, 10), 101]):
+        theta = torch.tensor(0.2, dtype=D, requires_grad=True)
+        state, total = None, 0.0
+        for first, last in itertools.pairwise(cuts):
+            counts, state = events.sensor_counts(
+                frames[first:last],
+                t_s[first:last],
+                SensorModel(leak_rate_hz=10.0),
+                state=state,
+                log_input=True,
+                theta_on=theta,
+            )
+            total = total + counts[:, 0].sum() / 4
+        total.backward()
+        slopes.append(float(theta.grad))
+    assert slopes[1] == pytest.approx(slopes[0], rel=1e-9)
+    assert abs(slopes[0]) * 0.2 < 0.5  # of 19 events

@@ -319,3 +319,17 @@ def test_counts_land_in_their_pixel_and_in_the_interval_that_ends_with_them():
     zero = torch.zeros(7, dtype=torch.int64)
     counts = to_counts(ordered(t_us, zero, zero, zero - 1, 1, 1), [0, 0.001, 0.002])
     assert counts[:, :, 0, 0].tolist() == [[0, 3], [0, 2]]
+
+
+def test_chunks_around_a_long_interval_are_the_whole_in_single_precision():
+    t_s = torch.tensor([0.0, 0.9, 1.8, 2.7, 3.6, 6.0], dtype=torch.float64)
+    level = torch.randn(6, 20, 20, generator=torch.Generator().manual_seed(0)).cumsum(0)
+    sensor, state = SensorModel(0.1, 0.1), events.SensorState()
+    whole = simulate(level, t_s, sensor, log_input=True)
+    parts = [
+        simulate(level[chunk], t_s[chunk], sensor, state=state, log_input=True)
+        for chunk in (slice(5), slice(5, None))
+    ]
+    joined = events.concatenate(parts)
+    assert torch.equal(joined.t_us, whole.t_us)
+    assert torch.equal(joined.x, whole.x)

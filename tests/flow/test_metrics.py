@@ -184,3 +184,22 @@ FOUR = torch.zeros(2, 2, 2, dtype=D)
 def test_what_has_no_answer_is_refused(call, sentence):
     with pytest.raises(CodesignError, match=sentence):
         call()
+
+
+@pytest.mark.parametrize("measure", [metrics.aee, metrics.angular_error_deg])
+def test_truth_that_is_nan_where_it_is_masked_leaves_gradients_alone(measure):
+    truth = torch.ones(2, 3, 3)
+    known = torch.full((3, 3), True)
+    known[1, 1] = False
+    slopes = []
+    for unknown in (1.0, float("nan")):
+        flow_px = torch.zeros(2, 3, 3, requires_grad=True)
+        measure(flow_px, torch.where(known, truth, unknown), known).backward()
+        slopes.append(flow_px.grad)
+    assert torch.equal(*slopes)
+    assert float(slopes[1][:, 1, 1].abs().max()) == 0 < float(slopes[1].abs().max())
+
+
+def test_long_flows_in_half_precision_have_lengths():
+    long = torch.full((2, 2, 2), 200.0, dtype=torch.float16)
+    assert float(metrics.outlier_percent(0 * long, long)) == 100.0

@@ -1,6 +1,7 @@
 """Recordings cut into packets, each with its true flow, whichever way that is stored."""
 # pyright: reportOptionalMemberAccess=false
 
+import itertools
 import zipfile
 from dataclasses import replace
 
@@ -241,3 +242,13 @@ def test_flows_without_times_share_the_recording_whatever_the_window(place, tmp_
     for options in (PacketOptions(window_s=1.0), PacketOptions(window_s=0.02, start_s=10.0)):
         with pytest.raises(CodesignError, match="fits behind the start"):
             read_packets(place, tmp_path / "flow.npy", options)
+
+
+@pytest.mark.parametrize("options", [{"window_s": 0.02, "count": 100}, {"events": 500}])
+def test_windows_that_follow_one_another_share_no_event(options, place):
+    held = made(4000, start_s=100.0, duration_s=0.5)[0]
+    packets = read_packets(place, None, PacketOptions(start_s=0.0, **options))
+    assert all(one.t1_us == other.t0_us for one, other in itertools.pairwise(packets))
+    read = torch.cat([packet.stream.t_us for packet in packets])
+    assert read.tolist() == held[: len(read)].tolist()
+    assert len(read) == len(held) or "window_s" in options

@@ -204,3 +204,11 @@ def test_what_is_hidden_invalid_or_between_surfaces_is_not_followed():
     # half a pixel on, the columns 4 and 5 are read together
     edge[0, 0], edge[1, 0, :, 5:] = 0.5, 3.0
     assert chained(edge, ok[:2])[1].all(0).tolist() == [k not in (4, 8) for k in range(9)]
+
+
+def test_flow_that_is_nan_where_it_is_unknown_stays_there():
+    still, known = torch.zeros(2, 2, 4, 4), torch.ones(2, 4, 4, dtype=torch.bool)
+    still[1, :, 1, 1], known[1, 1, 1] = float("nan"), False
+    flow, valid = chained(still, known)
+    assert torch.equal(valid, known[1])
+    assert torch.equal(flow, torch.zeros(2, 4, 4))

@@ -11,6 +11,7 @@ from codesign.errors import FileFormatError
 from codesign.events.formats.arrival import (
     NAMES,
     Arrival,
+    check_nothing_told,
     microseconds,
     settled_order,
     settled_unit,
@@ -51,6 +52,7 @@ def read_arrays(path, asked):
         order = settled_order(path, table, asked.columns)
         found = [table[:, order.index(letter)] for letter in "txyp"]
     else:
+        check_nothing_told(path, asked, "for files of rows", "columns")
         with open_npz(path, f"an NPZ file of events has the arrays {', '.join(OWN)}") as file:
             names = [
                 next((name for name in NAMES[key] if name in file), NAMES[key][0]) for key in "txyp"

@@ -3,6 +3,7 @@ mean where a format does not say (their order, the unit of times); and what a fo
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -113,6 +114,16 @@ class Asked:
     columns: str = "auto"
     time_unit: str = "auto"
     skip: tuple[str, ...] | None = None
+
+
+def check_nothing_told(path: Path, asked: Asked, those: str, *names: str) -> None:
+    """Raise FileFormatError where the caller says of a file what its format says: the ``names`` of
+    Asked, columns and time_unit when left out; ``those``: of which files they can be said."""
+    names = names or ("columns", "time_unit")
+    if any(getattr(asked, name) != "auto" for name in names):
+        raise FileFormatError(
+            f"{path} has these by its format; leave {' and '.join(names)} away ({those})."
+        )
 
 
 class Arrival:

@@ -17,6 +17,7 @@ from codesign.events.formats.arrival import (
     DISORDER_US,
     Arrival,
     Asked,
+    check_nothing_told,
     columns,
     microseconds,
     settled_order,
@@ -103,6 +104,7 @@ class Hdf5Events:
             )
             self.unit = settled_unit(first[:, self.order.index("t")], unit)
             return
+        check_nothing_told(path, self.asked, "they are for files of rows")
         self.rows = {"t": Rows(path, "events/t", [])}
         self.rows |= {key: Rows(path, f"events/{key}", [], len(self)) for key in "xyp"}
         if any(rows.dtype.kind not in "iu" for rows in self.rows.values()):

@@ -90,7 +90,7 @@ class Sigmoid:
         frames = _with_last(frames, state)
         on = soft(frames, theta_on, sharpness=self.sharpness, log_input=log_input)[:, 0]
         off = soft(frames, theta_off, sharpness=self.sharpness, log_input=log_input)[:, 1]
-        return torch.stack((on, off), dim=1), frames[-1]
+        return torch.stack((on, off), dim=1), frames[-1].clone()
 
 
 @dataclass
@@ -102,7 +102,7 @@ class SoftCounts:
 
     def __call__(self, frames, theta_on, theta_off, state, log_input):
         frames = _with_last(frames, state)
-        return soft_counts(frames, theta_on, theta_off, log_input=log_input), frames[-1]
+        return soft_counts(frames, theta_on, theta_off, log_input=log_input), frames[-1].clone()
 
 
 @dataclass
@@ -290,7 +290,7 @@ class ComparatorLayer(EventLayer):
         counts, comparator = self.comparator(seen, theta_on, theta_off, state.comparator, is_level)
         if shots is not None:
             counts = counts + shots
-        frame = None if level is None else frames[-1]
+        frame = None if level is None else frames[-1].clone()  # its buffer may be filled again
         time_s = float(times_s[-1])
         return counts, replace(
             state, comparator=comparator, level=level, frame=frame, deviates=deviates, time_s=time_s

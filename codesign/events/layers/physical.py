@@ -120,8 +120,15 @@ def sensor_counts(
     dead = value["refractory_s"] if hard_sensor.refractory_s > 0 else None
     smooth, reference, dead_state = _mean_counts(seen, thetas, interval_s, dead, state)
     counts = hard + (smooth - smooth.detach())
-    ramp = (seen[-1] - level[-1]).detach()
-    after = hard_state, reference - ramp, level[-1], frames[-1], float(times_s[-1]), dead_state
+    ramp = seen[-1] - level[-1]
+    after = (
+        hard_state,
+        reference - ramp,
+        level[-1],
+        frames[-1].clone(),
+        float(times_s[-1]),
+        dead_state,
+    )
     return counts, PhysicalState(*after)
 
 

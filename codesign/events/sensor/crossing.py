@@ -80,8 +80,8 @@ class EventKeys:
             np.array([round(time_s * 1e6) for time_s in times]) for times in (start_s, end_s)
         )
         length_us = (end_s - start_s) * 1e6
-        # single precision resolves a microsecond of intervals up to a second to better than a tenth
-        self._Time = Float if length_us.max() <= 1e6 else dr.float64_array_t(Float)
+        # of single precision a chunk with a long interval would round otherwise than the whole
+        self._Time = dr.float64_array_t(Float)
         self._Key = dr.uint64_array_t(Float)
         self._lanes = lanes
         # of every interval: its length, the fraction of a microsecond that it starts with, whole

@@ -37,7 +37,8 @@ class SensorModel:
     shot_rate_hz: noise events per pixel and second in the dark, both polarities together; a quarter
       at full light (1 - 0.75 (I + 20)/275). It scales inversely with the pixel's threshold, and a
       noise event sets the memorised level to the level seen.
-    refractory_s: dead time of a pixel after an event, seconds.
+    refractory_s: dead time of a pixel after an event of the signal, seconds; noise events neither
+      start one nor are lost to it.
     photoreceptor_noise: noise of the log level before the comparator instead of separate noise
       events, of the strength that v2e's fit assigns to shot_rate_hz; the rate that comes out
       depends on bandwidth and frame rate (measured in docs/events.md). Needs cutoff_hz and

@@ -186,7 +186,7 @@ class SpikeEsim(nn.Module):
                 theta_off=theta[1],
                 refractory_s=self.refractory_s(),
             )
-        return counts, SpikeEsimState(*after, frames[-1], float(times_s[-1]), comparator)
+        return counts, SpikeEsimState(*after, frames[-1].clone(), float(times_s[-1]), comparator)
 
     def expected_noise(
         self,

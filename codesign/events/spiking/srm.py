@@ -223,7 +223,7 @@ def count_spikes(level: Tensor, theta: Tensor, state: Any) -> tuple[Tensor, Any]
         # a chunk that kept no gradient carries no play on: it begins again at the last level
         begun = level if play is not None or state is None else torch.cat((start, level))
         spikes, play = with_play(spikes, begun, thetas[0], thetas[1], play)
-    return spikes, (level[-1], neurons, play)
+    return spikes, (level[-1].clone(), neurons, play)
 
 
 def alpha_response(

@@ -137,4 +137,4 @@ class TwoBranchSpikes(nn.Module):
                 [torch.conv2d(pictures, w[None].to(pictures), padding=1) for w in weights], 1
             )
 
-        return stepwise(convolved, steps[:, None])[:, 0], frames[-1]
+        return stepwise(convolved, steps[:, None])[:, 0], frames[-1].clone()

@@ -271,7 +271,7 @@ def _pieces(frames, t_s, max_displacement_px, max_log_change, max_steps):
             times_s = before_s + (time_s - before_s) * _shares(len(made))
             times_s[-1] = time_s
             yield made, times_s
-        before = frame
+        before = frame.clone()  # the next may be read into the same memory
         before_s = time_s
         brightest = max(brightest, float(frame.detach().max()))
         values += frame.numel()

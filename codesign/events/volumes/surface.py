@@ -39,6 +39,7 @@ def surface_from_stream(
     Source: Lagorce et al., HOTS, PAMI 2017, eq. 2 and 3.
     """
     tau_s = check_tau(tau_s)
+    check_dtype(dtype, fractions=True)
     check_stream(stream)
     height = stream.height_px
     width = stream.width_px
@@ -128,7 +129,7 @@ def decay_from_stream(
     """
     tau_s = check_tau(tau_s)
     check_stream(stream)
-    check_dtype(dtype)
+    check_dtype(dtype, fractions=True)
     height = stream.height_px
     width = stream.width_px
     trace = torch.zeros(2 * height * width, dtype=torch.float64, device=stream.t_us.device)

@@ -99,7 +99,7 @@ def from_stream(
     check_whole(t0_us, "start of the interval t0_us", None)
     check_whole(t1_us, "end of the interval t1_us", int(t0_us) + 1)
     check_bins(bins)
-    check_dtype(dtype)
+    check_dtype(dtype, fractions=True)
     check_room(2 * bins * stream.height_px * stream.width_px, "the volume")
     duration_us = int(t1_us) - int(t0_us)
     first, last = torch.searchsorted(

@@ -41,7 +41,8 @@ GAP_EVENTS = 100
 class Packet:
     """A window of events with its true flow.
 
-    stream: the events of the window. t0_us, t1_us: its ends, both included. truth: flow over the
+    stream: the events of the window. t0_us, t1_us: from its start, included, to its end,
+      which belongs to the next one (the last of a recording is included). truth: flow over the
       window [1, 2, H, W], or None. name, notes: for people.
     rotation_only: the truth is the flow of the camera's rotation alone. neglected_px: length of the
       flow that it leaves out, for a scene 1 m away; None where nobody recorded how the camera
@@ -156,8 +157,11 @@ def windows(
             raise DomainError(
                 f"{len(held) - first} events follow the start; windows of {options.events} need more."
             )
-        ends = ((int(held.t_us[k]), int(held.t_us[k + options.events - 1])) for k in starts)
-        possible = [(t0, max(t1, t0 + 1)) for t0, t1 in ends]
+        last = len(held) - 1
+        ends = ((k, min(k + options.events, last)) for k in starts)
+        times = [(int(held.t_us[a]), int(held.t_us[b])) for a, b in ends]
+        # events of one microsecond stay together
+        possible = [(t0, t1) for t0, t1 in times if t1 > t0]
     else:
         in_turn = in_turn or options.start_s is not None
         length_us = round((options.window_s or min(WINDOW_S, (whole[1] - whole[0]) * 1e-6)) * 1e6)
@@ -186,7 +190,8 @@ def without(
     """The windows without those that ``skip`` names (EMPTY, GAP), and how many these were."""
     left_out = {}
     ends = np.array(possible, np.int64).reshape(-1, 2)
-    few = np.searchsorted(held.t_us, ends[:, 1] + 1) == np.searchsorted(held.t_us, ends[:, 0])
+    behind = ends[:, 1] + (ends[:, 1] >= held.t_us[-1])
+    few = np.searchsorted(held.t_us, behind) == np.searchsorted(held.t_us, ends[:, 0])
     for fault, bad in ((EMPTY, few), (GAP, across(possible, gaps(held.t_us)))):
         if fault in skip:
             left_out[fault] = int(bad.sum())

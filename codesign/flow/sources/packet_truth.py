@@ -120,7 +120,8 @@ class Opened:
             )
         found = Packet(
             name,
-            self.events.window(*window),
+            # an end is the start of the next window, but at the recording's own
+            self.events.window(window[0], window[1] - (window[1] < self.whole[1])),
             *window,
             None,
             tuple(notes),
