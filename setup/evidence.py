@@ -97,12 +97,15 @@ def control(name: str) -> Callable[[Metrics], str]:
     )
 
 
+RACED = ("codesign", "scenes", "studies/codesign", "studies/placement", "studies/frame")
+
+
 def joint(pair: str, more: str) -> Part:
     """The race of whole designs on a robot, from its committed answers."""
     return Part(
         f"codesign --pair {pair} --grid 2 --slopes 0 --couplings 3 --processes 2 "
         f"--raw docs/joint_race_{pair}.jsonl {more}",
-        ("codesign", "scenes", "studies/codesign"),
+        RACED,
         {
             f"joint.{pair}.{name}": ratio(stem, pair)
             for name, stem in {
@@ -150,7 +153,7 @@ PARTS = {
     ),
     "hero": Part(
         "hero",
-        ("codesign", "scenes", "studies/hero.py", "studies/codesign"),
+        (*RACED, "studies/hero.py"),
         pictures={"hero.webp": "hero.webp"},
     ),
     "gallery-lens": Part(
@@ -230,7 +233,7 @@ PARTS = {
     "joint-flight": joint("flight", f"--designs 64 --arms joint {ORDERS} book nested default"),
     "joint-levers": Part(
         "joint_levers --processes 2",
-        ("codesign", "scenes", "studies/codesign", "studies/joint_levers.py"),
+        (*RACED, "studies/joint_levers.py"),
         {
             f"joint.levers.{part}": interval(
                 *(f"share_{part}{end}" for end in ("", "_low", "_high"))
@@ -241,7 +244,7 @@ PARTS = {
     ),
     "joint-controls": Part(
         'joint_controls --arms nested "lens > mount > read-out"',
-        ("codesign", "scenes", "studies/codesign", "studies/joint_controls.py"),
+        (*RACED, "studies/joint_controls.py"),
         {
             f"joint.controls.{name.replace('_', '-')}": control(name)
             for name in (
@@ -290,7 +293,8 @@ def measured(name: str) -> dict[str, Any]:
     if (folder / "report.html").exists():
         shutil.rmtree(folder)
     begun = (folder / "config.json").exists()
-    command += ["--resume", str(folder)] if begun else [*words[1:], "--out", str(folder)]
+    # what a run was begun with and what is asked now have to be the same
+    command += [*words[1:], "--resume" if begun else "--out", str(folder)]
     since = time.monotonic()
     subprocess.run(command, cwd=ROOT, check=True)
     for picture, made in part.pictures.items():

@@ -29,7 +29,7 @@ class Config(CellsConfig):
     QUICK: ClassVar = {"seeds": 1, "steps": 2, "worlds": 2, "per_draw": 2, "judged_worlds": 2}
     seeds: int = 12
     """Paired starting designs."""
-    rate: float = 1e-4
+    rate: float = 3e-4
     """Of Adam, for the weights."""
     updates: int = 4
     """Of the weights, on every round of drives."""

@@ -143,7 +143,7 @@ def _way(scene, task):
     poses = (
         task.T_world_body
         if task.mount is None
-        else task.T_world_body @ task.mount()[..., None, :, :]
+        else task.T_world_body @ task.mount()[..., None, :, :].to(task.T_world_body)
     )
     views = views_of(scene, poses.detach().requires_grad_(), camera.rays())
     return cheapest_gradient(camera, views)

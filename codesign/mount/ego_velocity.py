@@ -279,7 +279,9 @@ class EgoVelocity:
             return values.double().movedim(1, -1).reshape(count, -1, values.shape[1])
 
         valid = field.valid[:, None][at]
-        seen = field.valid if field.confidence is None else field.confidence
+        seen = field.valid
+        if field.confidence is not None:
+            seen = torch.where(field.valid, field.confidence, 0)
         confidence = per_body(seen[:, None][at])
         # what is not known means nothing, NaN too: it is masked before anything is computed with it
         known = confidence > 0

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from codesign.checks import check_finite, check_positive
 from codesign.errors import DomainError, ShapeError
-from codesign.mount.observability import chief_lines, flow_of_points
+from codesign.mount.observability import chief_lines, flow_of_points, some_pixels
 from codesign.pose import check_poses, se3_exp
 from codesign.types import ChiefRayCamera
 
@@ -177,9 +177,7 @@ class Mount(nn.Module):
             raise ShapeError(
                 f"mount: depth_m is one number or [{pixels.shape[0]}] (one per pixel), got {tuple(depth.shape)}."
             )
-        at = (
-            torch.linspace(0, pixels.shape[0] - 1, min(MOST_PIXELS, pixels.shape[0])).round().long()
-        )
+        at = some_pixels(camera.film, MOST_PIXELS)
         depth = depth.expand(pixels.shape[0])[at]
         seen = depth.isfinite() & (depth > NEAREST_M) & (camera.chief_rays(pixels[at]).weight > 0)
         if not bool(seen.any()):

@@ -18,6 +18,7 @@ from torch import Tensor
 from codesign.checks import check_finite, check_number, check_positive
 from codesign.errors import DomainError, ShapeError
 from codesign.mount.body import Body, Housing
+from codesign.mount.observability import some_pixels
 from codesign.render import Camera, MitsubaScene, frames
 from codesign.render.charts import glowing
 from codesign.render.moving import views_of
@@ -173,9 +174,7 @@ class LookAhead:
             raise DomainError(
                 "look-ahead: it looks through the camera; give one with chief rays, as render.Camera."
             )
-        pixels = camera.film.pixels()
-        count = min(CAMERA_PIXELS, len(pixels))
-        pixels = pixels[torch.linspace(0, len(pixels) - 1, count).round().long()]
+        pixels = camera.film.pixels()[some_pixels(camera.film, CAMERA_PIXELS)]
         rays = camera.chief_rays(pixels)
         pose = T_body_cam.double()
         direction = rays.direction.double() @ pose[..., :3, :3].mT
@@ -185,7 +184,8 @@ class LookAhead:
         height = origin[..., 2] - self.ground_z_m
         line_m = torch.hypot(height, before).clamp_min(1e-9)
         over = (height * forward + before * direction[..., 2]) / line_m
-        return torch.minimum(over, forward)
+        # what gets no light sees nothing
+        return torch.where(rays.weight > 0, torch.minimum(over, forward), -1.0)
 
 
 def penalty(
@@ -313,7 +313,9 @@ class OwnBody:
         and lens."""
         # of which the pictures are the same
         way = "boundary" if torch.is_grad_enabled() else "interior"
-        found = frames(camera, self.scene, T_body_cam.reshape(-1, 4, 4), way, self.per_px).double()
+        poses = T_body_cam.reshape(-1, 4, 4)
+        # by falloff a dark corner would be free
+        found = frames(camera.in_one_colour(), self.scene, poses, way, self.per_px).double()
         return found.flatten(-2).mean(-1).reshape(*T_body_cam.shape[:-2], -1)
 
     @torch.no_grad()

@@ -12,7 +12,7 @@ from torch import Tensor
 from codesign.checks import check_positive, check_whole
 from codesign.errors import DomainError, ShapeError
 from codesign.mount.depth import ground_depth
-from codesign.mount.observability import FREE, body_flow
+from codesign.mount.observability import FREE, body_flow, some_pixels
 from codesign.mount.pose import attitude
 from codesign.types import ChiefRayCamera
 
@@ -178,14 +178,14 @@ class Surroundings:
     def information(self, camera: ChiefRayCamera, T_body_cam: Tensor) -> tuple[Tensor, Tensor]:
         """Information [..., K, K] without prior of mounts [..., 4, 4], and the share [...] of the
         picture that sees something. Gradient: mount and lens."""
-        pixels = camera.film.pixels()
-        count = min(MOST_PIXELS, len(pixels))
-        pixels = pixels[torch.linspace(0, len(pixels) - 1, count).round().long()]
+        pixels = camera.film.pixels()[some_pixels(camera.film, MOST_PIXELS)]
+        count = len(pixels)
         pose = T_body_cam.double().reshape(-1, 4, 4)
         world = pose if self.T_world_body is None else self.T_world_body.to(pose) @ pose
         each = pixels.expand(len(pose), *pixels.shape)
         depth = self.depth(camera, each, world, self.scene)
-        depth = torch.where(depth.detach() <= self.farthest_m, depth, torch.inf)
+        lit = camera.chief_rays(pixels).weight > 0
+        depth = torch.where(lit & (depth.detach() <= self.farthest_m), depth, torch.inf)
         rows, seen = body_flow(camera, depth, pose, each)
         rows = rows[..., list(self.axes)]
         weight = self.points / count / self.deviation_px_s**2

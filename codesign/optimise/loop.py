@@ -3,6 +3,7 @@ resume."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -179,18 +180,18 @@ class Loop:
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Everything needed to go on: tensors by name, and plain numbers (see codesign.state)."""
-        tensors = {f"now_{i}": p.detach() for i, p in enumerate(self.parameters)}
-        tensors |= {f"best_{i}": b for i, b in enumerate(self.best)}
+        tensors = {f"now_{i}": p.detach().clone() for i, p in enumerate(self.parameters)}
+        tensors |= {f"best_{i}": b.clone() for i, b in enumerate(self.best)}
         numbers: dict[str, Any] = {
             "best_score": self.best_score if math.isfinite(self.best_score) else None,
             "shrunk": self._shrunk,
-            "record": vars(self.record),
+            "record": deepcopy(vars(self.record)),
             "optimiser": type(self.optimiser).__name__,
         }
         for i, parameter in enumerate(self.parameters):
             for name, value in self.optimiser.state.get(parameter, {}).items():
                 if torch.is_tensor(value):
-                    tensors[f"optimiser_{i}_{name}"] = value
+                    tensors[f"optimiser_{i}_{name}"] = value.clone()
                 elif value is not None:
                     raise DomainError(
                         f"{type(self.optimiser).__name__} keeps '{name}', which is no tensor and cannot be stored; "
@@ -224,7 +225,7 @@ class Loop:
         self.best = [tensors[f"best_{i}"].to(p).clone() for i, p in enumerate(self.parameters)]
         self.best_score = math.inf if numbers["best_score"] is None else numbers["best_score"]
         self._shrunk = numbers["shrunk"]
-        self.record = Record(**numbers["record"])
+        self.record = Record(**deepcopy(numbers["record"]))
         self.optimiser.state.clear()
         for name, value in tensors.items():
             if name.startswith("optimiser_"):

@@ -156,7 +156,10 @@ def _events(axis, counts):
 
 
 def _longest(flow_px):
-    return max(float(np.quantile(np.hypot(*flow_px), QUANTILE)), 1e-9)
+    """Of what moves: pixels without flow would be most of a sparse field."""
+    length = np.hypot(*flow_px)
+    some = length[length > 0]
+    return float(np.quantile(some, QUANTILE)) if some.size else 1e-9
 
 
 def _flow(axis, flow_and_full):
@@ -209,7 +212,7 @@ def _chain(run):
         camera = run["camera"]
         parts = [("lens", camera, _lens)] if _has_section(camera) else []
         frames = run["frames"].detach()
-        films = frames.reshape(-1, *frames.shape[-3:])[0]
+        films = run._samples(frames)[0]
         parts.append(("frame", (films[len(films) // 2], films), _frame))
         parts.append(("events", run["volume"].counts[:1].sum(2), _events))
         flows = {"flow, estimated": run["field"]}

@@ -310,19 +310,24 @@ class Pass(Mapping[str, Any]):
         return self._at("estimate", made, lambda value: None)
 
     def _truth(self) -> FlowField:
-        """True flow over the whole interval through the camera's lens, [N, 2, H, W], in float64."""
+        """True flow over the interval whose events are read (behind the ``lead_s`` of the event
+        stage) through the camera's lens, [N, 2, H, W], in float64."""
         recorded = getattr(self["batch"], "truth", None)
         if recorded is not None:
             height, width = self["camera"].film.shape[-2:]
             check_layout("the batch has as truth", recorded, FlowField, H=height, W=width)
             self._check_count("truth", recorded.flow_px.shape[0])
             return recorded
-        last = self["t_s"].numel() - 1
+        t_s = self["t_s"]
+        read_s = t_s[0] + getattr(self.system.events, "lead_s", 0.0)
+        first = int((t_s - read_s).abs().argmin())
         flow, valid = render_stage.true_flow(
-            self["camera"], self["scene"], self["T_world_cam"], stride=last
+            self["camera"], self["scene"], self["T_world_cam"], stride=t_s.numel() - 1 - first
         )
-        interval_s = float(self["t_s"][-1] - self["t_s"][0])
-        return FlowField(self._samples(flow, 1)[:, 0], self._samples(valid)[:, 0], interval_s)
+        interval_s = float(t_s[-1] - t_s[first])
+        return FlowField(
+            self._samples(flow, 1)[:, first], self._samples(valid)[:, first], interval_s
+        )
 
 
 def built_bins(flow: Any) -> int | None:

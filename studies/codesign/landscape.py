@@ -86,7 +86,7 @@ class Landscape:
     def inside(self, name: str) -> bool:
         """Whether the best of a number's grid lies off its bounds."""
         rows = [row for row in self.grid if row["number_of"] == name and row["hard"] is not None]
-        return 0 < min(rows, key=lambda row: row["hard"])["at"] < 1
+        return bool(rows) and 0 < min(rows, key=lambda row: row["hard"])["at"] < 1
 
 
 def ranked(one: Sequence[float], other: Sequence[float]) -> float | None:

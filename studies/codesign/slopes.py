@@ -18,6 +18,7 @@ from studies.frame.show import tabulate
 from studies.frame.sweep import Row, sweep
 
 FIRST = 5_000_000  # number of the first draw, beyond those of any race
+LEARNT = 4  # draws from which a trend is learnt
 
 
 @dataclass(frozen=True)
@@ -55,19 +56,22 @@ def slopes(
     """Rows of every place, draw and number: the slope at shares [V], and the differences over a
     step to either side.
 
-    The slope of the first draw, by which the trend has learnt nothing else, is not among them.
+    The trend knows LEARNT draws before these.
     """
     free = range(len(space.free))
 
     @cache
     def objective(place):
         found = Objective(drawn)
-        found(at[place], drawn.draw(FIRST - 1), free)
+        for draw in range(1, LEARNT + 1):
+            found(at[place], drawn.draw(FIRST - draw), free)
         return found
 
     def of_slope(place, draw):
         objective(place).forget()
-        return {"slope": objective(place)(at[place], drawn.draw(FIRST + draw), free)[1].tolist()}
+        looked_at = at[place], drawn.draw(FIRST + draw), free
+        # a draw teaches the next nothing, so that a run goes on with the same numbers
+        return {"slope": objective(place)(*looked_at, learn=False)[1].tolist()}
 
     def of_differences(place, draw, number):
         here = at[place]

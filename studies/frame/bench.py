@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from codesign.errors import CodesignError
+from codesign.errors import CodesignError, DomainError
 
 Key = TypeVar("Key")
 RUNNING: set[subprocess.Popen] = set()
@@ -132,7 +132,7 @@ def apart(
     Raises: CodesignError with the last line of its stderr when the process fails, KilledError when
       a signal ended it.
     """
-    name = f"{function.__module__}:{function.__qualname__}"
+    name = named(function)
     process = subprocess.Popen(
         [sys.executable, "-m", "studies.frame.bench", name, json.dumps([arguments, keywords])],
         stdout=subprocess.PIPE,
@@ -157,6 +157,23 @@ def apart(
         kind = KilledError if process.returncode < 0 else CodesignError
         raise kind(f"{function.__name__}({given}) ended with code {process.returncode}: {last}")
     return json.loads(said)
+
+
+def named(function: Callable[..., Any]) -> str:
+    """Module and name by which another process finds a function.
+
+    Raises: DomainError for one of a script, which no other process can import.
+    """
+    module = function.__module__
+    if module == "__main__":
+        spec = getattr(sys.modules[module], "__spec__", None)
+        if spec is None:
+            raise DomainError(
+                f"{function.__qualname__} stands in the script that runs, where other processes do not find it; move it "
+                "into a module and import it."
+            )
+        module = spec.name
+    return f"{module}:{function.__qualname__}"
 
 
 def end_running() -> None:

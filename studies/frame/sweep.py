@@ -129,13 +129,19 @@ def metrics(rows: Iterable[Mapping[str, Any]], *axes: str, prefix: str = "") -> 
             for key, value in row.items()
             if isinstance(value, int | float) and key not in axes
         }
-        found |= {f"{name}_{key}": value for key, value in numbers.items()}
+        named = {f"{name}_{key}": value for key, value in numbers.items()}
+        if twice := sorted(named.keys() & found.keys()):
+            raise DomainError(
+                f"two rows would both be '{twice[0]}' in metrics.json; give their axes other names."
+            )
+        found |= named
     return found
 
 
 def plain(*words: object) -> str:
-    """A name for metrics.json: letters, digits and underscores."""
-    return "_".join(re.findall(r"\w+", " ".join(map(str, words)))).lower()
+    """A name for metrics.json: letters, digits and underscores; numbers below zero say "minus"."""
+    text = re.sub(r"(?<!\S)-(?=[\d.])", "minus ", " ".join(map(str, words)))
+    return "_".join(re.findall(r"\w+", text)).lower()
 
 
 def _measured(cell, points, axes, given, processes, cluster) -> Generator[tuple[Row, Any]]:

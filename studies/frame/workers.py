@@ -67,7 +67,7 @@ def on_cluster(
       ``in_processes``.
     """
     with _connected(address) as ray:
-        name = f"{function.__module__}:{function.__qualname__}"
+        name = bench.named(function)
         ask = ray.remote(num_cpus=1, max_retries=TRIES - 1, max_calls=1)(_asked)
         waiting = {ask.remote(name, json.dumps(dict(given))): key for key, given in calls.items()}
         while waiting:

@@ -66,7 +66,8 @@ class Seen:
 @dataclass
 class Problem:
     """pair: robot and worlds. numbers: of the worlds that draws are made from. per_world: drives in
-    each of ``spread`` worlds of a draw. camera: in place of the pair's own."""
+    each of ``spread`` worlds of a draw. camera: in place of the pair's own; another may be put in its
+    place to render drives, while requirements are asked of the first (``real``)."""
 
     pair: RobotPair
     numbers: Sequence[int]
@@ -81,6 +82,7 @@ class Problem:
         self.rendered = 0  # samples so far
         if self.camera is None:
             self.camera = self.pair.camera(self.pair.design)
+        self.real = self.camera
 
     @property
     def samples(self) -> int:
@@ -170,7 +172,7 @@ class Problem:
 
     def penalty(self, T_body_cam: Tensor) -> Tensor:
         """0 where every requirement is kept with a step to spare. Gradient: mount."""
-        return mount.penalty(self.requirements, T_body_cam, self.camera)
+        return mount.penalty(self.requirements, T_body_cam, self.real)
 
     @torch.no_grad()
     def expected_around(

@@ -38,7 +38,7 @@ def feasible(problem: Problem, count: int, seed: int, first: Sequence[Tensor] = 
     return [
         *found,
         *(
-            starts(problem.ranges, more, problem.requirements, problem.camera, seed=seed)
+            starts(problem.ranges, more, problem.requirements, problem.real, seed=seed)
             if more
             else ()
         ),
@@ -48,7 +48,7 @@ def feasible(problem: Problem, count: int, seed: int, first: Sequence[Tensor] = 
 def kept(problem: Problem, share: Tensor) -> bool:
     """Whether a mount keeps every requirement, by the hard answer; the cheap ones are asked
     first."""
-    return first_missed(problem.requirements, problem.ranges.pose(share), problem.camera) is None
+    return first_missed(problem.requirements, problem.ranges.pose(share), problem.real) is None
 
 
 def fingerprints(pair: RobotPair) -> dict[str, str]:
