@@ -169,3 +169,9 @@ def test_a_figure_of_a_paper_has_its_width(width_in, tmp_path):
 def test_a_width_that_no_paper_has_is_refused(width_in):
     with pytest.raises(DomainError, match=r"width_in must be .* in inches"):
         codesign.show(torch.ones(4, 4), width_in=width_in)
+
+
+def test_the_wheel_of_a_sparse_field_is_of_what_moves():
+    flow, valid = torch.zeros(1, 2, 40, 50), torch.zeros(1, 40, 50, dtype=torch.bool)
+    flow[0, 0, 3, :20], valid[0, 3, :20] = 3.0, True
+    assert "rim 3 px" in codesign.show(FlowField(flow, valid, 0.05)).axes[0].texts[0].get_text()

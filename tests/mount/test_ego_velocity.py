@@ -153,6 +153,11 @@ def test_what_is_not_valid_means_nothing_and_nan_that_is_valid_is_refused(camera
     torch.testing.assert_close(
         solved(torch.nan, ~field.valid), solved(1e3, ~field.valid), rtol=0, atol=0
     )
+    # whatever confidence is claimed there
+    sure = replace(field, confidence=torch.ones_like(field.confidence))
+    said = ours(sure, camera, None, mount, poses).velocity
+    field = sure
+    torch.testing.assert_close(solved(1e3, ~field.valid), said, rtol=0, atol=0)
     with pytest.raises(DomainError, match=r"flow of valid pixels must be finite, got NaN"):
         solved(torch.nan, field.valid)
 

@@ -2,12 +2,14 @@
 simple mounts."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from codesign import lens, pose, render
 from codesign.mount import PLANAR, Mount, body_flow
+from codesign.mount.observability import some_pixels
 from codesign.render.truth import world_points
 from scenes import worlds
 
@@ -140,4 +142,22 @@ def test_gradient_to_depth_mount_and_focal_length(camera, generator):
     # rows are differences of chief rays, good to 1e-9 over steps of 1e-5
     assert torch.autograd.gradcheck(
         along, [v.requires_grad_() for v in at], eps=1e-5, atol=1e-3, rtol=1e-5
+    )
+
+
+@pytest.mark.parametrize("shape", [(64, 64), (48, 60), (3, 20, 64)])
+def test_some_pixels_lie_all_over_a_film(shape):
+    """Equal steps over 64 x 64 pixels would be one row and one column each: one diagonal."""
+    rows, columns = math.prod(shape[:-1]), shape[-1]
+    found = some_pixels(SimpleNamespace(shape=shape), 64)
+    row, column = found // columns, found % columns
+    assert len(found) >= 60
+    assert abs(float(torch.corrcoef(torch.stack([row, column]).double())[0, 1])) < 0.15
+    for place, size in ((row, rows), (column, columns)):
+        # of each eighth an eighth
+        counts = torch.bincount(8 * place // size, minlength=8)
+        assert int(counts.min()) >= 5
+        assert int(counts.max()) <= 11
+    assert torch.equal(
+        some_pixels(SimpleNamespace(shape=shape), 10**6), torch.arange(rows * columns)
     )

@@ -109,3 +109,10 @@ def test_it_is_a_requirement_like_any_other(rover):
     verdict = judge([required], poses[1], camera)[0]
     assert str(verdict).startswith("own body in view: missed by 0.")
     assert float(penalty([required], poses[0], camera)) == 0
+
+
+def test_a_body_in_dark_corners_is_in_the_way_too():
+    wide = render.Camera(lens.ThinLens(3.0, 1.0), 16, 16, 0.4, 4, falloff=True)
+    everywhere = OwnBody(sheet((-9.0, -9.0), (9.0, 9.0)), 0.7)
+    for found in (everywhere.slack, everywhere.exact):
+        assert float(found(at((0.0, 0.0, 0.0)), wide)) == pytest.approx(-0.3, abs=1e-6)

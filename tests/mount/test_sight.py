@@ -13,6 +13,7 @@ from codesign.mount import (
     ATTITUDES,
     PLANAR,
     VELOCITIES,
+    LookAhead,
     Mount,
     Surroundings,
     expected_error,
@@ -200,3 +201,13 @@ def test_what_is_seen_does_not_hang_on_the_unit_of_information(scale):
     )
     expected = torch.tensor([0.5, 1.0, math.inf], dtype=D) / math.sqrt(scale)
     torch.testing.assert_close(found.deviation, expected, rtol=1e-12, atol=0)
+
+
+def test_pixels_without_light_see_nothing(over_ground):
+    """A triplet before a film far beyond its field."""
+    wide = render.Camera(lens.load("cooke-triplet").scaled(0.22), 24, 24, 0.77, 4)
+    down = over_ground.mount(0.0, math.pi / 2)
+    lit = (wide.chief_rays(wide.film.pixels()).weight > 0).double().mean()
+    assert 0.1 < float(lit) < 0.6
+    assert float(over_ground.information(wide, down)[1]) <= float(lit)
+    assert float((LookAhead(1.0, 0.5).angles(down, wide) == -1.0).double().mean()) >= 1 - lit

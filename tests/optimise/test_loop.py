@@ -203,3 +203,19 @@ def loop_of(*samples, optimiser=None, **options):
 def test_what_cannot_be_optimised_is_refused_with_a_sentence(call, error, said):
     with pytest.raises(error, match=said):
         call()
+
+
+def test_a_state_is_of_its_moment_and_loops_resumed_from_it_go_apart():
+    whole, first = noisy_loop(), noisy_loop()
+    whole.run(10)
+    first.run(5)
+    kept = first.state()
+    second = noisy_loop().resume(*kept)
+    second.run(10)
+    first.run(10)
+    third = noisy_loop().resume(*kept)
+    assert third.step_number == 5
+    third.run(10)
+    for loop in (first, second, third):
+        assert loop.record == whole.record
+        assert torch.equal(loop.best[0], whole.best[0])

@@ -22,7 +22,8 @@ from studies.codesign.objective import Objective
 from studies.codesign.page import every_ratio
 from studies.codesign.problem import Drawn
 from studies.codesign.race import NEAR, Judge, compared, kept, start
-from studies.frame.run import main
+from studies.frame.config import StudyConfig
+from studies.frame.run import main, open_run
 from tests.studies.browser import check_page
 
 F = torch.float64
@@ -284,6 +285,29 @@ def test_agreement_of_slopes_is_that_of_their_means():
     assert found.length == pytest.approx(2.0, abs=0.1)
     assert found.beyond == pytest.approx(1.0, abs=0.01)  # twice as long is a whole length too far
     assert found.signal_to_noise == pytest.approx(10 / 3**0.5, rel=0.1)
+
+
+def test_slopes_of_a_resumed_run_are_those_of_one_in_one_go(space, tmp_path, monkeypatch):
+    """Of an objective whose slope is the draws that it learnt from: the same for every draw."""
+
+    class Learning:
+        def __init__(self, drawn):
+            self.learnt = []
+
+        def __call__(self, share, draw, free, learn=True):
+            if learn:
+                self.learnt.append(draw)
+            return 0.0, torch.full((len(free),), float(sum(self.learnt)), dtype=F), None
+
+        def forget(self):
+            pass
+
+    looked = SimpleNamespace(expected=torch.zeros(1), hard=lambda: torch.zeros(1))
+    drawn = SimpleNamespace(draw=lambda number: number, looked=lambda whole, draw: looked)
+    monkeypatch.setattr(slopes, "Objective", Learning)
+    run = open_run("slopes", StudyConfig(out=tmp_path / "run"))
+    rows = slopes.slopes(run, space, drawn, {"here": space.start}, 2)
+    assert {row["slope"] for row in rows} == {float(sum(slopes.FIRST - k for k in range(1, 5)))}
 
 
 def test_a_held_lens_is_focused_by_the_book_as_what_it_is():

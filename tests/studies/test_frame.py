@@ -27,6 +27,7 @@ from studies.frame.config import StudyConfig
 from studies.frame.run import open_run
 from studies.frame.show import Asked, Panel
 from studies.frame.sweep import column, metrics, select, sweep
+from tests.processes import ROOT, python
 from tests.studies.called_apart import killed, killed_once, power, slow, told
 
 
@@ -149,6 +150,10 @@ def test_metrics_of_a_table_are_its_numbers_in_plain_names():
         "flow_2_levels_cooke_triplet_64_error": 0.5
     }
     assert metrics(rows, "lens") == {"cooke_triplet_px": 64, "cooke_triplet_error": 0.5}
+    signed = [{"at": -1.0, "error": 1.0}, {"at": 1.0, "error": 2.0}]
+    assert metrics(signed, "at") == {"minus_1_0_error": 1.0, "1_0_error": 2.0}
+    with pytest.raises(DomainError, match="two rows would both be 'a_b_error'"):
+        metrics([{"on": "a > b", "error": 1.0}, {"on": "a < b", "error": 2.0}], "on")
 
 
 def test_turns_meet_all_cells_and_rows_have_their_medians(run):
@@ -295,6 +300,15 @@ def test_a_function_in_its_own_process_and_the_memory_that_it_takes():
     assert peak == pytest.approx(50, abs=5)
     assert nothing < 5
     assert bench.installed({"yes": "torch", "no": "no_such_package"}) == ["yes"]
+
+
+def test_a_function_of_a_script_is_not_found_elsewhere(tmp_path):
+    script = tmp_path / "mine.py"
+    script.write_text(
+        "from studies.frame.bench import apart\ndef cell():\n    return 1\napart(cell)\n"
+    )
+    done = python(str(script), PYTHONPATH=str(ROOT))
+    assert "move it into a module and import it" in done.stderr
 
 
 # show

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from codesign import lens
 from codesign.errors import DomainError
 from codesign.system import load_hand_over
 from scenes.robots import pair as robot_pair
@@ -324,3 +325,12 @@ def test_the_whole_study_and_its_resumption(tmp_path):
     assert ("stays at" in page) == (found["chosen_start"] < 0)
     assert "tensor(" not in page
     check_page("placement", out)
+
+
+def test_requirements_are_asked_of_the_real_camera_whatever_renders():
+    pair = PAIRS["outdoors"]()
+    problem = Problem(pair, robot_pair.training(1), 1, 1)
+    pose = problem.ranges.pose(problem.start)
+    before = problem.penalty(pose), kept(problem, problem.start)
+    problem.camera = problem.camera.with_lens(lens.Pinhole(30.0))  # sees a small part ahead
+    assert (problem.penalty(pose), kept(problem, problem.start)) == before

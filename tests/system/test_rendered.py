@@ -112,3 +112,16 @@ def test_a_moving_object_has_a_truth(wall):
     assert float(truth.flow_px[0, 0, 16, 16]) == pytest.approx(
         0.8 * 0.05 / 2.0 * 8.0 / 0.037, rel=1e-3
     )
+
+
+@pytest.mark.parametrize("lead", [0, 1, 2])
+def test_the_truth_is_of_the_interval_whose_events_are_read(wall, lead):
+    lead_s = float(T_S[lead])
+    settled = events.Settled(events.layer("counts"), lead_s)
+    run = system_of(triplet(), wall, events=settled).begin(batch())
+    truth = run["truth"]
+    assert truth.interval_s == pytest.approx(run["field"].interval_s, abs=1e-12)
+    asked = batch().T_world_body[:, [lead, -1]]
+    flow_px, valid = render.true_flow(run["camera"], wall, asked)
+    torch.testing.assert_close(truth.flow_px, flow_px[:, 0])
+    assert torch.equal(truth.valid, valid[:, 0])
