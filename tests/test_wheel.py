@@ -1,6 +1,7 @@
-"""The wheel as setuptools builds it, without a network: what it puts beside other people's packages,
-and that it works where there is no checkout."""
+"""The wheel as setuptools builds it out of the source archive, without a network: what it puts beside
+other people's packages, and that it works where there is no checkout."""
 
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 from tests.processes import ROOT, python
 
 SOURCES = ("codesign", "scenes", "studies", "pyproject.toml", "setup.py", "README.md", "LICENSE")
-BUILD = "from setuptools.build_meta import build_wheel; build_wheel('.')"
+BUILD = "from setuptools import build_meta; build_meta.build_{}('.')"
 DATA = {".txt", ".npz", ".safetensors", ".jinja", ".urdf", ".csv", ".typed"}
 
 
@@ -19,9 +20,15 @@ def wheel(tmp_path_factory):
     source = tmp_path_factory.mktemp("source")
     for name in SOURCES:
         (source / name).symlink_to(ROOT / name)
-    built = python("-c", BUILD, cwd=source, PYTHONPATH="")
+    packed = python("-c", BUILD.format("sdist"), cwd=source, PYTHONPATH="")
+    assert packed.returncode == 0, packed.stderr
+    [archive] = source.glob("*.tar.gz")
+    with tarfile.open(archive) as file:
+        file.extractall(source / "unpacked", filter="data")
+    [there] = (source / "unpacked").iterdir()
+    built = python("-c", BUILD.format("wheel"), cwd=there, PYTHONPATH="")
     assert built.returncode == 0, built.stderr
-    [path] = source.glob("*.whl")
+    [path] = there.glob("*.whl")
     return path
 
 
