@@ -117,7 +117,13 @@ def test_light_through_a_thin_lens_meets_where_geometry_has_it():
     [
         (np.array(["a"]), DomainError, "nothing is known of how to draw ndarray"),
         (3, DomainError, "nothing is known of how to draw int"),
-        (torch.tensor(1.0), ShapeError, "frames have shape"),
+        (torch.tensor(1.0), ShapeError, "frames are torch.float32 \\[\\]"),
+        (np.zeros((0, 4, 4)), ShapeError, "with a pixel is needed"),
+        (
+            FlowField(torch.zeros(0, 2, 4, 4), torch.zeros(0, 4, 4, dtype=torch.bool), 0.1),
+            ShapeError,
+            "no sample",
+        ),
         (codesign.mount.Mount((0, 0, 0.4), (0.1, 0.1, 0.1)), DomainError, "give camera= and body="),
     ],
 )

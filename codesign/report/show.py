@@ -102,8 +102,10 @@ def show(
             [(f"flow {k}" if k else "flow", (px, full), _flow) for k, px in enumerate(flows)]
         )
     elif isinstance(x, Tensor):
-        if x.ndim < 2 or x.dtype.is_complex:
-            raise ShapeError(f"frames have shape {list(x.shape)}; [..., H, W] is needed.")
+        if x.ndim < 2 or not x.numel() or x.dtype.is_complex:
+            raise ShapeError(
+                f"frames are {x.dtype} {list(x.shape)}; real [..., H, W] with a pixel is needed."
+            )
         films = x.detach().reshape(-1, *x.shape[-2:])
         picked = np.unique(np.linspace(0, len(films) - 1, MOST).round().astype(int)).tolist()
         figure = _row([(f"frame {k}", (films[k], films[picked]), _frame) for k in picked])
@@ -134,6 +136,8 @@ def _sample(field, k):
 
 def _row(parts):
     """Figure of (title, what, how to draw it) side by side; a lens gets more room."""
+    if not parts:
+        raise ShapeError("there is no sample in it to draw.")
     wide = [1.5 if draw is _lens else 1.0 for _, _, draw in parts]
     figure = Shown(figsize=(3.4 * sum(wide) + 0.6, 3.3), layout="constrained")
     axes = figure.subplots(1, len(parts), squeeze=False, width_ratios=wide)[0]
