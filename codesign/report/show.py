@@ -97,7 +97,7 @@ def show(
         )
     elif isinstance(x, FlowField):
         flows = [_sample(x, k) for k in range(min(MOST, len(x.flow_px)))]
-        full = max(map(_longest, flows))
+        full = max(map(_longest, flows), default=1e-9)
         figure = _row(
             [(f"flow {k}" if k else "flow", (px, full), _flow) for k, px in enumerate(flows)]
         )
