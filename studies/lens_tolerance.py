@@ -123,7 +123,7 @@ def study(run: Run[Config]):
     run.record(trials=config.trials, failed_trials=trials.failed, errors=errors)
     run.finish(
         "Tolerances",
-        f"Such errors make the RMS spot grow {' or '.join(grown)}: root mean square over the lenses, in the field where it "
+        f"Such errors make the RMS spot go {' or '.join(grown)}: root mean square over the lenses, in the field where it "
         f"grows most. {geo.name}, half field {math.degrees(half_field):.3g} degrees, {config.trials} trials of {errors} "
         f"errors, of which {trials.failed} failed. Every tolerance is one standard deviation of an "
         "independent normal error.",
@@ -345,6 +345,7 @@ def report_needed(run, geo, figure, refocus):
         radius_relative=config.radius_relative,
         thickness_mm=config.thickness_mm,
         index=config.index,
+        fringes=config.fringes,
         element_decentre_mm=config.decentre_mm,
         element_tilt_deg=config.tilt_deg,
         element_wedge_deg=config.tilt_deg,

@@ -148,7 +148,7 @@ def depth_curves(
     """Figure over the distance of the object, even in 1 / distance: RMS spot of each field with the
     film where it is, and the RMS radius of a disc ``blur_mm`` across as a dashed line."""
     vergence = torch.linspace(1 / far_m, 1 / near_m, 129, dtype=lens.dtype)
-    sizes = analysis.rms_spot_mm(lens, fields_rad, wavelength_um, 16, 1 / vergence) * 1e3
+    sizes = analysis.rms_spot_mm(lens, fields_rad, wavelength_um, 16, 1 / vergence, True) * 1e3
     figure, axis = plt.subplots(figsize=(7, 3.4), layout="constrained")
     for (field, colour), column in zip(coloured(fields_rad), sizes.T, strict=True):
         axis.plot(vergence.numpy(), column.numpy(), color=colour, label=degrees(field))

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from codesign.errors import DomainError
 from codesign.flow.losses import contrast_loss
 from codesign.flow.metrics import endpoint_error
 from codesign.train.batches import Source, to_device
@@ -92,6 +93,11 @@ def score(
     if not judged and blurs:
         share = sum(blur > 1 for blur in blurs) / len(blurs)
         return Score(0.0, 0.0, 100 * share, len(blurs), sum(blurs) / len(blurs))
+    if judged and not zero > 0:
+        raise DomainError(
+            "the true flow of the validation windows is 0 everywhere, so no error can be a share of it; validate on "
+            "windows that move."
+        )
     return Score(
         error / max(pixels, 1.0), zero / max(pixels, 1.0), 100 * worse / max(judged, 1), judged
     )

@@ -121,7 +121,9 @@ def study(run: Run[Config]) -> None:
     sets = judged(config, bins)
     who = estimators(network, config.models, config.clock)
     # opened first: a wrong path ends the study before its windows are judged
-    packets = recordings.cases(config, run.say) if config.recording or not config.sets else []
+    packets, left_out = [], []
+    if config.recording or not config.sets:
+        packets, left_out = recordings.cases(config, run.say)
     found = {}
     about = {}
     with run.progress(sum(number for _, number in sets.values()), "windows") as progress:
@@ -140,23 +142,23 @@ def study(run: Run[Config]) -> None:
     if "worlds" in found:
         _worlds(run, about["worlds"][1])
     if packets:
-        recordings.show(run, who, bins, packets)
+        recordings.show(run, who, bins, packets, left_out)
     run.finish(
         "Quality of event flow",
-        f"{answer(found)} Hard events with threshold mismatch and background noise; textures are photographs, unseen speckle "
+        f"{answer(found, config.network)} Hard events with threshold mismatch and background noise; textures are photographs, unseen speckle "
         "and few shapes, the worlds are seen by no training.",
     )
 
 
-def answer(found):
-    """How good the delivered flow is: its error over that of zero flow on the sets."""
+def answer(found, network=BEST):
+    """How good a network's flow is: its error over that of zero flow on the sets."""
     ratios = {name: mine[BEST]["ratio"] for name, mine in found.items()}
     if not ratios:
         return "On recordings alone the tables below tell."
     least, most = min(ratios, key=ratios.__getitem__), max(ratios, key=ratios.__getitem__)
     ahead = sum(mine[BEST]["aee_px"] < mine[START]["aee_px"] for mine in found.values())
     return (
-        f"The refiner's flow errs by {ratios[least]:.2f} ({least.replace('_', ' ')}) to {ratios[most]:.2f} "
+        f"The flow of {f'the {BEST}' if str(network) == BEST else f'{network}'} errs by {ratios[least]:.2f} ({least.replace('_', ' ')}) to {ratios[most]:.2f} "
         f"({most.replace('_', ' ')}) times what zero flow does, and by less than the closed form's on {ahead} of "
         f"{counted(len(ratios), 'set')}."
     )
@@ -164,7 +166,8 @@ def answer(found):
 
 def check(config):
     """Raises: DomainError for numbers and models that give no figures."""
-    check_least(config, 2, "windows", "world_windows", "real_windows")
+    check_least(config, 2, "windows", "real_windows")
+    check_least(config, len(ALL), "world_windows")
     if config.packets < 1 or not config.packet_events or min(config.packet_events) < 100:
         raise DomainError(
             f"--packets {config.packets}, --packet-events {config.packet_events}: at least 1 packet of at "

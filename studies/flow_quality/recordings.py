@@ -58,7 +58,7 @@ class Case:
 def cases(config, say):
     """Cases of all recordings, the made ones first; a recording with too few events for a packet
     says so."""
-    found = []
+    found, left_out = [], []
     for make, turns in ((turning, True), (sliding, False)):
         recording = make(seed=config.seed)
         for count in config.packet_events:
@@ -73,7 +73,8 @@ def cases(config, say):
                 )
                 for p in packets
             ]
-    for path in config.recording:
+    names = named(config.recording)
+    for path, name in zip(config.recording, names, strict=True):
         for count in config.packet_events:
             try:
                 packets = read_packets(
@@ -81,6 +82,7 @@ def cases(config, say):
                 )
             except DomainError as error:
                 say(f"{path}, packets of {count} events: left out: {error}")
+                left_out.append(f"{name}, packets of {count} events: {error}")
                 continue
             seek = (
                 partial(sharpest.rotation, focal_px=config.focal_px)
@@ -88,9 +90,21 @@ def cases(config, say):
                 else sharpest.affine
             )
             assumed = "rotation" if config.focal_px else "affine"
-            kind = _kind(Path(path).stem, count)
+            kind = _kind(name, count)
             found += [Case(kind, p, partial(seek, p), assumed) for p in packets]
-    return found
+    return found, left_out
+
+
+def named(paths):
+    """A name for each recording: its file's or folder's; that of the folder before it for events.txt,
+    and with a number where another has it."""
+    names = [
+        (path.parent if path.stem == "events" else path).resolve().name for path in map(Path, paths)
+    ]
+    return [
+        f"{name}_{names[: k + 1].count(name)}" if names.count(name) > 1 else name
+        for k, name in enumerate(names)
+    ]
 
 
 def _kind(name, count):
@@ -127,14 +141,20 @@ def in_context(recording, packet, turns):
     return sharpest.Sharpest(share * found.flow_px, found.contrast)
 
 
+def true_flow(packet):
+    """The truth of a packet; None where it is of rotation alone and the camera moved as well."""
+    return None if packet.translates else packet.truth
+
+
 def judged(packet, mask, flow_px, sharpest_px=None):
     """Figures of a flow on a packet, those that are defined: distance_px to the contrast
     maximisation and aee_px to the truth, over pixels with events (mask); fwl."""
     found = {"fwl": float(metrics.fwl(packet.stream, flow_px, packet.t0_us, packet.t1_us))}
     if sharpest_px is not None:
         found["distance_px"] = float(metrics.aee(flow_px, sharpest_px.to(flow_px), mask))
-    if packet.truth is not None and bool((both := packet.truth.valid & mask).any()):
-        found["aee_px"] = float(metrics.aee(flow_px, packet.truth.flow_px, both))
+    truth = true_flow(packet)
+    if truth is not None and bool((both := truth.valid & mask).any()):
+        found["aee_px"] = float(metrics.aee(flow_px, truth.flow_px, both))
     return found
 
 
@@ -150,15 +170,15 @@ def measured(case, who, bins):
         for name, estimate in who.items()
     }
     rows["contrast_maximisation"] = judged(packet, mask, sharpest_px.float())
-    if packet.truth is not None:
-        true_px = packet.truth.flow_px
+    if (truth := true_flow(packet)) is not None:
+        true_px = truth.flow_px
         rows["true_flow"] = {"fwl": judged(packet, mask, true_px)["fwl"]}
         rows["zero_flow"] = judged(packet, mask, torch.zeros_like(true_px))
     return rows
 
 
-def show(run, who, bins, todo):
-    """Measure the cases, record, and show on the page."""
+def show(run, who, bins, todo, left_out):
+    """Measure the cases, record, and show on the page, with what was left out."""
     found = {}
     cases_of = {}
     with run.progress(len(todo), "packets") as progress:
@@ -173,6 +193,12 @@ def show(run, who, bins, todo):
         "Packets of a fixed number of events. `turning` and `sliding` are made here with the full sensor "
         "(bandwidth, mismatch, noise, leak, dead time, hot pixels) and have exact flow.",
     )
+    if left_out:
+        run.text(f"Left out: {'; '.join(left_out)}")
+    if any(case.packet.translates for case in todo):
+        run.text(
+            "Where the camera moved besides turning, the flow of its rotation is no truth: no error is shown."
+        )
     rows = []
     for kind, mine in cases_of.items():
         stream = mine[0].packet.stream

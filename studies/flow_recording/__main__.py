@@ -149,7 +149,8 @@ def options(config):
     window_ms = config.window_ms
     if config.recording is None:
         size = MADE_QUICK_PX if config.quick else MADE_PX
-        window_ms = window_ms or 20.0
+        if config.events is None:
+            window_ms = window_ms or 20.0
     seconds = [None if ms is None else ms * 1e-3 for ms in (window_ms, config.truth_interval_ms)]
     return PacketOptions(
         window_s=seconds[0],

@@ -14,7 +14,7 @@ from codesign.report import lens_figures
 from scenes import worlds
 from studies.frame.compare import Interval, log_ratio
 from studies.frame.show import Panel, bars, panels, pictures, table
-from studies.lens_opt.task import DISTANCE_M, FIELDS, PITCH_MM, SENSOR
+from studies.lens_opt.task import DISTANCE_M, FIELDS, PITCH_MM, SENSOR, window_shares
 
 DESIGNS = {"flow": "the flow design", "edge": "the edge design"}
 RIVALS = {
@@ -179,16 +179,20 @@ def _who_wins(run, names, pairs, rivals):
 
 def _by_window(run, found, names, rivals):
     rows = []
-    for h in FIELDS:
+    for h, share in zip(FIELDS, window_shares(), strict=True):
         key = f"flow_error_mrad_field_{h:g}"
         own, *others = ([row[key] for row in found[name]] for name in ("optimised", *rivals))
         rows.append(
-            [f"{h:g}", sum(own) / len(own), *(log_ratio(own, other).percent() for other in others)]
+            [
+                f"{share:.2f}",
+                sum(own) / len(own),
+                *(log_ratio(own, other).percent() for other in others),
+            ]
         )
     run.table(
         "Where: by window",
         [
-            "window, of the way to the corner",
+            "middle of the window, of the way to the corner",
             f"{names['optimised']} (mrad)",
             *(names[name] for name in rivals),
         ],

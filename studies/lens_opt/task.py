@@ -53,6 +53,12 @@ def film() -> render.Film:
     return render.Film(*SENSOR_PX, WINDOW_PX, WINDOW_PX, PITCH_MM, corners)
 
 
+def window_shares() -> list[float]:
+    """How far the middles of the windows lie, of the way from the axis to the corner."""
+    room = [n - WINDOW_PX for n in SENSOR_PX]
+    return [h * math.hypot(*room) / math.hypot(*SENSOR_PX) for h in FIELDS]
+
+
 def log_error(every_px: int = 8) -> Callable[..., Tensor]:
     """The objective: mean log angular error over the windows, at pixels ``every_px`` apart."""
 

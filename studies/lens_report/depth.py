@@ -50,7 +50,8 @@ def depth(run, geo, fields, wavelength_um, distances):
             "Depth of field on the axis", ("rays", "near (m)", "far (m)", "sharpest (m)"), limits
         )
     run.text(" ".join(refused))
-    sizes = (analysis.rms_spot_mm(geo, fields, wavelength_um, at_m=distances) * 1e3).tolist()
+    spots = analysis.rms_spot_mm(geo, fields, wavelength_um, at_m=distances, vignetting=True)
+    sizes = (1e3 * spots).tolist()
     run.table(
         f"RMS spot (µm) at {wavelength_um * 1e3:.0f} nm, film where it stands",
         ("object at (m)", *(f"{math.degrees(f):.3g}°" for f in fields)),

@@ -135,9 +135,7 @@ def study(run: Run[Config]) -> None:
         run.record(
             session_resident_mb_first=resident_mb[0], session_resident_mb_last=resident_mb[-1]
         )
-    fresh = min(
-        (maker.chunks * len(names) - sum(ready)) * maker.chunk_frames, config.frames * len(names)
-    )
+    fresh = sum(max(config.frames - done * maker.chunk_frames, 0) for done in ready)
     pages.show(run, names, maker.clock.spent, wall_s, fresh)
 
 

@@ -143,10 +143,10 @@ def _pictures(folder):
         )
     counts = to_counts(EventStream(t, x, y, 2 * p - 1, *image.shape), t_s).sum(0)
     return {
-        "frame": _grey(image),
+        "frame": _grey(image) ** (1 / 2.2),  # linear light, with a display's gamma
         "events": picture(counts, 3).numpy(),
         "flow": np.where(valid[..., None], flow_colours(flow), 0.0),
-        "depth": _grey(depth),
+        "depth": _grey(np.where(depth > 0, depth, depth.max())),  # 0 where nothing is, as far
     }
 
 

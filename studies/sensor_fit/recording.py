@@ -84,6 +84,10 @@ def load(path):
 def _read_npz(path):
     with open_npz(path, f"a recording holds {', '.join(ENTRIES)}") as data:
         frames, exposure_us = (torch.from_numpy(data.read(name)) for name in ("frames", "exposure"))
+    if frames.dtype != torch.uint8:
+        raise FileFormatError(
+            f"'{path}' has frames of {frames.dtype}; uint8 is needed, digital values from 0 to 255."
+        )
     if frames.ndim != 3 or exposure_us.shape != (len(frames), 2):
         raise FileFormatError(
             f"'{path}' has frames {list(frames.shape)} and exposure {list(exposure_us.shape)}; [T, H, W] "

@@ -33,7 +33,7 @@ RATES = {"refiner": 2e-3, "flownet-events": 2e-3, "spike-flownet": 3e-3, "ecn": 
 ASKED = 0.6  # of a rival's error, at most
 # to every training, or of the race itself
 PASSED = (
-    *("mix", "batch", "learning_rate", "steps", "cpu_minutes", "weights", "final_windows"),
+    *("mix", "batch", "learning_rate", "steps", "cpu_minutes", "final_windows"),
     *("race", "own", "seeds", "jobs", "seed", "device", "out", "resume", "quick"),
 )
 SEED = 55  # of what is judged here
@@ -53,6 +53,8 @@ def race(run):
         for field in fields(config)
         if field.name not in PASSED and getattr(config, field.name) != getattr(plain, field.name)
     ]
+    if not config.own and config.learning_rate != plain.learning_rate:
+        lost.append("learning_rate")  # the five networks have their own
     if lost:
         raise DomainError(
             "a race trains every network with its own settings on windows that are made; leave "
@@ -131,7 +133,7 @@ def _command(run, network, seed):
         if value is not None
     }
     if network in NAMES and network != "refiner":
-        options["weights"] = config.weights or sum(p.numel() for p in Refiner().parameters())
+        options["weights"] = sum(p.numel() for p in Refiner().parameters())
     return [
         *start,
         *(word for name, value in options.items() for word in (f"--{name}", str(value))),

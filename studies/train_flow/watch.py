@@ -170,7 +170,8 @@ def show(run, job, scores):
             f"{ours.ratio:.3f}",
             f"closed form {closed.ratio:.3f}; worse than zero flow on {ours.worse_percent:.1f} %",
         )
-        errors = (ours.aee_px, closed.aee_px, ours.zero_flow_px, ours.ratio, closed.ratio)
+        errors = (ours.aee_px, closed.aee_px, ours.zero_flow_px)
+        errors = (*(errors if ours.blur is None else [None] * 3), ours.ratio, closed.ratio)
         rows.append((name, *errors, ours.worse_percent, closed.worse_percent, ours.windows))
     run.section(
         "On windows never trained on",

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
 import torch
 
 from codesign.events import decay_from_stream, picture, to_counts, write_video
@@ -296,7 +297,10 @@ def first_pictures(view, window_s):
         time_s = float(view.t_s[index])
         title = f"frame {view.first + index}, {1e3 * (time_s - float(view.t_s[0])):.4g} ms"
         frame = next(view.source.read(view.first + index))
-        rows["frame"][title] = view.light([frame], view.first + index)[0].cpu().numpy()
+        light = view.light([frame], view.first + index)[0].cpu().numpy()
+        # what is not made linear has a display's gamma already, and is shown in colours as it is
+        shown = np.repeat((light / 255).clip(0, 1)[..., None], 3, 2)
+        rows["frame"][title] = light if view.config.linear else shown
         start_us = round((time_s - window_s / 2) * 1e6)
         end_us = max(round((time_s + window_s / 2) * 1e6), start_us + 1)
         stream = view.log.read(*view.log.positions([start_us, end_us]))

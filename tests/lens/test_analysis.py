@@ -221,3 +221,12 @@ def test_failed_and_vignetted_rays_weigh_nothing():
     assert torch.equal(clipped.weight > 0, inside)
     expected = (open_.waves[inside] - open_.waves[inside].mean()).square().mean().sqrt()
     close(rms_waves(clipped), expected, 1e-12)
+
+
+def test_spots_behind_apertures_are_of_the_rays_that_pass():
+    """At 20 degrees half of the light of a double Gauss is cut off, the worse half."""
+    geo, field = lens.load("double-gauss").freeze(), math.radians(20)
+    passed = analysis.polychromatic_spot(geo, field, 0.5875618, 32, True)
+    found = lens.rms_spot_mm(geo, [field], vignetting=True)[0]
+    close(found, analysis.spot_radius_mm(*passed), 1e-9)
+    assert float(found) < 0.8 * float(lens.rms_spot_mm(geo, [field])[0])

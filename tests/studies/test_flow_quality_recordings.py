@@ -3,7 +3,7 @@ and the contrast maximisation against events placed by hand."""
 # pyright: reportAssignmentType=false
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -159,3 +159,18 @@ def test_packets_of_a_recording(slid, tmp_path):
     assert run.metrics["slid_refiner_fwl_least"] == 1.0
     assert run.metrics["slid_refiner_distance_over_closed_form_largest"] == 1.0
     assert math.isclose(run.metrics["slid_refiner_aee_px_largest"], still["aee_px"])
+
+
+def test_rotation_alone_is_no_truth_of_a_camera_that_slides():
+    made = dots(lambda x, y, time: (x + 3 * time, y))
+    flow_px = torch.full((1, 2, *SIZE), 3.5)
+    truth = FlowField(torch.zeros(1, 2, *SIZE), torch.ones(1, *SIZE, dtype=torch.bool), 0.01)
+    mask = torch.ones(1, *SIZE, dtype=torch.bool)
+    for neglected_px, figures in ((5.0, {"fwl"}), (0.0, {"fwl", "aee_px"})):
+        slid = replace(made, truth=truth, rotation_only=True, neglected_px=neglected_px)
+        assert recordings.judged(slid, mask, flow_px).keys() == figures
+
+
+def test_recordings_of_one_name_stay_apart(tmp_path):
+    given = [tmp_path / name for name in ("a/events.txt", "b/events.txt", "a/rec.h5", "b/rec.h5")]
+    assert recordings.named(given) == ["a", "b", "rec.h5_1", "rec.h5_2"]

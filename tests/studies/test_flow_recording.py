@@ -211,3 +211,8 @@ def test_bad_input_is_one_sentence_and_exit_code_2(options, sentence, recording,
     error = capsys.readouterr().err
     assert sentence in error
     assert error.count("\n") == 1
+
+
+def test_packets_of_events_of_the_made_recording_have_no_length_in_time():
+    assert study.options(study.Config(events=500)).window_s is None
+    assert study.options(study.Config()).window_s == 0.02

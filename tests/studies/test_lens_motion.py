@@ -16,7 +16,7 @@ from studies.frame.run import main
 from studies.lens_motion import __main__ as lens_motion
 from studies.lens_motion import rivals
 from studies.lens_motion.forms import BENDING, STEPS, make_form
-from studies.lens_motion.motions import HEIGHT_PX, SPEED_PX, Motion, flow_px
+from studies.lens_motion.motions import HEIGHT_PX, SPEED_PX, Motion, drawn_world, flow_px
 from studies.lens_opt import __main__ as lens_opt
 from studies.lens_opt.spots import SpotRays
 from studies.lens_opt.task import DISTANCE_M, PITCH_MM
@@ -191,3 +191,22 @@ def test_what_has_no_direction_cannot_be_turned_and_a_bad_file_is_named(tmp_path
     path.write_text("not a pose\n")
     with pytest.raises(FileFormatError, match=r"poses\.txt"):
         Motion(str(path), 9.0).directions_rad()
+
+
+def test_a_verdict_is_that_of_textures_where_cases_of_one_are_alike():
+    """Sixty cases that err alike on each of six textures: as sure as six, not as sixty."""
+    rows = []
+    for case in range(60):
+        drawn = torch.Generator().manual_seed(lens_motion.JUDGED + case)
+        world = drawn_world(len(lens_motion.HELD_OUT), drawn)
+        for name, error in (("flow", math.exp(0.3 * (-1) ** world)), ("spots", 1.0)):
+            rows.append({"case": case, "turned": 0, "lens": name, "error_mrad": error})
+    found = lens_motion.ratios(rows, "flow")["spots"]
+    assert found.count == len(lens_motion.HELD_OUT)
+    assert found.high - found.low > 0.3 > 4 * 0.3 / 60**0.5
+
+
+def test_a_table_that_is_not_there_is_said(tmp_path, capsys):
+    given = ["--raw", str(tmp_path / "none.csv"), "--out", str(tmp_path / "run")]
+    assert main(lens_motion.study, lens_motion.Config, given) == 2
+    assert "there is no such file" in capsys.readouterr().err

@@ -158,7 +158,12 @@ def test_a_recording_is_read_and_a_bad_one_refused(tmp_path):
     for changed, error, words in (
         ({"x": None}, FileFormatError, "no array x"),
         ({"exposure": np.zeros((3, 2))}, FileFormatError, "exposure"),
-        ({"frames": np.zeros((4, 40, 48)), "exposure": np.zeros((4, 2))}, ShapeError, "at least 5"),
+        ({"frames": np.zeros((7, 40, 48), np.uint16)}, FileFormatError, "uint8 is needed"),
+        (
+            {"frames": np.zeros((4, 40, 48), np.uint8), "exposure": np.zeros((4, 2))},
+            ShapeError,
+            "at least 5",
+        ),
     ):
         write_recording(path, **changed)
         with pytest.raises(error, match=words):

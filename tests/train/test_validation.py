@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from codesign.errors import DomainError
 from codesign.flow.export import evenly_timed
 from codesign.train.validation import error_ratio, score
 from codesign.types import EventVolume, FlowField, FlowWindows
@@ -76,3 +77,10 @@ def test_windows_without_truth_are_judged_by_the_blur_of_their_events():
     assert still.ratio == pytest.approx(1.0)
     assert along.ratio < 0.6 < 1.0 < against.ratio
     assert (along.worse_percent, against.worse_percent, along.windows) == (0.0, 100.0, 1)
+
+
+def test_windows_that_stand_still_judge_no_network():
+    truth = FlowField(torch.zeros(1, 2, 4, 4), torch.ones(1, 4, 4, dtype=torch.bool), 0.01)
+    windows = FlowWindows(evenly_timed(torch.ones(1, 2, 2, 4, 4)), truth, None)
+    with pytest.raises(DomainError, match="is 0 everywhere"):
+        score(lambda volume: truth, [windows])

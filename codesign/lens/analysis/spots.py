@@ -50,9 +50,11 @@ def rms_spot_mm(
     wavelength_um: float = D_UM,
     grid: int = 32,
     at_m: Distances = PARALLEL,
+    vignetting: bool = False,
 ) -> Tensor:
     """RMS distance of rays from their mean point, [fields] mm; [D, fields] for D distances
-    ``at_m``, see ``spots``. Raises DomainError where no ray of a field arrives.
+    ``at_m``, see ``spots``; ``vignetting``: of those that all apertures let through. Raises
+    DomainError where no ray of a field arrives.
 
     Example:
     >>> from codesign import lens
@@ -64,13 +66,14 @@ def rms_spot_mm(
     [0.172, 0.015, 0.108]
     """
     pupil = pupil_grid(grid, lens.curvature_per_mm.dtype, lens.curvature_per_mm.device)
-    rays = trace_field(lens, fields_rad, pupil, wavelength_um, at_m=at_m)
+    rays = trace_field(lens, fields_rad, pupil, wavelength_um, vignetting, at_m=at_m)
     positions, weight = rays.position_mm, rays.weight
     total = weight.sum(-1)
     w = weight[..., None]
     centre = (positions * w).sum(-2, keepdim=True) / total[..., None, None]
-    # weights are 0 or 1; the gradient at a point image is 0
-    return torch.linalg.vector_norm((positions - centre) * w, dim=(-2, -1)) / total.sqrt()
+    root = torch.where(w > 0, torch.where(w > 0, w, 1).sqrt(), 0)
+    # the gradient at a point image is 0
+    return torch.linalg.vector_norm((positions - centre) * root, dim=(-2, -1)) / total.sqrt()
 
 
 def polychromatic_spot(
