@@ -452,11 +452,12 @@ class GeoLens(Replaceable):
 
     @settled
     def thin(self) -> ThinLens:
-        """The paraxial level of this lens: same focal length, pupil and defocus, no aberrations."""
+        """The paraxial level of this lens: same focal length, pupil and defocus, no aberrations. The
+        lengths behind it are those of air: an image in a medium has them divided by its index."""
         f = self.first_order()
-        return ThinLens(
-            f.efl_mm, self.entrance_pupil_diameter_mm, f.efl_mm + self.thickness_mm[-1] - f.bfl_mm
-        )
+        image_mm = f.efl_mm + self.thickness_mm[-1] - f.bfl_mm
+        index = self.index()[-1]
+        return ThinLens(f.efl_mm / index, self.entrance_pupil_diameter_mm, image_mm / index)
 
     @settled
     def camera_rays(
