@@ -9,6 +9,7 @@ auto: the cheapest of the three that is right for the frames at hand.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Any, Literal
 
 import torch
@@ -40,6 +41,7 @@ LENS_STEP = {
     "phase": None,
     "decentre_mm": None,
     "tilt_rad": None,
+    "semi_aperture_mm": 2e-3,
     "efl_mm": 1e-2,
     "image_distance_mm": 2e-3,
 }
@@ -198,13 +200,15 @@ def lens_tensors(lens: Any) -> dict[str, Tensor]:
     }
 
 
-def _check_known(lens, known):
-    """Raise DomainError when a lens of the user's own asks for gradients to parameters, none of
-    which differences know."""
-    if known or not isinstance(lens, torch.nn.Module):
+def _check_known(lens):
+    """Raise DomainError when a lens asks for gradients to tensors that differences do not know: of a
+    phase plate, of the pupil, of a lens of the user's own."""
+    if not isinstance(lens, torch.nn.Module):
         return
-    for name, tensor in lens.named_parameters():
-        if tensor.requires_grad and tensor.numel():
+    # its tensors in place of the variables that make them
+    made = lens.replace() if hasattr(lens, "replace") else lens
+    for name, tensor in chain(made.named_parameters(), made.named_buffers()):
+        if tensor.requires_grad and tensor.numel() and name not in LENS_STEP:
             raise DomainError(
                 f"differences know no step for the lens's parameter '{name}'; freeze it, or choose gradient "
                 "'interior' or 'boundary'."
@@ -213,9 +217,8 @@ def _check_known(lens, known):
 
 def _lens_numbers(camera, views):
     """As above, for every number of the lens that asks for a gradient."""
-    known = lens_tensors(camera.lens)
-    _check_known(camera.lens, known)
-    for name, tensor in known.items():
+    _check_known(camera.lens)
+    for name, tensor in lens_tensors(camera.lens).items():
         if (size := LENS_STEP[name]) is None:
             raise DomainError(
                 f"differences to the lens's {name} have no step; freeze it, or use gradient 'boundary'."

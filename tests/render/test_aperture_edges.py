@@ -14,14 +14,12 @@ START = pose.look_at((0.05, -1.2, 1.0), (0.0, 1.0, 0.7))[None]
 WEIGHT = smooth_weights(32)
 
 
-def gradient(way, samples, seed, **options):
-    """To the six thicknesses of a triplet whose film reaches beyond its field, before a textured
-    wall."""
+def gradient(way, samples, seed, of="thickness_mm", **options):
+    """To the six thicknesses (or another tensor) of a triplet whose film reaches beyond its field,
+    before a textured wall."""
     optics = lens.load("cooke-triplet").scaled(0.22).freeze()
-    held = optics.thickness_mm.detach().clone().requires_grad_()
-    camera = render.Camera(
-        optics.replace(thickness_mm=held), 32, 32, 0.25, samples, seed, **options
-    )
+    held = getattr(optics, of).detach().clone().requires_grad_()
+    camera = render.Camera(optics.replace(**{of: held}), 32, 32, 0.25, samples, seed, **options)
     frames = render.frames(camera, silhouette_scenes.build("wall"), START, way)
     return torch.autograd.grad((WEIGHT * frames).double().mean(), held)[0]
 
@@ -43,6 +41,12 @@ def test_the_edge_of_the_light_has_the_gradient_of_the_whole_pupil(options):
     ).norm()
     assert float(error) < 0.03
     assert float((found.mean(0) - truth.mean(0)).norm() / truth.mean(0).norm()) < 3 * float(error)
+
+
+def test_differences_to_semi_apertures_have_the_gradient_of_the_same_samples():
+    truth, found = (gradient(way, 16, 20, "semi_aperture_mm") for way in ("interior", "difference"))
+    # over a step of a twentieth of the soft edge
+    torch.testing.assert_close(found, truth, rtol=0, atol=0.02 * float(truth.norm()))
 
 
 def test_it_scatters_by_less_than_half():
