@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from codesign import lens, pose, render
-from codesign.render.aperture_edges import aperture_edge_term
+from codesign.render.aperture_edges import _edge_points, aperture_edge_term
 from codesign.render.moving import views_of
 from scenes import silhouettes as silhouette_scenes
 from tests.render.differences import smooth_weights
@@ -41,6 +41,22 @@ def test_the_edge_of_the_light_has_the_gradient_of_the_whole_pupil(options):
     ).norm()
     assert float(error) < 0.03
     assert float((found.mean(0) - truth.mean(0)).norm() / truth.mean(0).norm()) < 3 * float(error)
+
+
+def test_every_pixel_meets_the_edge_in_each_colour_as_often():
+    """One pixel in many windows, with more points than colours."""
+    film = render.Film(32, 32, 1, 1, 0.25, ((28, 28),) * 900)
+    optics = lens.load("cooke-triplet").scaled(0.22)
+    camera = render.Camera(optics, 32, 32, 0.25, 3, spectrum=lens.Spectrum.visible_FdC()).with_film(
+        film
+    )
+    points = _edge_points(camera, 4)
+    assert points is not None
+    _, _, colour, pixel, _ = points
+    for number in range(3):
+        found = torch.bincount(colour[pixel % 3 == number], minlength=3).double()
+        # by chance some find no edge
+        assert float((found / found.mean() - 1).abs().max()) < 5 / float(found.mean()) ** 0.5
 
 
 def test_differences_to_semi_apertures_have_the_gradient_of_the_same_samples():
