@@ -19,7 +19,8 @@ from codesign.checks import check_choice, check_kind, check_positive
 from codesign.errors import DomainError
 from codesign.pose import Poses, inverse, se3_exp
 from codesign.render.aperture_edges import aperture_edge_term
-from codesign.render.camera import Camera, device_of
+from codesign.render.camera import Camera, device_of, lines
+from codesign.render.film import border_px
 from codesign.render.moving import MovingScene, Scene, Views, scenes_and_poses, views_of
 from codesign.render.silhouettes.boundary import boundary_term, radiance_jumps
 from codesign.render.silhouettes.occlusion_check import reach_m
@@ -31,7 +32,8 @@ WAYS: tuple[Way, ...] = ("interior", "boundary", "difference", "auto")
 PROVEN: tuple[Way, ...] = ("interior", "boundary")  # those that differences judge
 POSE_STEP = 2e-3  # metres and radians, but never more than STEP_PX on the film
 STEP_PX = 0.3
-# of the numbers of a lens; None where differences know none
+# of the numbers of a lens before they are sized to STEP_PX, by LONGEST at most; None where
+# differences know none
 LENS_STEP = {
     "curvature_per_mm": 2e-5,
     "thickness_mm": 5e-3,
@@ -45,6 +47,7 @@ LENS_STEP = {
     "efl_mm": 1e-2,
     "image_distance_mm": 2e-3,
 }
+LONGEST = 100.0
 APERTURE_SAMPLES = 4  # points per pixel on the edges of apertures, for "boundary"
 
 
@@ -232,11 +235,29 @@ def _lens_numbers(camera, views):
                 .reshape(held.shape)
             )
 
-            def at(change, name=name, held=held, way=way):
-                lens = camera.lens.replace(**{name: held + change * way})
-                return image(camera.with_lens(lens).rays(), camera, views)
+            def changed(change, name=name, held=held, way=way):
+                return camera.with_lens(camera.lens.replace(**{name: held + change * way}))
 
-            yield at, size, number - number.detach()
+            def at(change, changed=changed):
+                return image(changed(change).rays(), camera, views)
+
+            yield at, _lens_step(camera, changed, size), number - number.detach()
+
+
+@torch.no_grad()
+def _lens_step(camera, changed, trial):
+    """Step of a number that moves the rays of the film's border by STEP_PX, from what a trial step
+    does; ``trial`` itself where they stay."""
+    border = border_px(torch.zeros_like(camera.film.sensor_px), camera.film.sensor_px, 3)
+    pupil = torch.tensor([[0.0, 0.0], [0.7, 0.0], [0.0, 0.7]]).to(border)
+    at = border.repeat_interleave(len(pupil), 0), pupil.repeat(len(border), 1)
+    rays = [c.rays_through(*at) for c in (camera, changed(trial))]
+    passes = (rays[0].weight > 0) & (rays[1].weight > 0)
+    before, after = (lines(r)[1][passes] for r in rays)
+    if not bool((before != after).any()):
+        return trial
+    moved_px = float((after - before).norm(dim=1).max()) / abs(camera.slope_per_px())
+    return trial * min(STEP_PX / moved_px, LONGEST)
 
 
 def cheapest(camera: Camera, views: Views) -> Way:

@@ -81,6 +81,13 @@ def test_a_bright_square_moves_by_its_closed_form():
     assert float(first[0]) == pytest.approx(-100 * side * (20 - 11) * px_per_m, rel=1e-6)
     # nearer by dz: the area grows by 2 dz / z
     assert float(total[2]) == pytest.approx(2 * 100 * side**2 / 2.0, rel=1e-4)
+    # so it does by 2 ds / s when the film goes back; by differences whose step sweeps samples, a
+    # thousand per pixel and a tenth of a pixel on both sides
+    away_mm = torch.tensor(11.0, dtype=F64, requires_grad=True)
+    camera = render.Camera(ThinLens(11.0, 0.0, away_mm), 32, 32, 0.25, 1024)
+    frames = render.frames(camera, scene, torch.eye(4, dtype=F64)[None], "difference")
+    (found,) = torch.autograd.grad(frames.double().sum(), away_mm)
+    assert float(found) == pytest.approx(2 * 100 * side**2 / 11.0, rel=0.03)
 
 
 # half a turn of the pupil draws other points: 32 per pixel of edge agree to about 2 %
