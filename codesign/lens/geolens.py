@@ -247,8 +247,8 @@ class GeoLens(Replaceable):
         Returns: a lens as from ``replace``; this one stays as it is. Its last thickness is the
           image distance.
         Gradient: to every lens tensor that bends or moves light, and to the distance.
-        Raises: DomainError for a point that does not lie before the lens and beyond its front focal
-          plane, and for a spot of a single ray.
+        Raises: DomainError for a point that does not lie before the lens, or whose light does not
+          meet again behind it; and for a spot of a single ray.
         """
         return focus_at(self, distance_m, wavelength_um, spot_grid)
 
