@@ -259,7 +259,7 @@ def make_variables(
             )
     if not names:
         raise DomainError(f"{lens}: name the numbers that become variables, of {', '.join(kinds)}.")
-    tensors = {t: v.detach() for t, v in exact._now().items()}
+    tensors = {t: getattr(exact, t).detach() for t in exact.tensor_names}
     solved = [exact.solved_tensors[name] for name in held]
     chosen = {}
     for name in names:

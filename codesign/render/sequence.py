@@ -196,11 +196,20 @@ def _pose_numbers(rays, camera, views):
 
 
 def lens_tensors(lens: Any) -> dict[str, Tensor]:
-    """Tensors of a lens that ask for gradients, by name."""
-    found = {name: getattr(lens, name, None) for name in LENS_STEP}
-    return {
-        name: t for name, t in found.items() if torch.is_tensor(t) and t.requires_grad and t.numel()
-    }
+    """Tensors of a lens that ask for gradients, by name; one that another follows only once."""
+    made = _made(lens)
+    found = {}
+    for name in LENS_STEP:
+        value = getattr(made, name, None)
+        asks = torch.is_tensor(value) and value.requires_grad and value.numel()
+        if asks and not any(value is other for other in found.values()):
+            found[name] = value
+    return found
+
+
+def _made(lens):
+    """A lens with tensors in place of the variables that make them."""
+    return lens.replace() if hasattr(lens, "replace") else lens
 
 
 def _check_known(lens):
@@ -208,8 +217,7 @@ def _check_known(lens):
     phase plate, of the pupil, of a lens of the user's own."""
     if not isinstance(lens, torch.nn.Module):
         return
-    # its tensors in place of the variables that make them
-    made = lens.replace() if hasattr(lens, "replace") else lens
+    made = _made(lens)
     for name, tensor in chain(made.named_parameters(), made.named_buffers()):
         if tensor.requires_grad and tensor.numel() and name not in LENS_STEP:
             raise DomainError(
