@@ -128,22 +128,16 @@ def test_a_lens_with_an_intermediate_image_is_focused():
     """Two thin lenses of 50 and 25 mm, 100 mm apart: the second images the first's focus at 50 mm,
     upside down."""
 
-    def thin(efl_mm, gap_mm):
-        return Surface(efl_mm, 0.0, CROWN, 9.0), Surface(-efl_mm, gap_mm, None, 9.0)
-
     def other_side(efl_mm, distance_mm):
         return 1 / (1 / efl_mm - 1 / distance_mm)
 
-    relay = GeoLens([*thin(50.0, 100.0), *thin(25.0, 50.0)], 10.0)
+    faces = (50.0, 0.0, CROWN), (-50.0, 100.0, None), (25.0, 0.0, CROWN), (-25.0, 50.0, None)
+    relay = GeoLens([Surface(*face, 9.0) for face in faces], 10.0)
     close(efl(relay), -50.0, 1e-13)
-    close(
-        relay.focus_at(2.0).thickness_mm[-1],
-        other_side(25.0, 100 - other_side(50.0, 2e3)),
-        1e-12,
-    )
-    # parallel light, 10 mm wide at the second lens too, is blurred to 0.05 mm on a film further back
-    film_mm = 50 * (1 + 0.05 / 10)
-    focus_mm = other_side(50.0, 100 - other_side(25.0, film_mm))
+    image_mm = other_side(25.0, 100 - other_side(50.0, 2e3))
+    close(relay.focus_at(2.0).thickness_mm[-1], image_mm, 1e-12)
+    # parallel light, 10 mm wide at the second lens too, is blurred to 0.05 mm 0.25 mm further back
+    focus_mm = other_side(50.0, 100 - other_side(25.0, 50.25))
     close(1e3 * analysis.hyperfocal_m(relay, 0.05), focus_mm, 1e-11)
 
 

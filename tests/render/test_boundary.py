@@ -92,7 +92,7 @@ def test_a_bright_square_moves_by_its_closed_form():
 
 # half a turn of the pupil draws other points: 32 per pixel of edge agree to about 2 %
 @pytest.mark.parametrize(
-    ("side", "pupil_mm", "film_mm", "within"), [(1, 2.0, 14.0, 1e-9), (-1, 20.0, 11.3, 0.05)]
+    ("side", "pupil_mm", "film_mm", "within"), [(1, 2.0, 14.0, 1e-6), (-1, 20.0, 11.3, 0.05)]
 )
 def test_a_lens_with_an_intermediate_image_has_the_gradient_of_the_picture_turned(
     side, pupil_mm, film_mm, within
@@ -111,18 +111,13 @@ def test_a_lens_with_an_intermediate_image_has_the_gradient_of_the_picture_turne
     scene = MitsubaScene({"ball": ball})
     weight = torch.arange(256.0).reshape(16, 16)
 
-    def gradient(lens, weight):
-        camera = render.Camera(lens, 16, 16, 0.15, 16)
-        return to_twist(
-            lambda t: (
-                (render.frames(camera, scene, pose.se3_exp(t), "boundary", 32.0) * weight)
-                .double()
-                .sum()
-            )
-        )
+    def loss(twist, optics, weight):
+        camera = render.Camera(optics, 16, 16, 0.15, 16)
+        return (render.frames(camera, scene, pose.se3_exp(twist), "boundary", 32.0) * weight).sum()
 
-    truth = gradient(thin, weight.flip(0, 1))
-    assert float((gradient(Relay(), weight) - truth).norm()) < within * float(truth.norm())
+    truth = to_twist(lambda t: loss(t, thin, weight.flip(0, 1)))
+    error = to_twist(lambda t: loss(t, Relay(), weight)) - truth
+    assert float(error.norm()) < within * float(truth.norm())
 
 
 def test_auto_takes_the_cheapest_way_that_agrees():
