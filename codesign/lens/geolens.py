@@ -247,8 +247,8 @@ class GeoLens(Replaceable):
         Returns: a lens as from ``replace``; this one stays as it is. Its last thickness is the
           image distance.
         Gradient: to every lens tensor that bends or moves light, and to the distance.
-        Raises: DomainError for a point that does not lie before the lens and beyond its front focal
-          plane, and for a spot of a single ray.
+        Raises: DomainError for a point that does not lie before the lens, or whose light does not
+          meet again behind it; and for a spot of a single ray.
         """
         return focus_at(self, distance_m, wavelength_um, spot_grid)
 
@@ -452,11 +452,12 @@ class GeoLens(Replaceable):
 
     @settled
     def thin(self) -> ThinLens:
-        """The paraxial level of this lens: same focal length, pupil and defocus, no aberrations."""
+        """The paraxial level of this lens: same focal length, pupil and defocus, no aberrations. The
+        lengths behind it are those of air: an image in a medium has them divided by its index."""
         f = self.first_order()
-        return ThinLens(
-            f.efl_mm, self.entrance_pupil_diameter_mm, f.efl_mm + self.thickness_mm[-1] - f.bfl_mm
-        )
+        image_mm = f.efl_mm + self.thickness_mm[-1] - f.bfl_mm
+        index = self.index()[-1]
+        return ThinLens(f.efl_mm / index, self.entrance_pupil_diameter_mm, image_mm / index)
 
     @settled
     def camera_rays(

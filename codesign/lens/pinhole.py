@@ -29,7 +29,8 @@ class ThinLens(Replaceable):
     Args:
       efl_mm, image_distance_mm: numbers, or tensors that gradients flow to. A number becomes a
         Parameter that asks for no gradient until ``requires_grad_()`` or ``variables``; a tensor
-        with a gradient is kept as given. image_distance_mm follows efl_mm when it is None.
+        with a gradient is kept as given. image_distance_mm follows efl_mm when it is None, also in
+        what ``replace`` returns.
     Raises: DomainError for lengths that are not positive, or a diameter below 0.
     """
 
@@ -76,6 +77,11 @@ class ThinLens(Replaceable):
     def __getattr__(self, name: str) -> Any:
         found = super().__getattr__(name)
         return self.efl_mm if found is None and name == "image_distance_mm" else found
+
+    def _now(self):
+        own = self._parameters, self._buffers, self._made(self._driver)
+        held = any(found.get("image_distance_mm") is not None for found in own)
+        return super()._now() | ({} if held else {"image_distance_mm": None})
 
     @property
     def dtype(self) -> torch.dtype:

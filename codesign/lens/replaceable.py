@@ -114,9 +114,11 @@ class Replaceable(nn.Module):
         twin._parameters = {name: copy.deepcopy(p, memo) for name, p in self._parameters.items()}
         twin._buffers = {name: _own(b) for name, b in self._buffers.items()}
         for name in self.parameter_names if self._driver is None else ():
-            value = twin._buffers.pop(name, None)
-            if value is not None:
-                twin._parameters[name] = nn.Parameter(value.detach(), value.requires_grad)
+            if name in twin._buffers:
+                value = twin._buffers.pop(name)
+                twin._parameters[name] = (
+                    None if value is None else nn.Parameter(value.detach(), value.requires_grad)
+                )
         return twin
 
     def _apply(self, fn, recurse=True):

@@ -89,12 +89,15 @@ def focus_at(lens: L, distance_m: float | Tensor, wavelength_um: float, spot_gri
     """The lens with its film where an axial point is imaged; see ``GeoLens.focus_at``."""
     vergence = vergence_per_mm(lens, one_distance(distance_m))
     height, angle = paraxial.focused_image(lens, vergence, wavelength_um)
-    if not float(angle.detach()) < -1e-12:
+    image_mm = -height * lens.index(wavelength_um)[-1] / angle
+    # where it meets again, and not within rounding of parallel; its angle is positive behind an
+    # intermediate image
+    if not (float(image_mm.detach()) > 0 and abs(float(angle.detach())) > 1e-12):
         raise DomainError(
             f"{lens.name}: the light of a point {float(1e-3 / vergence.detach()):.6g} m before the "
             f"entrance pupil does not converge behind the lens; {_remedy(lens)}."
         )
-    focused = _last_thickness(lens, -height * lens.index(wavelength_um)[-1] / angle)
+    focused = _last_thickness(lens, image_mm)
     if spot_grid is None:
         return focused
     return focus_rays(focused, [0.0], [wavelength_um], spot_grid, distance_m)
@@ -120,9 +123,8 @@ def least_spot_shift(position: Tensor, slope: Tensor, weight: Tensor) -> tuple[T
 
 
 def _remedy(lens):
-    power = -float(paraxial.system_matrix(lens)[1][0].detach())
-    if power <= 0:
-        return "no distance helps, as the lens diverges; change a curvature"
+    if not float(paraxial.image_place_mm(lens).detach()) > 0:
+        return "nor does parallel light; change a curvature"
     nearest = (
         lens.first_order().entrance_pupil_z_mm - paraxial.cardinal_points(lens).front_focal_z_mm
     )

@@ -313,3 +313,18 @@ def passes_of(surfaces: Sequence[Surface], gap: int) -> list[int]:
         and not surface.mirror
         and min(high, stop) - max(low, start) > SHARED * (high - low)
     ]
+
+
+def passed_twice(surfaces: Sequence[Surface]) -> tuple[set[int], set[int], set[int]]:
+    """Rows of faces, gaps and media of glass that the light passes again behind a mirror, where
+    another row says the same. A mirrored back is one face, with the medium in front on both ways."""
+    media = {i for i in range(len(surfaces)) if passes_of(surfaces, i)}
+    gaps = set(media)
+    filled = False
+    for i, surface in enumerate(surfaces):
+        if not surface.mirror:
+            filled = surface.medium not in (None, AIR)
+        elif filled:
+            gaps |= {i - 1, i}
+    faces = {i for i, s in enumerate(surfaces) if not s.mirror and not gaps.isdisjoint((i - 1, i))}
+    return faces, gaps, media

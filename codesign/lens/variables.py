@@ -2,7 +2,7 @@
 rays on the film by a set distance."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from codesign.checks import check_positive
 from codesign.errors import DomainError, ShapeError
+from codesign.lens.surface import passed_twice
 from codesign.lens.traced import TracedLens
 
 # a bound on one side bends the map within about this part of the room that the start leaves
@@ -29,14 +30,15 @@ class Kind:
 
     tensor: name of the tensor they are in. places: [K] their places in it, flattened. reach: [K]
     the largest change that a unit of a variable may make, for numbers that hardly move a ray. low:
-    least value where no
-      other bound is given.
+    least value where no other bound is given. tied: those of the places whose numbers another row
+    repeats.
     """
 
     tensor: str
     places: Tensor
     reach: Tensor
     low: float = -math.inf
+    tied: Collection[int] = ()
 
 
 @dataclass(frozen=True)
@@ -259,7 +261,7 @@ def make_variables(
             )
     if not names:
         raise DomainError(f"{lens}: name the numbers that become variables, of {', '.join(kinds)}.")
-    tensors = {t: v.detach() for t, v in exact._now().items()}
+    tensors = {t: getattr(exact, t).detach() for t in exact.tensor_names}
     solved = [exact.solved_tensors[name] for name in held]
     chosen = {}
     for name in names:
@@ -281,6 +283,12 @@ def make_variables(
                 "variable; leave it out."
             )
         rows = rows[alive]
+        if not set(kind.places[rows].tolist()).isdisjoint(kind.tied):
+            raise DomainError(
+                f"{lens}: the light passes a piece of glass twice, as a mirror sends it back, and {name} would "
+                "vary in one pass without the other; leave that piece out by mask, or make both from one "
+                "number and replace."
+            )
         limits = checked_bounds(name, kind, value, bounds.get(name), rows)
         chosen[name] = Chosen(kind.tensor, kind.places[rows], unit[alive], *limits)
     made = {kind.tensor for kind in chosen.values()} | set(solved)
@@ -315,22 +323,24 @@ def kinds(lens: TracedLens) -> dict[str, Kind]:
     gap = (GAP * efl).expand(rows.shape)
     turn = (lens.curvature_per_mm.detach() * rim).square().clamp_min(1e-12)
     index = torch.full_like(rim, INDEX)[lens.glass]
+    faces, gaps, media = passed_twice(lens.surfaces)
     return {
-        "curvature": Kind("curvature_per_mm", rows, BEND / rim),
-        "thickness": Kind("thickness_mm", rows[:-1], gap[:-1], 0.0),
+        "curvature": Kind("curvature_per_mm", rows, BEND / rim, tied=faces),
+        "thickness": Kind("thickness_mm", rows[:-1], gap[:-1], 0.0, gaps),
         "focus": Kind("thickness_mm", rows[-1:], gap[-1:], 0.0),
-        "conic": Kind("conic", rows, BEND / turn),
-        "asphere": _polynomial("asphere", lens.asphere, BEND, rim),
-        "index": Kind("index_offset", rows[lens.glass], index),
-        "phase": _polynomial("phase", lens.phase, PHASE, rim),
+        "conic": Kind("conic", rows, BEND / turn, tied=faces),
+        "asphere": _polynomial("asphere", lens.asphere, BEND, rim, faces),
+        "index": Kind("index_offset", rows[lens.glass], index, tied=media),
+        "phase": _polynomial("phase", lens.phase, PHASE, rim, faces),
     }
 
 
-def _polynomial(name, table, slope, rim):
+def _polynomial(name, table, slope, rim, faces):
     """Coefficients [S, A] of r^2, r^4, ...: each may add that much per millimetre at the rim."""
     power = 2 * torch.arange(1, table.shape[1] + 1, dtype=rim.dtype, device=rim.device)
     return Kind(
         name,
         torch.arange(table.numel(), device=rim.device),
         (slope * rim[:, None] ** (1 - power)).reshape(-1),
+        tied=[at for at in range(table.numel()) if at // table.shape[1] in faces],
     )

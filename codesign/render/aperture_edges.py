@@ -33,7 +33,8 @@ def aperture_edge_term(camera: Camera, views: Views, samples: int) -> Tensor | N
     Args:
       camera: as for ``frames``.
       views: of a scene.
-      samples: points of the edge per pixel, for those pixels whose pupil has one.
+      samples: points of the edge per pixel, for those pixels whose pupil has one; more where the
+        colours could not share them equally.
     Gradient: to what the camera's lens says of ``Rays.weight``.
     """
     shape = (*views.batch, *camera.film.shape)
@@ -42,7 +43,7 @@ def aperture_edge_term(camera: Camera, views: Views, samples: int) -> Tensor | N
         found = _edge_points(camera, samples)
     if found is None:
         return None
-    film_px, pupil, colour, pixel, size = found
+    film_px, pupil, colour, pixel, share = found
     if not len(pixel):
         return torch.zeros(shape, dtype=dtype)
     rays = camera.coloured_rays(film_px, pupil, colour)
@@ -51,7 +52,7 @@ def aperture_edge_term(camera: Camera, views: Views, samples: int) -> Tensor | N
         frame = torch.arange(count).repeat_interleave(len(pixel))
         origin, direction = (v.detach().repeat(count, 1) for v in (rays.origin_m, rays.direction))
         light, _ = look(views.scene, views.cameras, frame, origin, direction)
-        light = light.reshape(count, -1) * (size / samples)
+        light = light.reshape(count, -1) * share
     taken = light * camera.light(replace(rays, weight=rays.weight - rays.weight.detach()), colour)
     image = torch.zeros(count, math.prod(camera.film.shape), dtype=taken.dtype).index_add(
         1, pixel, taken
@@ -66,6 +67,8 @@ def _edge_points(camera, samples):
     if edge is None:
         return None
     low, high, cell = edge
+    count = len(camera.colours)
+    samples = math.ceil(samples / count) * count
     pixels = camera.film.pixels()
     at = torch.quasirandom.SobolEngine(4, scramble=True, seed=camera.seed).draw(
         len(pixels) * samples, dtype=torch.float64
@@ -77,7 +80,9 @@ def _edge_points(camera, samples):
     rows = torch.nonzero(last > first)[:, 0]
     angle = 2 * torch.pi * at[rows, 2]
     spoke = torch.stack([angle.cos(), angle.sin()], 1)
-    colour = rows % len(camera.colours)
+    # every pixel has as many of each; another one first from pixel to pixel, so that none keeps to
+    # one part of the pixels
+    colour = (rows // (samples // count) + rows // samples) % count
 
     # the edge lies between the largest radius at which all light passes and the smallest at which
     # none does; both at once
@@ -96,7 +101,7 @@ def _edge_points(camera, samples):
         radius[:, None] * spoke,
         colour,
         rows // samples,
-        2 * (end - begin) * radius,
+        2 * (end - begin) * radius / samples,
     )
 
 

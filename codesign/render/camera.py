@@ -262,7 +262,7 @@ class Camera:
 
     def chief_rays(self, pixels: Tensor) -> Rays:
         """Rays through the pupil's centre for pixel coordinates [N, 2]: Rays, float64."""
-        return self.lens.camera_rays(self.film_mm(pixels), torch.zeros_like(pixels))
+        return self.lens.camera_rays(self.film_mm(pixels), torch.zeros_like(pixels), aim=self.aim)
 
     def slope_per_px(self) -> float:
         """Slope of a chief ray per pixel, near the axis; no gradient."""

@@ -22,6 +22,7 @@ from codesign.render.moving import MovingScene, Scene, scenes_and_poses, views_o
 from codesign.render.psf_map import SIDE, PsfMap, psf_map
 from codesign.render.wavefront import light_and_nearness
 
+ALIKE = ("spectrum", "falloff", "aim")  # of the cameras of a map and of its frames
 LEAST = 1e-3  # coverage below this counts as this
 FEW = 4  # layers that are made finer where what is seen needs no more
 FINEST = 4  # times that their step is halved at most
@@ -53,8 +54,8 @@ def psf_frames(
     Gradient: to lens, poses and poses of objects, through the sharp picture, its depth and the
       point spread functions; "interior" as in ``render.frames``: the motion of silhouettes is left
       out.
-    Raises: DomainError for surfaces nearer than the map is made for, and scenes without distances;
-      ShapeError for a map of another film.
+    Raises: DomainError for surfaces nearer than the map is made for, scenes without distances, and
+      a map of another lens, spectrum, falloff or aim; ShapeError for one of another film.
     True where blur changes slowly; not within a blur's radius of depth edges, where light that a
     chief ray does not see is guessed (docs/worlds.md has figures).
     """
@@ -65,6 +66,13 @@ def psf_frames(
             f"psf frames: the map is of the film {psf.camera.film}, the camera has {camera.film}; make the "
             "map of this camera, psf_map(camera)."
         )
+    same = {name: getattr(camera, name) == getattr(psf.camera, name) for name in ALIKE}
+    same["lens"] = _same_lens(camera.lens, psf.camera.lens)
+    if not all(same.values()):
+        raise DomainError(
+            f"psf frames: {' and '.join(name for name in same if not same[name])} of the camera are not "
+            "those of the map; make the map of this camera, psf_map(camera)."
+        )
     if pairs := scenes_and_poses(scene, T_world_cam):
         return torch.stack([psf_frames(camera, one, poses, psf) for one, poses in pairs])
     views = views_of(scene, T_world_cam, psf.sharp)
@@ -73,6 +81,14 @@ def psf_frames(
     numbers, step = _layers(psf, per_m.detach(), lit)
     found = [_frame(psf, *frame, lit, numbers, step) for frame in zip(light, per_m, strict=True)]
     return torch.stack(found).reshape(*views.batch, *camera.film.shape)
+
+
+def _same_lens(one, other):
+    """Whether two lenses are one, or alike to the last number."""
+    if one is other or not (isinstance(one, torch.nn.Module) and type(one) is type(other)):
+        return one is other
+    ours, theirs = one.state_dict(), other.state_dict()
+    return ours.keys() == theirs.keys() and all(torch.equal(v, theirs[k]) for k, v in ours.items())
 
 
 def _layers(psf, per_m, lit):

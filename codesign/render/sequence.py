@@ -9,6 +9,7 @@ auto: the cheapest of the three that is right for the frames at hand.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Any, Literal
 
 import torch
@@ -18,7 +19,8 @@ from codesign.checks import check_choice, check_kind, check_positive
 from codesign.errors import DomainError
 from codesign.pose import Poses, inverse, se3_exp
 from codesign.render.aperture_edges import aperture_edge_term
-from codesign.render.camera import Camera, device_of
+from codesign.render.camera import Camera, device_of, lines
+from codesign.render.film import border_px
 from codesign.render.moving import MovingScene, Scene, Views, scenes_and_poses, views_of
 from codesign.render.silhouettes.boundary import boundary_term, radiance_jumps
 from codesign.render.silhouettes.occlusion_check import reach_m
@@ -30,7 +32,8 @@ WAYS: tuple[Way, ...] = ("interior", "boundary", "difference", "auto")
 PROVEN: tuple[Way, ...] = ("interior", "boundary")  # those that differences judge
 POSE_STEP = 2e-3  # metres and radians, but never more than STEP_PX on the film
 STEP_PX = 0.3
-# of the numbers of a lens; None where differences know none
+# of the numbers of a lens before they are sized to STEP_PX, by LONGEST at most; None where
+# differences know none
 LENS_STEP = {
     "curvature_per_mm": 2e-5,
     "thickness_mm": 5e-3,
@@ -40,9 +43,11 @@ LENS_STEP = {
     "phase": None,
     "decentre_mm": None,
     "tilt_rad": None,
+    "semi_aperture_mm": 2e-3,
     "efl_mm": 1e-2,
     "image_distance_mm": 2e-3,
 }
+LONGEST = 100.0
 APERTURE_SAMPLES = 4  # points per pixel on the edges of apertures, for "boundary"
 
 
@@ -191,20 +196,30 @@ def _pose_numbers(rays, camera, views):
 
 
 def lens_tensors(lens: Any) -> dict[str, Tensor]:
-    """Tensors of a lens that ask for gradients, by name."""
-    found = {name: getattr(lens, name, None) for name in LENS_STEP}
-    return {
-        name: t for name, t in found.items() if torch.is_tensor(t) and t.requires_grad and t.numel()
-    }
+    """Tensors of a lens that ask for gradients, by name; one that another follows only once."""
+    made = _made(lens)
+    found = {}
+    for name in LENS_STEP:
+        value = getattr(made, name, None)
+        asks = torch.is_tensor(value) and value.requires_grad and value.numel()
+        if asks and not any(value is other for other in found.values()):
+            found[name] = value
+    return found
 
 
-def _check_known(lens, known):
-    """Raise DomainError when a lens of the user's own asks for gradients to parameters, none of
-    which differences know."""
-    if known or not isinstance(lens, torch.nn.Module):
+def _made(lens):
+    """A lens with tensors in place of the variables that make them."""
+    return lens.replace() if hasattr(lens, "replace") else lens
+
+
+def _check_known(lens):
+    """Raise DomainError when a lens asks for gradients to tensors that differences do not know: of a
+    phase plate, of the pupil, of a lens of the user's own."""
+    if not isinstance(lens, torch.nn.Module):
         return
-    for name, tensor in lens.named_parameters():
-        if tensor.requires_grad and tensor.numel():
+    made = _made(lens)
+    for name, tensor in chain(made.named_parameters(), made.named_buffers()):
+        if tensor.requires_grad and tensor.numel() and name not in LENS_STEP:
             raise DomainError(
                 f"differences know no step for the lens's parameter '{name}'; freeze it, or choose gradient "
                 "'interior' or 'boundary'."
@@ -213,9 +228,8 @@ def _check_known(lens, known):
 
 def _lens_numbers(camera, views):
     """As above, for every number of the lens that asks for a gradient."""
-    known = lens_tensors(camera.lens)
-    _check_known(camera.lens, known)
-    for name, tensor in known.items():
+    _check_known(camera.lens)
+    for name, tensor in lens_tensors(camera.lens).items():
         if (size := LENS_STEP[name]) is None:
             raise DomainError(
                 f"differences to the lens's {name} have no step; freeze it, or use gradient 'boundary'."
@@ -229,11 +243,29 @@ def _lens_numbers(camera, views):
                 .reshape(held.shape)
             )
 
-            def at(change, name=name, held=held, way=way):
-                lens = camera.lens.replace(**{name: held + change * way})
-                return image(camera.with_lens(lens).rays(), camera, views)
+            def changed(change, name=name, held=held, way=way):
+                return camera.with_lens(camera.lens.replace(**{name: held + change * way}))
 
-            yield at, size, number - number.detach()
+            def at(change, changed=changed):
+                return image(changed(change).rays(), camera, views)
+
+            yield at, _lens_step(camera, changed, size), number - number.detach()
+
+
+@torch.no_grad()
+def _lens_step(camera, changed, trial):
+    """Step of a number that moves the rays of the film's border by STEP_PX, from what a trial step
+    does; ``trial`` itself where they stay."""
+    border = border_px(torch.zeros_like(camera.film.sensor_px), camera.film.sensor_px, 3)
+    pupil = torch.tensor([[0.0, 0.0], [0.7, 0.0], [0.0, 0.7]]).to(border)
+    at = border.repeat_interleave(len(pupil), 0), pupil.repeat(len(border), 1)
+    rays = [c.rays_through(*at) for c in (camera, changed(trial))]
+    passes = (rays[0].weight > 0) & (rays[1].weight > 0)
+    before, after = (lines(r)[1][passes] for r in rays)
+    if not bool((before != after).any()):
+        return trial
+    moved_px = float((after - before).norm(dim=1).max()) / abs(camera.slope_per_px())
+    return trial * min(STEP_PX / moved_px, LONGEST)
 
 
 def cheapest(camera: Camera, views: Views) -> Way:

@@ -246,7 +246,7 @@ def _lost_px(camera, found, rays, lost):
     before = rays.direction.double().expand(*lost.shape, 3)[lost]
     after = found.points_cam_m[lost]
     moved = after[:, :2] / after[:, 2:] - before[:, :2] / before[:, 2:]
-    return float(moved.norm(dim=1).max()) / camera.slope_per_px()
+    return float(moved.norm(dim=1).max()) / abs(camera.slope_per_px())
 
 
 def _at(scene, t_s):

@@ -226,6 +226,15 @@ def test_limits_and_tolerances_see_the_distance(triplet):
     close(found, analysis.distortion_percent(focused, [0.15], at_m=0.5)[0], atol=0.15)
 
 
+def test_near_the_axis_an_eye_full_of_water_sends_rays_as_its_thin_lens_does():
+    cornea = lens.Surface(5.55, 23.0, glass(1.333), 3.0, is_stop=True)
+    eye = lens.GeoLens([cornea], 2.0).freeze()
+    film_mm, pupil = f64([[1e-3, 0.0], [0.0, 2e-3]]), f64([[2e-3, 0.0], [0.0, 1e-3]])
+    traced, thin = (of.camera_rays(film_mm, pupil) for of in (eye, eye.thin()))
+    close(traced.direction, thin.direction, atol=1e-9)  # of slopes of 1e-4
+    close(traced.origin_m, thin.origin_m, atol=1e-11)
+
+
 @pytest.mark.parametrize("focus_m", [0.5, 4.0, math.inf])
 @torch.no_grad()
 def test_depth_of_field_of_a_thin_lens_is_that_of_its_circle_of_confusion(focus_m):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from codesign import lens
-from codesign.lens import GeoLens, Glass, Pinhole, Surface, ThinLens
+from codesign.lens import GeoLens, Glass, Pinhole, Surface, ThinLens, analysis
 from codesign.lens.design import fit_apertures
 from codesign.lens.solves import focus_paraxial, focus_rays, hold_efl, holding_surface
 from tests.lens.systems import PLANE, close, efl, f64, glass
@@ -122,6 +122,23 @@ def test_thin_lenses_follow_their_equation(distance_m):
     found = ThinLens(50.0, 10.0, 60.0).focus_at(distance_m).image_distance_mm
     close(found, 1 / (1 / 50 - 1 / (1e3 * distance_m)), 1e-14)
     assert Pinhole(50.0).focus_at(math.inf).image_distance_mm.item() == 50.0
+
+
+def test_a_lens_with_an_intermediate_image_is_focused():
+    """Two thin lenses of 50 and 25 mm, 100 mm apart: the second images the first's focus at 50 mm,
+    upside down."""
+
+    def other_side(efl_mm, distance_mm):
+        return 1 / (1 / efl_mm - 1 / distance_mm)
+
+    faces = (50.0, 0.0, CROWN), (-50.0, 100.0, None), (25.0, 0.0, CROWN), (-25.0, 50.0, None)
+    relay = GeoLens([Surface(*face, 9.0) for face in faces], 10.0)
+    close(efl(relay), -50.0, 1e-13)
+    image_mm = other_side(25.0, 100 - other_side(50.0, 2e3))
+    close(relay.focus_at(2.0).thickness_mm[-1], image_mm, 1e-12)
+    # parallel light, 10 mm wide at the second lens too, is blurred to 0.05 mm 0.25 mm further back
+    focus_mm = other_side(50.0, 100 - other_side(25.0, 50.25))
+    close(1e3 * analysis.hyperfocal_m(relay, 0.05), focus_mm, 1e-11)
 
 
 def planes(gap_mm=20.0):

@@ -188,8 +188,11 @@ def test_the_film_of_a_pinhole_follows_its_focal_length():
     optimiser.step()
     assert float(pinhole.image_distance_mm.detach()) == 4.0
     assert float(copy.deepcopy(pinhole).image_distance_mm.detach()) == 4.0
-    twin = pinhole.replace(efl_mm=f64(7.0))  # names one length, moves one length
-    assert (float(twin.efl_mm), float(twin.image_distance_mm.detach())) == (7.0, 4.0)
+    for optics in (pinhole, pinhole.replace(), ThinLens(4.0, 1.0)):
+        twin = copy.deepcopy(optics.replace(efl_mm=f64(7.0)))
+        assert (float(twin.efl_mm), float(twin.image_distance_mm)) == (7.0, 7.0)
+    held = ThinLens(4.0, 1.0, 5.0).replace(efl_mm=f64(7.0))
+    assert (float(held.efl_mm), float(held.image_distance_mm.detach())) == (7.0, 5.0)
 
 
 def test_gradients_reach_the_tensors_a_thin_lens_is_given():

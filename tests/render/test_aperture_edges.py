@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from codesign import lens, pose, render
-from codesign.render.aperture_edges import aperture_edge_term
+from codesign.render.aperture_edges import _edge_points, aperture_edge_term
 from codesign.render.moving import views_of
 from scenes import silhouettes as silhouette_scenes
 from tests.render.differences import smooth_weights
@@ -14,14 +14,12 @@ START = pose.look_at((0.05, -1.2, 1.0), (0.0, 1.0, 0.7))[None]
 WEIGHT = smooth_weights(32)
 
 
-def gradient(way, samples, seed, **options):
-    """To the six thicknesses of a triplet whose film reaches beyond its field, before a textured
-    wall."""
+def gradient(way, samples, seed, of="thickness_mm", **options):
+    """To the six thicknesses (or another tensor) of a triplet whose film reaches beyond its field,
+    before a textured wall."""
     optics = lens.load("cooke-triplet").scaled(0.22).freeze()
-    held = optics.thickness_mm.detach().clone().requires_grad_()
-    camera = render.Camera(
-        optics.replace(thickness_mm=held), 32, 32, 0.25, samples, seed, **options
-    )
+    held = getattr(optics, of).detach().clone().requires_grad_()
+    camera = render.Camera(optics.replace(**{of: held}), 32, 32, 0.25, samples, seed, **options)
     frames = render.frames(camera, silhouette_scenes.build("wall"), START, way)
     return torch.autograd.grad((WEIGHT * frames).double().mean(), held)[0]
 
@@ -43,6 +41,24 @@ def test_the_edge_of_the_light_has_the_gradient_of_the_whole_pupil(options):
     ).norm()
     assert float(error) < 0.03
     assert float((found.mean(0) - truth.mean(0)).norm() / truth.mean(0).norm()) < 3 * float(error)
+
+
+def test_every_pixel_meets_the_edge_in_each_colour_as_often():
+    """One pixel in many windows, with more points than colours; by chance some find no edge."""
+    light, optics = lens.Spectrum.visible_FdC(), lens.load("cooke-triplet").scaled(0.22)
+    camera = render.Camera(optics, 32, 32, 0.25, 3, spectrum=light)
+    film = render.Film(32, 32, 1, 1, 0.25, ((28, 28),) * 900)
+    points = _edge_points(camera.with_film(film), 4)
+    assert points is not None
+    _, _, colour, pixel, _ = points
+    found = torch.bincount(3 * (pixel % 3) + colour).reshape(3, 3).double()
+    assert float((found / found.mean(1, keepdim=True) - 1).abs().max()) < 0.25
+
+
+def test_differences_to_semi_apertures_have_the_gradient_of_the_same_samples():
+    truth, found = (gradient(way, 16, 20, "semi_aperture_mm") for way in ("interior", "difference"))
+    # over a step of a twentieth of the soft edge
+    torch.testing.assert_close(found, truth, rtol=0, atol=0.02 * float(truth.norm()))
 
 
 def test_it_scatters_by_less_than_half():

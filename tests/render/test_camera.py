@@ -63,6 +63,16 @@ def test_projection_brings_points_of_chief_rays_back(name, generator):
     assert float((found - pixels)[lit].detach().abs().max()) <= 1e-9
 
 
+def test_chief_rays_of_an_aimed_camera_are_those_that_projection_brings_back():
+    camera = Camera(lens.family("retrofocus-4").lens(2.5, 2.0), *SENSOR_PX, PITCH_MM, 1, aim=True)
+    pixels = torch.tensor(
+        [[0.0, 0.0], [172.0, 129.0]], dtype=D
+    )  # paraxially 0.14 px off in the corner
+    rays = camera.chief_rays(pixels)
+    found = project(camera, (rays.origin_m + 2 * rays.direction).detach())
+    torch.testing.assert_close(found, pixels, rtol=0, atol=1e-9)
+
+
 def test_points_outside_the_field_are_nan_and_leave_the_others_alone():
     camera = on_sensor(fitted("cooke-triplet"))
     curvature = camera.lens.curvature_per_mm

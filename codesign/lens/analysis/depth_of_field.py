@@ -19,7 +19,7 @@ from codesign.lens.analysis.spots import rms_spot_mm
 from codesign.lens.distance import real_numbers
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import D_UM
-from codesign.lens.paraxial import yu_trace
+from codesign.lens.paraxial import image_place_mm, yu_trace
 
 RMS_OF_DISC = 1 / (2 * math.sqrt(2))  # RMS radius of an evenly filled disc over its diameter
 CLOSEST_PER_MM = 1e3  # to a pupil that has no surface before it
@@ -77,17 +77,19 @@ def hyperfocal_m(lens: GeoLens, blur_mm: float | Tensor, wavelength_um: float = 
     blurred to a disc of ``blur_mm`` and no more, scalar: f^2 / (N blur) + f for a thin lens.
 
     Gradient: as for ``depth_of_field``. Raises: DomainError for a limit that is not positive, or a
-      diverging lens.
+      lens behind which parallel light does not converge.
     """
     blur = _checked(lens, blur_mm)
     f = lens.first_order(wavelength_um)
     (_, parallel), (_, from_centre) = _film_heights(lens, wavelength_um)
-    if not float(parallel.detach()) < 0:
+    if not 0 < float(image_place_mm(lens, 0.0, wavelength_um).detach()) < math.inf:
         raise DomainError(
-            f"{lens.name}: a lens that diverges has no hyperfocal distance; change a curvature."
+            f"{lens.name}: parallel light does not converge behind the lens, so it has no hyperfocal distance; "
+            "change a curvature."
         )
-    index = lens.index(wavelength_um)[0]
-    return -1e-3 * (f.entrance_pupil_diameter_mm * index + blur * from_centre) / (blur * parallel)
+    # turned over by an intermediate image
+    width = torch.sign(parallel) * f.entrance_pupil_diameter_mm * lens.index(wavelength_um)[0]
+    return 1e-3 * (width - blur * from_centre) / (blur * parallel)
 
 
 @torch.no_grad()

@@ -131,7 +131,9 @@ def gap_mm(lens: GeoLens, heights: Tensor, semi_aperture_mm: Tensor | None = Non
             [k[:, None] for k in lens.asphere[rows].unbind(1)],
         )
 
-    return lens.thickness_mm[:-1, None] + sag(slice(1, None)) - sag(slice(None, -1))
+    # behind a mirror its shape is seen from the other side
+    side = y.new_tensor([-1.0 if mirror else 1.0 for mirror in lens.mirrors[:-1]])[:, None]
+    return lens.thickness_mm[:-1, None] + sag(slice(1, None)) - side * sag(slice(None, -1))
 
 
 def evaluate(

@@ -36,7 +36,7 @@ from codesign.lens.distance import PARALLEL, Distances, one_distance, vergence_p
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import D_UM
 from codesign.lens.paraxial import image_scale_mm
-from codesign.lens.surface import passes_of
+from codesign.lens.surface import passed_twice, passes_of
 
 OF_ELEMENT = "element "  # before the argument of ``moved_element``
 
@@ -96,8 +96,8 @@ def errors_of(lens: GeoLens, tolerances: Tolerances | Sequence[Error]) -> list[E
     not its fringes.
 
     Surfaces that do not bend light (a stop in air) have no shape or place to get wrong.
-    Raises: DomainError for tolerances of elements with a mirror in them, or that the light passes
-      twice.
+    Raises: DomainError for tolerances of elements with a mirror in them, or of glass that the light
+      passes twice.
     """
     if not isinstance(tolerances, Tolerances):
         return list(tolerances)
@@ -133,7 +133,16 @@ def errors_of(lens: GeoLens, tolerances: Tolerances | Sequence[Error]) -> list[E
         for kind, deviation in of_elements.items():
             element = f"element {first + 1}-{last + 1}"
             found += _two(kind.split("_")[0], element, OF_ELEMENT + kind, g, deviation)
-    return [error for error in found if error.deviation > 0]
+    found = [error for error in found if error.deviation > 0]
+    faces, gaps, media = passed_twice(lens.surfaces)
+    tied = {"thickness_mm": gaps, "index_offset": media}
+    for error in found:
+        if not error.tensor.startswith(OF_ELEMENT) and error.at[0] in tied.get(error.tensor, faces):
+            raise DomainError(
+                f"{lens.name}: the light passes a piece of glass twice, as a mirror sends it back, and the "
+                f"{error.name} would err in one pass alone; give a list of Error without that piece."
+            )
+    return found
 
 
 def _two(noun, where, tensor, row, deviation):

@@ -65,7 +65,7 @@ def with_plate(
             f"{lens.name}: the gap behind surface {gap + 1} is glass; put the plate on the other side of "
             f"surface {at + 1}."
         )
-    low = -math.inf if gap < 0 else _reach(lens, gap, 1)
+    low = -math.inf if gap < 0 else _reach(lens, gap, -1 if lens.mirrors[gap] else 1)
     high = float(room[gap]) if gap >= 0 else 0.0
     high = high - _reach(lens, gap + 1, -1) if gap < last else high
     if not low <= after <= high:

@@ -6,7 +6,7 @@ from typing import Any
 from codesign.errors import FileFormatError
 from codesign.lens.files import page as p
 from codesign.lens.files.page import Page
-from codesign.lens.files.system import FileLens, FileSurface
+from codesign.lens.files.system import FileLens, FileSurface, largest_field
 from codesign.lens.files.text import at, shown, title
 from codesign.lens.glass import AIR, Glass
 
@@ -123,11 +123,8 @@ def _take_field(lens, fields):
         )
     _check_pupil(fields)
     points = [f for f in fields["fields"] if isinstance(f, dict)]
-    lens.field = (
-        FIELDS[kind],
-        max(
-            (math.hypot(p.number(f, "x", 0.0), p.number(f, "y", 0.0)) for f in points), default=0.0
-        ),
+    lens.field = largest_field(
+        FIELDS[kind], ((p.number(f, "x", 0.0), p.number(f, "y", 0.0)) for f in points)
     )
 
 

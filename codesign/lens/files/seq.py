@@ -8,7 +8,7 @@ from typing import Any
 
 from codesign.errors import FileFormatError
 from codesign.lens.files.seq_surface import IDLE_TABLE, SURFACE, PrivateGlasses, SeqSurface
-from codesign.lens.files.system import FileLens
+from codesign.lens.files.system import FileLens, largest_field
 from codesign.lens.files.text import (
     MOST_SURFACES,
     Rule,
@@ -238,9 +238,7 @@ class System:
         fields = self.values.get("fields", {})
         found = None
         for kind, label in FIELDS.items():
-            points = itertools.zip_longest(
-                *(fields.get(axis + kind, []) for axis in "XY"), fillvalue=0.0
-            )
-            heights = [math.hypot(*point) for point in points]
-            found = (label, max(heights)) if heights else found
+            axes = [fields.get(axis + kind, []) for axis in "XY"]
+            points = itertools.zip_longest(*axes, fillvalue=0.0)
+            found = largest_field(label, points) if any(axes) else found
         return found

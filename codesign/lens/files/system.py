@@ -5,6 +5,7 @@ ways."""
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from codesign.errors import FileFormatError
@@ -63,6 +64,18 @@ class FileLens:
     focus: bool = False
     defocus: float = 0.0
     image_tilt_deg: float = 0.0
+
+
+def largest_field(kind: str, points: Iterable[tuple[float, float]]) -> tuple[str, float]:
+    """The field of a FileLens: the point furthest from the axis, from its x and y. Angles in x and y
+    are those of the slopes in x and y."""
+
+    def radial(x, y):
+        if kind != "angle" or not (x and y) or max(abs(x), abs(y)) >= 90:
+            return math.hypot(x, y)
+        return math.degrees(math.atan(math.hypot(*(math.tan(math.radians(a)) for a in (x, y)))))
+
+    return kind, max((radial(x, y) for x, y in points), default=0.0)
 
 
 # of a length in the file's unit; a gap negative by less is a rounding error and counts as none

@@ -1,14 +1,13 @@
 """Reader of OpticStudio .zmx files (sequential mode)."""
 
 import itertools
-import math
 from typing import Any
 
 import numpy as np
 
 from codesign.errors import FileFormatError
 from codesign.lens.files.breaks import along, place
-from codesign.lens.files.system import FileLens
+from codesign.lens.files.system import FileLens, largest_field
 from codesign.lens.files.text import (
     MOST_SURFACES,
     Rule,
@@ -173,13 +172,12 @@ def _lens(header, entries, name):
         )
     kind, count = header.get("field", (FIELDS[0], None))
     pairs = itertools.zip_longest(header.get("x", []), header.get("y", []), fillvalue=0.0)
-    height = max((math.hypot(x, y) for x, y in list(pairs)[:count]), default=0.0)
     found = FileLens(
         title(header.get("name", ""), name),
         [],
         header["unit_mm"],
         header.get("pupil"),
-        (kind, height),
+        largest_field(kind, list(pairs)[:count]),
         header.get("waves", {}).get(header.get("primary", 1), 0.5875618),
         entries[0].get("thickness", 0.0),
     )

@@ -146,7 +146,7 @@ def _on_pieces(view, curve, pieces, cameras, part, per_px, generator):
     pupil = view.pupils[(number + turn[0]) % PUPILS]
     pose = cameras[frame]
     eye = pose[:, :3, 3]
-    viewpoint = eye + (pose[:, :3, :2] @ (pupil * view.aperture_m)[..., None])[..., 0]
+    viewpoint = eye + (pose[:, :3, :2] @ (pupil * view.viewpoint_m)[..., None])[..., 0]
     y = curve.points(index, s, viewpoint)
     on = curve.points(index, s + STEP * (high - low), viewpoint)
     share = share * curve.counts(index, y, viewpoint)
@@ -172,8 +172,9 @@ def known_beside(curve: Any, index: Tensor, y: Tensor, viewpoint: Tensor) -> tup
 
 
 def piece_rad(slope_per_px: float) -> float:
-    """Largest angle of a piece for a camera with so much slope per pixel."""
-    return min(PIECE_PX * slope_per_px, PIECE_RAD)
+    """Largest angle of a piece for a camera with so much slope per pixel, which is negative behind an
+    intermediate image."""
+    return min(PIECE_PX * abs(slope_per_px), PIECE_RAD)
 
 
 class FieldOfView:
@@ -192,7 +193,8 @@ class FieldOfView:
         size = torch.tensor([film.width_px, film.height_px], dtype=torch.float64)
         boxes = [self._box(camera, border_px(corner, size, 9)) for corner in film.corners_px]
         self.low, self.high = (torch.stack(side) for side in zip(*boxes, strict=True))
-        self.spread, self.shift = self._blur(camera)
+        self.spread, self.shift, side = self._blur(camera)
+        self.viewpoint_m = side * self.aperture_m  # from the axis, of a unit point of the pupil
 
     @property
     def steepest(self) -> float:
@@ -232,10 +234,10 @@ class FieldOfView:
     def _blur(self, camera):
         """Differences of slope [k, 2] and of place at the pupil [k, 2] m between rays of a film
         point through the pupil's rim and the straight line from its middle to where its chief ray
-        points."""
+        points; and -1 where the pupil is seen turned by half a turn, or else 1."""
         none = torch.zeros(1, 2, dtype=torch.float64)
         if not self.aperture_m:
-            return none, none
+            return none, none, 1
         angle = torch.arange(8, dtype=torch.float64) * (math.pi / 4)
         rim = torch.stack([angle.cos(), angle.sin()], 1)
         fields = camera.film.middle_px + camera.film.sensor_px * torch.tensor(
@@ -246,7 +248,10 @@ class FieldOfView:
         passes = (rays.weight > 0) & (chief.weight > 0).repeat_interleave(8)
         straight = lines(chief)[1].repeat_interleave(8, 0)
         base, slope = lines(rays)
-        return ((slope - straight)[passes], base[passes]) if bool(passes.any()) else (none, none)
+        if not bool(passes.any()):
+            return none, none, 1
+        side = -1 if float((base * rim.repeat(5, 1))[passes].sum()) < 0 else 1
+        return (slope - straight)[passes], base[passes], side
 
     def _blur_px(self, depth_m):
         """Radius [n] px of the blur of points at depths [n]; the larger of two ends bounds all
@@ -254,7 +259,7 @@ class FieldOfView:
         near = 1 / depth_m
         return (self.spread[:, None] + self.shift[:, None] * near[:, None]).norm(dim=2).amax(
             0
-        ) * self.px_per_slope
+        ) * abs(self.px_per_slope)
 
     def clipped(self, window, start_cam_m, end_cam_m):
         """Of pieces from [n, 3] to [n, 3] in camera axes, the rows that touch a window, and for
