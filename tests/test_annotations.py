@@ -13,22 +13,8 @@ ROOT = Path(__file__).resolve().parents[1]
 # a room or package that is done is added by one line
 # rooms of codesign where this holds in every file
 WHOLE = (
-    "atomic",
-    "backend",
-    "errors",
-    "fidelity",
-    "flow",
-    "grad",
-    "lens",
-    "optimise",
-    "mount",
-    "plain_yaml",
-    "pose",
-    "report",
-    "state",
-    "system",
-    "train",
-    "types",
+    *("atomic", "backend", "errors", "fidelity", "flow", "grad", "lens", "optimise", "mount"),
+    *("plain_yaml", "pose", "report", "state", "system", "train", "types"),
 )
 EXPORTED = (  # packages where it holds of what their __all__ names
     "codesign.events",
