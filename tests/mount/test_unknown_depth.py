@@ -118,7 +118,15 @@ def camera():
     )
 
 
-def drives(camera, bodies, nearest_m, farthest_m, seed, noise_px=NOISE_PX):
+def field_of(flow, deviation_px):
+    """The field of flow [N, points, 2] that claims this deviation everywhere."""
+    flow = flow.reshape(-1, 32, 32, 2).movedim(-1, 1)
+    ones = torch.ones_like(flow[:, 0])
+    covariance = deviation_px**2 * torch.stack([ones, 0 * ones, ones], 1)
+    return FlowField(flow, ones.bool(), INTERVAL_S, ones, covariance)
+
+
+def drives(camera, bodies, nearest_m, farthest_m, seed):
     """Mount [4, 4], poses, twists [N, 6] and flow fields where every point read has a depth of its
     own."""
     random = torch.Generator().manual_seed(seed)
@@ -129,14 +137,9 @@ def drives(camera, bodies, nearest_m, farthest_m, seed, noise_px=NOISE_PX):
     depth = 1 / (low + (high - low) * torch.rand(bodies, len(pixels), generator=random, dtype=D))
     rows, _ = body_flow(camera, depth, turned)
     flow = (rows @ twist[:, None, :, None])[..., 0] * INTERVAL_S
-    flow = flow + noise_px * torch.randn(flow.shape, generator=random, dtype=D)
-    flow = flow.reshape(bodies * len(WINDOWS), 32, 32, 2).movedim(-1, 1)
-    ones = torch.ones_like(flow[:, 0])
-    field = FlowField(
-        flow, ones.bool(), INTERVAL_S, ones, NOISE_PX**2 * torch.stack([ones, 0 * ones, ones], 1)
-    )
+    flow = flow + NOISE_PX * torch.randn(flow.shape, generator=random, dtype=D)
     poses = torch.eye(4, dtype=D).expand(bodies, 3, 4, 4) @ turned
-    return turned, poses, twist, field
+    return turned, poses, twist, field_of(flow, NOISE_PX)
 
 
 def estimator(nearest_m, farthest_m, **how):
@@ -180,13 +183,8 @@ def test_depths_are_found_where_the_body_moves_across(camera):
     depth = 1 / (0.2 + (1 / 0.3 - 0.2) * share)
     rows, _ = body_flow(camera, depth, mount)
     flow = (rows @ torch.tensor([0.8, 0.8, 0.0, 0.0, 0.0, 0.3], dtype=D))[0] * INTERVAL_S
-    flow = flow.reshape(len(WINDOWS), 32, 32, 2).movedim(-1, 1)
-    ones = torch.ones_like(flow[:, 0])
-    field = FlowField(
-        flow, ones.bool(), INTERVAL_S, ones, 1e-6 * torch.stack([ones, 0 * ones, ones], 1)
-    )
     with torch.no_grad():
-        found = estimator(0.3, 5.0)(field, camera, None, mount, poses)
+        found = estimator(0.3, 5.0)(field_of(flow, 1e-3), camera, None, mount, poses)
     at = depth.reshape(len(WINDOWS), 32, 32)[:, 8::16, 8::16].reshape(1, -1)
     # all depths and the speed may be longer together: that is what the bounds leave open
     ratio = (found.depth_m / at).log()
