@@ -109,10 +109,8 @@ def test_a_verdict_weighs_errors_by_their_noise():
     assert found.noise == pytest.approx(spread, rel=1e-6)
 
 
-def test_random_worlds_are_judged_once_and_counted(tmp_path, monkeypatch):
+def test_random_worlds_are_judged_once_and_counted(tmp_path):
     """Two worlds of which one is known from an earlier call, as wrong and refused as it can be."""
-    effort = dataclasses.replace(worlds.EFFORT, samples=256, per_px=8.0, enough=0.2)
-    monkeypatch.setattr(worlds, "EFFORT", effort)
     path = tmp_path / "worlds.jsonl"
     known = {
         "pinhole": judge.Judged("near", 0.08, 0.01),

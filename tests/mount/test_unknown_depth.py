@@ -48,6 +48,16 @@ def points(seed, count=4, many=5, scale=1.0, bounds=(0.1, 3.0)):
     ), flow
 
 
+def power(rho, f, far, near, p):
+    """Logarithm of how likely a flow f is where the nearness is rho, over that of none."""
+    miss = f - far - rho * near
+    return float(-miss @ p @ miss / 2 + f @ p @ f / 2)
+
+
+def density(rho, top, *seen):
+    return math.exp(power(rho, *seen) - top)
+
+
 @pytest.mark.parametrize("scale", [1e-4, 0.1, 1.0, 30.0])
 def test_the_likelihood_is_the_integral_over_depths(scale):
     seen, flow = points(1, scale=scale)
@@ -60,24 +70,14 @@ def test_the_likelihood_is_the_integral_over_depths(scale):
             far, near = seen.far[body, k] @ velocity[body], seen.near[body, k] @ velocity[body]
             p, f = seen.precision[body, k], flow[body, k, :, 0]
 
-            def power(rho, far=far, near=near, p=p, f=f):
-                miss = f - far - rho * near
-                return float(-miss @ p @ miss / 2 + f @ p @ f / 2)
-
             bend, tilt = float(near @ p @ near), float(near @ p @ (f - far))
             peak = min(max(tilt / bend, low), high)
             width = 1 / math.sqrt(bend)
             breaks = [
-                x
-                for x in (peak - 5 * width, peak - width, peak, peak + width, peak + 5 * width)
-                if low < x < high
+                x for x in (peak + share * width for share in (-5, -1, 0, 1, 5)) if low < x < high
             ]
-            top = power(peak)
-
-            def integrand(rho, power=power, top=top):
-                return math.exp(power(rho) - top)
-
-            area = quad(integrand, low, high, points=breaks, limit=400)[0]
+            top = power(peak, f, far, near, p)
+            area = quad(density, low, high, (top, f, far, near, p), points=breaks, limit=400)[0]
             expected -= float(seen.weight[body, k]) * (top + math.log(area / (high - low)))
         assert float(ours[body]) == pytest.approx(expected, rel=1e-6, abs=1e-6)
 
