@@ -89,7 +89,7 @@ def test_slope_and_curvature_are_those_of_differences():
     step = 1e-4
     for axis in range(6):
         moved = step * torch.eye(6, dtype=D)[axis]
-        up, down = (unknown_depth.look(seen, velocity + sign * moved) for sign in (1, -1))
+        up, down = (unknown_depth.look(seen, velocity + way) for way in (moved, -moved))
         torch.testing.assert_close(
             (up.value - down.value) / (2 * step), found.slope[:, axis], rtol=1e-5, atol=1e-5
         )
