@@ -7,25 +7,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 aten = torch.ops.aten
 PRODUCTS = {
-    aten.mm,
-    aten.bmm,
-    aten.addmm,
-    aten.baddbmm,
-    aten.mv,
-    aten.addmv,
-    aten.dot,
+    *(aten.mm, aten.bmm, aten.addmm, aten.baddbmm, aten.mv, aten.addmv, aten.dot),
     aten.convolution,
 }
 TRANSCENDENTAL = {
-    aten.log,
-    aten.log_,
-    aten.exp,
-    aten.exp_,
-    aten.log1p,
-    aten.expm1,
-    aten.sin,
-    aten.cos,
-    aten.tanh,
+    *(aten.log, aten.log_, aten.exp, aten.exp_, aten.log1p, aten.expm1),
+    *(aten.sin, aten.cos, aten.tanh),
 }
 LOOPS = 400  # batches of smaller matrices are multiplied by plain loops of torch's own
 PERIOD = 7

@@ -13,35 +13,11 @@ ROOT = Path(__file__).resolve().parents[1]
 # a room or package that is done is added by one line
 # rooms of codesign where this holds in every file
 WHOLE = (
-    "atomic",
-    "backend",
-    "errors",
-    "fidelity",
-    "flow",
-    "grad",
-    "lens",
-    "optimise",
-    "mount",
-    "plain_yaml",
-    "pose",
-    "report",
-    "state",
-    "system",
-    "train",
-    "types",
+    *("atomic", "backend", "errors", "fidelity", "flow", "grad", "lens", "optimise", "mount"),
+    *("plain_yaml", "pose", "report", "state", "system", "train", "types"),
 )
-EXPORTED = (  # packages where it holds of what their __all__ names
-    "codesign.events",
-    "codesign.flow",
-    "codesign.flow.sources",
-    "codesign.grad",
-    "codesign.lens",
-    "codesign.lens.analysis",
-    "codesign.lens.design",
-    "codesign.optimise",
-    "codesign.mount",
-    "codesign.render",
-)
+# packages where it holds of what their __all__ names
+EXPORTED = ("codesign.events", "codesign.render")
 CALLED = ("__init__", "__call__")  # the special methods a user calls
 
 

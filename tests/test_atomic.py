@@ -76,15 +76,8 @@ def test_a_file_is_as_readable_as_the_process_makes_files(tmp_path):
 
 
 WRITES = {
-    "write_text",
-    "write_bytes",
-    "save",
-    "savez",
-    "savez_compressed",
-    "savetxt",
-    "savefig",
-    "imwrite",
-    "tofile",
+    *("write_text", "write_bytes", "save", "savez", "savez_compressed", "savetxt"),
+    *("savefig", "imwrite", "tofile"),
 }
 # a name that ``replacing`` yields, or a file in memory
 HARMLESS = {"temporary", "buffer", "png", "content"}

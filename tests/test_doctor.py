@@ -25,17 +25,8 @@ def test_doctor_approves_a_machine_that_renders():
     done = python("-m", "codesign", "doctor")
     assert done.returncode == 0, done.stdout + done.stderr
     lines = done.stdout.splitlines()
-    assert [line[8:].split()[0] for line in lines[:-1]] == [
-        "Python",
-        "torch",
-        "mitsuba",
-        "drjit",
-        "LLVM",
-        "CUDA",
-        "threads",
-        "extras",
-        "render",
-    ]
+    names = " ".join(line[8:].split()[0] for line in lines[:-1])
+    assert names == "Python torch mitsuba drjit LLVM CUDA threads extras render"
     assert lines[-1].startswith("Ready")
     assert "llvm_ad_mono" in done.stdout
     found = backend.llvm_version()

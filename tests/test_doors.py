@@ -11,65 +11,17 @@ import torch
 from torch import Tensor
 
 from codesign import doors, events, flow, lens, pose, render
-from codesign.errors import CodesignError, DomainError, ShapeError
+from codesign.errors import DomainError, ShapeError
 from scenes import robots, textures, worlds
+from tests import refusals
 from tests.hostile import calls
 
 
-@pytest.mark.parametrize(
-    ("call", "sentence"),
-    [
-        (lambda: lens.load(3.4), "lens.load: source = 3.4, but a str or a path is needed"),
-        (lambda: lens.half_field_deg("none"), "no published lens is called 'none'"),
-        (lambda: lens.rms_spot_mm(None, [0.0]), "rms_spot_mm: lens = None, but a TracedLens"),
-        (
-            lambda: pose.look_at("up", (0, 0, 1)),
-            "pose.look_at: origin_m = 'up', but a Sequence or a torch.Tensor",
-        ),
-        (
-            lambda: pose.se3_exp(torch.ones(6, dtype=torch.complex64)),
-            r"pose.se3_exp cannot work with twist = Tensor \[",
-        ),
-        (lambda: lens.ThinLens(float("inf"), 5.0), "focal length, mm, must be .* got inf"),
-        (
-            lambda: lens.analysis.ideal_mtf((10.0,), float("nan")),
-            r"analysis.ideal_mtf: an argument is NaN, which is no number; give one \(.*fno = nan",
-        ),
-        (
-            lambda: render.project(7, torch.ones(1, 3)),
-            "render.project: camera = 7, but a Camera is needed",
-        ),
-        (
-            lambda: list(
-                render.frame_chunks(None, None, pose.look_at((0, 0, 0), (1, 0, 0))[None], 2)
-            ),
-            "render.frame_chunks: camera = None",
-        ),
-        (
-            lambda: worlds.from_mesh(None),
-            "worlds.from_mesh: path = None, but a str or a path is needed",
-        ),
-        (
-            lambda: worlds.from_mesh("a.stl", unit_m="mm"),
-            "unit_m = 'mm', but a number or None is needed",
-        ),
-        (
-            lambda: robots.from_urdf(None),
-            "robots.from_urdf: path = None, but a str or a path is needed",
-        ),
-        (
-            lambda: textures.photo("gravel", "512"),
-            "textures.photo: size_px = '512', but a whole number",
-        ),
-        (
-            lambda: textures.speckle("a"),
-            "textures.speckle: seed = 'a', but a whole number is needed",
-        ),
-    ],
-)
-def test_arguments_that_do_not_fit_are_named(call, sentence):
-    with pytest.raises(CodesignError, match=sentence):
-        call()
+@refusals.table(__file__, "doors")
+def test_arguments_that_do_not_fit_are_named(row):
+    row.holds(
+        globals() | {"render": render, "robots": robots, "textures": textures, "worlds": worlds}
+    )
 
 
 def test_arguments_are_named_also_where_the_package_is_installed_among_libraries(monkeypatch):

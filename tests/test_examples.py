@@ -13,42 +13,20 @@ MODULES = sorted(
     if ">>> " in path.read_text()
 )
 FIRST_MET = {  # modules whose examples a user meets first
-    "codesign.events.files",
-    "codesign.events.layers.comparators",
-    "codesign.events.level_path",
-    "codesign.events.layers.memory",
-    "codesign.events.layers.soft",
-    "codesign.events.sensor.model",
-    "codesign.events.sensor.simulate",
-    "codesign.events.spiking.srm",
-    "codesign.events.volumes.volume",
-    "codesign.flow.baselines.flownet_events",
-    "codesign.flow.baselines.spike_flownet",
-    "codesign.flow.checkpoint",
-    "codesign.flow.export",
-    "codesign.flow.files",
-    "codesign.flow.lk.estimate",
-    "codesign.flow.losses",
-    "codesign.flow.metrics",
-    "codesign.flow.refiner",
-    "codesign.grad.jacobian",
-    "codesign.lens.analysis.spots",
-    "codesign.lens.solves",
-    "codesign.lens.files.load",
-    "codesign.lens.geolens",
-    "codesign.lens.glass",
-    "codesign.lens.spectrum",
-    "codesign.lens.surface",
-    "codesign.optimise.least_squares",
-    "codesign.mount.body",
-    "codesign.mount.pose",
-    "codesign.mount.observability",
-    "codesign.mount.starts",
-    "codesign.pose",
-    "codesign.render.camera",
-    "codesign.render.sequence",
-    "codesign.render.truth",
-}
+    f"codesign.{room}.{name}"
+    for room, names in {
+        "events": "files level_path sensor.model sensor.simulate spiking.srm volumes.volume",
+        "events.layers": "comparators memory soft",
+        "flow": "checkpoint export files losses metrics refiner lk.estimate",
+        "flow.baselines": "flownet_events spike_flownet",
+        "grad": "jacobian",
+        "lens": "solves geolens glass spectrum surface analysis.spots files.load",
+        "optimise": "least_squares",
+        "mount": "body pose observability starts",
+        "render": "camera sequence truth",
+    }.items()
+    for name in names.split()
+} | {"codesign.pose"}
 
 
 def test_what_a_user_meets_first_has_an_example():

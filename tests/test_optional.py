@@ -21,16 +21,7 @@ EXTRAS = {
     extra: {re.split(r"[^A-Za-z0-9_-]", line)[0] for line in lines}
     for extra, lines in PROJECT["optional-dependencies"].items()
 }
-LEFT_OUT = (
-    "h5py",
-    "hdf5plugin",
-    "lz4",
-    "zstandard",
-    "imageio",
-    "imageio_ffmpeg",
-    "tifffile",
-    "tensorboard",
-)
+LEFT_OUT = "h5py hdf5plugin lz4 zstandard imageio imageio_ffmpeg tifffile tensorboard"
 
 
 CALLS = {
@@ -45,7 +36,7 @@ CALLS = {
 # one process for all: importing the toolkit is what takes the time
 SCRIPT = f"""
 import sys
-sys.modules.update(dict.fromkeys({LEFT_OUT}))  # importing one of them raises ModuleNotFoundError
+sys.modules.update(dict.fromkeys('{LEFT_OUT}'.split()))  # importing one of them raises ModuleNotFoundError
 import codesign, scenes.textures, scenes.worlds
 for name in codesign.__all__:
     getattr(codesign, name)

@@ -15,20 +15,8 @@ from tests.processes import ROOT, python
 
 # for the toolkit itself
 PRIVATE = {
-    "arrays",
-    "__init__",
-    "__main__",
-    "atomic",
-    "checks",
-    "doctor",
-    "doors",
-    "former",
-    "interrupt",
-    "optional",
-    "place",
-    "plain_yaml",
-    "reading",
-    "task",
+    *("arrays", "__init__", "__main__", "atomic", "checks", "doctor", "doors", "former"),
+    *("interrupt", "optional", "place", "plain_yaml", "reading", "task"),
 }
 
 

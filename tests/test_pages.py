@@ -7,25 +7,12 @@ import pytest
 from studies.frame.listing import studies
 from tests.processes import ROOT, python
 
-PAGES = (
-    "README.md",
-    "docs/start.md",
-    "docs/chain.md",
-    "docs/select.md",
-    "docs/diffraction.md",
-    "docs/your_own.md",
-    "docs/mounts.md",
-    "docs/placement.md",
-    "docs/worlds.md",
-    "docs/robots_and_worlds.md",
-    "docs/flow_needs.md",
-    "docs/lens_files.md",
-    "docs/lens_design.md",
-    *(f"docs/{name}.md" for name in ("flow", "events", "flow_closed_form", "srm", "silhouettes")),
-    *(f"docs/flow_{name}.md" for name in ("metrics", "recordings", "training")),
-    *(f"docs/{name}.md" for name in ("event_files", "event_views", "sensor_fit", "upsampling")),
-    "docs/run_many.md",
-)
+GUIDES = """
+start chain select diffraction your_own mounts placement worlds robots_and_worlds flow_needs lens_files
+lens_design flow events flow_closed_form srm silhouettes flow_metrics flow_recordings flow_training
+event_files event_views sensor_fit upsampling run_many
+"""
+PAGES = ("README.md", *(f"docs/{name}.md" for name in GUIDES.split()))
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -25,9 +25,8 @@ def box_mesh(low, high):
 
 def box_distance(points, low, high):
     """Closed form: outside the norm of what sticks out, inside the nearest face."""
-    middle = (torch.tensor(low, dtype=D) + torch.tensor(high, dtype=D)) / 2
-    half = (torch.tensor(high, dtype=D) - torch.tensor(low, dtype=D)) / 2
-    over = (points - middle).abs() - half
+    low, high = torch.tensor([low, high], dtype=D)
+    over = (points - (low + high) / 2).abs() - (high - low) / 2
     return over.clamp_min(0).norm(dim=-1) + over.amax(-1).clamp_max(0)
 
 

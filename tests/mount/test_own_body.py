@@ -12,12 +12,8 @@ D = torch.float64
 
 
 def sheet(low, high, at_m=2.0):
-    corners = [
-        (at_m, low[0], low[1]),
-        (at_m, high[0], low[1]),
-        (at_m, high[0], high[1]),
-        (at_m, low[0], high[1]),
-    ]
+    (y, z), (far_y, far_z) = low, high
+    corners = [(at_m, y, z), (at_m, far_y, z), (at_m, far_y, far_z), (at_m, y, far_z)]
     return Body([(corners, [(0, 1, 2), (0, 2, 3)])])
 
 

@@ -23,9 +23,8 @@ def test_directions_of_known_angles(generator):
     share = torch.rand(3, 7, 6, generator=generator, dtype=D)
     poses = MountRanges(LOW, HIGH).pose(share)
     check_poses(poses)
-    numbers = torch.tensor(LOW, dtype=D) + share * (
-        torch.tensor(HIGH, dtype=D) - torch.tensor(LOW, dtype=D)
-    )
+    low, high = torch.tensor([LOW, HIGH], dtype=D)
+    numbers = low.lerp(high, share)
     torch.testing.assert_close(poses[..., :3, 3], numbers[..., :3], rtol=0, atol=1e-15)
     yaw, pitch, roll = numbers[..., 3:].unbind(-1)
     view = torch.stack([yaw.cos() * pitch.cos(), yaw.sin() * pitch.cos(), -pitch.sin()], -1)

@@ -2,14 +2,11 @@
 said."""
 
 import math
-from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 
 from codesign import lens, mount, render
-from codesign.errors import CodesignError
 from codesign.mount import (
     FREE,
     Body,
@@ -22,6 +19,7 @@ from codesign.mount import (
     UnknownDepth,
 )
 from scenes import bodies, robots
+from tests import refusals
 
 D = torch.float64
 NAN, INF = math.nan, math.inf
@@ -56,11 +54,8 @@ def read(parallax=None):
 
 
 NAMES = vars(mount) | globals()
-TEXT = Path(__file__).with_name("refusals.txt").read_text()
-ROWS = [row.split(" | ", 1) for row in TEXT.splitlines() if " | " in row]
 
 
-@pytest.mark.parametrize(("call", "sentence"), ROWS, ids=[sentence for _, sentence in ROWS])
-def test_what_cannot_be_is_refused(call, sentence):
-    with pytest.raises(CodesignError, match=sentence):
-        eval(call, NAMES)
+@refusals.table(__file__)
+def test_what_cannot_be_is_refused(row):
+    row.holds(NAMES)

@@ -119,10 +119,8 @@ def test_gradient_of_the_look_ahead_to_the_focal_length():
     def slack(value):
         return ahead.slack(pose, camera_of(value)).sum()
 
+    assert torch.autograd.gradcheck(slack, focal, eps=1e-5, rtol=1e-6, atol=1e-12)
     (slope,) = torch.autograd.grad(slack(focal), focal)
-    with torch.no_grad():
-        difference = float(slack(focal + 1e-5) - slack(focal - 1e-5)) / 2e-5
-    assert float(slope) == pytest.approx(difference, rel=1e-6)
     assert float(slope) < -1e-3  # a longer lens sees less of the far ground
 
 
@@ -130,15 +128,10 @@ def test_penalty_pushes_before_the_limit_and_is_smooth(cube, camera):
     wanted = Clearance(cube, Housing(0.03), step=0.05)
     height = torch.linspace(0.13, 0.25, 200, dtype=D, requires_grad=True)
     poses = mount_at(0.0).repeat(200, 1, 1)
-    poses = (
-        poses
-        + torch.eye(4, dtype=D)[2][:, None]
-        * torch.eye(4, dtype=D)[3]
-        * (height - HEIGHT)[:, None, None]
-    )
+    poses[:, 2, 3] = height
     found = penalty([wanted], poses, camera)
     over = (1 - (height.detach() - 0.13) / 0.05).clamp_min(0)
     torch.testing.assert_close(found.detach(), over**2, rtol=0, atol=1e-12)
     (slope,) = torch.autograd.grad(found.sum(), height)
     torch.testing.assert_close(slope, -2 * over / 0.05, rtol=0, atol=1e-9)
-    assert float(penalty([], poses, camera).abs().max()) == 0
+    assert not penalty([], poses, camera).any()

@@ -48,6 +48,16 @@ def points(seed, count=4, many=5, scale=1.0, bounds=(0.1, 3.0)):
     ), flow
 
 
+def power(rho, f, far, near, p):
+    """Logarithm of how likely a flow f is where the nearness is rho, over that of none."""
+    miss = f - far - rho * near
+    return float(-miss @ p @ miss / 2 + f @ p @ f / 2)
+
+
+def density(rho, top, *seen):
+    return math.exp(power(rho, *seen) - top)
+
+
 @pytest.mark.parametrize("scale", [1e-4, 0.1, 1.0, 30.0])
 def test_the_likelihood_is_the_integral_over_depths(scale):
     seen, flow = points(1, scale=scale)
@@ -60,24 +70,14 @@ def test_the_likelihood_is_the_integral_over_depths(scale):
             far, near = seen.far[body, k] @ velocity[body], seen.near[body, k] @ velocity[body]
             p, f = seen.precision[body, k], flow[body, k, :, 0]
 
-            def power(rho, far=far, near=near, p=p, f=f):
-                miss = f - far - rho * near
-                return float(-miss @ p @ miss / 2 + f @ p @ f / 2)
-
             bend, tilt = float(near @ p @ near), float(near @ p @ (f - far))
             peak = min(max(tilt / bend, low), high)
             width = 1 / math.sqrt(bend)
             breaks = [
-                x
-                for x in (peak - 5 * width, peak - width, peak, peak + width, peak + 5 * width)
-                if low < x < high
+                x for x in (peak + share * width for share in (-5, -1, 0, 1, 5)) if low < x < high
             ]
-            top = power(peak)
-
-            def integrand(rho, power=power, top=top):
-                return math.exp(power(rho) - top)
-
-            area = quad(integrand, low, high, points=breaks, limit=400)[0]
+            top = power(peak, f, far, near, p)
+            area = quad(density, low, high, (top, f, far, near, p), points=breaks, limit=400)[0]
             expected -= float(seen.weight[body, k]) * (top + math.log(area / (high - low)))
         assert float(ours[body]) == pytest.approx(expected, rel=1e-6, abs=1e-6)
 
@@ -89,7 +89,7 @@ def test_slope_and_curvature_are_those_of_differences():
     step = 1e-4
     for axis in range(6):
         moved = step * torch.eye(6, dtype=D)[axis]
-        up, down = (unknown_depth.look(seen, velocity + sign * moved) for sign in (1, -1))
+        up, down = (unknown_depth.look(seen, velocity + way) for way in (moved, -moved))
         torch.testing.assert_close(
             (up.value - down.value) / (2 * step), found.slope[:, axis], rtol=1e-5, atol=1e-5
         )
@@ -118,7 +118,15 @@ def camera():
     )
 
 
-def drives(camera, bodies, nearest_m, farthest_m, seed, noise_px=NOISE_PX):
+def field_of(flow, deviation_px):
+    """The field of flow [N, points, 2] that claims this deviation everywhere."""
+    flow = flow.reshape(-1, 32, 32, 2).movedim(-1, 1)
+    ones = torch.ones_like(flow[:, 0])
+    covariance = deviation_px**2 * torch.stack([ones, 0 * ones, ones], 1)
+    return FlowField(flow, ones.bool(), INTERVAL_S, ones, covariance)
+
+
+def drives(camera, bodies, nearest_m, farthest_m, seed):
     """Mount [4, 4], poses, twists [N, 6] and flow fields where every point read has a depth of its
     own."""
     random = torch.Generator().manual_seed(seed)
@@ -129,14 +137,9 @@ def drives(camera, bodies, nearest_m, farthest_m, seed, noise_px=NOISE_PX):
     depth = 1 / (low + (high - low) * torch.rand(bodies, len(pixels), generator=random, dtype=D))
     rows, _ = body_flow(camera, depth, turned)
     flow = (rows @ twist[:, None, :, None])[..., 0] * INTERVAL_S
-    flow = flow + noise_px * torch.randn(flow.shape, generator=random, dtype=D)
-    flow = flow.reshape(bodies * len(WINDOWS), 32, 32, 2).movedim(-1, 1)
-    ones = torch.ones_like(flow[:, 0])
-    field = FlowField(
-        flow, ones.bool(), INTERVAL_S, ones, NOISE_PX**2 * torch.stack([ones, 0 * ones, ones], 1)
-    )
+    flow = flow + NOISE_PX * torch.randn(flow.shape, generator=random, dtype=D)
     poses = torch.eye(4, dtype=D).expand(bodies, 3, 4, 4) @ turned
-    return turned, poses, twist, field
+    return turned, poses, twist, field_of(flow, NOISE_PX)
 
 
 def estimator(nearest_m, farthest_m, **how):
@@ -180,13 +183,8 @@ def test_depths_are_found_where_the_body_moves_across(camera):
     depth = 1 / (0.2 + (1 / 0.3 - 0.2) * share)
     rows, _ = body_flow(camera, depth, mount)
     flow = (rows @ torch.tensor([0.8, 0.8, 0.0, 0.0, 0.0, 0.3], dtype=D))[0] * INTERVAL_S
-    flow = flow.reshape(len(WINDOWS), 32, 32, 2).movedim(-1, 1)
-    ones = torch.ones_like(flow[:, 0])
-    field = FlowField(
-        flow, ones.bool(), INTERVAL_S, ones, 1e-6 * torch.stack([ones, 0 * ones, ones], 1)
-    )
     with torch.no_grad():
-        found = estimator(0.3, 5.0)(field, camera, None, mount, poses)
+        found = estimator(0.3, 5.0)(field_of(flow, 1e-3), camera, None, mount, poses)
     at = depth.reshape(len(WINDOWS), 32, 32)[:, 8::16, 8::16].reshape(1, -1)
     # all depths and the speed may be longer together: that is what the bounds leave open
     ratio = (found.depth_m / at).log()

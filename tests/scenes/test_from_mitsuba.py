@@ -14,6 +14,7 @@ from codesign.pose import look_at
 from codesign.render import Camera, light
 from codesign.render.charts import emissive_mesh
 from scenes import trial_load, worlds
+from tests import refusals
 
 XML = """<scene version="3.0.0">
     <default name="bright" value="2"/>
@@ -64,6 +65,9 @@ def described(mi, bright=2.0) -> dict[str, Any]:
             "intensity": {"type": "rgb", "value": 20.0},
         },
     }
+
+
+BALL = {"ball": {"type": "sphere"}}
 
 
 @pytest.fixture
@@ -190,43 +194,15 @@ def test_whatever_ends_mitsuba_ends_a_trial(path, monkeypatch, trial, sentence):
         worlds.view_of(path)
 
 
-def test_what_is_no_scene_is_refused(path, tmp_path):
-    mi = backend.mitsuba()
-    sphere = {"ball": {"type": "sphere"}}
+@refusals.table(__file__, "scenes")
+def test_what_is_no_scene_is_refused(row, path, tmp_path):
     (tmp_path / "one.xml").write_text('<shape version="3.0.0" type="sphere"/>')
     (tmp_path / "a.obj").write_text("")
-    for source, sentence in (
-        (tmp_path / "none.xml", "none.xml' is not a file"),
-        (tmp_path / "a.obj", "ends in '.obj'"),
-        (tmp_path / "one.xml", "not a scene"),
-        (3, "not a int"),
-        ({"sky": {"type": "constant"}}, "has no shapes"),
-        (sphere, "has no light"),
-        ({"ball": {"type": "balloon"}}, "balloon"),
-    ):
-        with pytest.raises((DomainError, FileFormatError), match=sentence) as found:
-            worlds.from_mitsuba(source)
-        assert "\n" not in str(found.value)
-    for options, sentence in (
-        ({"light": "dim"}, "light must be one of .* got 'dim'"),
-        ({"up": "x"}, "up must be one of .* got 'x'"),
-        ({"unit_m": 0.0}, "unit_m must be .* got 0.0"),
-        ({"gain": math.nan}, "gain must be .* got nan"),
-    ):
-        with pytest.raises(DomainError, match=sentence):
-            worlds.from_mitsuba(path, **options)
-    with pytest.raises(DomainError, match="'colour' is no argument"):
-        worlds.from_mitsuba(sphere, colour=1)
-    with pytest.raises(DomainError, match="has 0 sensors"):
-        worlds.view_of(sphere)
-    with pytest.raises(DomainError, match="not a perspective one"):
-        worlds.view_of({**sphere, "sensor": {"type": "orthographic"}})
-    off = {"type": "perspective", "principal_point_offset_x": 0.1}
-    with pytest.raises(DomainError, match="principal point"):
-        worlds.view_of({**sphere, "sensor": off})
-    mirrored = {"type": "perspective", "to_world": mi.ScalarTransform4f().scale([-1, 1, 1])}
-    with pytest.raises(DomainError, match="mirrors its picture"):
-        worlds.view_of({**sphere, "sensor": mirrored})
+
+    def viewed(**sensor):
+        return worlds.view_of({**BALL, "sensor": sensor})
+
+    row.holds(globals() | {"path": path, "tmp": tmp_path, "viewed": viewed})
 
 
 def test_a_scene_of_another_variant_is_refused_with_what_to_do():

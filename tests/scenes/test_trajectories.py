@@ -8,7 +8,6 @@ import torch
 from torch import pi
 from torch.testing import assert_close
 
-from codesign.errors import DomainError, ShapeError
 from codesign.mount import Mount
 from codesign.pose import check_poses, inverse, look_at, se3_exp
 from scenes import trajectories
@@ -22,6 +21,7 @@ from scenes.trajectories import (
     minimum_snap,
     mounted,
 )
+from tests import refusals
 
 D = torch.float64
 START = look_at((0.3, -2.0, 1.1), (0.0, 0.0, 1.0))
@@ -258,38 +258,8 @@ def test_a_mounted_camera_passes_gradients_to_its_mount():
 
 
 DROP = [[0, 0, 0], [0, 0, 8.0], [0, 0, 0]]
-REFUSED = [
-    (DomainError, "at least 2 frames", lambda: trajectories.times(1, 100.0)),
-    (DomainError, "rate_hz = nan", lambda: trajectories.times(5, math.nan)),
-    (DomainError, "finite seconds", lambda: driving()([0.0, math.nan])),
-    (DomainError, "from 0 to 5 s", lambda: driving()([5.1])),
-    (ShapeError, "list of times", lambda: driving()([[0.0]])),
-    (DomainError, "slip = 1", lambda: driving(slip=1.0)),
-    (DomainError, "finite numbers", lambda: driving(height_m=math.inf)),
-    (DomainError, "radius_m = 0.*above", lambda: Orbital((0, 0, 0), 0.0, 0.5, 1.0)),
-    (DomainError, "rate_rad_s = 0", lambda: Orbital((0, 0, 0), 1.0, 0.5, 0.0)),
-    (DomainError, "radius_swing = 1", lambda: Orbital((0, 0, 0), 1.0, 0.5, 1.0, radius_swing=1.0)),
-    (
-        DomainError,
-        "rate_swing = -0.1.*at least",
-        lambda: Orbital((0, 0, 0), 1.0, 0.5, 1.0, rate_swing=-0.1),
-    ),
-    (ShapeError, "one time each", lambda: minimum_snap(torch.zeros(3, 3), [0.0, 1.0])),
-    (
-        DomainError,
-        "at most 200 points",
-        lambda: minimum_snap(torch.zeros(201, 1), torch.arange(201.0)),
-    ),
-    (DomainError, "increase strictly", lambda: minimum_snap(torch.zeros(3, 3), [0.0, 1.0, 1.0])),
-    (DomainError, "NaN", lambda: minimum_snap(torch.zeros(3, 3), [0.0, 1.0, math.nan])),
-    (DomainError, "100 times", lambda: minimum_snap(torch.zeros(3, 3), [0.0, 0.001, 5.0])),
-    (ShapeError, "one yaw each", lambda: Flying(DROP, [0.0, 0.0], [0.0, 1.0, 2.0])),
-    (DomainError, "free fall", lambda: Flying(DROP, [0.0, 0, 0], [0.0, 1.0, 2.0])),
-    (ShapeError, "one pose", lambda: mounted(driving(), torch.eye(3, dtype=D))),
-]
 
 
-@pytest.mark.parametrize(("error", "sentence", "call"), REFUSED)
-def test_what_is_no_path_is_refused(error, sentence, call):
-    with pytest.raises(error, match=sentence):
-        call()
+@refusals.table(__file__, "paths")
+def test_what_is_no_path_is_refused(row):
+    row.holds(globals())

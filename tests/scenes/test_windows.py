@@ -9,7 +9,6 @@ import pytest
 import torch
 from scipy.ndimage import map_coordinates
 
-from codesign.errors import CodesignError
 from codesign.flow.warp import pixel_grid, read_at
 from scenes.windows import (
     SETS,
@@ -24,6 +23,7 @@ from scenes.windows import (
 )
 from scenes.windows.rendered import LEAD
 from scenes.windows.sets import EVERYDAY
+from tests import refusals
 
 NOISELESS = (1e-12, 1e-12)
 QUIET = Sensors(
@@ -227,16 +227,6 @@ def test_sets_give_windows_of_their_own_for_every_seed(name):
     assert not torch.equal(one.truth.flow_px, other.truth.flow_px)
 
 
-@pytest.mark.parametrize(
-    ("make", "sentence"),
-    [
-        (lambda: PacketWindows(EVERYDAY, 0.0), "events_per_px is 0"),
-        (lambda: RenderedWindows(Draws(motion="rotation")), "one plane"),
-        (lambda: RenderedWindows(Draws(motion="walk")), "'walk'"),
-        (lambda: textures.pool("wood"), "texture pool 'wood' is unknown"),
-        (lambda: WorldWindows(("moon",)), r"worlds \['moon'\] are unknown"),
-    ],
-)
-def test_what_is_unfit_is_refused(make, sentence):
-    with pytest.raises(CodesignError, match=sentence):
-        make()
+@refusals.table(__file__, "windows")
+def test_what_is_unfit_is_refused(row):
+    row.holds(globals() | {"textures": textures})

@@ -12,6 +12,7 @@ from torch import nn
 from codesign.errors import DomainError, GradientError, NonFiniteError, ShapeError
 from codesign.system import Batch, System, check
 from codesign.types import EventVolume, FlowField, Rays
+from tests import refusals
 from tests.hostile.stages import Stage, held
 
 ONE = torch.ones(1)
@@ -214,27 +215,12 @@ def test_estimator_and_bins_must_fit():
         toy(flow=network, bins=9)
 
 
-@pytest.mark.parametrize(
-    ("batch", "kind", "sentence"),
-    [
-        (
-            Batch(torch.eye(4).expand(3, 4, 4), T_S, "wall"),
-            ShapeError,
-            r"poses must be \[\.\.\., T, 4, 4\] with T = .*, got \[3, 4, 4\]",
-        ),
-        (
-            Batch(torch.eye(3), T_S, "wall"),
-            ShapeError,
-            r"must be \[\.\.\., T, 4, 4\] with T = .*, got \[3, 3\]",
-        ),
-        (Batch(None, T_S, "wall"), DomainError, "no poses and the system no trajectory"),
-        (Batch(BATCH.T_world_body, T_S), DomainError, "no scene; give Batch"),
-        (Batch(BATCH.T_world_body, T_S, ("a", "b")), ShapeError, "2 scenes and poses of shape"),
-    ],
-)
-def test_batches_that_do_not_fit_are_refused(batch, kind, sentence):
-    with pytest.raises(kind, match=sentence):
-        toy(render=lambda rays, T_world_cam: render_sum(rays))(batch)
+@refusals.table(__file__, "batches")
+def test_batches_that_do_not_fit_are_refused(row):
+    def run(*given):
+        return toy(render=lambda rays, T_world_cam: render_sum(rays))(Batch(*given))
+
+    row.holds(globals() | {"run": run})
 
 
 def test_scenes_each_see_their_own_poses():
