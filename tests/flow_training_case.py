@@ -104,26 +104,9 @@ def undraw(replace=setattr):
         replace(watch, name, lambda *_: plt.figure(figsize=(1, 1)))
 
 
-BASE = [
-    "--network",
-    "linear",
-    "--mix",
-    "made",
-    "--bins",
-    "2",
-    "--height-px",
-    "16",
-    "--width-px",
-    "16",
-    "--batch",
-    "4",
-    "--final-windows",
-    "8",
-    "--validation-windows",
-    "4",
-    "--device",
-    "cpu",
-]
+OPTIONS = "--network linear --mix made --bins 2 --height-px 16 --width-px 16 --batch 4"
+OPTIONS += " --final-windows 8 --validation-windows 4 --device cpu"
+BASE = OPTIONS.split()
 
 
 def train(folder, options=""):
