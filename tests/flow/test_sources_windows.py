@@ -160,39 +160,31 @@ def test_a_recording_is_a_source_of_windows(tmp_path):
 RADIAL = "sequence_001_radial"
 
 
-MANIFEST = "manifest.json"
+NARROW = np.zeros((12, 2, 40, 39), np.float32)
+FAR = np.full(200, 10**9, np.uint64)
 
 
-# path, what happens to it and with what, words of the sentence
+# of the set or one sequence: path, what happens to it and with what, words of the sentence
 @pytest.mark.parametrize(
-    ("path", "damage", "given", "reason"),
+    ("of", "path", "damage", "given", "reason"),
     [
-        (f"{RADIAL}/events.h5", gone, (), "lacks events.h5"),
-        (f"{RADIAL}/frames.h5", halved, (), "by the manifest; it was cut"),
-        (MANIFEST, gone, (), "has no manifest.json"),
-        (MANIFEST, rewritten, ("-dataset/1", "-dataset/9"), "format 'codesign-dataset/9'"),
+        ("", f"{RADIAL}/events.h5", gone, (), "lacks events.h5"),
+        ("", f"{RADIAL}/frames.h5", halved, (), "by the manifest; it was cut"),
+        ("", "manifest.json", gone, (), "has no manifest.json"),
+        (
+            "",
+            "manifest.json",
+            rewritten,
+            ("-dataset/1", "-dataset/9"),
+            "format 'codesign-dataset/9'",
+        ),
+        (RADIAL, "frames.h5", stores, ("flow", NARROW), r"flow has shape \[12, 2, 40, 39\], \["),
+        (RADIAL, "frames.h5", stores, ("timestamps", np.zeros(13, np.int64)), "do not rise"),
+        (RADIAL, "events.h5", stores, ("ms_to_idx", FAR), "no index"),
     ],
 )
-def test_damage_is_refused_at_once(path, damage, given, reason, dataset, tmp_path):
-    shutil.copytree(dataset, tmp_path / "set")
+def test_damage_is_refused_at_once(of, path, damage, given, reason, dataset, tmp_path):
+    shutil.copytree(dataset / of, tmp_path / "set")
     damage(tmp_path / "set" / path, *given)
     with pytest.raises(CodesignError, match=reason):
         DatasetWindows(tmp_path / "set")
-
-
-NARROW = np.zeros((12, 2, 40, 39), np.float32)
-
-
-@pytest.mark.parametrize(
-    ("name", "key", "values", "reason"),
-    [
-        ("frames.h5", "flow", NARROW, r"flow has shape \[12, 2, 40, 39\], \["),
-        ("frames.h5", "timestamps", np.zeros(13, np.int64), "do not rise"),
-        ("events.h5", "ms_to_idx", np.full(200, 10**9, np.uint64), "no index"),
-    ],
-)
-def test_a_sequence_whose_parts_do_not_fit(name, key, values, reason, dataset, tmp_path):
-    shutil.copytree(dataset / RADIAL, tmp_path / "one")
-    stores(tmp_path / "one" / name, key, values)
-    with pytest.raises(CodesignError, match=reason):
-        DatasetWindows(tmp_path / "one")
