@@ -3,6 +3,7 @@ layouts."""
 
 import io
 import struct
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -28,6 +29,11 @@ def same(first, second):
 def stream_of(*events, height_px=480, width_px=640):
     """Stream of (t_us, x, y, p)."""
     return ordered(*torch.tensor(events).unbind(1), height_px, width_px)
+
+
+def part(stream, which):
+    """Some of the events of a stream."""
+    return replace(stream, **{name: getattr(stream, name)[which] for name in FIELDS})
 
 
 def random_stream(count, height_px, width_px, last_us, first_us=0, seed=0):

@@ -68,9 +68,8 @@ def difference(move):
     """Derivative of the stream's volume, event by event, the mean over beginnings."""
     ends = []
     for sign in (1, -1):
-        stream = events.simulate(
-            waves(1000, **{move: sign * STEP}), times(1000), SENSOR, log_input=True
-        )
+        level = waves(1000, **{move: sign * STEP})
+        stream = events.simulate(level, times(1000), SENSOR, log_input=True)
         found = events.from_stream(stream, 0, round(SPAN_S * 1e6), BINS, dtype=D).counts[0, :, :, 0]
         ends.append((found @ GROUPS.T).flatten())
     return (ends[0] - ends[1]) / (2 * STEP)
@@ -80,9 +79,8 @@ def difference(move):
 @pytest.mark.parametrize("name", ["memory", "counts", "physical"])
 def test_eight_intervals_steer_a_volume_as_the_stream_at_10_khz_does(name, move):
     level = waves(8).requires_grad_()
-    volume = (
-        events.layer(name, SENSOR, log_input=True).volume(level, times(8), BINS).counts[0, :, :, 0]
-    )
+    layer = events.layer(name, SENSOR, log_input=True)
+    volume = layer.volume(level, times(8), BINS).counts[0, :, :, 0]
     cosine, scale = cosine_and_scale(steered(volume @ GROUPS.T, level, move), difference(move))
     # what is asked of eight intervals
     assert cosine >= 0.97
@@ -92,12 +90,8 @@ def test_eight_intervals_steer_a_volume_as_the_stream_at_10_khz_does(name, move)
 def test_events_of_one_long_interval_lie_where_the_level_crosses():
     level = torch.tensor([4.0, 4.0 + 20.5 * C], dtype=D).reshape(2, 1, 1)
     t_s = torch.tensor([0.0, SPAN_S], dtype=D)
-    volume = (
-        events.layer("memory", SENSOR, log_input=True)
-        .volume(level, t_s, BINS)
-        .counts[0, 0, :, 0, 0]
-        .detach()
-    )
+    layer = events.layer("memory", SENSOR, log_input=True)
+    volume = layer.volume(level, t_s, BINS).counts[0, 0, :, 0, 0].detach()
     crossing = torch.arange(1, 21, dtype=D) / 20.5 * (BINS - 1)  # in node spacings
     nodes = torch.arange(BINS, dtype=D)
     truth = (1 - (crossing - nodes[:, None]).abs()).clamp(min=0).sum(1)
@@ -174,9 +168,8 @@ def test_every_layer_gives_volumes_from_few_frames(name):
     torch.testing.assert_close(volume.counts.sum((0, 2)), counts.sum((0, 1)))
     if not layer.refines:  # events of an interval come evenly
         halves = counts.unflatten(1, (8, 2))
-        torch.testing.assert_close(
-            halves, (layer(level, times(8)) / 2)[:, :, None].expand_as(halves)
-        )
+        each = layer(level, times(8)) / 2
+        torch.testing.assert_close(halves, each[:, :, None].expand_as(halves))
 
 
 def test_a_system_asks_a_layer_for_its_volume_and_sets_plain_counts_at_middles():

@@ -7,16 +7,10 @@ import math
 
 import pytest
 import torch
+from torch.autograd.functional import jacobian
 
-from codesign.events import (
-    LAYERS,
-    SensorModel,
-    expected,
-    layer,
-    memory,
-    naive,
-    sensor_counts,
-)
+from codesign.events import LAYERS, SensorModel, expected, layer, memory, naive, sensor_counts
+from tests.event_streams import rows
 from tests.events.slopes import cosine_and_scale, seeded
 from tests.events.test_memory import plain_loop
 
@@ -192,16 +186,11 @@ def test_gradients_to_the_sensor_follow_differences_of_hard_counts(
     before = getattr(sensor, name)
 
     def pooled(value):
-        source = seeded(1)
-        counts, _ = sensor_counts(
-            level, t_s, sensor, generator=source, log_input=True, **{name: value}
-        )
+        options = {"generator": seeded(1), "log_input": True, name: value}
+        counts, _ = sensor_counts(level, t_s, sensor, **options)
         return counts[:56].reshape(4, 14, 2, 3, 12, 3, 12).sum((1, 4, 6)).flatten()
 
-    value = torch.tensor(before, dtype=D, requires_grad=True)
-    slope = torch.stack(
-        [torch.autograd.grad(c, value, retain_graph=True)[0] for c in pooled(value)]
-    )
+    slope = jacobian(pooled, torch.tensor(before, dtype=D))
     ends = [pooled(torch.tensor(before * (1 + sign * step), dtype=D)) for sign in (1, -1)]
     difference = (ends[0] - ends[1]) / (2 * step * before)
     found_cosine, scale = cosine_and_scale(slope, difference)
@@ -244,5 +233,4 @@ def test_frame_difference_caps_at_one_and_forgets():
     )
     found = naive(level[:, None], [0.0, 0.01, 0.02], 0.25, log_input=True)
     assert (found.height_px, found.width_px) == (1, 4)
-    rows = torch.stack((found.t_us, found.x, found.y, found.p), dim=1).tolist()
-    assert rows == [[10_000, 1, 0, 1], [10_000, 2, 0, -1], [20_000, 2, 0, -1]]
+    assert rows(found) == [(10_000, 1, 0, 1), (10_000, 2, 0, -1), (20_000, 2, 0, -1)]

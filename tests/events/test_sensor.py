@@ -10,16 +10,10 @@ import torch
 
 from codesign import events
 from codesign.errors import DomainError
-from codesign.events import (
-    SensorModel,
-    SensorState,
-    dense_counts,
-    lin_log,
-    memory,
-    simulate,
-    to_counts,
-)
+from codesign.events import SensorModel, SensorState, lin_log, memory, simulate, to_counts
 from codesign.events.stream import ordered
+from tests.event_streams import same, stream_of
+from tests.events.slopes import seeded
 
 D = torch.float64
 DAY_S = 86_400.0
@@ -91,18 +85,15 @@ def test_counts_are_those_of_the_definition(values, theta):
     # per frame and polarity
     on, off = (counts.sum((0, 2, 3)) - torch.tensor(hard_total(values, theta))).tolist()
     assert max(abs(on), abs(off), abs(on - off)) <= 1
-    assert torch.equal(
-        to_counts(simulate(frames, t_s, SensorModel(theta, theta)), t_s, dtype=D), counts
-    )
+    stream = simulate(frames, t_s, SensorModel(theta, theta))
+    assert torch.equal(to_counts(stream, t_s, dtype=D), counts)
 
 
 def test_single_precision_keeps_the_times_of_long_ramps():
     """Each event once rounded the memorised level alike: microseconds too early or late after some
     dozens."""
-    generator = torch.Generator().manual_seed(0)
-    speed = (5 + 5 * torch.rand(40, dtype=D, generator=generator)) * torch.tensor(
-        [1.0, -1.0]
-    ).repeat(20)
+    speed = 5 + 5 * torch.rand(40, dtype=D, generator=seeded())
+    speed[1::2] *= -1
     t_s = torch.arange(31, dtype=D) / 60
     frames = (7.5 + speed * (t_s[:, None] - 0.25)).exp().float()[:, None]
     stream = simulate(frames, t_s, SensorModel(0.05, 0.05))
@@ -260,7 +251,7 @@ def test_a_changed_sensor_goes_on_as_if_simulated_in_two_pieces(changed, refract
     for part, sensor in zip((slice(0, cut), slice(cut, None)), sensors, strict=True):
         call = (levels[part], t_s[part], sensor)
         streams.append(simulate(*call, state=state, log_input=True))
-        counts.append(dense_counts(*call, state=counted, log_input=True))
+        counts.append(events.dense_counts(*call, state=counted, log_input=True))
     stream = events.concatenate(streams)
     assert torch.equal(torch.cat(counts), to_counts(stream, t_s))
     for pixel in range(20):
@@ -310,26 +301,21 @@ def test_streams_are_sorted_as_python_sorts(generator):
 
 
 def test_counts_land_in_their_pixel_and_in_the_interval_that_ends_with_them():
-    t_us, x, y, p = (
-        torch.tensor(one) for one in ([5, 6, 7, 7], [0, 2, 2, 2], [1, 0, 0, 0], [1, -1, 1, 1])
-    )
-    counts = to_counts(ordered(t_us, x, y, p, 2, 3), [0, 1e-5])
+    rows = (5, 0, 1, 1), (6, 2, 0, -1), (7, 2, 0, 1), (7, 2, 0, 1)
+    counts = to_counts(stream_of(*rows, height_px=2, width_px=3), [0, 1e-5])
     assert counts.tolist() == [[[[0, 0, 2], [1, 0, 0]], [[0, 0, 1], [0, 0, 0]]]]
-    t_us = torch.tensor([-1, 0, 1, 1000, 1001, 2000, 2001])
-    zero = torch.zeros(7, dtype=torch.int64)
-    counts = to_counts(ordered(t_us, zero, zero, zero - 1, 1, 1), [0, 0.001, 0.002])
+    rows = ((t_us, 0, 0, -1) for t_us in (-1, 0, 1, 1000, 1001, 2000, 2001))
+    counts = to_counts(stream_of(*rows, height_px=1, width_px=1), [0, 0.001, 0.002])
     assert counts[:, :, 0, 0].tolist() == [[0, 3], [0, 2]]
 
 
 def test_chunks_around_a_long_interval_are_the_whole_in_single_precision():
     t_s = torch.tensor([0.0, 0.9, 1.8, 2.7, 3.6, 6.0], dtype=torch.float64)
-    level = torch.randn(6, 20, 20, generator=torch.Generator().manual_seed(0)).cumsum(0)
+    level = torch.randn(6, 20, 20, generator=seeded()).cumsum(0)
     sensor, state = SensorModel(0.1, 0.1), events.SensorState()
     whole = simulate(level, t_s, sensor, log_input=True)
     parts = [
         simulate(level[chunk], t_s[chunk], sensor, state=state, log_input=True)
         for chunk in (slice(5), slice(5, None))
     ]
-    joined = events.concatenate(parts)
-    assert torch.equal(joined.t_us, whole.t_us)
-    assert torch.equal(joined.x, whole.x)
+    assert same(events.concatenate(parts), whole)

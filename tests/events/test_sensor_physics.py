@@ -2,6 +2,7 @@
 differential equations and the laws of their randomness."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,28 +28,17 @@ from codesign.events.low_pass import coefficients
 from codesign.events.sensor.crossing import hashed, normal_pair, uniform
 from tests.event_streams import same
 from tests.events.slopes import seeded
+from tests.events.test_layers import PHYSICAL
 
 D = torch.float64
-EVERYTHING = {
-    "theta_on": 0.15,
-    "theta_sigma": 0.03,
-    "cutoff_hz": 60.0,
-    "leak_rate_hz": 3.0,
-    "leak_jitter": 0.2,
-    "rate_cov_decades": 0.2,
-    "shot_rate_hz": 20.0,
-    "refractory_s": 2e-3,
-    "hot_pixel_share": 0.05,
-    "hot_pixel_rate_hz": 80.0,
-}
-NOISY = {"theta_sigma": 0.02, "cutoff_hz": 50.0, "shot_rate_hz": 2.0, "photoreceptor_noise": True}
+EVERYTHING = replace(PHYSICAL, hot_pixel_share=0.05, hot_pixel_rate_hz=80.0)
+NOISY = SensorModel(0.2, 0.2, 0.02, 50.0, shot_rate_hz=2.0, photoreceptor_noise=True)
 
 
 def clip(frames=30, dtype=torch.float32):
     drift = torch.randn(frames, 9, 8, generator=seeded(1), dtype=dtype).cumsum(0) * 0.1
-    return (4 + drift).exp(), torch.rand(frames, generator=seeded(1), dtype=D).add(0.2).cumsum(
-        0
-    ) * 2e-3
+    steps_s = 2e-3 * (torch.rand(frames, generator=seeded(1), dtype=D) + 0.2)
+    return (4 + drift).exp(), steps_s.cumsum(0)
 
 
 @pytest.mark.parametrize("cutoff_hz", [0.01, 30.0, 2000.0])
@@ -56,12 +46,8 @@ def test_the_low_pass_of_sensor_and_layers_solves_its_differential_equation(cuto
     frames, t_s = clip(dtype=D)
     state = SensorState()
     simulate(frames, t_s, SensorModel(cutoff_hz=cutoff_hz), state=state)
-    torch.testing.assert_close(
-        low_pass(lin_log(frames), frames, t_s.diff(), cutoff_hz)[-1],
-        state.level,
-        rtol=0,
-        atol=1e-12,
-    )
+    by_function = low_pass(lin_log(frames), frames, t_s.diff(), cutoff_hz)[-1]
+    torch.testing.assert_close(by_function, state.level, rtol=0, atol=1e-12)
     intensity = frames[:, 3, 4].numpy()
     level = np.log(intensity)
     filtered = level[0]
@@ -107,7 +93,7 @@ def test_the_mean_of_the_fading_and_its_slope_are_those_of_their_power_series(pa
 @pytest.mark.parametrize("physics", [EVERYTHING, NOISY])
 def test_any_chunking_gives_the_events_of_the_whole_and_dense_counts_are_theirs(timing, physics):
     frames, t_s = clip()
-    sensor = SensorModel(**physics, timing=timing)
+    sensor = replace(physics, timing=timing)
     whole = simulate(frames, t_s, sensor, seeded(5))
     assert len(whole) > 100
     assert not same(whole, simulate(frames, t_s, sensor, seeded(6)))
@@ -136,11 +122,10 @@ def test_any_chunking_gives_the_events_of_the_whole_and_dense_counts_are_theirs(
 def test_refused_frames_leave_a_stream_as_it_was(change, words):
     frames, t_s = clip()
     state = SensorState()
-    sensor = SensorModel(**EVERYTHING)
-    simulate(frames, t_s, sensor, state=state)
+    simulate(frames, t_s, EVERYTHING, state=state)
     before = {name: tensor.clone() for name, tensor in state.tensors().items()}
     with pytest.raises(CodesignError, match=words):
-        simulate(*change(frames, t_s + 1), sensor, state=state)
+        simulate(*change(frames, t_s + 1), EVERYTHING, state=state)
     assert state.time_s == float(t_s[-1])
     assert all(torch.equal(tensor, before[name]) for name, tensor in state.tensors().items())
 
@@ -155,33 +140,29 @@ def test_thresholds_follow_a_clamped_normal_distribution():
     share = float((off == off.min()).double().mean())
     assert abs(share - below) < 5 * math.sqrt(below / 200_000)
     assert float(off.min()) == pytest.approx(0.01)
-    assert abs(float(((on - on.mean()) * (off - off.mean())).mean())) < 5 * 0.05**2 / math.sqrt(
-        200_000
-    )
+    together = float(((on - on.mean()) * (off - off.mean())).mean())
+    assert abs(together) < 5 * 0.05**2 / math.sqrt(200_000)
     assert torch.equal(draw_thresholds(sensor, (500, 400), seeded(3))[0].double(), on)
 
 
 def test_drawn_shot_counts_are_poisson_per_pixel_and_polarity():
     interval_s = torch.tensor([0.01, 0.03, 0.05])
-    counts = draw_shot_counts(
-        SensorModel(shot_rate_hz=40.0), (200, 250), interval_s, seeded(4), dtype=D
-    )
+    sensor = SensorModel(shot_rate_hz=40.0)
+    counts = draw_shot_counts(sensor, (200, 250), interval_s, seeded(4), dtype=D)
     for k, expected in enumerate((0.2, 0.6, 1.0)):  # 20 Hz per polarity
         for found in counts[k]:
             assert abs(found.mean() - expected) < 5 * math.sqrt(expected / 50_000)
             # variance of the sample variance of a Poisson count: (m + 2 m^2)/n
-            assert abs(found.var() - expected) < 5 * math.sqrt(
-                (expected + 2 * expected**2) / 50_000
-            )
+            spread = expected + 2 * expected**2
+            assert abs(found.var() - expected) < 5 * math.sqrt(spread / 50_000)
 
 
 @pytest.mark.parametrize("fps", [20, 1000])
 def test_noise_events_are_a_poisson_process_at_every_frame_rate(fps):
     # (I + 20)/275 = 0.4 at I = 90: 40 Hz * (1 - 0.3) = 28 Hz
     still = torch.full((fps + 1, 25, 80), 90.0)
-    events = simulate(
-        still, torch.arange(fps + 1, dtype=D) / fps, SensorModel(shot_rate_hz=40.0), seeded(4)
-    )
+    t_s = torch.arange(fps + 1, dtype=D) / fps
+    events = simulate(still, t_s, SensorModel(shot_rate_hz=40.0), seeded(4))
     expected = 28 * 2000
     assert abs(len(events) - expected) < 4 * math.sqrt(expected)
     assert abs(int(events.p.sum())) < 4 * math.sqrt(len(events))
@@ -190,9 +171,8 @@ def test_noise_events_are_a_poisson_process_at_every_frame_rate(fps):
     assert float(((histogram - len(events) / 20) ** 2 / (len(events) / 20)).sum()) < 45
     per_pixel = torch.bincount(events.y * 80 + events.x, minlength=2000).double()
     # Poisson: variance = mean
-    assert float(per_pixel.var() / per_pixel.mean()) == pytest.approx(
-        1, abs=4 * math.sqrt(2 / 2000)
-    )
+    ratio = float(per_pixel.var() / per_pixel.mean())
+    assert ratio == pytest.approx(1, abs=4 * math.sqrt(2 / 2000))
     rank = np.lexsort((events.t_us, events.x, events.y))
     gap_s = np.diff(events.t_us.numpy()[rank]) * 1e-6
     gap_s = gap_s[np.diff((events.y * 80 + events.x).numpy()[rank]) == 0]
@@ -209,14 +189,12 @@ def test_noise_events_scale_with_thresholds_and_reset_the_memorised_level():
     expected = 15 * 0.7 * 2 * 0.2 / state.theta_on.double().flatten()  # per pixel, 2 s
     split = state.theta_on.flatten() < 0.2
     for half in (split, ~split):
-        assert abs(on[half].sum() - expected[half].sum()) < 4 * math.sqrt(
-            float(expected[half].sum())
-        )
+        total = float(expected[half].sum())
+        assert abs(float(on[half].sum()) - total) < 4 * math.sqrt(total)
     # a drift below every threshold: each noise event sets the memorised level to the level seen
     state = SensorState()
-    simulate(
-        ramps(60, 0.19), [0.0, 1.0], SensorModel(shot_rate_hz=1e3), seeded(2), state, log_input=True
-    )
+    noisy = SensorModel(shot_rate_hz=1e3)
+    simulate(ramps(60, 0.19), [0.0, 1.0], noisy, seeded(2), state, log_input=True)
     rate_hz = 1e3 * (1 - 0.75 * (0.5 * (math.exp(4) + math.exp(4.19)) + 20) / 275)
     # the last noise event lies 1/rate back on average, an exponential law: 1.7 % standard error of
     # 3600 pixels
@@ -324,16 +302,14 @@ def test_normal_numbers_follow_their_law_and_neighbours_are_uncorrelated():
     count = 1 << 20
     arr = backend.arrays("cpu", torch.float32)
     even = uniform(arr, hashed(dr.arange(arr.UInt32, count))).torch().double()
-    normals = [
-        value.torch().double() for value in normal_pair(dr, arr, dr.arange(arr.UInt32, count))
-    ]
+    pair = normal_pair(dr, arr, dr.arange(arr.UInt32, count))
+    normals = [value.torch().double() for value in pair]
     error = 4 / math.sqrt(count)
     assert 0 < float(even.min()) < float(even.max()) < 1
     for normal in normals:
         for power, moment, spread in ((1, 0, 1), (2, 1, 2), (4, 3, 96)):
-            assert float((normal**power).mean()) == pytest.approx(
-                moment, abs=error * math.sqrt(spread)
-            )
+            found = float((normal**power).mean())
+            assert found == pytest.approx(moment, abs=error * math.sqrt(spread))
     flat = even - even.mean()
     for lag in (1, 2, 16, 346):
         assert abs(float((flat[lag:] * flat[:-lag]).mean() / flat.var())) < error

@@ -16,6 +16,7 @@ from codesign.events.spiking.spike_esim import SpikeEsim
 from codesign.events.spiking.srm import srm
 from codesign.events.spiking.surrogate import Laplace
 from codesign.events.spiking.thesis_network import TwoBranchSpikes
+from tests.events.slopes import seeded
 from tests.rounding_case import RoundsByPlace
 
 D = torch.float64
@@ -23,12 +24,9 @@ D = torch.float64
 
 def clip(frames=40, side=12, seed=0, dtype=D, step=0.15):
     """Smooth random pictures that change by about a threshold every few frames."""
-    draw = torch.randn(
-        frames, side, side, generator=torch.Generator().manual_seed(seed), dtype=dtype
-    )
-    return (3.5 + (step * draw).cumsum(0)).clamp(0.1, 5.5).exp(), torch.arange(
-        frames, dtype=D
-    ) / 500
+    draw = torch.randn(frames, side, side, generator=seeded(seed), dtype=dtype)
+    level = (3.5 + (step * draw).cumsum(0)).clamp(0.1, 5.5)
+    return level.exp(), torch.arange(frames, dtype=D) / 500
 
 
 def levels(frames):
@@ -40,12 +38,10 @@ def levels(frames):
 def disturbed(**options):
     """A generator all of whose parameters have moved from where they start."""
     model = SpikeEsim(0.2, 0.25, **options)
-    draw = torch.Generator().manual_seed(1)
+    draw = seeded(1)
     with torch.no_grad():
         for parameter in model.parameters():
-            parameter.add_(
-                0.05 * torch.randn(parameter.shape, generator=draw, dtype=parameter.dtype)
-            )
+            parameter.add_(torch.empty_like(parameter).normal_(std=0.05, generator=draw))
         model.bandwidth.gate.fill_(0.6)
     return model
 
@@ -130,9 +126,8 @@ def test_bandwidth_tone_and_scaled_thresholds_are_those_of_the_hard_sensor(chang
     model = SpikeEsim(0.2, 0.25)
     with torch.no_grad():
         change(model)
-        moved = (
-            model(frames, t_s, **options)[0] - events.dense_counts(frames, t_s, sensor)
-        ).cumsum(0)
+        found, _ = model(frames, t_s, **options)
+    moved = (found - events.dense_counts(frames, t_s, sensor)).cumsum(0)
     # rounding (1e-14) moves an event by a frame, and loses none
     assert moved.abs().max() <= 1
     assert int((moved != 0).sum()) <= 3
@@ -163,11 +158,10 @@ def test_drawn_noise_is_poisson_of_the_expected_rate():
     t_s = torch.arange(201, dtype=D) / 500
     # (117.5 + 20)/275 = 1/2
     expected = torch.tensor([30.0, 10.0], dtype=D) * math.exp(-2.0 * 0.5) / 500
-    torch.testing.assert_close(
-        model.expected_noise(frames, t_s)[0, :, 0, 0], expected, rtol=1e-6, atol=0
-    )
+    found = model.expected_noise(frames, t_s)[0, :, 0, 0]
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)
     # a still scene: nothing but noise
-    counts, _ = model.draw(frames, t_s, torch.Generator().manual_seed(0))
+    counts, _ = model.draw(frames, t_s, seeded(0))
     for found, mean in zip(counts.unbind(1), expected.tolist(), strict=True):
         error = math.sqrt(mean / found.numel())
         assert abs(float(found.mean()) - mean) < 4 * error
@@ -201,9 +195,8 @@ def test_the_generator_that_comes_along_has_learnt_its_sensor():
     assert model.refractory_s().item() == pytest.approx(1e-3, rel=0.2)
     frames, t_s = clip(frames=60, side=24, dtype=torch.float32)
     found, _ = model(frames, t_s)
-    target = events.dense_counts(
-        frames, t_s, SensorModel(0.18, 0.22, cutoff_hz=60.0, refractory_s=1e-3)
-    )
+    sensor = SensorModel(0.18, 0.22, cutoff_hz=60.0, refractory_s=1e-3)
+    target = events.dense_counts(frames, t_s, sensor)
     # white changes from frame to frame are nothing it was trained on; an ideal sensor gives three
     # times the events
     assert float(found.detach().sum() / target.sum()) == pytest.approx(1, abs=0.25)
@@ -217,12 +210,8 @@ def test_network_of_the_thesis_equals_the_reference(shared, through_reset, name)
     data = {key: torch.from_numpy(np.asarray(file[key]).astype(np.float64)) for key in file.files}
     for key in ("I", "spikes", "u", "target"):
         data[key] = data[key].movedim(-1, 0).clone()
-    network = TwoBranchSpikes(
-        3,
-        theta=0.7,
-        surrogate=Laplace(float(data["alpha"]), float(data["beta"])),
-        through_reset=through_reset,
-    ).double()
+    options = {"surrogate": Laplace(float(data["alpha"]), float(data["beta"])), "theta": 0.7}
+    network = TwoBranchSpikes(3, through_reset=through_reset, **options).double()
     weights = [network.weight_on, network.weight_off]
     with torch.no_grad():
         network.weight_on.copy_(data["wp"])
@@ -248,7 +237,7 @@ def test_network_of_the_thesis_equals_the_reference(shared, through_reset, name)
 
 
 def test_a_woken_network_reaches_its_threshold_with_the_share_asked():
-    frames = torch.rand(30, 16, 16, generator=torch.Generator().manual_seed(2), dtype=D)
+    frames = torch.rand(30, 16, 16, generator=seeded(2), dtype=D)
     network = TwoBranchSpikes(1, theta=0.7, kernel="step").double()
     network.wake(frames, share=0.1)
     drive, _ = network._drive(frames, None)
@@ -262,9 +251,8 @@ def test_losses_have_their_closed_forms():
     h, dt = 0.1, 2e-3
     q = math.exp(-2 * h)
     truth = 0.5 * dt * h**2 * math.e**2 * q * (1 + q) / (1 - q) ** 3  # sum of k^2 q^k
-    assert float(van_rossum(found, 0 * found, tau_s=dt / h, dt=dt)) == pytest.approx(
-        truth, rel=1e-12
-    )
+    distance = float(van_rossum(found, 0 * found, tau_s=dt / h, dt=dt))
+    assert distance == pytest.approx(truth, rel=1e-12)
     target, found = torch.zeros(2, 4, 2, 4, 4, dtype=D)
     target[0, 0, 0, 0] = 3  # block (0, 0, 0) of ON holds 3
     found[1, 0, 1, 1] = 1  # the same block: 1 against 3, (1 - 3)^2/(3 + 1) = 1

@@ -11,6 +11,7 @@ from codesign import lens, pose, render
 from codesign.events import SensorModel, lin_log, simulate, to_counts, upsample, upsample_stream
 from codesign.events.upsampling.flow import flow_both_ways, with_matches
 from codesign.events.upsampling.upsample import between, repaired, visibility
+from codesign.flow.warp import pixel_grid
 from scenes import trajectories, worlds
 
 D = torch.float64
@@ -19,18 +20,12 @@ D = torch.float64
 def moving(shifts, height=48, width=64):
     """[T, H, W] of smooth light on the 0-255 scale, periods of 9 to 23 px, moved by each (x, y) of
     ``shifts``, pixels."""
-    y, x = torch.meshgrid(
-        torch.arange(height, dtype=D), torch.arange(width, dtype=D), indexing="ij"
-    )
+    x, y = pixel_grid(height, width, torch.zeros((), dtype=D))
     frames = []
     for dx, dy in shifts:
         a, b = x - dx, y - dy
-        waves = (
-            (0.7 * a + 0.2 * b).sin()
-            + (0.27 * a - 0.31 * b + 1).sin()
-            + (0.1 * a + 0.55 * b + 2).sin()
-        )
-        frames.append(90 * torch.exp(0.25 * waves))
+        waves = (0.7 * a + 0.2 * b).sin() + (0.27 * a - 0.31 * b + 1).sin()
+        frames.append(90 * torch.exp(0.25 * (waves + (0.1 * a + 0.55 * b + 2).sin())))
     return torch.stack(frames).float()
 
 
@@ -217,7 +212,7 @@ def test_what_leaves_the_picture_is_blended_where_it_stands_and_holes_are_filled
     torch.testing.assert_close(made, 0.75 * first + 0.25 * second)
     # a picture that grows fivefold from its middle leaves four of five rows and columns empty,
     # filled from their neighbours: a slope stays a slope
-    y, x = torch.meshgrid(torch.arange(41.0), torch.arange(41.0), indexing="ij")
+    x, y = pixel_grid(41, 41, torch.zeros(()))
     grows = 4 * torch.stack((x - 20, y - 20))
     # at share 1 the first frame's flow has carried all the way
     flows = torch.stack((grows, -grows / 5))

@@ -19,19 +19,11 @@ from codesign.events import (
 )
 from codesign.events.stream import ordered
 from tests.event_streams import rows, same
+from tests.events.slopes import seeded
 
 D = torch.float64
-STATISTICS = (
-    "shot5_dn0",
-    "shot5_dn20",
-    "shot5_dn128",
-    "shot5_dn255",
-    "shot5_dn128_sig.03",
-    "leak1",
-    "leak1_jit0_cov0",
-    "leak1_cov.3",
-    "leak1_sig.03",
-)
+STATISTICS = [f"shot5_{case}" for case in ("dn0", "dn20", "dn128", "dn255", "dn128_sig.03")]
+STATISTICS += [f"leak1{case}" for case in ("", "_jit0_cov0", "_cov.3", "_sig.03")]
 
 
 def sensor_of(given, timing):
@@ -86,9 +78,8 @@ def test_counts_of_the_interpolated_sensor_equal_v2e_in_every_pixel_and_frame(
     given = json.loads(str(data["params"]))
     thetas = given["pos_thres"], given["neg_thres"]
     # v2e rounds the double-precision log level to 1e-8 and goes on in single precision
-    counts, memorised = memory(
-        ((lin_log(frames) * 1e8).round() / 1e8).float(), *thetas, log_input=True
-    )
+    level = ((lin_log(frames) * 1e8).round() / 1e8).float()
+    counts, memorised = memory(level, *thetas, log_input=True)
     assert torch.equal(counts, truth)
     assert torch.equal(memorised[0], torch.from_numpy(data["base_log_frame"]))
     assert torch.equal(to_counts(simulate(frames.float(), t_s, SensorModel(*thetas)), t_s), truth)
@@ -105,9 +96,7 @@ def test_noise_rates_are_those_of_v2e(shared, timing, case):
     truth = json.loads(shared("refs/events/v2e_stats.json").read_text())[case]
     frames = torch.full((truth["frames"], *truth["shape"]), float(truth["dn"]))
     t_s = torch.arange(truth["frames"], dtype=D) * truth["dt"]
-    events = simulate(
-        frames, t_s, sensor_of(truth["params"], timing), torch.Generator().manual_seed(7)
-    )
+    events = simulate(frames, t_s, sensor_of(truth["params"], timing), seeded(7))
     for polarity, name in ((1, "on"), (-1, "off")):
         pixels = (events.y * 64 + events.x)[events.p == polarity]
         per_pixel = torch.bincount(pixels, minlength=4096).double() / float(t_s[-1])
@@ -123,9 +112,8 @@ def test_noise_rates_are_those_of_v2e(shared, timing, case):
 @pytest.mark.parametrize("timing", ["v2e", "interpolated"])
 @pytest.mark.parametrize("sigma", [0.03, 0.05])
 def test_counts_under_mismatch_are_those_of_v2e(shared, timing, sigma):
-    truth = json.loads(shared("refs/events/v2e_stats.json").read_text())[
-        f"grating40_counts_sigma{sigma:g}"
-    ]
+    statistics = json.loads(shared("refs/events/v2e_stats.json").read_text())
+    truth = statistics[f"grating40_counts_sigma{sigma:g}"]
     sensor = SensorModel(theta_sigma=sigma, timing=timing)
     # v2e's recorded sequence "grating" in closed form (to 1e-12): 17.3 px and 12.7 Hz at 0.35 rad,
     # 1 kHz
@@ -133,9 +121,7 @@ def test_counts_under_mismatch_are_those_of_v2e(shared, timing, sigma):
     along = x * math.cos(0.35) + y * math.sin(0.35)
     frames = 127.5 + 100.3 * torch.sin(2 * math.pi * (along / 17.3 - 12.7e-3 * t))
     t_s = t[:, 0, 0] * 1e-3
-    streams = [
-        simulate(frames, t_s, sensor, torch.Generator().manual_seed(seed)) for seed in range(5)
-    ]
+    streams = [simulate(frames, t_s, sensor, seeded(seed)) for seed in range(5)]
     for polarity, name in ((1, "on"), (-1, "off")):
         mean = np.mean([int((stream.p == polarity).sum()) for stream in streams])
         # means of five seeds each: their difference has sd * sqrt(2/5); 3.3 of it is passed once in
@@ -164,7 +150,7 @@ def test_a_noise_event_of_either_polarity_resets_the_memorised_level():
     frames = torch.tensor([80.0, 80.0 * math.exp(0.15)])[:, None, None].expand(2, 40, 50)
     state = SensorState()
     sensor = SensorModel(shot_rate_hz=1.0, timing="v2e")
-    events = simulate(frames, [0.0, 0.8], sensor, torch.Generator().manual_seed(3), state)
+    events = simulate(frames, [0.0, 0.8], sensor, seeded(3), state)
     assert min(int((events.p > 0).sum()), int((events.p < 0).sum())) > 100
     wanted = torch.full((40, 50), math.log(80))
     wanted[events.y, events.x] += 0.15

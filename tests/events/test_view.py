@@ -20,20 +20,14 @@ COUNTS = torch.tensor([[[4.0, 0, 2, 0]], [[0, 4, 2, 0]]])
 
 
 def test_colours_say_polarity_and_strength():
-    assert picture(COUNTS)[0].tolist() == [
-        [255, 0, 0],
-        [0, 0, 255],
-        [191, 128, 191],
-        [255, 255, 255],
-    ]
+    assert picture(COUNTS)[0].tolist() == [[255, 0, 0], [0, 0, 255], [191, 128, 191], [255] * 3]
     assert picture(COUNTS, full_scale=2)[0, 2].tolist() == [128, 0, 128]
     assert gray_picture(COUNTS)[0].tolist() == [255, 1, 128, 128]
 
 
 def test_gif_shows_the_pictures_enlarged_and_even(tmp_path):
-    pictures = picture(
-        torch.stack((COUNTS, COUNTS.flip(0), COUNTS.flip(2))).repeat(1, 1, 3, 1)[..., :3]
-    )
+    counts = torch.stack((COUNTS, COUNTS.flip(0), COUNTS.flip(2)))
+    pictures = picture(counts.repeat(1, 1, 3, 1)[..., :3])
     write_video(tmp_path / "e.gif", pictures, fps=10)
     back = iio.imread(tmp_path / "e.gif")
     assert back.shape == (3, 258, 258, 3)  # 3 x 3 by a factor of 86

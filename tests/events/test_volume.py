@@ -11,21 +11,15 @@ from codesign.events import decay, from_counts, from_stream, surface_from_counts
 from codesign.events.stream import ordered
 from codesign.events.volumes.surface import decay_from_stream, surface_from_stream
 from codesign.events.volumes.volume import spikes_from_stream
-from tests.event_streams import random_stream, rows
+from tests.event_streams import part, random_stream, rows, stream_of
 
 D = torch.float64
 EPOCH_US = 1_700_000_000_000_000
 TAU_S = 0.013
 
 
-def part(stream, keep):
-    columns = (column[keep] for column in (stream.t_us, stream.x, stream.y, stream.p))
-    return ordered(*columns, stream.height_px, stream.width_px)
-
-
 def at_one_pixel(*t_us):
-    zero = torch.zeros(len(t_us), dtype=torch.int64)
-    return ordered(torch.tensor(t_us), zero, zero, zero + 1, 1, 1)
+    return stream_of(*((time_us, 0, 0, 1) for time_us in t_us), height_px=1, width_px=1)
 
 
 @pytest.mark.parametrize("bins", [1, 2, 5])
@@ -96,9 +90,8 @@ def by_hand(stream, at_us, last_only):
         for t_us, x, y, p in rows(stream):
             if t_us <= time_us:
                 faded = math.exp(-(time_us - t_us) / (1e6 * TAU_S))
-                found[k, int(p < 0), y, x] = faded + (
-                    0 if last_only else found[k, int(p < 0), y, x]
-                )
+                found[k, int(p < 0), y, x] *= not last_only
+                found[k, int(p < 0), y, x] += faded
     return found
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.errors import DomainError
 from codesign.flow import checkpoint
 from codesign.flow.baselines import FlowNetEvents, SpikeFlowNet
 from codesign.flow.baselines.parts import count_weights
@@ -81,18 +80,13 @@ def test_the_flow_fades_in_with_the_square_of_the_events():
 
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("budget", [300_000, 432_413])
-def test_a_weight_budget_is_filled_and_hardly_exceeded(network, budget):
+def test_a_weight_budget_is_filled_hardly_exceeded_and_begins_as_that_width_does(network, budget):
     net = network.with_weights(budget)
     assert budget <= count_weights(net) <= 1.04 * budget
-    assert count_weights(network(**net.config)) == count_weights(net)
-
-
-@pytest.mark.parametrize("network", NETWORKS)
-def test_a_network_by_its_budget_begins_as_one_by_its_width(network):
-    net = network.with_weights(300_000)
     sizes = {name: net.config[name] for name in ("bins", "width", "hidden")}
-    for found, wanted in zip(net.parameters(), network(**sizes).parameters(), strict=True):
-        assert torch.equal(found, wanted)
+    for again in (network(**net.config), network(**sizes)):
+        for found, wanted in zip(net.parameters(), again.parameters(), strict=True):
+            assert torch.equal(found, wanted)
 
 
 def test_weights_by_hand():
@@ -119,23 +113,6 @@ def test_configuration_and_file_make_the_same_network(network, tmp_path):
     assert not torch.equal(network(**{**net.config, "seed": 4})(volume).flow_px, right)
     checkpoint.save(net, tmp_path / "net.safetensors")
     assert torch.equal(checkpoint.load(tmp_path / "net.safetensors")(volume).flow_px, right)
-
-
-@pytest.mark.parametrize(
-    ("build", "sentence"),
-    [
-        (lambda: FlowNetEvents(bins=1), "whole number from 2"),
-        (lambda: SpikeFlowNet(bins=5), "an even number"),
-        (lambda: SpikeFlowNet(threshold=0.0), "threshold must be .* got 0"),
-        (lambda: FlowNetEvents.with_weights(100), "budget of 100 weights is too small"),
-        (lambda: ECN(hidden=6), "hidden is 6"),
-        (lambda: IDNet(width=0.0), "width must be .* got 0"),
-        (lambda: IDNet(iterations=0), "iterations"),
-    ],
-)
-def test_unfit_constructions_are_refused(build, sentence):
-    with pytest.raises(DomainError, match=sentence):
-        build()
 
 
 def test_the_recurrent_unit_written_out():

@@ -28,13 +28,8 @@ def busy(batch=1, size=32, bins=8, mean=0.3, seed=0):
 def by_hand(net, halves):
     """Sums and flows of the published loop: step by step, layer by layer, hard reset, every neck
     and head on its own; each level adds to the coarser flow."""
-    sums, potential = (
-        [
-            torch.zeros(len(halves), c, 32 >> i, 32 >> i, dtype=D)
-            for i, c in enumerate((8, 16, 32, 64), 1)
-        ]
-        for _ in range(2)
-    )
+    sums = [torch.zeros(len(halves), 8 << i, 16 >> i, 16 >> i, dtype=D) for i in range(4)]
+    potential = list(sums)
     for t in range(halves.shape[4]):
         x = halves[..., t]
         for i, layer in enumerate(net.encoder):
@@ -46,10 +41,8 @@ def by_hand(net, halves):
     x = sums[3]
     flows = []
     for first, second in net.residual:
-        x = x + leaky_relu(
-            conv2d(leaky_relu(conv2d(x, first.weight, padding=1), 0.1), second.weight, padding=1),
-            0.1,
-        )
+        hidden = leaky_relu(conv2d(x, first.weight, padding=1), 0.1)
+        x = x + leaky_relu(conv2d(hidden, second.weight, padding=1), 0.1)
     for level in range(4):
         neck = conv_transpose2d(x, net.necks[level].weight, stride=2, padding=1)
         # twice the pixels, twice the vectors

@@ -2,15 +2,13 @@
 differences."""
 # pyright: reportArgumentType=false, reportCallIssue=false
 
-import math
-
 import pytest
 import torch
 
-from codesign.errors import CodesignError
-from codesign.events.stream import ordered
 from codesign.flow import contrast
+from codesign.flow.warp import pixel_grid
 from codesign.types import EventVolume
+from tests.event_streams import stream_of
 from tests.flow.test_losses import check_gradients
 
 D = torch.float64
@@ -33,14 +31,11 @@ def lone(height, width, row, column, count=1.0):
 
 def centred(size):
     """x and y [2, size, size] from the middle."""
-    y, x = torch.meshgrid(*[torch.arange(size, dtype=D) - (size - 1) / 2] * 2, indexing="ij")
-    return torch.stack([x, y])
+    return pixel_grid(size, size, torch.zeros((), dtype=D)) - (size - 1) / 2
 
 
 def uniform(u, v, height, width):
-    return (
-        torch.tensor([u, v], dtype=D)[None, :, None, None].expand(1, 2, height, width).contiguous()
-    )
+    return torch.tensor([u, v], dtype=D)[None, :, None, None].repeat(1, 1, height, width)
 
 
 def moving_dots():
@@ -81,9 +76,8 @@ def test_shares_of_an_event_between_pixels_and_what_leaves():
 def test_a_stream_uses_exact_time_stamps_and_both_ends_of_the_interval():
     # an edge that passes one pixel per millisecond; the event before and the one after are not of
     # the interval
-    t_us = torch.tensor([4999, 5000, 6000, 7000, 8000, 8001])
-    x = torch.tensor([0, 2, 3, 4, 5, 0])
-    stream = ordered(t_us, x, torch.ones_like(x), torch.tensor([1, 1, -1, 1, 1, 1]), 3, 8)
+    edge = (5000, 2, 1, 1), (6000, 3, 1, -1), (7000, 4, 1, 1), (8000, 5, 1, 1)
+    stream = stream_of((4999, 0, 1, 1), *edge, (8001, 0, 1, 1), height_px=3, width_px=8)
     tracks = contrast.stream_tracks(stream, uniform(3.0, 0.0, 3, 8), 5000, 8000)
     image = contrast.count_image(tracks, 1.0)[0]
     assert image[:, 1, 5].tolist() == pytest.approx([3, 1])
@@ -103,9 +97,8 @@ def test_tracks_are_carried_back_to_the_pixel_they_start_from(zoom):
     tau = torch.tensor([0.0, 0.5, 1.0], dtype=D)[:, None, None]
     exact = (flow[0, :, None] / (1 + tau * zoom))[inside]
     for steps in (0, 1, 3):
-        found = contrast.volume_tracks(volume, flow, steps).flow_px.unflatten(2, (3, 17, 17))[0][
-            inside
-        ]
+        tracks = contrast.volume_tracks(volume, flow, steps)
+        found = tracks.flow_px.unflatten(2, (3, 17, 17))[0][inside]
         left = (exact * (-tau * zoom) ** (steps + 1)).abs().amax((0, 2, 3))
         torch.testing.assert_close((found - exact).abs().amax((0, 2, 3)), left, rtol=0, atol=1e-12)
 
@@ -113,9 +106,8 @@ def test_tracks_are_carried_back_to_the_pixel_they_start_from(zoom):
 def test_the_smooth_spread_is_alike_wherever_an_event_falls():
     place = torch.arange(9, dtype=D)
     for u, v in [(0.0, 0.0), (0.3, -0.2), (0.5, 0.5), (1.7, -1.1)]:
-        image = contrast.smooth_image(
-            contrast.volume_tracks(lone(9, 9, 4, 4), uniform(u, v, 9, 9)), 1.0
-        )[0, 0]
+        tracks = contrast.volume_tracks(lone(9, 9, 4, 4), uniform(u, v, 9, 9))
+        image = contrast.smooth_image(tracks, 1.0)[0, 0]
         assert float(image.sum()) == pytest.approx(1)
         for shares, centre in ((image.sum(0), 4 + u), (image.sum(1), 4 + v)):
             assert float((shares * place).sum()) == pytest.approx(centre)
@@ -167,35 +159,3 @@ def test_the_smooth_image_has_no_jump_in_its_gradient():
     for place in (0.5, 1.0):
         assert jump(contrast.smooth_image, place) <= 1e-7  # curvature 2 times 2e-9
     assert jump(contrast.count_image, 1.0) == pytest.approx(2)
-
-
-DOTS = moving_dots()
-STREAM = ordered(*[torch.tensor([one]) for one in (10, 1, 1, 1)], 8, 16)
-FLAT = window(torch.zeros(1, 2, 2, 1, 4, dtype=D))
-NAN = torch.zeros(1, 2, 8, 16, dtype=D).index_fill(3, torch.tensor([2]), math.nan)
-STILL = torch.zeros(2, 8, 16)
-
-
-@pytest.mark.parametrize(
-    ("call", "sentence"),
-    [
-        (lambda: contrast.volume_tracks(DOTS, STILL[None, ..., 8:]), r"must be \[1, 2, 8, 16\]"),
-        (lambda: contrast.volume_tracks(window(DOTS.counts[0, :, :, None]), NAN), r"bins, H, W\]"),
-        (
-            lambda: contrast.volume_tracks(DOTS, NAN),
-            "flow of these events must be finite, got .* in 16 of 256",
-        ),
-        (
-            lambda: contrast.warp_jacobian(
-                contrast.volume_tracks(FLAT, uniform(0, 0, 1, 4)), 2, 0.0
-            ),
-            "1 x 4 pixels has no slope",
-        ),
-        (lambda: contrast.stream_tracks(STREAM, STILL, 20, 30), "no event lies"),
-        (lambda: contrast.stream_tracks(STREAM, STILL, 30, 20), "t1 > t0"),
-        (lambda: contrast.stream_tracks(STREAM, STILL, 0, 10.5), "whole micro"),
-    ],
-)
-def test_what_cannot_be_warped_is_refused(call, sentence):
-    with pytest.raises(CodesignError, match=sentence):
-        call()

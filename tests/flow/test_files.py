@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from codesign import backend
-from codesign.errors import CodesignError, DomainError, FileFormatError
+from codesign.errors import DomainError, FileFormatError
 from codesign.flow.files import read_flow, write_flow
 
 QUANTUM_PX = 1 / 128
@@ -96,47 +96,27 @@ def test_files_cut_off_anywhere_are_refused_in_one_sentence(name, field, tmp_pat
         read_flow(tmp_path / f"none-{name}")
 
 
+def flo(*size):
+    return b"PIEH" + struct.pack("<ii", *size) + b"\0" * 8 * 25
+
+
 @pytest.mark.parametrize(
-    ("content", "sentence"),
+    ("name", "content", "sentence"),
     [
-        (png(2, 1, b"\0" * 7, depth=8), "bit depth 8"),
-        (png(2, 1, b"\0" * 12), "cut off or damaged"),
-        (png(2, 1, b"\x05" + b"\0" * 12), "cut off or damaged"),
-        (png(2, 1, b"\0" * 6 + b"\2" + b"\0" * 6), "third channel"),
-        (png(2**31, 2**31 - 1, b""), "up to"),
-        (png(2, 1, b"\0" * 13).replace(b"k\0v", b"k\0w"), "cut off or damaged"),
-        (png(4000, 4000, b"\0" * 20_000_000), "cut off or damaged"),
+        ("a.png", png(2, 1, b"\0" * 7, depth=8), "bit depth 8"),
+        ("a.png", png(2, 1, b"\0" * 12), "cut off or damaged"),
+        ("a.png", png(2, 1, b"\x05" + b"\0" * 12), "cut off or damaged"),
+        ("a.png", png(2, 1, b"\0" * 6 + b"\2" + b"\0" * 6), "third channel"),
+        ("a.png", png(2**31, 2**31 - 1, b""), "up to"),
+        ("a.png", png(2, 1, b"\0" * 13).replace(b"k\0v", b"k\0w"), "cut off or damaged"),
+        ("a.png", png(4000, 4000, b"\0" * 20_000_000), "cut off or damaged"),
+        *(
+            ("a.flo", flo(w, h), "do not hold")
+            for w, h in ((-1, 5), (0, 0), (2**30, 2**30), (5, 6))
+        ),
     ],
 )
-def test_pngs_that_are_no_flow_are_refused(content, sentence, tmp_path):
-    (tmp_path / "a.png").write_bytes(content)
+def test_files_that_are_no_flow_are_refused(name, content, sentence, tmp_path):
+    (tmp_path / name).write_bytes(content)
     with pytest.raises(FileFormatError, match=sentence):
-        read_flow(tmp_path / "a.png")
-
-
-@pytest.mark.parametrize("size", [(-1, 5), (0, 0), (2**30, 2**30), (5, 6)])
-def test_flo_sizes_that_cannot_be_are_refused(size, tmp_path):
-    (tmp_path / "a.flo").write_bytes(b"PIEH" + struct.pack("<ii", *size) + b"\0" * 8 * 25)
-    with pytest.raises(FileFormatError, match="do not hold"):
-        read_flow(tmp_path / "a.flo")
-
-
-FLOW = torch.zeros(2, 3, 3)
-
-
-@pytest.mark.parametrize(
-    ("name", "flow", "valid", "sentence"),
-    [
-        ("a.png", FLOW * torch.nan, None, "NaN or infinite"),
-        ("a.png", FLOW[:1], None, r"\[2, H, W\]"),
-        ("a.png", FLOW, torch.ones(3, 3), "valid mask"),
-        ("a.png", FLOW, torch.ones(3, 4) > 0, "valid mask"),
-        ("a.tif", FLOW, None, r"end in \.flo or \.png"),
-        ("a.flo", FLOW + 2e9, None, "reads as unknown"),
-        ("none/a.flo", FLOW, None, "existing, writable folder"),
-    ],
-)
-def test_what_is_no_flow_is_refused(name, flow, valid, sentence, tmp_path):
-    with pytest.raises(CodesignError, match=sentence):
-        write_flow(tmp_path / name, flow, valid)
-    assert not list(tmp_path.iterdir())
+        read_flow(tmp_path / name)

@@ -2,13 +2,15 @@
 confidence and its gradient."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from codesign import events
 from codesign.flow import estimate_lk
-from codesign.types import EventVolume
+from codesign.flow.export import evenly_timed
+from codesign.flow.warp import pixel_grid
 from scenes.windows.rendered import RenderedWindows, planes
 from tests.certain_case import certain
 
@@ -30,10 +32,8 @@ def pattern(seed, finest_px=6.0, coarsest_px=24.0, count=40):
 
 
 def pixels(height=SIZE, width=SIZE):
-    """x and y [H, W]."""
-    return reversed(
-        torch.meshgrid(torch.arange(height, dtype=D), torch.arange(width, dtype=D), indexing="ij")
-    )
+    """x and y [2, H, W]."""
+    return pixel_grid(height, width, torch.zeros((), dtype=D))
 
 
 def moving(
@@ -54,7 +54,7 @@ def moving(
     matrix = torch.tensor(matrix, dtype=D)
     shift = torch.tensor(shift, dtype=D)
     unit = torch.eye(2, dtype=D)
-    at = torch.stack(list(pixels()), -1) - (SIZE - 1) / 2
+    at = pixels().movedim(0, -1) - (SIZE - 1) / 2
     rate = pattern(seed, *waves_px)
     counts = []
     for k in range(steps):
@@ -113,9 +113,7 @@ def test_flow_changes_sign_with_time_turns_with_the_image_and_knows_no_polarity(
     volume, _ = moving(3, shift=(2.0, 1.0))
 
     def found(counts, model="affine"):
-        return estimate_lk(
-            EventVolume(counts, volume.centroid_s, volume.collected_s), model
-        ).flow_px
+        return estimate_lk(replace(volume, counts=counts), model).flow_px
 
     counts = volume.counts
     right = found(counts)
@@ -131,23 +129,17 @@ def test_scattered_noise_gives_almost_no_flow(count):
     # damping gives some 9 px here.)
     shell, _ = moving(0, steps=10)
     for seed in range(3):
-        cells = torch.randint(
-            shell.counts.numel(), (count,), generator=torch.Generator().manual_seed(seed)
-        )
-        counts = torch.zeros_like(shell.counts)
-        counts.view(-1).index_add_(0, cells, torch.ones(count, dtype=D))
-        flow = estimate_lk(EventVolume(counts, shell.centroid_s, shell.collected_s)).flow_px
+        draw = torch.Generator().manual_seed(seed)
+        cells = torch.randint(shell.counts.numel(), (count,), generator=draw)
+        counts = cells.bincount(minlength=shell.counts.numel()).to(D).reshape(shell.counts.shape)
+        flow = estimate_lk(replace(shell, counts=counts)).flow_px
         assert float(flow.norm(dim=1).max()) <= 0.3
 
 
 def test_confidence_follows_from_the_covariance_and_is_zero_without_events():
     volume, _ = moving(0, shift=(1.0, 0.5), steps=10)
     both = torch.cat([volume.counts, 0 * volume.counts])
-    field = certain(
-        estimate_lk(
-            EventVolume(both, volume.centroid_s, volume.collected_s), "constant", prior_px=2.0
-        )
-    )
+    field = certain(estimate_lk(replace(volume, counts=both), "constant", prior_px=2.0))
     variance = field.covariance_px2[:, 0] + field.covariance_px2[:, 2]
     # the empty sample has the prior's: 2^2 + 2^2, and a little for what no polynomial explains
     assert 8 < float(variance[1].min()) <= float(variance[1].max()) < 8.5
@@ -176,29 +168,19 @@ def test_squared_errors_are_those_of_the_covariance(kind, most):
     )
 
 
-@pytest.mark.parametrize(
-    ("model", "clock"),
-    [
-        ("constant", "time"),
-        ("affine", "time"),
-        ("quadratic", "time"),
-        ("local", "time"),
-        ("affine", "events"),
-    ],
-)
-def test_gradients_are_those_of_differences(model, clock, generator):
+@pytest.mark.parametrize("case", ["constant", "affine", "quadratic", "local", "affine events"])
+def test_gradients_are_those_of_differences(case, generator):
     """Of the flow, its covariance and confidence; by events as the clock, of a motion that turns
     back."""
+    model, clock = (*case.split(), "time")[:2]
     volume, _ = moving(4, shift=(0.7, -0.4), steps=20, bins=6)
     counts = volume.counts[..., 10:24, 8:22] * 0.3
     if clock == "events":
         counts = torch.cat([counts, counts.flip(1, 2)[:, :, 1:4]], 2)
-    bins = counts.shape[2]
-    times = (torch.arange(bins, dtype=D) + 0.5) / bins, torch.full((bins,), 1 / bins, dtype=D)
     weights = torch.randn(6, 14, 14, generator=generator, dtype=D)
 
     def loss(counts):
-        field = certain(estimate_lk(EventVolume(counts, *times), model, clock=clock))
+        field = certain(estimate_lk(evenly_timed(counts), model, clock=clock))
         values = torch.cat([field.flow_px[0], field.confidence, field.covariance_px2[0]])
         return (values * weights).sum()
 

@@ -45,12 +45,8 @@ def drawn(case, generator):
     grid = Grid(height, width, stride)
     # batch first, then bins: two of flow, density, three of weights
     numbers = torch.randn(bins + 6, batch, *grid.shape, generator=generator, dtype=D)
-    rate, flow, density = (
-        numbers[:-6].transpose(0, 1),
-        4 * numbers[-6:-4].transpose(0, 1),
-        numbers[-4].abs(),
-    )
-    return grid, cell, rate.contiguous(), flow.contiguous(), density, numbers[-3:]
+    rate, flow = numbers[:-6].transpose(0, 1), 4 * numbers[-6:-4].transpose(0, 1)
+    return grid, cell, rate.contiguous(), flow.contiguous(), numbers[-4].abs(), numbers[-3:]
 
 
 def leaves(*tensors):
@@ -66,11 +62,8 @@ def everything(form, grid, cell, rate, flow, density, weights):
     with form():
         rate = blurred(images, grid, TAPS)
         read = moving(rate, flow, time, contrast, grid, FADE_PX)
-        by_reading = torch.autograd.grad(
-            sum((w * x).sum() for w, x in zip(weights, read, strict=True)),
-            (images, flow),
-            retain_graph=True,
-        )
+        total = sum((w * x).sum() for w, x in zip(weights, read, strict=True))
+        by_reading = torch.autograd.grad(total, (images, flow), retain_graph=True)
         sums = cell_sums(*read, density, grid, cell)
         pulls = torch.linspace(-1, 1, sums.numel(), dtype=D).to(sums).reshape(sums.shape)
         by_sums = torch.autograd.grad((pulls * sums).sum(), (images, flow, density))
@@ -245,13 +238,8 @@ def test_the_step_to_the_start_is_that_of_plain_operations(model, height, width,
 
     half = 0.3 * draw(2, 2 * shape.terms, 2 * shape.terms)
     value, covariance = draw(*cells.value.shape), draw(*cells.covariance.shape)
-    given = leaves(
-        1.5 * draw(2, 2 * shape.terms),
-        half @ half.mT,
-        value,
-        covariance,
-        torch.tensor([-0.5, -0.4], dtype=D),
-    )
+    start = torch.tensor([-0.5, -0.4], dtype=D)
+    given = leaves(1.5 * draw(2, 2 * shape.terms), half @ half.mT, value, covariance, start)
     weights = [draw(2, count, height, width) for count in (2, 3)]
 
     def run(form):

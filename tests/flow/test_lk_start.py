@@ -1,12 +1,13 @@
 """Warm starts of the closed form: motions that are found from near by only, and starts that are
 wrong."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from codesign.flow import estimate_lk
 from codesign.flow.lk import polynomials
-from codesign.types import EventVolume
 from tests.flow.test_lk import D, length, mean_error, moving, pixels
 
 FINE_PX = (4.0, 8.0)  # a blur of 4 px leaves a thousandth of these textures
@@ -60,19 +61,17 @@ def test_events_that_say_nothing_keep_no_start(count):
     # stay)
     shell, _ = moving(0, steps=10)
     for seed in range(2):
+        draw = torch.Generator().manual_seed(seed)
         counts = torch.zeros_like(shell.counts)
-        places = torch.randint(
-            counts.numel(), (count,), generator=torch.Generator().manual_seed(seed)
-        )
-        counts.view(-1)[places] += 1
-        volume = EventVolume(counts, shell.centroid_s, shell.collected_s)
+        counts.view(-1)[torch.randint(counts.numel(), (count,), generator=draw)] += 1
+        volume = replace(shell, counts=counts)
         warm = estimate_lk(volume, start_px=torch.tensor([[40.0, -20.0]])).flow_px
         torch.testing.assert_close(warm, estimate_lk(volume).flow_px, rtol=0, atol=1e-6)
 
 
 def test_starts_of_a_batch_are_each_their_own_and_have_no_gradient():
     (a, _), (b, _) = moving(0, shift=(2.0, 1.0)), moving(1, shift=(-1.0, 0.5))
-    both = EventVolume(torch.cat([a.counts, b.counts]), a.centroid_s, a.collected_s)
+    both = replace(a, counts=torch.cat([a.counts, b.counts]))
     starts = torch.tensor([[4.0, 0.0], [-2.0, -1.0]], requires_grad=True)
     found = estimate_lk(both, start_px=starts).flow_px
     assert not found.requires_grad

@@ -2,14 +2,14 @@
 collapse, and finite differences."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 
 from codesign import events
 from codesign.flow import contrast, losses
-from codesign.types import EventVolume
+from codesign.flow.export import evenly_timed
+from tests.flow.test_contrast import centred
 from tests.flow.test_losses import check_gradients
 
 D = torch.float64
@@ -18,7 +18,7 @@ D = torch.float64
 def dots(zoom=0.0, shift=(0.0, 0.0), size=40, radius=12.0, count=24, bins=6, steps=36):
     """Volume of Gaussian dots (1.2 px) of both signs, scattered around the middle, that move and
     grow by zoom x + shift; the grid [2, H, W] from the middle."""
-    y, x = torch.meshgrid(*[torch.arange(size, dtype=D) - (size - 1) / 2] * 2, indexing="ij")
+    x, y = grid = centred(size)
     u = torch.rand(3, count, generator=torch.Generator().manual_seed(3), dtype=D)
     place = (
         radius * u[0].sqrt() * torch.stack([(2 * math.pi * u[1]).cos(), (2 * math.pi * u[1]).sin()])
@@ -32,7 +32,7 @@ def dots(zoom=0.0, shift=(0.0, 0.0), size=40, radius=12.0, count=24, bins=6, ste
     )
     frames = torch.stack([blob[:, u[2] > 0.5].sum(1), blob[:, u[2] <= 0.5].sum(1)], 1)
     times = torch.linspace(0, 0.05, steps + 1, dtype=D)
-    return events.from_counts(frames, times, bins), torch.stack([x, y])
+    return events.from_counts(frames, times, bins), grid
 
 
 def least(loss, values):
@@ -46,11 +46,9 @@ def least(loss, values):
 def plain_contrast(volume, flow_px):
     """The objective as published, without a guard: zero-flow sharpness over mean sharpness."""
     tracks = contrast.volume_tracks(volume, flow_px)
-    moved = [
-        share * contrast.sharpness(contrast.smooth_image(tracks, at))
-        for at, share in losses.REFERENCES
-    ]
-    return (contrast.sharpness(contrast.still_image(volume.counts)) / sum(moved)).mean()
+    images = [(share, contrast.smooth_image(tracks, at)) for at, share in losses.REFERENCES]
+    moved = sum(share * contrast.sharpness(image) for share, image in images)
+    return (contrast.sharpness(contrast.still_image(volume.counts)) / moved).mean()
 
 
 @pytest.mark.parametrize("loss", [losses.contrast_loss, plain_contrast])
@@ -90,22 +88,18 @@ def test_the_plain_objective_collapses_and_the_guarded_one_finds_the_zoom(zoom):
 def test_no_events_cost_as_much_as_zero_flow_and_give_no_gradient(generator):
     counts = torch.zeros(1, 2, 3, 8, 9, requires_grad=True)
     flow = torch.randn(1, 2, 8, 9, generator=generator).requires_grad_()
-    volume = EventVolume(counts, torch.linspace(0, 1, 3), torch.full((3,), 1 / 3))
-    value = losses.contrast_loss(volume, flow)
+    value = losses.contrast_loss(evenly_timed(counts), flow)
     assert value.item() == 1
     assert not any(grad.any() for grad in torch.autograd.grad(value, (counts, flow)))
     drawn = torch.rand(counts.shape, generator=generator)
-    still = losses.contrast_loss(replace(volume, counts=drawn), torch.zeros(1, 2, 8, 9))
+    still = losses.contrast_loss(evenly_timed(drawn), torch.zeros(1, 2, 8, 9))
     assert float(still) == pytest.approx(1, rel=1e-6)
 
 
 def test_gradcheck_in_events_and_flow(generator):
-    shell = EventVolume(
-        torch.zeros(1), torch.tensor([0.0, 0.7], dtype=D), torch.full((2,), 0.5, dtype=D)
-    )
     counts = torch.rand(1, 2, 2, 3, 4, generator=generator, dtype=D)
     flow = 0.8 * torch.randn(1, 2, 3, 4, generator=generator, dtype=D)
-    check_gradients(lambda c, f: losses.contrast_loss(replace(shell, counts=c), f), counts, flow)
+    check_gradients(lambda c, f: losses.contrast_loss(evenly_timed(c), f), counts, flow)
 
 
 def test_the_weight_of_an_area_is_itself_where_it_is_moderate():

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from codesign.errors import CodesignError, DomainError
+from codesign.errors import DomainError
 from codesign.events.stream import ordered
 from codesign.flow import metrics
 from codesign.flow.export import evenly_timed
@@ -159,31 +159,6 @@ def test_polarities_share_an_image_in_fwl_but_not_in_rsat():
     assert metrics.fwl(stream, flow, 0, 10) == pytest.approx((4 / 4 - 1 / 4) / (2 / 4 - 1 / 4))
     # (0 + 1) / 1 pixel against (0 + 1) / 2 pixels
     assert metrics.rsat(stream, flow, 0, 10) == pytest.approx(2)
-
-
-NOTHING = torch.zeros(1, 5, dtype=torch.bool)
-ONES = torch.ones(4, dtype=torch.int64)
-EVERYWHERE = ordered(
-    torch.arange(4), torch.tensor([0, 1, 0, 1]), torch.tensor([0, 0, 1, 1]), ONES, 2, 2
-)
-AT_ONCE = ordered(0 * ONES[:1], 0 * ONES[:1], 0 * ONES[:1], ONES[:1], 2, 2)
-FOUR = torch.zeros(2, 2, 2, dtype=D)
-
-
-@pytest.mark.parametrize(
-    ("call", "sentence"),
-    [
-        (lambda: metrics.aee(FOUND, TRUTH, NOTHING), "selects no pixel"),
-        (lambda: metrics.aee(FOUND, TRUTH[:, :, :3]), r"\[\.\.\., 2, H, W\]"),
-        (lambda: metrics.aee(FOUND, TRUTH, torch.ones(4, 4) > 0), r"mask must be .*, got \[4, 4\]"),
-        (lambda: metrics.fwl(EVERYWHERE, FOUR, 5, 9), "no event lies between"),
-        (lambda: metrics.fwl(EVERYWHERE, FOUR, 0, 3), "equally many events"),
-        (lambda: metrics.rsat(AT_ONCE, FOUR, 0, 3), "at the start of the interval"),
-    ],
-)
-def test_what_has_no_answer_is_refused(call, sentence):
-    with pytest.raises(CodesignError, match=sentence):
-        call()
 
 
 @pytest.mark.parametrize("measure", [metrics.aee, metrics.angular_error_deg])

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.errors import DomainError
 from codesign.events import from_stream
 from codesign.flow.checkpoint import load
 from codesign.flow.lk import estimate_lk
@@ -274,5 +273,3 @@ def test_the_budget_of_weights():
     made = Refiner()
     assert sum(parameter.numel() for parameter in made.parameters()) <= 400_000
     assert made.config == {"bins": 8, "width": 48, "steps": 2}
-    with pytest.raises(DomainError, match="multiple of 16"):
-        Refiner(width=10)

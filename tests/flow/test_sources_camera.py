@@ -50,15 +50,11 @@ def test_events_are_read_as_written_whatever_the_chunks(form, tmp_path, monkeypa
 
 def test_the_sensor_is_the_one_told_or_the_smallest_that_holds_the_events(tmp_path):
     path = tmp_path / "events.txt"
-    for reach, size in (
-        ((10, 10), (180, 240)),
-        ((345, 259), (260, 346)),
-        ((346, 0), (480, 640)),
-        ((1280, 4), (5, 1281)),
-    ):
-        path.write_text(f"0.5 {reach[0]} {reach[1]} 1\n0.6 0 0 0\n")
+    reaches = (10, 10, 180, 240), (345, 259, 260, 346), (346, 0, 480, 640), (1280, 4, 5, 1281)
+    for x, y, *size in reaches:
+        path.write_text(f"0.5 {x} {y} 1\n0.6 0 0 0\n")
         found = read_recording(path)
-        assert (found.height_px, found.width_px) == size
+        assert [found.height_px, found.width_px] == size
     with pytest.raises(FileFormatError, match=r"line 1: .*x = 1280; the sensor has 1280 pixels"):
         read_recording(path, PacketOptions(size_px=(720, 1280)))
     (tmp_path / "images").mkdir()
@@ -129,10 +125,8 @@ def test_flow_of_undistorted_pixels_is_carried_to_raw_ones(lens, tmp_path):
     write_flow(tmp_path / "flow.flo", torch.from_numpy(flat))
 
     def read(**options):
-        made_of = PacketOptions(
-            window_s=0.02, start_s=0.0, size_px=DAVIS, truth_interval_s=0.02, **options
-        )
-        return read_packets(tmp_path / "a", tmp_path / "flow.flo", made_of)[0]
+        options |= {"window_s": 0.02, "start_s": 0.0, "truth_interval_s": 0.02, "size_px": DAVIS}
+        return read_packets(tmp_path / "a", tmp_path / "flow.flo", PacketOptions(**options))[0]
 
     carried = read(truth_pixels="undistorted")
     both = carried.truth.valid[0].numpy() & valid

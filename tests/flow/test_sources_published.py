@@ -2,6 +2,8 @@
 training."""
 # pyright: reportArgumentType=false
 
+from pathlib import Path
+
 import hdf5plugin
 import numpy as np
 import pytest
@@ -9,26 +11,17 @@ import torch
 
 from codesign import events
 from codesign.errors import CodesignError
-from codesign.events.stream import ordered
 from codesign.flow.files import write_flow
 from codesign.flow.sources import DsecWindows, MvsecWindows, open_windows
 from codesign.flow.sources.dsec import splatted
 from studies.make_dataset.store import h5
+from tests.event_streams import random_stream
 from tests.recording_case import gone, halved, rewritten, stores
 
 # DSEC
 
 
-def some_events(count, size, t0_us, t1_us, seed=0):
-    draw = torch.Generator().manual_seed(seed)
-    t_us, x, y, on = (
-        torch.randint(low, high, (count,), generator=draw)
-        for low, high in ((t0_us, t1_us + 1), (0, size[1]), (0, size[0]), (0, 2))
-    )
-    return ordered(t_us, x, y, 2 * on - 1, *size)
-
-
-DSEC = some_events(6000, (120, 160), 1_000_000, 1_450_000)
+DSEC = random_stream(6000, 120, 160, 450_000, 1_000_000)
 
 
 def dsec_field(k):
@@ -47,13 +40,10 @@ def make_dsec(folder, shift=(0.0, 0.0), two=False):
     events.write(place / "events.h5", DSEC)
     with h5(place / "events.h5", "r+") as file:
         for key in "xypt":
-            packed = {
-                "data": file[f"events/{key}"][()],
-                "chunks": (1000,),
-                **hdf5plugin.Blosc(cname="zstd"),
-            }
+            values = file[f"events/{key}"][()]
             del file[f"events/{key}"]
-            file["events"].create_dataset(key, **packed)
+            packing = hdf5plugin.Blosc(cname="zstd")
+            file["events"].create_dataset(key, data=values, chunks=(1000,), **packing)
     y, x = np.mgrid[0:120, 0:160].astype(np.float32)
     with h5(place / "rectify_map.h5", "w") as file:
         file["rectify_map"] = np.stack([x + np.float32(shift[0]), y + np.float32(shift[1])], -1)
@@ -96,30 +86,24 @@ def test_events_between_pixels_are_shared_and_none_is_lost():
 # MVSEC
 
 
-MVSEC = some_events(9000, (26, 34), 10_000_000, 10_600_000, seed=3)
+MVSEC = random_stream(9000, 26, 34, 600_000, 10_000_000, seed=3)
+ROWS = np.stack([MVSEC.x, MVSEC.y, MVSEC.t_us.double() / 1e6, MVSEC.p], 1, dtype=np.float64)
 
 
 def make_mvsec(folder, chunks=None):
     """indoor_flying1 of 26 x 34 px: flow (8, -4) px per 50 ms, grey frames every 31.25 ms; nothing
     measured in the first columns."""
     folder.mkdir(parents=True)
-    columns = (MVSEC.x, MVSEC.y, MVSEC.t_us.double() / 1e6, MVSEC.p)
-    rows = torch.stack([column.double() for column in columns], 1).numpy()
     packing = {} if chunks is None else {"chunks": chunks, "compression": "gzip"}
-    with h5(folder / "indoor_flying1_data.hdf5", "w") as file:
+    with h5(folder / GREY, "w") as file:
         group = file.create_group("davis/left")
-        group.create_dataset("events", data=rows, **packing)
+        group.create_dataset("events", data=ROWS, **packing)
         group["image_raw_ts"] = 10.0 + np.arange(19) * 0.03125
         group["image_raw"] = np.zeros((19, 26, 34), np.uint8)
     seen = np.arange(34) >= 5
-    flow = {name: np.full((11, 26, 34), speed) * seen for name, speed in (("x", 8.0), ("y", -4.0))}
+    flow = {f"{k}_flow_dist": np.full((11, 26, 34), v) * seen for k, v in (("x", 8.0), ("y", -4.0))}
     save = np.savez if chunks is None else np.savez_compressed  # left on the disk, or read
-    save(
-        folder / "indoor_flying1_gt_flow_dist.npz",
-        timestamps=10.02 + 0.05 * np.arange(11),
-        x_flow_dist=flow["x"],
-        y_flow_dist=flow["y"],
-    )
+    save(folder / GT, timestamps=10.02 + 0.05 * np.arange(11), **flow)
     return folder
 
 
@@ -156,9 +140,7 @@ def test_mvsec_windows(frames, chunks, length_s, grid, tmp_path):
 
 def test_windows_end_with_the_events(tmp_path):
     make_mvsec(tmp_path / "m")
-    columns = (MVSEC.x, MVSEC.y, MVSEC.t_us.double() / 1e6, MVSEC.p)
-    early = torch.stack([column.double() for column in columns], 1)[MVSEC.t_us < 10_300_000]
-    stores(tmp_path / "m" / GREY, "davis/left/events", early.numpy())
+    stores(tmp_path / "m" / GREY, "davis/left/events", ROWS[MVSEC.t_us < 10_300_000])
     # flows begin at 10.02 s, 50 ms apart
     assert len(MvsecWindows(tmp_path / "m", frames=0)) == 5
 
@@ -176,65 +158,47 @@ def mvsec(folder):
     return MvsecWindows
 
 
+def holds(path, arrays):
+    np.savez(path, **arrays)
+
+
 LEFT = "thun_00_a/events/left"
 FLOW = "thun_00_a/flow"
+TIMES = f"{FLOW}/forward_timestamps.txt"
 GREY = "indoor_flying1_data.hdf5"
 GT = "indoor_flying1_gt_flow_dist.npz"
+SMALL = np.zeros((9, 9, 2), np.float32)
 MAPS = {"x_flow_dist": np.ones((11, 26, 34)), "y_flow_dist": np.ones((11, 26, 34))}
+STILL = {"timestamps": np.zeros(11), **MAPS}
 
 
+# source, path, what happens to it and with what, words of the sentence
 @pytest.mark.parametrize(
-    ("source", "damage", "reason"),
+    ("source", "path", "damage", "given", "reason"),
     [
-        (dsec, lambda at: gone(at / LEFT / "rectify_map.h5"), "no file lies at .*rectify_map.h5"),
-        (
-            dsec,
-            lambda at: stores(
-                at / LEFT / "rectify_map.h5", "rectify_map", np.zeros((9, 9, 2), np.float32)
-            ),
-            "rectify_map has shape",
-        ),
-        (dsec, lambda at: gone(at / LEFT / "events.h5"), "no file lies at .*events.h5"),
-        (dsec, lambda at: halved(at / LEFT / "events.h5"), "cut or damaged"),
-        (
-            dsec,
-            lambda at: rewritten(at / FLOW / "forward_timestamps.txt", "1310000, 1410000", ""),
-            "for 3 flow",
-        ),
-        (
-            dsec,
-            lambda at: rewritten(
-                at / FLOW / "forward_timestamps.txt", "1310000, 14", "9310000, 94"
-            ),
-            "the events of",
-        ),
-        (
-            dsec,
-            lambda at: rewritten(
-                at / FLOW / "forward_timestamps.txt", "1310000, 141", "1310000, 142"
-            ),
-            "all must last alike",
-        ),
-        (
-            dsec,
-            lambda at: (at / FLOW / "forward" / "000004.png").write_bytes(b"no"),
-            "is not a PNG file",
-        ),
-        (dsec, lambda at: gone(at / FLOW), "holds no sequence of DSEC"),
-        (dsec, lambda at: gone(at / LEFT), "is missing; download the events"),
-        (mvsec, lambda at: gone(at / GT), f"has no {GT}"),
-        (mvsec, lambda at: halved(at / GT), "use a whole .npz file"),
-        (mvsec, lambda at: np.savez(at / GT, timestamps=np.arange(3.0)), "use a whole .npz file"),
-        (mvsec, lambda at: np.savez(at / GT, timestamps=np.zeros(11), **MAPS), "rising times"),
-        (mvsec, lambda at: halved(at / GREY), "cut or damaged"),
-        (mvsec, lambda at: stores(at / GREY, "davis/left/events", np.zeros((9, 3))), r"\[9, 3\]"),
-        (mvsec, lambda at: gone(at / GREY), "holds no"),
+        (dsec, f"{LEFT}/rectify_map.h5", gone, (), "no file lies at .*rectify_map.h5"),
+        (dsec, f"{LEFT}/rectify_map.h5", stores, ("rectify_map", SMALL), "rectify_map has shape"),
+        (dsec, f"{LEFT}/events.h5", gone, (), "no file lies at .*events.h5"),
+        (dsec, f"{LEFT}/events.h5", halved, (), "cut or damaged"),
+        (dsec, TIMES, rewritten, ("1310000, 1410000", ""), "for 3 flow"),
+        (dsec, TIMES, rewritten, ("1310000, 14", "9310000, 94"), "the events of"),
+        (dsec, TIMES, rewritten, ("1310000, 141", "1310000, 142"), "all must last alike"),
+        (dsec, f"{FLOW}/forward/000004.png", Path.write_bytes, (b"no",), "is not a PNG file"),
+        (dsec, FLOW, gone, (), "holds no sequence of DSEC"),
+        (dsec, LEFT, gone, (), "is missing; download the events"),
+        (mvsec, GT, gone, (), f"has no {GT}"),
+        (mvsec, GT, halved, (), "use a whole .npz file"),
+        (mvsec, GT, holds, ({"timestamps": np.arange(3.0)},), "use a whole .npz file"),
+        (mvsec, GT, holds, (STILL,), "rising times"),
+        (mvsec, GREY, halved, (), "cut or damaged"),
+        (mvsec, GREY, stores, ("davis/left/events", np.zeros((9, 3))), r"\[9, 3\]"),
+        (mvsec, GREY, gone, (), "holds no"),
     ],
 )
-def test_damage_is_refused_at_once(source, damage, reason, tmp_path):
+def test_damage_is_refused_at_once(source, path, damage, given, reason, tmp_path):
     folder = tmp_path / "set"
     opened = source(folder)
-    damage(folder)
+    damage(folder / path, *given)
     with pytest.raises(CodesignError, match=reason):
         opened(folder)
 
@@ -249,9 +213,7 @@ def test_a_folder_is_opened_as_what_it_is(tmp_path):
     with pytest.raises(CodesignError, match="no window"):
         MvsecWindows(tmp_path / "m", span_s=(0.0, 0.01))
     (tmp_path / "empty").mkdir()
-    for name, reason in (
-        ("empty", r"holds no events: no events\.txt"),
-        ("absent", "nothing lies at"),
-    ):
-        with pytest.raises(CodesignError, match=reason):
-            open_windows(tmp_path / name)
+    with pytest.raises(CodesignError, match=r"holds no events: no events\.txt"):
+        open_windows(tmp_path / "empty")
+    with pytest.raises(CodesignError, match="nothing lies at"):
+        open_windows(tmp_path / "absent")

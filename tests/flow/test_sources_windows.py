@@ -26,22 +26,8 @@ from tests.recording_case import eth_text, gone, halved, made, rewritten, stores
 def dataset(tmp_path_factory):
     threads = torch.get_num_threads()
     folder = tmp_path_factory.mktemp("data") / "set"
-    options = [
-        "--trajectories",
-        "2",
-        "--frames",
-        "13",
-        "--size",
-        "40",
-        "--samples",
-        "2",
-        "--chunk",
-        "5",
-        "--rate-hz",
-        "90",
-        "--out",
-    ]
-    assert main(study.study, study.Config, [*options, str(folder)]) == 0
+    options = "--trajectories 2 --frames 13 --size 40 --samples 2 --chunk 5 --rate-hz 90 --out"
+    assert main(study.study, study.Config, [*options.split(), str(folder)]) == 0
     torch.set_num_threads(threads)
     return folder
 
@@ -174,41 +160,31 @@ def test_a_recording_is_a_source_of_windows(tmp_path):
 RADIAL = "sequence_001_radial"
 
 
+NARROW = np.zeros((12, 2, 40, 39), np.float32)
+FAR = np.full(200, 10**9, np.uint64)
+
+
+# of the set or one sequence: path, what happens to it and with what, words of the sentence
 @pytest.mark.parametrize(
-    ("damage", "reason"),
+    ("of", "path", "damage", "given", "reason"),
     [
-        (lambda at: gone(at / RADIAL / "events.h5"), "lacks events.h5"),
-        (lambda at: halved(at / RADIAL / "frames.h5"), "by the manifest; it was cut"),
-        (lambda at: gone(at / "manifest.json"), "has no manifest.json"),
+        ("", f"{RADIAL}/events.h5", gone, (), "lacks events.h5"),
+        ("", f"{RADIAL}/frames.h5", halved, (), "by the manifest; it was cut"),
+        ("", "manifest.json", gone, (), "has no manifest.json"),
         (
-            lambda at: rewritten(at / "manifest.json", "-dataset/1", "-dataset/9"),
+            "",
+            "manifest.json",
+            rewritten,
+            ("-dataset/1", "-dataset/9"),
             "format 'codesign-dataset/9'",
         ),
+        (RADIAL, "frames.h5", stores, ("flow", NARROW), r"flow has shape \[12, 2, 40, 39\], \["),
+        (RADIAL, "frames.h5", stores, ("timestamps", np.zeros(13, np.int64)), "do not rise"),
+        (RADIAL, "events.h5", stores, ("ms_to_idx", FAR), "no index"),
     ],
 )
-def test_damage_is_refused_at_once(damage, reason, dataset, tmp_path):
-    folder = tmp_path / "set"
-    shutil.copytree(dataset, folder)
-    damage(folder)
+def test_damage_is_refused_at_once(of, path, damage, given, reason, dataset, tmp_path):
+    shutil.copytree(dataset / of, tmp_path / "set")
+    damage(tmp_path / "set" / path, *given)
     with pytest.raises(CodesignError, match=reason):
-        DatasetWindows(folder)
-
-
-@pytest.mark.parametrize(
-    ("name", "key", "values", "reason"),
-    [
-        (
-            "frames.h5",
-            "flow",
-            np.zeros((12, 2, 40, 39), np.float32),
-            r"flow has shape \[12, 2, 40, 39\], \[",
-        ),
-        ("frames.h5", "timestamps", np.zeros(13, np.int64), "do not rise"),
-        ("events.h5", "ms_to_idx", np.full(200, 10**9, np.uint64), "no index"),
-    ],
-)
-def test_a_sequence_whose_parts_do_not_fit(name, key, values, reason, dataset, tmp_path):
-    shutil.copytree(dataset / RADIAL, tmp_path / "one")
-    stores(tmp_path / "one" / name, key, values)
-    with pytest.raises(CodesignError, match=reason):
-        DatasetWindows(tmp_path / "one")
+        DatasetWindows(tmp_path / "set")
