@@ -9,56 +9,56 @@ ROOT = Path(__file__).resolve().parents[1]
 UNCOUNTED = (ast.expr_context, ast.operator, ast.unaryop, ast.cmpop, ast.boolop)
 BUDGETS = {
     "codesign": 9_900,
-    "codesign/events": 47_450,
+    "codesign/events": 47_500,  # copies of last frames, options of files that say all
     "codesign/fidelity": 2_950,
-    "codesign/flow": 42_650,  # windows that run past a recording are left out
+    "codesign/flow": 42_760,  # truth that is unknown, windows that share no event
     "codesign/grad": 3_300,
-    "codesign/lens": 47_300,  # glass passed twice, fields as slopes, films that follow
-    "codesign/mount": 14_600,  # objects need a pose for each of the camera's
+    "codesign/lens": 47_310,  # glass passed twice, fields as slopes, films that follow
+    "codesign/mount": 14_660,  # films looked at all over
     "codesign/optimise": 3_900,
     "codesign/render": 43_500,  # steps of differences by their motion on the film, maps of other cameras
-    "codesign/report": 7_100,  # thin lenses are drawn
+    "codesign/report": 7_130,  # says that there is nothing to draw
     "codesign/system": 9_550,
-    "codesign/train": 5_500,
+    "codesign/train": 5_510,  # windows that stand still
     "scenes": 14_500,
     "scenes/robots": 9_500,
     "scenes/trajectories": 3_100,
     "scenes/windows": 8_700,
     "setup": 5_350,  # doctests are code in the docs, four more parts of evidence
-    "studies": 7_400,  # what a subset brings beyond its parts
+    "studies": 7_780,  # joint_refiner
     "studies/chain_picture": 1_650,  # each stage alone, for the gallery
-    "studies/codesign": 13_950,  # near starts
-    "studies/flow_quality": 5_400,
+    "studies/codesign": 14_730,  # a refiner in the joint optimiser
+    "studies/flow_quality": 5_560,  # names of recordings, no truth of rotation alone
     "studies/flow_recording": 3_350,
-    "studies/frame": 8_750,
+    "studies/frame": 8_780,  # functions of scripts are named
     "studies/gradient_flow": 6_350,  # a first line that answers
     "studies/lens_motion": 4_150,
-    "studies/lens_opt": 6_350,
+    "studies/lens_opt": 6_370,  # where windows lie
     "studies/lens_report": 2_350,
     "studies/make_dataset": 4_000,
     "studies/placement": 7_950,
-    "studies/sensor_fit": 2_000,
+    "studies/sensor_fit": 2_010,  # frames of uint8
     "studies/speed_error": 7_650,  # the same
     "studies/spike_esim": 3_050,
     "studies/stability": 8_250,
-    "studies/train_flow": 5_150,
+    "studies/train_flow": 5_170,  # steps of a race
     "studies/viewer": 3_500,  # says what a fail may be
     "studies/video_to_events": 4_300,
-    "tests": 15_110,
+    "tests": 15_220,  # sdist, scripts of other processes
     "tests/data": 1_000,
     "tests/events": 32_570,
     "tests/flow": 28_830,
     "tests/gradients": 3_500,
     "tests/hard_cases": 2_600,
     "tests/hostile": 19_090,
-    "tests/lens": 37_350,  # the same
+    "tests/lens": 37_400,  # the same
     "tests/mount": 14_600,
-    "tests/optimise": 3_500,
+    "tests/optimise": 3_560,  # a state is a copy
     "tests/render": 30_900,  # intermediate images
     "tests/scenes": 20_150,
-    "tests/studies": 33_650,  # loops play, pages that no browser saw are named, panels of the gallery
+    "tests/studies": 34_840,  # joint_refiner and a review of studies
     "tests/system": 7_050,
-    "tests/train": 4_950,  # heads that take turns
+    "tests/train": 5_010,
 }
 
 
