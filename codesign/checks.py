@@ -131,7 +131,8 @@ def check_whole(
     lowest = -most if least is None else least
     if not (math.isfinite(number) and number % 1 == 0 and lowest <= int(value) <= most):
         first = lowest if least is not None or number < lowest else -math.inf
-        bounds = _bounds(first, most if most < MOST_WHOLE or number > most else math.inf)
+        beyond = math.isfinite(number) and int(value) > most
+        bounds = _bounds(first, most if most < MOST_WHOLE or beyond else math.inf)
         raise DomainError(
             f"{name} must be a whole number{bounds}, got {shown(value)}{_told(remedy)}."
         )

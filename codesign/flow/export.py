@@ -61,8 +61,8 @@ def export(
         raise DomainError(
             f"'{path.name}' is no program file; give a name that ends in .pt2 (torch.export) or .onnx."
         )
-    program = trace(network, height_px, width_px, batch)
-    with replacing(path) as temporary:
+    with replacing(path) as temporary:  # where nothing can be written, nothing is traced
+        program = trace(network, height_px, width_px, batch)
         if path.suffix == ".pt2":
             buffer = io.BytesIO()
             with warnings.catch_warnings():

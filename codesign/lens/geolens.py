@@ -162,8 +162,8 @@ class GeoLens(Replaceable):
         thickness, a sag slope of 0.1 at the rim for a shape, 0.05 of an index) gets that as its
         unit.
         Returns: one Parameter [K] per name.
-        Raises: DomainError for unknown names, values outside their bounds, and names with nothing
-          to vary.
+        Raises: DomainError for unknown names, values outside their bounds, names with nothing to
+          vary, and numbers of glass that the light passes twice.
         """
         efl = self.first_order().efl_mm.detach()
         held = {}

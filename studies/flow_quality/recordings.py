@@ -31,7 +31,7 @@ MEASURES = {
     ),
     "aee_px": (
         "Endpoint error where events are, px",
-        "Against the exact flow; mean over packets (worst).",
+        "Against the true flow, exact for the two that are made; mean over packets (worst).",
         "largest",
         max,
     ),

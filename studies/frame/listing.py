@@ -18,7 +18,8 @@ GROUPS = {
     "flow": ("train_flow", "flow_quality", "flow_recording"),
     "whole chain": (
         *("lens_opt", "lens_motion", "placement"),
-        *("codesign", "joint_map", "joint_levers", "joint_controls", "velocity_head"),
+        *("codesign", "joint_map", "joint_levers", "joint_controls"),
+        *("joint_refiner", "velocity_head"),
         *("gradient_flow", "speed_error", "stability", "chain_picture", "hero", "viewer"),
     ),
 }

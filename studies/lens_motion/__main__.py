@@ -2,7 +2,7 @@
 direction?
 
 A cheap fast lens with few free numbers looks at textured walls from a drive with statistics of its
-own: forward, a turn, hovering, any motion, or a file of poses. Five designers with the same
+own: forward, a turn, hovering, any motion, or a file of poses. Six designers with the same
 variables, light and limits place and bend it: the film alone, RMS spots, mean MTF at 0.15 cycles
 per pixel, the same MTF along the motion of every window, and, on development cases with hard
 events, the edge energy and the flow error itself. Held-out cases judge, once as they are and once,
@@ -12,7 +12,7 @@ where the motion has a direction, with the motion turned by 90 degrees.
 import csv
 import math
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import ClassVar
@@ -206,7 +206,8 @@ def ratios(rows, design: str, turned: int = 0) -> dict[str, Interval]:
     for name in dict.fromkeys(row["lens"] for row in rows if row["lens"] != design):
         other = column(rows, "error_mrad", lens=name)
         pairs = log_ratio(own, other), grouped(log_ratios(own, other), drawn)
-        found[name] = max(pairs, key=lambda pair: pair.high - pair.low)
+        wider = max(pairs, key=lambda pair: pair.high - pair.low)
+        found[name] = replace(wider, count=len(own))
     return found
 
 

@@ -53,7 +53,7 @@ class Tolerances:
     decentre_mm: of every surface, in x and in y. tilt_deg: of every surface, about x and about y.
     element_decentre_mm, element_tilt_deg, element_wedge_deg: of every element, a cemented group
       being one, moved as a rigid body; in x and y, and about x and y. See
-      ``element_errors.moved_element``.
+      ``moves.moved_element``.
     """
 
     radius_relative: float = 0.0
