@@ -222,6 +222,7 @@ PARTS = {
         "lens_motion --raw docs/lens_motion.csv",
         ("codesign", "scenes", "studies/lens_motion"),
         {"lens-motion.spots": gains("mtf_along_spots")},
+        {"lens_motion.png": "lens_motion.png"},
     ),
     "joint-outdoors": joint(
         "outdoors",
