@@ -305,7 +305,9 @@ def _redraw(run):
                 | {"over": page.LABELS[name], "ratio": f"{pair.ratio():.3f}"}
             )
             if design == "mtf_along":
-                values[f"{setting}{', turned' if turned else ''}: over {name}"] = pair.ratio()
+                values[f"{setting}{', turned' if turned else ''}: over {page.LABELS[name]}"] = (
+                    pair.ratio()
+                )
     run.figure(
         bars(values, "flow error of MTF along the motion, ratio", log=True, level=1.0),
         "lens_motion",
