@@ -47,6 +47,8 @@ def study(run: Run[Config]) -> None:
     seeds = range(config.seed, config.seed + config.seeds)
     rows = sweep(run, raced, "answers", given=given, **beside, seed=seeds)
     over = compared(rows, JOINT)
+    trained = compared(rows, AFTERWARDS)["design alone"][0].ratio()
+    run.record(**trained.metrics("training_over_none"))
     lines = []
     for arm in dict.fromkeys(row["arm"] for row in rows):
         mine = select(rows, arm=arm)
@@ -70,7 +72,7 @@ def study(run: Run[Config]) -> None:
     run.finish(
         "The refiner in the joint optimiser",
         f"Designed together with its refiner, the camera of '{config.pair}' {found.outcome} against the same design followed by "
-        f"training: errors {found.ratio():.2f} of it.{few}",
+        f"training: errors {found.ratio():.2f} of it. Training leaves {trained:.2f} of the error.{few}",
     )
 
 

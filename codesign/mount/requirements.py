@@ -25,6 +25,7 @@ from codesign.render.moving import views_of
 from codesign.render.truth import hits_of
 from codesign.types import ChiefRayCamera
 
+DARK = -1.0  # sine of where a pixel without light looks
 CAMERA_PIXELS = 4096  # of a film, spread over it, that a look ahead looks at
 
 
@@ -153,9 +154,11 @@ class LookAhead:
         rank = torch.arange(angles.shape[-1]).to(angles)
         reach = max(1.0, self.smooth * len(rank))
         weight = (1 - (rank - self._rank(angles)).abs() / reach).clamp_min(0)
-        return (angles.sort(-1, descending=True).values * weight).sum(
-            -1, keepdim=True
-        ) / weight.sum()
+        found = angles.sort(-1, descending=True).values
+        # pixels without light are no part of the edge between those that have some
+        dark = (found == DARK) & (found[..., self._rank(angles)][..., None] != DARK)
+        weight = torch.where(dark, 0.0, weight)
+        return (found * weight).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True)
 
     def exact(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
         """[..., 1]: the angle that just ``share`` of the pixels reach."""
@@ -185,7 +188,7 @@ class LookAhead:
         line_m = torch.hypot(height, before).clamp_min(1e-9)
         over = (height * forward + before * direction[..., 2]) / line_m
         # what gets no light sees nothing
-        return torch.where(rays.weight > 0, torch.minimum(over, forward), -1.0)
+        return torch.where(rays.weight > 0, torch.minimum(over, forward), DARK)
 
 
 def penalty(

@@ -320,13 +320,24 @@ class Pass(Mapping[str, Any]):
             return recorded
         t_s = self["t_s"]
         read_s = t_s[0] + getattr(self.system.events, "lead_s", 0.0)
-        first = int((t_s - read_s).abs().argmin())
-        flow, valid = render_stage.true_flow(
-            self["camera"], self["scene"], self["T_world_cam"], stride=t_s.numel() - 1 - first
-        )
+        first = int((t_s[:-1] - read_s).abs().argmin())
+        if abs(float(t_s[first] - read_s)) > 1e-6:
+            raise DomainError(
+                f"truth: no frame but the last stands {float(read_s - t_s[0]):g} s after the first, where events begin to "
+                "be read; give one there."
+            )
+        scene, poses = self["scene"], self["T_world_cam"]
+        worlds = scene if isinstance(scene, list | tuple) else [scene]
+        # where nothing moves, no other frames than the two are asked
+        if first and not any(isinstance(world, render_stage.MovingScene) for world in worlds):
+            poses, first_of = poses[..., [first, -1], :, :], 0
+        else:
+            first_of = first
+        stride = poses.shape[-3] - 1 - first_of
+        flow, valid = render_stage.true_flow(self["camera"], scene, poses, stride=stride)
         interval_s = float(t_s[-1] - t_s[first])
         return FlowField(
-            self._samples(flow, 1)[:, first], self._samples(valid)[:, first], interval_s
+            self._samples(flow, 1)[:, first_of], self._samples(valid)[:, first_of], interval_s
         )
 
 

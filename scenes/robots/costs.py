@@ -121,6 +121,11 @@ class Exposed(nn.Module):
         self.most = most
         self.windows = windows
 
+    @property
+    def lead_s(self) -> float:
+        """That of the stage."""
+        return getattr(self.stage, "lead_s", 0.0)
+
     def volume(
         self, frames: Tensor, t_s: Tensor, bins: int, generator: torch.Generator | None = None
     ) -> EventVolume:

@@ -1,6 +1,7 @@
 """Recordings, cut into packets of a fixed number of events: two that are made here, with exact
 flow, and those the user names."""
 
+import itertools
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from codesign.flow.sources.packets import Packet
 from codesign.types import EventStream
 from scenes.windows.streams import sliding, turning
 from studies.flow_quality import sharpest
+from studies.frame.sweep import plain
 
 # figure -> title and note of its table, what its worst value is called, and which that is
 MEASURES = {
@@ -99,12 +101,16 @@ def named(paths):
     """A name for each recording: its file's or folder's; that of the folder before it for events.txt,
     and with a number where another has it."""
     names = [
-        (path.parent if path.stem == "events" else path).resolve().name for path in map(Path, paths)
+        plain((path.parent if path.stem == "events" else path).resolve().name)
+        for path in map(Path, paths)
     ]
-    return [
-        f"{name}_{names[: k + 1].count(name)}" if names.count(name) > 1 else name
-        for k, name in enumerate(names)
-    ]
+    found: list[str] = []
+    for name in names:
+        later = (f"{name}_{number}" for number in itertools.count(2))
+        found.append(
+            next(one for one in (name, *itertools.islice(later, len(names))) if one not in found)
+        )
+    return found
 
 
 def _kind(name, count):

@@ -92,7 +92,7 @@ def write(run, held, tracker, name, start_s):
 
 def arrows(held, window, cell):
     """Arrows of a TrackedWindow: means over cells, of the pixels with events."""
-    stream = held.window(window.t0_us, window.t1_us)
+    stream = held.window(window.t0_us, window.t1_us - 1)  # its end belongs to the next
     seen = torch.zeros(1, 1, held.height_px, held.width_px)
     seen[0, 0, stream.y, stream.x] = 1
     field = window.field

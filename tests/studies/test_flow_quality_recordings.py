@@ -172,5 +172,6 @@ def test_rotation_alone_is_no_truth_of_a_camera_that_slides():
 
 
 def test_recordings_of_one_name_stay_apart(tmp_path):
-    given = [tmp_path / name for name in ("a/events.txt", "b/events.txt", "a/rec.h5", "b/rec.h5")]
-    assert recordings.named(given) == ["a", "b", "rec.h5_1", "rec.h5_2"]
+    names = ("a/events.txt", "b/events.txt", "a/rec.h5", "b/rec.h5", "c/rec_h5_2", "c/rec-h5")
+    found = recordings.named([tmp_path / name for name in names])
+    assert found == ["a", "b", "rec_h5", "rec_h5_2", "rec_h5_2_2", "rec_h5_3"]

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from codesign import System, events, flow, lens, pose, render
-from codesign.errors import GradientError
+from codesign.errors import DomainError, GradientError
 from codesign.system import Batch, check
 from scenes import textures, trajectories, worlds
 
@@ -114,7 +114,7 @@ def test_a_moving_object_has_a_truth(wall):
     )
 
 
-@pytest.mark.parametrize("lead", [0, 1, 2])
+@pytest.mark.parametrize("lead", [0, 1, 3])
 def test_the_truth_is_of_the_interval_whose_events_are_read(wall, lead):
     lead_s = float(T_S[lead])
     settled = events.Settled(events.layer("counts"), lead_s)
@@ -125,3 +125,10 @@ def test_the_truth_is_of_the_interval_whose_events_are_read(wall, lead):
     flow_px, valid = render.true_flow(run["camera"], wall, asked)
     torch.testing.assert_close(truth.flow_px, flow_px[:, 0])
     assert torch.equal(truth.valid, valid[:, 0])
+
+
+def test_a_lead_between_frames_has_no_truth(wall):
+    between = events.HardSensor(events.SensorModel(), 4, 0.014)
+    run = system_of(triplet(), wall, events=between).begin(batch())
+    with pytest.raises(DomainError, match=r"no frame but the last stands 0.014 s after the first"):
+        _ = run["truth"]

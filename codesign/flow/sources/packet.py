@@ -162,6 +162,10 @@ def windows(
         times = [(int(held.t_us[a]), int(held.t_us[b])) for a, b in ends]
         # events of one microsecond stay together
         possible = [(t0, t1) for t0, t1 in times if t1 > t0]
+        if not possible:
+            raise DomainError(
+                f"all {len(held) - first} events behind the start are of one microsecond; a window lasts some time."
+            )
     else:
         in_turn = in_turn or options.start_s is not None
         length_us = round((options.window_s or min(WINDOW_S, (whole[1] - whole[0]) * 1e-6)) * 1e6)
