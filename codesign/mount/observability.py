@@ -8,9 +8,6 @@ velocity of its origin (forward, left, up; m/s) and rotation rate (about the sam
 body in the plane has three of these six: forward, lateral, yaw rate.
 """
 
-import math
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -20,7 +17,6 @@ from codesign.types import ChiefRayCamera
 
 # central differences of chief rays: exact for a pinhole, 1e-6 of the third derivative otherwise
 _STEP_PX = 1e-3
-R2 = (0.7548776662466927, 0.5698402909980532)  # 1 / g, 1 / g^2 with g^3 = g + 1
 # of the six: forward, lateral, yaw rate
 PLANAR = (0, 1, 5)
 FREE = (0, 1, 2, 3, 4, 5)
@@ -98,19 +94,6 @@ def flow_precision(covariance: Tensor, floor: float = 0.0) -> Tensor:
         )
     inverse = torch.stack([torch.stack([yy, -xy], -1), torch.stack([-xy, xx], -1)], -2)
     return inverse / determinant[..., None, None]
-
-
-def some_pixels(film: Any, most: int) -> Tensor:
-    """Numbers [P] of at most so many pixels of a film, spread over it in both directions; all where
-    there are no more. By the R2 sequence (Roberts, 2018): equal steps along the film's order may be
-    whole rows, and then look along one line."""
-    rows, columns = math.prod(film.shape[:-1]), film.shape[-1]
-    if rows * columns <= most:
-        return torch.arange(rows * columns)
-    turns = torch.arange(1, most + 1, dtype=torch.float64)[:, None]
-    share = (0.5 + turns * torch.tensor(R2, dtype=torch.float64)) % 1
-    row, column = (share * torch.tensor([rows, columns])).long().T
-    return (row * columns + column).unique()
 
 
 def chief_lines(camera: ChiefRayCamera, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

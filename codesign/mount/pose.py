@@ -15,8 +15,9 @@ from torch import Tensor, nn
 
 from codesign.checks import check_finite, check_positive
 from codesign.errors import DomainError, ShapeError
-from codesign.mount.observability import chief_lines, flow_of_points, some_pixels
+from codesign.mount.observability import chief_lines, flow_of_points
 from codesign.pose import check_poses, se3_exp
+from codesign.render.film import some_pixels
 from codesign.types import ChiefRayCamera
 
 # sine of the angle to the vertical below which the view has no direction over ground

@@ -18,9 +18,9 @@ from torch import Tensor
 from codesign.checks import check_finite, check_number, check_positive
 from codesign.errors import DomainError, ShapeError
 from codesign.mount.body import Body, Housing
-from codesign.mount.observability import some_pixels
 from codesign.render import Camera, MitsubaScene, frames
 from codesign.render.charts import glowing
+from codesign.render.film import some_pixels
 from codesign.render.moving import views_of
 from codesign.render.truth import hits_of
 from codesign.types import ChiefRayCamera

@@ -12,8 +12,9 @@ from torch import Tensor
 from codesign.checks import check_positive, check_whole
 from codesign.errors import DomainError, ShapeError
 from codesign.mount.depth import ground_depth
-from codesign.mount.observability import FREE, body_flow, some_pixels
+from codesign.mount.observability import FREE, body_flow
 from codesign.mount.pose import attitude
+from codesign.render.film import some_pixels
 from codesign.types import ChiefRayCamera
 
 NAMES = ("forward", "left", "up", "roll", "pitch", "yaw")

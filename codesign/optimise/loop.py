@@ -233,7 +233,7 @@ class Loop:
                 parameter = self.parameters[int(index)]
                 # numbers such as NAdam's product of momenta have a dtype of their own, and stay on
                 # the CPU
-                own = value.clone() if value.ndim == 0 else value.to(parameter)
+                own = value.clone() if value.ndim == 0 else value.to(parameter, copy=True)
                 self.optimiser.state[parameter][entry] = own
         return self
 

@@ -15,6 +15,7 @@ from codesign.errors import DomainError
 # origin, direction and weight of a ray in float64, and its film and pupil position; tracing takes
 # more
 BYTES_PER_RAY = 88
+R2 = (0.7548776662466927, 0.5698402909980532)  # 1 / g, 1 / g^2 with g^3 = g + 1
 
 
 @dataclass(frozen=True)
@@ -139,6 +140,19 @@ def coarse_pixels(film: Film, every_px: int) -> Tensor:
         for n in (film.height_px, film.width_px)
     )
     return film.in_windows(rows, columns)
+
+
+def some_pixels(film: Film, most: int) -> Tensor:
+    """Numbers [P] of at most so many pixels of a film, spread over it in both directions; all where
+    there are no more. By the R2 sequence (Roberts, 2018): equal steps along the film's order may be
+    whole rows, and then look along one line."""
+    rows, columns = math.prod(film.shape[:-1]), film.shape[-1]
+    if rows * columns <= most:
+        return torch.arange(rows * columns)
+    turns = torch.arange(1, most + 1, dtype=torch.float64)[:, None]
+    share = (0.5 + turns * torch.tensor(R2, dtype=torch.float64)) % 1
+    row, column = (share * torch.tensor([rows, columns])).long().T
+    return (row * columns + column).unique()
 
 
 def film_pupil_pattern(samples, seed, device="cpu"):

@@ -18,6 +18,7 @@ from torch.nn.functional import avg_pool2d, pad
 from codesign.errors import DomainError, ShapeError
 from codesign.pose import Poses
 from codesign.render.camera import Camera
+from codesign.render.film import some_pixels
 from codesign.render.moving import MovingScene, Scene, scenes_and_poses, views_of
 from codesign.render.psf_map import SIDE, PsfMap, psf_map
 from codesign.render.wavefront import light_and_nearness
@@ -89,8 +90,7 @@ def _same_lens(one, other):
     pixels and points of the pupil."""
     if one.lens is other.lens:
         return True
-    pixels = one.film.pixels()
-    pixels = pixels[:: max(1, len(pixels) // 64)]
+    pixels = one.film.pixels()[some_pixels(one.film, 64)]
     turn = torch.arange(len(pixels)).to(pixels)
     pupil = 0.7 * torch.stack([turn.cos(), turn.sin()], 1)
     ours, theirs = (camera.rays_through(pixels, pupil) for camera in (one, other))

@@ -11,6 +11,7 @@ from codesign import events as event_stage
 from codesign import render as render_stage
 from codesign.errors import DomainError, ShapeError
 from codesign.events.entry import check_times
+from codesign.render.moving import at_frames
 from codesign.system.batch import check_batch, scenes_of
 from codesign.system.contents import tensors_in
 from codesign.system.layout import check_layout, look_at, look_at_times
@@ -326,19 +327,14 @@ class Pass(Mapping[str, Any]):
                 f"truth: no frame but the last stands {float(read_s - t_s[0]):g} s after the first, where events begin to "
                 "be read; give one there."
             )
-        scene, poses = self["scene"], self["T_world_cam"]
-        worlds = scene if isinstance(scene, list | tuple) else [scene]
-        # where nothing moves, no other frames than the two are asked
-        if first and not any(isinstance(world, render_stage.MovingScene) for world in worlds):
-            poses, first_of = poses[..., [first, -1], :, :], 0
-        else:
-            first_of = first
-        stride = poses.shape[-3] - 1 - first_of
-        flow, valid = render_stage.true_flow(self["camera"], scene, poses, stride=stride)
-        interval_s = float(t_s[-1] - t_s[first])
-        return FlowField(
-            self._samples(flow, 1)[:, first_of], self._samples(valid)[:, first_of], interval_s
+        scene, ends = self["scene"], [first, len(t_s) - 1]
+        several = isinstance(scene, list | tuple)
+        cut = [at_frames(one, ends) for one in scene] if several else at_frames(scene, ends)
+        flow, valid = render_stage.true_flow(
+            self["camera"], cut, self["T_world_cam"][..., ends, :, :]
         )
+        interval_s = float(t_s[-1] - t_s[first])
+        return FlowField(self._samples(flow, 1)[:, 0], self._samples(valid)[:, 0], interval_s)
 
 
 def built_bins(flow: Any) -> int | None:

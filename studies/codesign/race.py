@@ -66,6 +66,11 @@ def kept(space: Space, share: Tensor, requirements: Sequence[Any]) -> bool:
     return first_missed(requirements, whole.T_body_cam, whole.camera) is None
 
 
+def last_kept(drawn: Drawn, shares: Sequence[Tensor]) -> Tensor:
+    """The last of some shares [V] that keeps what is required; the first, a start, does."""
+    return next(share for share in reversed(shares) if kept(drawn.space, share, drawn.requirements))
+
+
 def run_arm(
     drawn: Drawn,
     arm: str,
@@ -81,8 +86,7 @@ def run_arm(
     task = Task(Objective(drawn), start(space, seed, near), steps, 10_000 * seed, seed, settling)
     answer, way = ARMS[arm](task)
     answer = read_out(task, answer, way)
-    candidates = [answer, *reversed(way.shares), task.start]
-    chosen = next(share for share in candidates if kept(space, share, drawn.requirements))
+    chosen = last_kept(drawn, [task.start, *way.shares, answer])
     return {
         "share": chosen.tolist(),
         "kept": bool(chosen is answer),
@@ -94,15 +98,20 @@ def run_arm(
     }
 
 
+def with_threads(threads: int) -> None:
+    """Leave so many threads to a process that works beside others; 0: as it is."""
+    if threads:
+        torch.set_num_threads(threads)
+        drjit.set_thread_count(threads)
+
+
 def racing(seed: int, arm: str, setting: Mapping[str, Any], threads: int = 0) -> dict[str, Any]:
     """``run_arm`` in a process that may know nothing yet.
 
     setting: of the race, plain values. threads: that the process may use, beside others; 0: as it
       is.
     """
-    if threads:
-        torch.set_num_threads(threads)
-        drjit.set_thread_count(threads)
+    with_threads(threads)
     sizes = setting["steps"], setting["settling"], setting.get("near")
     found = run_arm(training(setting), arm, seed, *sizes)
     return {**found, "setting": dict(setting)}

@@ -4,22 +4,20 @@ from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from typing import Any
 
-import drjit
 import torch
 from torch import Tensor
 
 from codesign import flow
 from scenes.robots import pair as robot_pair
+from studies.codesign.arms import END, RECORDED
 from studies.codesign.cells import space_of
 from studies.codesign.design import PARTS, Whole
 from studies.codesign.objective import Objective
 from studies.codesign.problem import Drawn, Looked
-from studies.codesign.race import JUDGED, kept, spread_over, start
+from studies.codesign.race import JUDGED, last_kept, spread_over, start, with_threads
 from studies.frame.sweep import Row
 
 FIRST, LAST = 0.08, 0.01  # of the cube, a step of a number of the design
-END = 0.25  # of the way, whose mean is the answer
-RECORDED = 3  # rounds of drives on which the sensor is settled
 JOINT, AFTERWARDS = "joint", "design, then weights"
 
 
@@ -81,8 +79,7 @@ def descended(
         return begun, seen
     answer = torch.stack(way[-max(1, round(END * len(way))) :]).mean(0)
     answer = objective.settled(answer, seen[-RECORDED:], setting["settling"])
-    candidates = (answer, *reversed(way), begun)
-    return next(s for s in candidates if kept(drawn.space, s, drawn.requirements)), seen
+    return last_kept(drawn, [begun, *way, answer]), seen
 
 
 def trained(
@@ -105,9 +102,7 @@ def raced(seed: int, setting: Mapping[str, Any], threads: int) -> list[Row]:
 
     setting: of a cell (``cells.setting``), with judged_worlds, judged_drives, rate and updates.
     """
-    if threads:
-        torch.set_num_threads(threads)
-        drjit.set_thread_count(threads)
+    with_threads(threads)
     space, worlds = space_of(setting), setting["judged_worlds"]
     spread = spread_over(setting["worlds"], setting["per_draw"])
     drawn = Refined(space, robot_pair.training(setting["worlds"]), *spread)

@@ -9,7 +9,7 @@ import torch
 
 from codesign import lens, pose, render
 from codesign.mount import PLANAR, Mount, body_flow
-from codesign.mount.observability import some_pixels
+from codesign.render.film import some_pixels
 from codesign.render.truth import world_points
 from scenes import worlds
 
