@@ -1,7 +1,7 @@
 """Speed of what the project lives by, in two commands.
 
     make bench-check                  times over those of plain torch work in the same run, against docs/bench.json
-    make bench-check ARGS=--write     measures anew and writes docs/bench.json
+    make bench-check ARGS=--write     measures anew and writes docs/bench.json and docs/speed.md
     make cuda-check                   on a GPU: its tests, the same work there, training in bfloat16, two GPUs;
                                       writes docs/speed_cuda.md; without one it says what is missing
     make cuda-check ARGS="--device cpu --quick"    the same path on the processor: does the command work?
@@ -27,9 +27,12 @@ sys.path.insert(0, str(ROOT))
 
 import drjit  # noqa: E402
 import torch  # noqa: E402
+from torch.utils.flop_counter import FlopCounterMode  # noqa: E402
 
 from codesign import doctor, events, flow, lens, mount, render  # noqa: E402
+from codesign.backend import arrays  # noqa: E402
 from codesign.errors import CodesignError, DomainError  # noqa: E402
+from codesign.events.kernels import Lanes  # noqa: E402
 from codesign.system import Batch, System  # noqa: E402
 from codesign.train.batches import to_device  # noqa: E402
 from codesign.train.learner import Learner  # noqa: E402
@@ -39,32 +42,43 @@ from studies.frame import machine  # noqa: E402
 from studies.frame.bench import measure  # noqa: E402
 
 KEPT = ROOT / "docs" / "bench.json"
+LIMITS = ROOT / "docs" / "speed.md"
+TABLE = "<!--limits-->"  # before and after it
 PAGE = ROOT / "docs" / "speed_cuda.md"
 WORSE = 1.2  # of the committed ratio fails
 TESTS = ("tests/test_devices.py", "tests/events/test_layers.py", "tests/flow/test_lk_kernels.py")
+MOVED, SUMS = 2**29, 9 * 32 * 32 * 256**2  # bytes of the copy, multiply-adds of the convolution
 SURFACES = 11  # of the double Gauss
+EVENT = 13  # bytes: 2 + 2 of the place, 1 of the polarity, 8 of the time
 STEP = "robot step, 12 drives"
 
 
 @dataclass(frozen=True)
 class Work:
     """call: one go. amount: how much of ``unit`` it does, in millions. beside: its yardstick.
+    moved: bytes a unit that have to pass through memory: what comes in once, what goes out once.
+    bare: the least kernel (``bare``) that a unit's share of it is set beside, and how many of its
+    units; or multiply-adds of the convolution.
     least: what is asked of an H100-class GPU, millions of the unit a second."""
 
     call: Callable[[], Any]
     amount: float
     unit: str
     beside: str = "copy"
+    moved: float = 0
+    bare: tuple[str, float] | None = None
     least: float | None = None
 
 
 def slopes(function: Callable[[], torch.Tensor], *leaves: torch.Tensor) -> Callable[[], Any]:
-    """A pass with gradients to the leaves."""
-    return lambda: torch.autograd.grad(function().square().mean(), leaves, allow_unused=True)
+    """A pass with gradients to the leaves, of ones that are there: a loss would be timed along."""
+    ones = torch.ones_like(function())
+    return lambda: torch.autograd.grad(function(), leaves, ones, allow_unused=True)
 
 
 def yardsticks(device: torch.device) -> dict[str, Callable[[], Any]]:
-    """A copy of 256 MiB into memory that is there; a convolution of 0.6 billion multiplications."""
+    """A copy of 256 MiB into memory that is there; a convolution of 0.6 billion multiply-adds
+    (``MOVED``, ``SUMS``)."""
     memory = torch.ones(2**26, device=device)
     there = torch.zeros_like(memory)  # new pages from the system cost now this, now that
     image = torch.ones(1, 32, 256, 256, device=device)
@@ -98,9 +112,11 @@ def _of_lens(device, share):
         return trace()
 
     rays = SURFACES * count / 1e6
+    # six numbers in and three out over all surfaces
+    each = {"amount": rays, "unit": "ray-surfaces", "moved": 36 / SURFACES}
     return {
-        "tracing": Work(forward, rays, "ray-surfaces", least=20_000),
-        "tracing with gradient": Work(slopes(trace, curves), rays, "ray-surfaces"),
+        "tracing": Work(forward, **each, bare=("surfaces", 1), least=20_000),
+        "tracing with gradient": Work(slopes(trace, curves), **each, bare=("surfaces", 3)),
     }
 
 
@@ -108,22 +124,34 @@ def _of_events(device, small):
     height, width, count = (65, 87, 20) if small else (260, 346, 100)
     x = torch.linspace(0, 40, width, device=device)
     y = torch.linspace(0, 30, height, device=device)[:, None]
-    t = torch.arange(count, device=device)[:, None, None] * 0.02
-    frames = 120 + 80 * torch.sin(x + t) * torch.cos(y + 0.5 * t)
     t_s = torch.arange(count, dtype=torch.float64) * 1e-3
-    leaf = frames.clone().requires_grad_()
-    pixels = frames.numel() / 1e6
 
-    def layer(name):
+    def shown(speed):
+        t = torch.arange(count, device=device)[:, None, None] * speed
+        return 120 + 80 * torch.sin(x + t) * torch.cos(y + 0.5 * t)
+
+    calm, busy = (shown(speed) for speed in (0.02, 0.2))  # 0.02 and 0.2 events a pixel and frame
+    pixels = {"amount": calm.numel() / 1e6, "unit": "pixels"}
+
+    def hard(frames):
+        return lambda: events.simulate(frames, t_s, events.SensorModel())
+
+    def layer(name, frames=calm):
         made = events.layer(name, events.SensorModel(0.2, 0.2)).to(device)
-        return slopes(lambda: made(leaf, t_s), leaf)
+        leaf = frames.clone().requires_grad_()
+        # frames in twice; counts out; what they are worth in; slopes out
+        return Work(slopes(lambda: made(leaf, t_s), leaf), **pixels, moved=28, bare=("rows", 2))
 
+    drive = torch.rand(40 if small else 200, 2, 128, 128, device=device).requires_grad_()
+    spikes = slopes(lambda: events.srm(drive, theta=1.0, tau_r=3.0)[0], drive)
     return {
-        "hard events": Work(
-            lambda: events.simulate(frames, t_s, events.SensorModel()), pixels, "pixels", least=5000
-        ),
-        "memory layer with gradient": Work(layer("memory"), pixels, "pixels"),
-        "sigmoid with gradient": Work(layer("sigmoid"), pixels, "pixels"),
+        "hard events": Work(hard(calm), **pixels, moved=4, bare=("rows", 1), least=5000),
+        "hard events, busy": Work(hard(busy), **pixels, moved=4 + 0.2 * EVENT, bare=("rows", 1)),
+        "memory layer with gradient": layer("memory"),
+        "memory layer with gradient, busy": layer("memory", busy),
+        "sigmoid with gradient": layer("sigmoid"),
+        # drives in twice, spikes and potentials out, what spikes are worth in, slopes out
+        "spikes (SRM) with gradient": Work(spikes, drive.numel() / 1e6, "neuron steps", moved=24),
     }
 
 
@@ -132,7 +160,7 @@ def _of_flow(device, small):
     volume = _volume(1, side, device)
     counts = volume.counts.clone().requires_grad_()
     learnt = flow.load("refiner").to(device).eval()
-    pixels = side**2 / 1e6
+    pixels = {"amount": side**2 / 1e6, "unit": "pixels", "beside": "convolution", "moved": 72}
 
     def estimated(estimate):
         return lambda: estimate(replace(volume, counts=counts)).flow_px
@@ -144,13 +172,15 @@ def _of_flow(device, small):
 
         return call
 
+    with FlopCounterMode(display=False) as counted, torch.no_grad():
+        learnt(volume)
+    sums = "convolution", counted.get_total_flops() / 2 / side**2
+    step = _robot_step(device, 2 if small else 12)
     return {
-        "closed form": Work(forward(flow.estimate_lk), pixels, "pixels", "convolution"),
-        "closed form with gradient": Work(
-            slopes(estimated(flow.estimate_lk), counts), pixels, "pixels", "convolution"
-        ),
-        "refiner": Work(forward(learnt), pixels, "pixels", "convolution"),
-        STEP: Work(_robot_step(device, 2 if small else 12), 1e-6, "steps", "convolution", 1e-4),
+        "closed form": Work(forward(flow.estimate_lk), **pixels),
+        "closed form with gradient": Work(slopes(estimated(flow.estimate_lk), counts), **pixels),
+        "refiner": Work(forward(learnt), **pixels, bare=sums),
+        STEP: Work(step, 1e-6, "steps", "convolution", least=1e-4),
     }
 
 
@@ -227,10 +257,13 @@ def timed(
             "ms": 1e3 * time_s,
             "over_yardstick": min(own) / min(other),
             "yardstick": work.beside,
+            "yardstick_ms": 1e3 * min(other),
             "million_per_s": work.amount / time_s,
             "unit": work.unit,
             "second_over_tenth": first[1] / first[9],
             "asked_million_per_s": work.least,
+            "moved_b": work.moved,
+            "bare": work.bare,
         }
         print(f"{name}: {found[name]['ms']:.3g} ms", flush=True)
     return found
@@ -264,9 +297,10 @@ def bench_check(options: argparse.Namespace) -> int:
     if options.quick:
         return 0  # nothing to compare with
     if options.write:
-        KEPT.write_text(
-            json.dumps({"machine": machine.hardware(), "works": found}, indent=1) + "\n"
-        )
+        result = {"machine": machine.hardware(), "works": found}
+        KEPT.write_text(json.dumps(result, indent=1) + "\n")
+        before, _, after = LIMITS.read_text().split(TABLE)
+        LIMITS.write_text(f"{before}{TABLE}\n{limits(found, bare())}\n{TABLE}{after}")
         return 0
     kept = json.loads(KEPT.read_text())["works"]
     if slow := [name for name in found.keys() & kept.keys() if is_worse(found[name], kept[name])]:
@@ -275,6 +309,72 @@ def bench_check(options: argparse.Namespace) -> int:
     said = worse(found, kept)
     print("\n".join(said) or f"{len(found)} works within {WORSE:g} times their committed ratios")
     return bool(said)
+
+
+def bare() -> dict[str, float]:
+    """Least ns of kernels that do nothing else, a unit each: "surfaces", the operations of a sphere
+    met and refracted at, one after the other; "rows", a loop over time that reads a number of every
+    pixel and writes two."""
+    arr = arrays("cpu", torch.float32)
+    ray = arr.Float(torch.rand(2**20) + 1)
+    one = drjit.opaque(arr.Float, 1)
+
+    def surfaces():
+        value = ray
+        for _ in range(SURFACES):
+            for _ in range(45):
+                value = drjit.fma(value, one, one)
+            value = drjit.sqrt(one / (one / (one / drjit.sqrt(value))))
+        drjit.eval(value)
+        drjit.sync_thread()
+
+    frames = torch.rand(100, 260, 346)
+    lanes = Lanes(frames, frames[0].numel())
+    numbers, target = lanes.load(frames), lanes.fresh(2 * len(frames))
+
+    def rows():
+        def step(index, total):
+            value = lanes.at(numbers, index)
+            lanes.put(target, value, 2 * index)
+            lanes.put(target, total, 2 * index + 1)
+            return (total + value,)
+
+        drjit.eval(lanes.loop(lanes.opaque(0), lanes.opaque(len(frames)), step, lanes.lane * one))
+        drjit.eval(target)
+        drjit.sync_thread()
+
+    units = {surfaces: SURFACES * 2**20, rows: frames.numel()}
+    return {
+        call.__name__: 1e9 * min(measure(call, 11, warm=2).cpu_s) / count
+        for call, count in units.items()
+    }
+
+
+def limits(found: dict[str, dict[str, Any]], bare_ns: dict[str, float]) -> str:
+    """Table of how near each work comes to what a copy and the least kernels of the same run
+    allow."""
+
+    def least_ms(yardstick):
+        return min(row["yardstick_ms"] for row in found.values() if row["yardstick"] == yardstick)
+
+    byte_ns = 1e6 * least_ms("copy") / MOVED
+    bare_ns = {**bare_ns, "convolution": 1e6 * least_ms("convolution") / SUMS}
+    lines = [
+        "| work | ns a unit | unit | a copy takes | the bare kernel takes | of the nearer limit |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, row in found.items():
+        if row["moved_b"]:
+            time_ns = row["over_yardstick"] * row["yardstick_ms"] / row["ms"]  # of the least time
+            time_ns *= 1e3 / row["million_per_s"]
+            kernel, times = row["bare"] or ("", 0)
+            by = [row["moved_b"] * byte_ns, times * bare_ns.get(kernel, 0)]
+            told = [f"{float(f'{each:.2g}'):g}" if each else "not counted" for each in by]
+            time = f"{float(f'{time_ns:.3g}'):g}"
+            unit = row["unit"].removesuffix("s")
+            share = f"{100 * max(by) / time_ns:.2g} %" if by[1] else "not told"
+            lines.append(f"| {name} | {time} | {unit} | {told[0]} | {told[1]} | {share} |")
+    return "\n".join(lines)
 
 
 def training(device: torch.device, small: bool) -> dict[str, dict[str, Any]]:

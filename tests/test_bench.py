@@ -41,6 +41,16 @@ def test_a_ratio_is_that_of_work_and_yardstick(monkeypatch):
     assert (row["over_yardstick"], row["ms"], row["million_per_s"]) == (1.5, 3000.0, 2.0)
 
 
+def test_a_work_stands_beside_the_nearer_of_its_limits():
+    """Twice a copy of half a GiB that took 100 ms, of a million units in 200 ms; the bare kernel
+    takes 50 of its 200 ns."""
+    of = {"over_yardstick": 2.0, "yardstick_ms": 100.0, "ms": 200.0, "million_per_s": 5.0}
+    beside = {"yardstick": "convolution", "yardstick_ms": 1.0, "moved_b": 0}
+    trace = of | {"unit": "rays", "yardstick": "copy", "moved_b": 8, "bare": ("surfaces", 2)}
+    table = bench.limits({"trace": trace, "other": beside}, {"surfaces": 25.0})
+    assert table.splitlines()[2:] == ["| trace | 200 | ray | 1.5 | 50 | 25 % |"]
+
+
 def test_every_work_has_a_committed_ratio():
     kept = json.loads(bench.KEPT.read_text())["works"]
     assert set(kept) == set(bench.works(torch.device("cpu"), small=True))

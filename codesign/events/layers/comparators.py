@@ -88,9 +88,8 @@ class Sigmoid:
 
     def __call__(self, frames, theta_on, theta_off, state, log_input):
         frames = _with_last(frames, state)
-        on = soft(frames, theta_on, sharpness=self.sharpness, log_input=log_input)[:, 0]
-        off = soft(frames, theta_off, sharpness=self.sharpness, log_input=log_input)[:, 1]
-        return torch.stack((on, off), dim=1), frames[-1].clone()
+        given = {"sharpness": self.sharpness, "log_input": log_input}
+        return soft(frames, theta_on, theta_off, **given), frames[-1].clone()
 
 
 @dataclass

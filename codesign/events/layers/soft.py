@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 
+from codesign.backend import run_kernel
 from codesign.checks import check_number, check_positive
-from codesign.events.entry import check_level, check_per_pixel
-from codesign.events.intensity import log_levels
+from codesign.events.entry import check_frames, check_level, check_per_pixel, warn_of_scale
+from codesign.events.intensity import FrontEnd, log_levels
 
 # a pixel without change fires sigmoid(-5) = 0.67 % of an event per polarity and frame
 GHOST_LOGIT = -5.0
@@ -25,6 +26,7 @@ MOST_SPREAD = 1.0
 def soft(
     frames: Tensor,
     theta: Tensor | float,
+    theta_off: Tensor | float | None = None,
     *,
     sharpness: float | None = None,
     log_input: bool = False,
@@ -35,11 +37,12 @@ def soft(
     Args:
       frames: [T, ...] linear intensity on the 0-255 scale (lin-log is applied here), any pixel
         shape; log intensity with ``log_input``.
-      theta: contrast threshold > 0, natural log units, scalar or broadcasting over one frame.
+      theta, theta_off: contrast thresholds > 0, natural log units, scalar or broadcasting over one
+        frame; one for both polarities when None.
       sharpness: k > 0 in 1/log units; None: k = 5/theta.
-    Returns: [T-1, 2, ...] ON = sigmoid(k (dL - theta)), OFF = sigmoid(k (-dL - theta)), between 0
-      and 1, never 0.
-    Gradient: frames and theta, exact.
+    Returns: [T-1, 2, ...] ON = sigmoid(k (dL - theta)), OFF = sigmoid(k (-dL - theta_off)), between
+      0 and 1, never 0.
+    Gradient: frames and thetas, exact. Second derivatives raise.
     Raises: ShapeError for fewer than two frames; DomainError for theta or sharpness <= 0, NaN,
       infinite or negative input.
 
@@ -50,13 +53,35 @@ def soft(
     >>> [[round(count, 3) for count in step] for step in counts.flatten(1).tolist()]
     [[1.0, 0.0], [0.0, 1.0]]
     """
-    level = log_levels(frames, log_input, minimum=2)
-    theta = check_per_pixel(theta, "theta", level)
-    k = -GHOST_LOGIT / theta if sharpness is None else check_positive(sharpness, "sharpness")
-    step = level.diff(dim=0)
-    return torch.stack(
-        (torch.sigmoid(k * (step - theta)), torch.sigmoid(k * (-step - theta))), dim=1
+    front_end = FrontEnd(log_input)
+    frames = check_frames(frames, 2, non_negative=not log_input)
+    warn_of_scale(frames, log_input)
+    if sharpness is not None:
+        check_positive(sharpness, "sharpness")
+    before, after = frames[:-1], frames[1:]
+    thetas = (
+        check_per_pixel(each, "theta", frames)
+        for each in (theta, theta if theta_off is None else theta_off)
     )
+    thetas = [each if each.numel() == 1 else each.expand(after.shape) for each in thetas]
+
+    def pair(arr, before, after, *thetas):
+        import drjit as dr
+
+        step = front_end.traced(dr, after)[0] - front_end.traced(dr, before)[0]
+        return tuple(
+            _sigmoid(dr, (sharpness or -GHOST_LOGIT / theta) * (way - theta))
+            for way, theta in zip((step, -step), thetas, strict=True)
+        )
+
+    return torch.stack(run_kernel(pair, (before, after, *thetas), [after.shape] * 2), dim=1)
+
+
+def _sigmoid(dr, value):
+    """Without overflow."""
+    above = value >= 0
+    small = dr.exp(dr.select(above, -value, value))
+    return dr.select(above, 1, small) * dr.rcp(1 + small)
 
 
 def dense(

@@ -126,10 +126,9 @@ class EventKeys:
         return int(self._count[0])
 
     def sorted(self):
-        """[N] int64 keys in order, in the memory of the sink."""
-        keys = self._keys.numpy()[: self.found]
-        keys.sort()
-        return keys.view(np.int64)
+        """[N] int64 keys in order."""
+        keys = torch.from_numpy(self._keys.numpy()[: self.found].view(np.int64))
+        return keys.sort().values.numpy()  # numpy takes twice as long for keys that come in runs
 
 
 @dataclass(frozen=True)
