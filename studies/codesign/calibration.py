@@ -51,7 +51,7 @@ class Calibration:
     the interval. reach_px: flow that is lost half of the time, however wide the prior; priors: the
     same, in units of the prior.
 
-    The numbers are those of docs/joint_design.md.
+    The numbers are those of docs/joint_race.md.
     """
 
     claimed: float = 0.425

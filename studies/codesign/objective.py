@@ -84,7 +84,7 @@ class Objective:
 
         Nothing is rendered: a simplex (Nelder and Mead) of so many tries from what they are now, on
         frames that are there. By expected errors, which rank good read-outs better than hard ones
-        of so few drives do (0.93 and 0.85, docs/joint_design.md).
+        of so few drives do (0.93 and 0.85, docs/joint_race.md).
         """
         free = self.space.part("read-out")
         tried = []
