@@ -9,9 +9,9 @@ ROOT = Path(__file__).resolve().parents[1]
 UNCOUNTED = (ast.expr_context, ast.operator, ast.unaryop, ast.cmpop, ast.boolop)
 BUDGETS = {
     "codesign": 9_900,
-    "codesign/events": 47_650,  # copies of last frames, options of files that say all, soft as a kernel
+    "codesign/events": 47_710,  # copies of last frames, options of files that say all, soft as a kernel
     "codesign/fidelity": 2_950,
-    "codesign/flow": 42_780,  # truth that is unknown, windows that share no event
+    "codesign/flow": 42_910,  # truth that is unknown, windows that share no event
     "codesign/grad": 3_300,
     "codesign/lens": 47_310,  # glass passed twice, fields as slopes, films that follow
     "codesign/mount": 14_590,  # films looked at all over
@@ -19,7 +19,7 @@ BUDGETS = {
     "codesign/render": 43_600,  # steps of differences by their motion on the film, maps of other cameras
     "codesign/report": 7_130,  # says that there is nothing to draw
     "codesign/system": 9_630,  # truth of what is read
-    "codesign/train": 5_510,  # windows that stand still
+    "codesign/train": 5_560,  # moments of weights of as many axes
     "scenes": 14_500,
     "scenes/robots": 9_500,
     "scenes/trajectories": 3_100,
@@ -46,15 +46,15 @@ BUDGETS = {
     "studies/video_to_events": 4_300,
     "tests": 15_290,  # sdist, scripts of other processes, limits
     "tests/data": 1_000,
-    "tests/events": 32_570,
-    "tests/flow": 28_830,
+    "tests/events": 32_690,  # spikes on the brink in chunks
+    "tests/flow": 29_140,  # events between two windows
     "tests/gradients": 3_500,
     "tests/hard_cases": 2_600,
     "tests/hostile": 19_090,
     "tests/lens": 37_400,  # the same
     "tests/mount": 14_600,
-    "tests/optimise": 3_570,  # a state is a copy
-    "tests/render": 30_900,  # intermediate images
+    "tests/optimise": 3_650,  # a state is a copy; steps in single precision
+    "tests/render": 30_920,  # intermediate images, lenses changed after their map
     "tests/scenes": 20_150,
     "tests/studies": 34_850,  # joint_refiner and a review of studies
     "tests/system": 7_090,

@@ -104,7 +104,8 @@ def trace(
         )
     was_training = network.training
     network.eval()
-    counts = torch.zeros(batch, 2, config["bins"], height_px, width_px)
+    device = next((weight.device for weight in network.parameters()), None)
+    counts = torch.zeros(batch, 2, config["bins"], height_px, width_px, device=device)
     try:
         with torch.no_grad(), plain_operations():
             # traced with values, since torch.export alone cannot follow a check for finite input or
@@ -140,7 +141,7 @@ def eliminate(matrix: Tensor, right: Tensor) -> Tensor:
     """Solution [..., n, m] of positive definite systems [..., n, n] by Gauss-Jordan elimination,
     which needs no exchange of rows there: plain operations alone."""
     size = matrix.shape[-1]
-    unit = torch.eye(size, dtype=matrix.dtype)
+    unit = torch.eye(size, dtype=matrix.dtype, device=matrix.device)
     rows = torch.cat([matrix, right], -1)
     for k in range(size):
         pivot = rows[..., k : k + 1, :] / rows[..., k : k + 1, k : k + 1]
@@ -161,9 +162,9 @@ def _solve_ex(matrix, right, *, left=True, check_errors=False):
 
 
 def _inverse_ex(matrix, *, check_errors=False):
-    return eliminate(
-        matrix, torch.eye(matrix.shape[-1], dtype=matrix.dtype).expand_as(matrix)
-    ), matrix[..., 0, 0].to(torch.int32)
+    return eliminate(matrix, torch.eye(matrix.shape[-1]).to(matrix).expand_as(matrix)), matrix[
+        ..., 0, 0
+    ].to(torch.int32)
 
 
 # ONNX has neither

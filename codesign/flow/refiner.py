@@ -33,6 +33,7 @@ SPARE_PX2 = 0.01  # unit of the variance that is added to the start's claim
 # half,
 BENT = 0.01
 BENT_PX = 0.03  # and in px
+POWERS = (0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)  # of x and y in a quadratic field
 
 
 class Refiner(nn.Module):
@@ -240,7 +241,9 @@ def _bends(flow):
     [B, 2, H, W]."""
     y, x = (torch.linspace(-1, 1, size).to(flow) for size in flow.shape[2:])
     y, x = torch.meshgrid(y, x, indexing="ij")
-    basis = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1).flatten(0, 1)
+    height, width = flow.shape[2:]  # a film of a row or two has fewer directions
+    powers = [(i, j) for i, j in POWERS if i < width and j < height]
+    basis = torch.stack([x**i * y**j for i, j in powers], -1).flatten(0, 1)
     basis = torch.linalg.qr(basis).Q
     whole = flow.flatten(2)
     left = whole - whole @ basis @ basis.T

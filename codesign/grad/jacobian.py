@@ -90,7 +90,8 @@ def column_scales(jacobian: Tensor, limit: float | Tensor = math.inf) -> Tensor:
     """
     norms = torch.linalg.vector_norm(jacobian, dim=0)
     return torch.minimum(
-        1 / norms.clamp_min(1e-300), torch.as_tensor(limit, dtype=norms.dtype, device=norms.device)
+        1 / norms.clamp_min(torch.finfo(norms.dtype).tiny),
+        torch.as_tensor(limit, dtype=norms.dtype, device=norms.device),
     )
 
 
@@ -110,4 +111,5 @@ def principal_modes(
     """
     power, modes = torch.linalg.eigh(jacobian.T @ jacobian)
     reach = torch.minimum(power.clamp_min(1e-30).rsqrt(), limit / modes.abs().amax(0))
-    return torch.as_tensor(size, dtype=modes.dtype).reshape(-1, 1) * modes * reach
+    size = torch.as_tensor(size, dtype=modes.dtype, device=modes.device)
+    return size.reshape(-1, 1) * modes * reach

@@ -65,17 +65,18 @@ class Descent(torch.optim.Optimizer):
     def step(self, closure: Any = None) -> Any:
         """One step from the gradients in ``.grad``; parameters without one only feel pull and
         momentum."""
-        value = None if closure is None else closure()
+        with torch.enable_grad():
+            value = None if closure is None else closure()
         for group in self.param_groups:
             slopes = [torch.zeros_like(p) if p.grad is None else p.grad for p in group["params"]]
-            share = 1 / _length(slopes) if group["normalised"] else 1.0
+            share = _over(1.0, slopes) if group["normalised"] else 1.0
             velocities = [
-                self._velocity(p, share * g, group)
+                self._velocity(p, (share * g.double()).to(g), group)
                 for p, g in zip(group["params"], slopes, strict=True)
             ]
-            reach = group["lr"] / _length(velocities) if group["normalised"] else group["lr"]
+            reach = _over(group["lr"], velocities) if group["normalised"] else group["lr"]
             for parameter, velocity in zip(group["params"], velocities, strict=True):
-                moved = parameter - reach * velocity
+                moved = parameter - (reach * velocity.double()).to(parameter)
                 grain = group["grain"]
                 parameter.copy_((moved * grain).round() / grain if grain else moved)
         return value
@@ -94,5 +95,7 @@ class Descent(torch.optim.Optimizer):
         return state["velocity"]
 
 
-def _length(vectors: list[torch.Tensor]) -> float:
-    return max(math.sqrt(sum(float(v.square().sum()) for v in vectors)), 1e-300)
+def _over(length: float, vectors: list[torch.Tensor]) -> float:
+    """Factor that gives vectors that length together; 0 where they have none."""
+    own = math.hypot(*(float(v.double().norm()) for v in vectors))
+    return length / own if own else 0.0

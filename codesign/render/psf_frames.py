@@ -18,9 +18,8 @@ from torch.nn.functional import avg_pool2d, pad
 from codesign.errors import DomainError, ShapeError
 from codesign.pose import Poses
 from codesign.render.camera import Camera
-from codesign.render.film import some_pixels
 from codesign.render.moving import MovingScene, Scene, scenes_and_poses, views_of
-from codesign.render.psf_map import SIDE, PsfMap, psf_map
+from codesign.render.psf_map import SIDE, PsfMap, probed, psf_map
 from codesign.render.wavefront import light_and_nearness
 
 ALIKE = ("spectrum", "falloff", "aim")  # of the cameras of a map and of its frames
@@ -56,7 +55,8 @@ def psf_frames(
       point spread functions; "interior" as in ``render.frames``: the motion of silhouettes is left
       out.
     Raises: DomainError for surfaces nearer than the map is made for, scenes without distances, and
-      a map of another lens, spectrum, falloff or aim; ShapeError for one of another film.
+      a map of another lens (also of this one before it was changed), spectrum, falloff or aim;
+      ShapeError for one of another film.
     True where blur changes slowly; not within a blur's radius of depth edges, where light that a
     chief ray does not see is guessed (docs/worlds.md has figures).
     """
@@ -68,7 +68,11 @@ def psf_frames(
             "map of this camera, psf_map(camera)."
         )
     same = {name: getattr(camera, name) == getattr(psf.camera, name) for name in ALIKE}
-    same["lens"] = _same_lens(camera, psf.camera)
+    rays = probed(camera)
+    same["lens"] = all(
+        torch.equal(getattr(rays, name).double(), getattr(psf.probe, name).double())
+        for name in ("origin_m", "direction", "weight")
+    )
     if not all(same.values()):
         raise DomainError(
             f"psf frames: {' and '.join(name for name in same if not same[name])} of the camera are not "
@@ -82,22 +86,6 @@ def psf_frames(
     numbers, step = _layers(psf, per_m.detach(), lit)
     found = [_frame(psf, *frame, lit, numbers, step) for frame in zip(light, per_m, strict=True)]
     return torch.stack(found).reshape(*views.batch, *camera.film.shape)
-
-
-@torch.no_grad()
-def _same_lens(one, other):
-    """Whether two cameras have one lens, or lenses whose rays are alike to the last bit at some
-    pixels and points of the pupil."""
-    if one.lens is other.lens:
-        return True
-    pixels = one.film.pixels()[some_pixels(one.film, 64)]
-    turn = torch.arange(len(pixels)).to(pixels)
-    pupil = 0.7 * torch.stack([turn.cos(), turn.sin()], 1)
-    ours, theirs = (camera.rays_through(pixels, pupil) for camera in (one, other))
-    return all(
-        torch.equal(getattr(ours, name).double(), getattr(theirs, name).double())
-        for name in ("origin_m", "direction", "weight")
-    )
 
 
 def _layers(psf, per_m, lit):

@@ -18,7 +18,7 @@ from torch.nn.functional import interpolate
 from codesign.checks import check_number, check_positive
 from codesign.errors import DomainError, ShapeError
 from codesign.render.camera import Camera, lines
-from codesign.render.film import coarse_pixels, concentric_disc
+from codesign.render.film import coarse_pixels, concentric_disc, some_pixels
 from codesign.types import Rays
 
 ROUNDING = 1e-6  # of distances given in float32
@@ -45,7 +45,8 @@ class PsfMap:
       blur grows by LAYER_PX at most.
       sharp: chief rays of the film's pixels and a margin of radius_px around them, window after
       window, SIDE x SIDE values a pixel of ``fine`` x ``fine`` rays each.
-      transfers: what ``psf_frames`` keeps for its next call.
+      probe: a few rays of the lens as it was (``probed``). transfers: what ``psf_frames`` keeps
+      for its next call.
     base_m, slope: [N, M, 2] where rays through pupil points meet the entrance pupil's plane, and
       their slopes, both relative to the chief ray; share: [N, M] of the light, sum 1.
       base_m_per_px, slope_per_px: [N, 2, 2] the same of neighbouring chief rays, per pixel.
@@ -66,6 +67,7 @@ class PsfMap:
     step_per_m: float
     sharp: Rays
     fine: int
+    probe: Rays
     transfers: dict[tuple[Any, ...], Tensor] = field(
         default_factory=dict, repr=False, compare=False
     )
@@ -220,7 +222,16 @@ def psf_map(
         step,
         camera.chief_rays(_places(camera.film, math.ceil(reach) + TAIL_PX, fine)),
         fine,
+        probed(camera),
     )
+
+
+@torch.no_grad()
+def probed(camera: Camera) -> Rays:
+    """Rays at some pixels and points of the pupil, by which lenses are told apart."""
+    pixels = camera.film.pixels()[some_pixels(camera.film, 64)]
+    turn = torch.arange(len(pixels)).to(pixels)
+    return camera.rays_through(pixels, 0.7 * torch.stack([turn.cos(), turn.sin()], 1))
 
 
 def _nodes(camera, cell_px):

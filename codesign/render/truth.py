@@ -380,7 +380,8 @@ def camera_velocity(T_world_cam: Poses, t_s: Tensor | Sequence[float]) -> tuple[
       pose to the next; ShapeError.
     """
     T_world_cam = check_poses(T_world_cam)
-    t_s = check_finite(torch.as_tensor(t_s, dtype=torch.float64), "times of the poses")
+    t_s = torch.as_tensor(t_s, dtype=torch.float64, device=T_world_cam.device)
+    check_finite(t_s, "times of the poses")
     if t_s.shape != T_world_cam.shape[-3:-2] or t_s.numel() < 2:
         raise ShapeError(
             f"camera velocity: {tuple(t_s.shape)} times for {T_world_cam.shape[-3]} poses; give one time per "

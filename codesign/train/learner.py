@@ -298,14 +298,20 @@ class Learner:
         for held, now in of.values():
             held.copy_(held + (1 - decay) * (now - held) if held.is_floating_point() else now)
 
+    def _moved(self):
+        groups = self.optimiser.param_groups
+        return [parameter for group in groups for parameter in group["params"]]
+
     def _fill_optimiser(self, tensors, path):
         held: dict[str, dict[str, Tensor]] = {}
+        axes = {name: weight.ndim for name, weight in zip(self._names, self._moved(), strict=True)}
         for name, tensor in tensors.items():
             moment, _, weight = name.partition("/")
             held.setdefault(weight, {})[moment] = tensor
-        moments = set().union(*held.values())
         for weight, found in held.items():
-            lost = sorted(moments - set(found))
+            # of weights of as many axes: Adafactor keeps others of a matrix than of a vector
+            alike = (held[name] for name in held if axes.get(name) == axes.get(weight))
+            lost = sorted(set().union(*alike) - set(found))
             if weight not in self._names or lost:
                 raise FileFormatError(
                     f"'{path}' does not fit this optimiser (weight '{weight}', "
@@ -313,9 +319,7 @@ class Learner:
                 )
         state = {index: held[name] for index, name in enumerate(self._names) if name in held}
         self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": state})
-        moved = [
-            parameter for group in self.optimiser.param_groups for parameter in group["params"]
-        ]
+        moved = self._moved()
         # numbers keep their dtype, which torch takes from the weights
         for index, moments in state.items():
             numbers = {name: value.clone() for name, value in moments.items() if value.ndim == 0}

@@ -60,17 +60,16 @@ def score(
     found: Iterable[FlowWindows],
     device: torch.device | None = None,
 ) -> Score:
-    """Score of ``estimator`` on windows, computed on ``device``.
+    """Score of ``estimator`` on windows, computed on ``device``; where they are for None.
 
     Windows without a valid pixel count for nothing beside others that have some; by themselves they
     are judged by how sharp the estimate makes their events.
     """
-    device = device or torch.device("cpu")
     sums = torch.zeros(3, dtype=torch.float64)  # error, error of zero flow, pixels
     worse = judged = 0
     blurs = []
     for windows in found:
-        windows = to_device(windows, device)
+        windows = windows if device is None else to_device(windows, device)
         flow = estimator(windows.volume).flow_px
         truth = windows.truth.flow_px
         valid = windows.truth.valid

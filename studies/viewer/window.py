@@ -114,10 +114,10 @@ class Window:
         processor seconds of every stage and of drawing, those of this process."""
         values = {name: slider.value for name, slider in self.sliders.items()}
         moved = {name: value for name, value in values.items() if value != self._taken[name]}
-        self._taken = values
         began = time.perf_counter()
         try:
             self.setting = self.setting.at(**moved)
+            self._taken = values
             spent = self.show()
             self.update_s.append(time.perf_counter() - began)
             return spent

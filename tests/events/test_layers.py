@@ -123,6 +123,17 @@ def test_a_batch_is_its_samples_and_chunks_are_the_whole(name):
         torch.testing.assert_close(torch.cat(parts, -4), one(given, t_s), rtol=0, atol=1e-12)
 
 
+@pytest.mark.bits
+def test_chunks_of_spikes_between_frames_are_the_whole():
+    """Levels on the brink of a spike: an eighth of a threshold apart."""
+    levels = 0.2 / 8 * torch.randint(0, 40, (12, 60, 60), generator=seeded(0)).to(D)
+    t_s = torch.arange(12, dtype=D) / 100
+    made = layer("srm", SensorModel(0.2, 0.2), steps=5, log_input=True)
+    first, state = made.advance(levels[:5], t_s[:5])
+    second, _ = made.advance(levels[5:], t_s[5:], state)
+    assert torch.equal(torch.cat((first, second)), made(levels, t_s))
+
+
 @pytest.mark.parametrize("name", LAYERS)
 def test_gradients_of_batches_and_chunks_are_those_of_samples_and_the_whole(name):
     frames, t_s = drifting(2, 4, 5, frames=12)

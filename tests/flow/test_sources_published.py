@@ -145,6 +145,35 @@ def test_windows_end_with_the_events(tmp_path):
     assert len(MvsecWindows(tmp_path / "m", frames=0)) == 5
 
 
+@pytest.mark.parametrize("layout", ["dsec", "mvsec"])
+def test_an_event_between_two_windows_is_in_the_second_alone(layout, tmp_path):
+    """Five events on every border: each is counted once, those at the last end of all too where the
+    recording ends with it."""
+    folder = tmp_path / "set"
+    if layout == "dsec":
+        make_dsec(folder)
+        borders = [1_100_000, 1_200_000, 1_300_000]
+        t = np.repeat(borders, 5) - 1_000_000  # since t_offset
+        path = folder / LEFT / "events.h5"
+        for key, values in (("t", t), ("x", 0 * t), ("y", 0 * t), ("p", 0 * t + 1)):
+            stores(path, f"events/{key}", values.astype(np.uint32))
+        stores(path, "t_offset", np.array(1_000_000))
+        stores(path, "ms_to_idx", np.searchsorted(t, 1000 * np.arange(301)))
+        (folder / TIMES).write_text("1100000, 1200000\n1200000, 1300000\n")
+        (folder / FLOW / "forward" / "000010.png").unlink()
+        source = DsecWindows(folder, bins=1, size_px=(120, 160))
+        expected = [5, 10]  # the recording ends with the second
+    else:
+        make_mvsec(folder)
+        t = np.repeat(10.02 + 0.05 * np.arange(12), 5)
+        rows = np.stack([0 * t, 0 * t, t, 0 * t + 1], 1)
+        stores(folder / GREY, "davis/left/events", rows)
+        source = MvsecWindows(folder, frames=0, bins=1)
+        expected = [5] * 10
+    counts = source.batch(range(len(source))).volume.counts
+    assert counts.sum((1, 2, 3, 4)).tolist() == expected
+
+
 # damage
 
 

@@ -71,6 +71,15 @@ def test_normalised_descent_steps_as_far_as_told_over_all_parameters_and_stays_o
     assert float((a.detach() * 4) % 1) == 0
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-40, 1e-24, 1e20, 1e38])
+def test_a_normalised_step_in_single_precision_is_as_long_for_any_gradient(size):
+    x = nn.Parameter(torch.zeros(2))
+    x.grad = torch.tensor([0.6, -0.8]) * size
+    Descent([x], lr=0.5, pull=0.0, normalised=True, grain=0).step()
+    goal = [-0.3, 0.4] if size else [0.0, 0.0]
+    torch.testing.assert_close(x.tolist(), goal, rtol=1e-5, atol=0)
+
+
 def test_sample_gradients_are_clipped_one_by_one():
     x = parameter(0.0, 0.0)
     slopes = torch.tensor([[3.0, 4.0], [0.3, 0.4], [0.0, -1.0]], dtype=torch.float64)

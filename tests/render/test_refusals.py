@@ -357,6 +357,15 @@ def psf():
     return render.psf_map(THIN, nearest_m=1.0)
 
 
+def changed_after_its_map():
+    optics = lens.load("cooke-triplet").scaled(0.2).focus_at(2.0)
+    camera = Camera(optics, 48, 40, 0.02)
+    psf = render.psf_map(camera, nearest_m=1.0)
+    with torch.no_grad():
+        optics.curvature_per_mm *= 1.001
+    return camera, PLANE, POSES, psf
+
+
 def test_light_that_is_traced_has_no_gradient():
     efl = torch.tensor(6.0, dtype=D, requires_grad=True)
     lamp = light.PathScene({"lamp": {"type": "cube", "emitter": area(1.0)}}, samples=1)

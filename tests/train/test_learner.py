@@ -125,6 +125,7 @@ def test_chance_within_a_step_is_the_seed_and_the_number_of_the_step():
         (torch.optim.AdamW, {}, torch.float32),
         (torch.optim.RMSprop, {"centered": True}, torch.float32),
         (torch.optim.NAdam, {}, torch.float64),
+        (torch.optim.Adafactor, {}, torch.float32),  # other moments of matrices than of vectors
     ],
 )
 def test_a_learner_goes_on_from_its_state_bit_for_bit(kind, options, dtype):

@@ -165,7 +165,15 @@ class Arrival:
         Raises: FileFormatError naming the first that is no event, lies outside the sensor or more
           than DISORDER_US before an earlier one.
         """
-        latest_us = np.maximum(np.maximum.accumulate(t_us), self.latest_us) if len(t_us) else t_us
+        outside = [
+            self._outside(*axis) for axis in (("x", x, self.size[1]), ("y", y, self.size[0]))
+        ]
+        seen_us = t_us
+        if OFF_SENSOR in self.left_out:  # what is left out makes no later event late
+            seen_us = np.where(outside[0][0] | outside[1][0], -LAST_US, t_us)
+        latest_us = (
+            np.maximum(np.maximum.accumulate(seen_us), self.latest_us) if len(t_us) else t_us
+        )
         if self.off is None:
             self.off = next(iter(p[(p == 0) | (p == -1)][:1].tolist()), None)
         unfit = ~((p == 1) | (p == (0 if self.off is None else self.off)))
@@ -187,8 +195,7 @@ class Arrival:
         for fault, bad, say in (
             ("", ~((t_us > -LAST_US) & (t_us < LAST_US)), bad_time),
             (BACKWARDS, latest_us - t_us > DISORDER_US, late),
-            (OFF_SENSOR, *self._outside("x", x, self.size[1])),
-            (OFF_SENSOR, *self._outside("y", y, self.size[0])),
+            *((OFF_SENSOR, *found) for found in outside),
             ("", unfit, bad_polarity),
         ):
             bad &= kept

@@ -147,9 +147,12 @@ class Hdf5Events:
         a few blocks are read, not the file."""
         if self.index is not None:
             edges = (t0_us - self.offset_us) // 1000, (t1_us - self.offset_us) // 1000 + 1
+            # an index may end before the events do: behind its last entry lie all that follow
             low, high = (
-                int(np.append(self.index, len(self))[min(max(k, 0), len(self.index))])
-                for k in edges
+                int(np.append(self.index, end)[min(max(k, 0), len(self.index))])
+                for k, end in zip(
+                    edges, (self.index[-1] if len(self.index) else 0, len(self)), strict=True
+                )
             )
         else:
             low, high = self._place(t0_us - DISORDER_US), self._place(t1_us + DISORDER_US + 1)

@@ -178,6 +178,8 @@ def _between(level, steps):
     share = torch.arange(1, steps + 1, dtype=level.dtype, device=level.device) / steps
     share = share.reshape(-1, *[1] * (level.ndim - 1))
     line = level[:-1, None] + share * level.diff(dim=0)[:, None]
+    # the last of a line is the level itself, also where rounding says otherwise
+    line = torch.cat((line[:, :-1], level[1:, None]), 1)
     return torch.cat((level[:1], line.flatten(0, 1)))
 
 

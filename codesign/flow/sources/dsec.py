@@ -97,7 +97,7 @@ class Sequence(Recording):
 
     def counts(self, bins: int, t0_us: int, t1_us: int) -> Tensor:
         """Of the events on the rectified picture."""
-        stream = self.events.window(t0_us, t1_us, self.size_px)
+        stream = self.within(t0_us, t1_us)
         place = torch.from_numpy(self.map[stream.y.numpy(), stream.x.numpy()])
         if not bool(torch.isfinite(place).all()):
             raise FileFormatError(

@@ -196,11 +196,12 @@ def without(
     ends = np.array(possible, np.int64).reshape(-1, 2)
     behind = ends[:, 1] + (ends[:, 1] >= held.t_us[-1])
     few = np.searchsorted(held.t_us, behind) == np.searchsorted(held.t_us, ends[:, 0])
+    kept = np.ones(len(possible), bool)
     for fault, bad in ((EMPTY, few), (GAP, across(possible, gaps(held.t_us)))):
         if fault in skip:
-            left_out[fault] = int(bad.sum())
-            few = few[~bad]
-            possible = [window for window, one in zip(possible, bad, strict=True) if not one]
+            left_out[fault] = int((bad & kept).sum())
+            kept &= ~bad
+    possible = [window for window, one in zip(possible, kept, strict=True) if one]
     if not possible:
         raise DomainError(
             f"no window is left: {', '.join(f'{n} {name}' for name, n in left_out.items())}."

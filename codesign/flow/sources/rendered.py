@@ -19,6 +19,7 @@ from codesign.flow.checks import MOST_STEPS
 from codesign.flow.sources.windows import Recording, Windows
 from codesign.flow.warp import chained
 from codesign.reading import read_json, reading
+from codesign.types import EventStream
 
 FORMAT = "codesign-dataset/1"
 # of the fit of a camera
@@ -117,6 +118,11 @@ class Sequence(Recording):
         }
         self.rays = camera
         self.fit = None
+
+    def within(self, t0_us: int, t1_us: int) -> EventStream:
+        """Events of a window: those at its start belong to the interval that ends there, as the
+        sensor made them (``events.to_counts``)."""
+        return self.events.window(t0_us + 1, t1_us, self.size_px)
 
     def frames(self, first: int, last: int) -> Tensor:
         """[2, H, W] at both ends."""

@@ -3,6 +3,7 @@ layout, pieces cut out of large pictures, and samples of a batch put together.""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -12,7 +13,7 @@ from codesign.checks import check_positive, check_whole
 from codesign.errors import DomainError, ShapeError
 from codesign.events.volumes.volume import from_stream
 from codesign.flow.checks import MOST_STEPS
-from codesign.types import EventVolume, FlowField, FlowWindows
+from codesign.types import EventStream, EventVolume, FlowField, FlowWindows
 
 ALIKE = 0.05  # windows of one source may differ in length by this share
 
@@ -60,10 +61,19 @@ class Recording:
         first, last = (float(self.events.packet(k, k + 1)[0][0]) for k in (0, len(self.events) - 1))
         return first, last
 
+    @cached_property
+    def last_us(self) -> float:
+        """Time of the last event."""
+        return self.ends_us()[1]
+
+    def within(self, t0_us: int, t1_us: int) -> EventStream:
+        """Events of a window, from its start, included, to its end, which belongs to the next one
+        (the last of a recording is included)."""
+        return self.events.window(t0_us, t1_us - (t1_us < self.last_us), self.size_px)
+
     def counts(self, bins: int, t0_us: int, t1_us: int) -> Tensor:
         """[2, bins, H, W]."""
-        stream = self.events.window(t0_us, t1_us, self.size_px)
-        return from_stream(stream, t0_us, t1_us, bins).counts[0]
+        return from_stream(self.within(t0_us, t1_us), t0_us, t1_us, bins).counts[0]
 
 
 class Windows:
