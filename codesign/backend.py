@@ -62,7 +62,8 @@ def device_name(device: Any) -> str:
     found = str(device)
     if found not in ("cpu", "cuda", "cuda:0"):
         raise DomainError(
-            f"device {found!r} is not known here; choose 'cpu' or 'cuda' (the first GPU)."
+            f"device {found!r} is not known here; choose 'cpu' or 'cuda' (the first GPU that the process sees, "
+            "which CUDA_VISIBLE_DEVICES chooses)."
         )
     return found.removesuffix(":0")
 
@@ -280,6 +281,8 @@ def run_kernel(
 def load(array: Any, tensor: Tensor) -> Any:
     """A flat drjit array of that type, of the numbers of a tensor, without a copy where they are
     dense. It must not outlive the ``exclusive`` function that loads it."""
+    if tensor.device.index:  # drjit knows one GPU, and takes memory of any other for its own
+        device_name(tensor.device)
     return array(exclusive.keep(tensor.detach().contiguous().reshape(-1)))
 
 

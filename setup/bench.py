@@ -409,7 +409,8 @@ def commands(device: torch.device) -> dict[str, str]:
     if torch.cuda.device_count() > 1:
         asked["two GPUs"] = [
             *(sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2"),
-            *("-m", "studies.train_flow", "--quick", "--device", device.type),
+            *("--no-python", "sh", "-c", 'CUDA_VISIBLE_DEVICES=$LOCAL_RANK exec "$@"', "sh"),
+            *(sys.executable, "-m", "studies.train_flow", "--quick", "--device", device.type),
         ]
     found = {}
     for name, command in asked.items():

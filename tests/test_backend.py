@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from codesign import backend
-from codesign.errors import BackendError, GradientError
+from codesign.errors import BackendError, DomainError, GradientError
 
 N = 5
 
@@ -172,3 +172,11 @@ def test_cuda_without_a_device_is_refused(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(BackendError, match="no CUDA device"):
         backend.check_version("cuda")
+
+
+def test_a_tensor_on_another_gpu_is_refused():
+    class There:
+        device = torch.device("cuda", 1)
+
+    with pytest.raises(DomainError, match="CUDA_VISIBLE_DEVICES chooses"):
+        backend.load(None, There())

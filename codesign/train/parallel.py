@@ -63,13 +63,14 @@ class Ranks:
 
     def on(self, device_type: str) -> "Ranks":
         """The same process with its device: the processor, or the graphics card of its number on
-        this machine.
+        this machine; the one that CUDA_VISIBLE_DEVICES names, which kernels need.
 
         Raises: DomainError when a process has no graphics card of its own.
         """
         if device_type != "cuda":
             return self
-        local = int(os.environ.get("LOCAL_RANK", "0"))
+        alone = os.environ.get("CUDA_VISIBLE_DEVICES", ",").count(",") == 0
+        local = 0 if alone else int(os.environ.get("LOCAL_RANK", "0"))
         if local >= torch.cuda.device_count():
             raise DomainError(
                 f"process {local} of this machine has no CUDA device ({torch.cuda.device_count()} present); "
