@@ -56,7 +56,7 @@ BUDGETS = {
     "tests/optimise": 3_570,  # a state is a copy
     "tests/render": 30_900,  # intermediate images
     "tests/scenes": 20_150,
-    "tests/studies": 34_850,  # joint_refiner and a review of studies
+    "tests/studies": 32_890,
     "tests/system": 7_090,
     "tests/train": 5_010,
 }
