@@ -26,29 +26,24 @@ PARTS = {
 
 
 def main() -> int:
+    form = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
-        prog="python -m tests.hostile",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        prog="python -m tests.hostile", description=__doc__, formatter_class=form
     )
     parts = parser.add_subparsers(dest="part", required=True)
     for name, (words, count) in PARTS.items():
         part = parts.add_parser(name, help=words)
         part.add_argument("--count", type=int, default=count, help=f"how many (default {count})")
         part.add_argument("--seed", type=int, default=0)
-        part.add_argument(
-            "--out", type=Path, default=Path("runs/hostile"), help="folder of metrics.json"
-        )
+        part.add_argument("--out", type=Path, default="runs/hostile", help="of metrics.json")
         if name == "fuzz":
+            ends = "end of the names of seeds, such as .npz"
             part.add_argument("--minutes", type=float, default=10.0)
-            part.add_argument(
-                "--format", default="", help="end of the names of seeds, such as .npz"
-            )
+            part.add_argument("--format", default="", help=ends)
             part.add_argument("--processes", type=int, default=2)
         if name == "calls":
-            part.add_argument(
-                "paths", nargs="*", default=["tests"], help="tests whose calls are exchanged"
-            )
+            asked = "tests whose calls are exchanged"
+            part.add_argument("paths", nargs="*", default=["tests"], help=asked)
     chosen = vars(parser.parse_args())
     part, out = chosen.pop("part"), chosen.pop("out")
     figures, findings = importlib.import_module(f"tests.hostile.{part}").measure(**chosen)

@@ -33,24 +33,19 @@ import torch
 
 from codesign import doors
 from codesign.errors import CodesignError
+from tests.processes import ROOT, python
 
+OWN = "pose state types events flow grad lens mount optimise render system train"
+SCENES = "bodies robots textures trajectories tum windows worlds"
 ROOMS = [
-    *(
-        f"codesign.{room}"
-        for room in ("pose", "state", "types", "events", "flow", "grad", "lens", "mount")
-    ),
-    *(f"codesign.{room}" for room in ("optimise", "render", "system", "train")),
-    *(
-        f"scenes.{room}"
-        for room in ("bodies", "robots", "textures", "trajectories", "tum", "windows", "worlds")
-    ),
+    *(f"codesign.{room}" for room in OWN.split()),
+    *(f"scenes.{room}" for room in SCENES.split()),
 ]
 KEPT = 2  # calls of a function
 SECONDS = 10  # of a wrong call
 RIGHT_S = 2.0  # of a right one that is worth repeating
 DOOR_S = 20.0  # for all wrong calls made of a right one
 PASSED = "NaN of what is not finite"  # is no finding, and counted
-ROOT = Path(__file__).parents[2]
 
 
 class Hang(BaseException):
@@ -85,14 +80,13 @@ class Calls:
             return
         full = f"{module.__name__.removeprefix('codesign.')}.{name}"
         if inspect.isclass(public):
-            if not issubclass(public, BaseException | enum.Enum) and not getattr(
-                public, "_is_protocol", False
-            ):
-                for method, made in list(vars(public).items()):
-                    if isinstance(made, types.FunctionType) and (
-                        method == "__init__" or method[0] != "_"
-                    ):
-                        setattr(public, method, self._kept(f"{full}.{method}", made))
+            protocol = getattr(public, "_is_protocol", False)
+            if protocol or issubclass(public, BaseException | enum.Enum):
+                return
+            for method, made in list(vars(public).items()):
+                named = method == "__init__" or method[0] != "_"
+                if named and isinstance(made, types.FunctionType):
+                    setattr(public, method, self._kept(f"{full}.{method}", made))
         elif isinstance(public, types.FunctionType):
             setattr(module, name, self._kept(full, public))
 
@@ -118,9 +112,8 @@ class Calls:
         with (
             tempfile.TemporaryDirectory() as folder,
             contextlib.chdir(folder),
-            warnings.catch_warnings(),
+            warnings.catch_warnings(action="ignore"),
         ):
-            warnings.simplefilter("ignore")
             for name, door in self.doors.items():
                 for args, kwargs in door.calls[door.attacked :]:
                     self._attack(name, door.call, args, kwargs)
@@ -164,24 +157,15 @@ def wrong_values(value: Any) -> list[tuple[str, Any]]:
         return wrong
     if isinstance(value, int | float):
         numbers = (math.nan, math.inf, -math.inf, -1, 0, 1.5, 1e300, 1e-300, 1j)
-        return [
-            *wrong,
-            *((str(number), number) for number in numbers),
-            ("nan tensor", torch.tensor(math.nan)),
-        ]
+        wrong += [(str(number), number) for number in numbers]
+        return [*wrong, ("nan tensor", torch.tensor(math.nan))]
     if not isinstance(value, torch.Tensor):
         return [*wrong, ("number", 3.0), ("nan", math.nan)]
     value = value.detach()
-    wrong += [
-        ("number", 3.0),
-        ("empty", value[:0] if value.ndim else value.new_zeros(0)),
-        ("flat", value.reshape(-1)),
-    ]
-    wrong += [
-        ("one axis more", value[None]),
-        ("numpy text", np.array(["a"])),
-        ("meta", value.to("meta")),
-    ]
+    empty = value[:0] if value.ndim else value.new_zeros(0)
+    wrong += [("number", 3.0), ("empty", empty), ("flat", value.reshape(-1))]
+    wrong += [("one axis more", value[None]), ("numpy text", np.array(["a"]))]
+    wrong.append(("meta", value.to("meta")))
     if value.ndim and value.shape[-1] > 1:
         wrong.append(("shorter", value[..., :-1]))
     if value.is_floating_point() and value.numel():
@@ -280,21 +264,17 @@ def measure(
 
     Returns: figures (calls made, doors, findings by kind), and a sentence for each finding.
     """
-    files = [
-        file
-        for path in paths
-        for file in (
-            [path] if path.endswith(".py") else sorted(map(str, Path(path).rglob("test_*.py")))
-        )
-    ]
+    files = []
+    for path in paths:
+        inside = sorted(map(str, Path(path).rglob("test_*.py")))
+        files += [path] if path.endswith(".py") else inside
     files = [file for file in files if "/hostile/" not in file and "/studies/" not in file][:count]
     made, passed, doors, findings = 0, 0, set(), {}
     for file in files:
         with tempfile.TemporaryDirectory() as folder:
             journal = Path(folder) / "journal"
-            command = [sys.executable, "-m", "tests.hostile.calls", str(journal), file, *doors]
             with contextlib.suppress(subprocess.TimeoutExpired):
-                subprocess.run(command, cwd=ROOT, capture_output=True, timeout=900, check=False)
+                python("-m", "tests.hostile.calls", str(journal), file, *doors)
             lines = journal.read_text().splitlines() if journal.exists() else []
         for line in lines:
             if not line.endswith("}"):

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from tests.hostile.reader import SECONDS, numbered, seed_of
+from tests.processes import ROOT
 
 HERE = Path(__file__).parent
-ROOT = HERE.parents[1]
 CRASHES = HERE / "crashes"
 MOST_KEPT = 20_000  # bytes of a crash that is kept
 START_S = 120
@@ -39,21 +39,10 @@ def read_mutants(module: str, name: str, seed: int, count: int, seconds: float =
     findings = []
     first, last, until = 1, 1 + count, float("inf")
     while first < last and time.monotonic() < until:
+        words = ("-m", "tests.hostile.reader", module, name, *map(str, (seed, first, last - first)))
+        pipe = subprocess.PIPE
         process = subprocess.Popen(
-            [
-                sys.executable,
-                "-m",
-                "tests.hostile.reader",
-                module,
-                name,
-                str(seed),
-                str(first),
-                str(last - first),
-            ],
-            cwd=ROOT,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
+            [sys.executable, *words], cwd=ROOT, stdout=pipe, stderr=pipe, text=True
         )
         said: queue.Queue[str | None] = queue.Queue()
         threading.Thread(target=_passed_on, args=(process.stdout, said), daemon=True).start()
@@ -78,10 +67,9 @@ def read_mutants(module: str, name: str, seed: int, count: int, seconds: float =
         if not ended:
             if current is None:
                 raise RuntimeError(f"{module} {name}: the file itself cannot be read: {complaint}")
+            what = f"exit code {code}: {complaint[-300:]}"
             kind = "hang" if code == -9 else "died"
-            findings.append(
-                {"index": current, "kind": kind, "found": f"exit code {code}: {complaint[-300:]}"}
-            )
+            findings.append({"index": current, "kind": kind, "found": what})
             first = current + 1
         else:
             first = last if "done" in told else current or first
@@ -119,18 +107,14 @@ def measure(
         say(f"{name:28} {read:9d} mutants, {len(found)} findings")
         for finding in found:
             kept(module, name, seed, finding)
-        return (
-            name,
-            read,
-            [f"{name} {each['index']}: {each['kind']}: {each['found']}" for each in found],
-        )
+        told = [f"{name} {each['index']}: {each['kind']}: {each['found']}" for each in found]
+        return name, read, told
 
     with ThreadPoolExecutor(processes) as pool:
         rows = list(pool.map(one, chosen))
     figures = {name: read for name, read, _ in rows}
-    return {**figures, "all": sum(figures.values())}, [
-        each for _, _, found in rows for each in found
-    ]
+    findings = [each for _, _, found in rows for each in found]
+    return {**figures, "all": sum(figures.values())}, findings
 
 
 def kept(module, name, seed, finding):

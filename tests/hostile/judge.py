@@ -73,9 +73,8 @@ class Case:
         """What the pixels of every frame count in the loss: [T, H, W], smooth and random."""
         generator = torch.Generator().manual_seed(self.seed)
         coarse = torch.randn(len(self.path), 1, COARSE, COARSE, generator=generator)
-        return torch.nn.functional.interpolate(coarse, size=(self.width_px,) * 2, mode="bicubic")[
-            :, 0
-        ]
+        size = (self.width_px,) * 2
+        return torch.nn.functional.interpolate(coarse, size=size, mode="bicubic")[:, 0]
 
     @property
     def path(self) -> Tensor:
@@ -163,17 +162,11 @@ def compared(truth: Tensor, got: Tensor, plain: Tensor, cpu_s: float = 0.0) -> J
     size = max(float(mean.norm()), 1e-30)
     error = float((got.mean(0) - mean).norm()) / size
     noise = float((_spread(truth).square() + _spread(got).square()).sum().sqrt()) / size
+    share = _share(got, truth)
+    interior = float((plain - mean).norm()) / size
+    means, seeds = (mean.tolist(), got.mean(0).tolist()), (len(truth), len(got))
     return Judged(
-        verdict(error, noise, _share(got, truth)),
-        error,
-        noise,
-        _share(got, truth),
-        float((plain - mean).norm()) / size,
-        "",
-        mean.tolist(),
-        got.mean(0).tolist(),
-        (len(truth), len(got)),
-        cpu_s,
+        verdict(error, noise, share), error, noise, share, interior, "", *means, seeds, cpu_s
     )
 
 
@@ -226,9 +219,8 @@ def gradient(case: Case, effort: Effort, seed: int, way: Way) -> Tensor:
         gradient=way,
         per_px=effort.per_px,
     )
-    (found,) = torch.autograd.grad(
-        (frames.double() * case.weight).sum() / case.weight.numel(), twist
-    )
+    loss = (frames.double() * case.weight).sum() / case.weight.numel()
+    (found,) = torch.autograd.grad(loss, twist)
     return (found.reshape(-1, effort.poses, 6).mean(1) * steps).sum(1)
 
 

@@ -20,8 +20,8 @@ from collections import Counter
 from pathlib import Path
 
 from codesign.atomic import UNFINISHED
+from tests.processes import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 # whose state is kept between steps, in small sizes; without those that begin with a recording
 STUDIES = {
     "lens_tolerance": "--lens la1509 --half-field-deg 3 --trials 120",
@@ -63,6 +63,11 @@ def _started(arguments):
     )
 
 
+def _words(study, folder, seed):
+    """How a run begins."""
+    return [f"studies.{study}", *STUDIES[study].split(), f"--seed={seed}", "--out", str(folder)]
+
+
 def _kept(folder):
     return folder.is_dir() and any(
         path.is_file()
@@ -90,9 +95,7 @@ def _numbers(folder):
 def _whole(study, folder, seed):
     """(numbers, seconds until something is kept, seconds in all) of a run that nobody kills."""
     began = time.monotonic()
-    process = _started(
-        [f"studies.{study}", *STUDIES[study].split(), f"--seed={seed}", "--out", str(folder)]
-    )
+    process = _started(_words(study, folder, seed))
     while process.poll() is None and not _kept(folder):
         time.sleep(0.02)
     first_s = time.monotonic() - began
@@ -139,13 +142,7 @@ def measure(
                 say(f"{study}: first kept after {whole[study][1]:.1f} s of {whole[study][2]:.1f} s")
             expected, first_s, all_s = whole[study]
             folder = Path(place) / f"{study}-{number}"
-            arguments = [
-                f"studies.{study}",
-                *STUDIES[study].split(),
-                f"--seed={seed}",
-                "--out",
-                str(folder),
-            ]
+            arguments = _words(study, folder, seed)
             story = []
             code = None
             for _ in range(order.randint(1, KILLS)):
@@ -181,18 +178,15 @@ def measure(
             left = [path.name for path in folder.rglob(".*")]
             compared += 1
             equal += not different and not left
+            told = f"{study}, {', '.join(story)}"
             if code != 0:
-                findings.append(f"{study}, {', '.join(story)}: resuming ends with {code}: {said}")
+                findings.append(f"{told}: resuming ends with {code}: {said}")
             elif different or left:
                 pairs = [
                     f"{name} {found.get(name)} for {expected.get(name)}" for name in different[:3]
                 ]
-                findings.append(
-                    f"{study}, {', '.join(story)}: {len(different)} differ: {pairs}; left: {left}"
-                )
-            say(
-                f"{study}, {', '.join(story)}: {'equal' if not different and not left else findings[-1]}"
-            )
+                findings.append(f"{told}: {len(different)} differ: {pairs}; left: {left}")
+            say(f"{told}: {'equal' if not different and not left else findings[-1]}")
     figures = {f"kill_hits_{kind}": hits[kind] for kind in KINDS}
     figures |= {"kills": kills, "kill_hits": sum(hits.values()), "kill_studies": len(hit_studies)}
     return figures | {"killed_runs": compared, "killed_runs_equal": equal}, findings

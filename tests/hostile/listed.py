@@ -53,9 +53,8 @@ def measure(
             figures[f"{label}_refused"] = 1.0
         else:
             figures |= {f"{label}_error": found.error or 0.0, f"{label}_noise": found.noise or 0.0}
-        say(
-            f"{label}: {found.verdict}, error {found.error}, noise {found.noise}, interior {found.interior}"
-        )
+        beside = f"noise {found.noise}, interior {found.interior}"
+        say(f"{label}: {found.verdict}, error {found.error}, {beside}")
         if not passes(label.rsplit("_", 1)[0], found):
             findings.append(f"{label}: {found.verdict} {found.error or 0.0:.1%} {found.sentence}")
     return figures, findings
@@ -65,11 +64,9 @@ def passes(name: str, found: Judged) -> bool:
     """Within RIGHT + twice the noise, or refused where shapes pass through each other."""
     if found.verdict == "refused":
         return name in outline_cases.CROSSING
-    return (
-        found.error is not None
-        and found.verdict not in ("noisy", "doubtful")
-        and found.error <= RIGHT + 2 * (found.noise or 0)
-    )
+    if found.error is None or found.verdict in ("noisy", "doubtful"):
+        return False
+    return found.error <= RIGHT + 2 * (found.noise or 0)
 
 
 def auto_after_wall(effort: Effort = USUAL) -> Judged:

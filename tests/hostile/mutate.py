@@ -51,9 +51,8 @@ def changed_bytes(content, dice):
         length = int(dice.choice((1, 2, 4, 8, 16, 64)))
         match int(dice.integers(8)):
             case 0:
-                data[at : at + 1] = bytes(
-                    [(data[at : at + 1] or b"\0")[0] ^ 1 << int(dice.integers(8))]
-                )
+                byte = (data[at : at + 1] or b"\0")[0]
+                data[at : at + 1] = bytes([byte ^ 1 << int(dice.integers(8))])
             case 1:
                 data = data[:at]
             case 2:
@@ -125,9 +124,8 @@ def _zip(content, dice):
             if number == chosen:
                 match int(dice.integers(6)):
                     case 0:
-                        name = dice.choice(
-                            ("../out.npy", "a\\b", "x" * 300, "²", members[0][0].filename + ".npy")
-                        )
+                        names = ("../out.npy", "a\\b", "x" * 300, "²")
+                        name = dice.choice((*names, members[0][0].filename + ".npy"))
                     case 1:
                         continue
                     case _:
@@ -162,10 +160,6 @@ def _png(content, dice):
                 data = zlib.compress(changed_bytes(zlib.decompress(data), dice))
             else:
                 data = changed_bytes(data, dice)
-        made += [
-            struct.pack(">I", len(data)),
-            name,
-            data,
-            struct.pack(">I", zlib.crc32(name + data)),
-        ]
+        checksum = struct.pack(">I", zlib.crc32(name + data))
+        made += [struct.pack(">I", len(data)), name, data, checksum]
     return b"".join(made)

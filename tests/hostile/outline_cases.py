@@ -4,6 +4,7 @@ tested."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from codesign.render.charts import emissive_mesh
 from scenes import silhouettes
 from tests.hostile.random_worlds import convex
 
+AHEAD = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 RADIUS_M = 0.01  # of the cylinders that are seen from afar
 
 
@@ -59,14 +61,12 @@ def icosphere(level):
         edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
         ends, which = np.unique(edges, axis=0, return_inverse=True)
         middle = vertices[ends].mean(1)
+        middle /= np.linalg.norm(middle, axis=1, keepdims=True)
         ab, bc, ca = len(vertices) + which.reshape(3, -1)
-        vertices = np.concatenate(
-            [vertices, middle / np.linalg.norm(middle, axis=1, keepdims=True)]
-        )
+        vertices = np.concatenate([vertices, middle])
         a, b, c = faces.T
-        faces = np.concatenate(
-            [np.stack(t, 1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
-        )
+        parts = ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))
+        faces = np.concatenate([np.stack(part, 1) for part in parts])
     return vertices, faces
 
 
@@ -83,7 +83,7 @@ def _placed(matrix):
 def _ahead(roll=0.3):
     """A camera at the origin that looks along +y, rolled by some radians."""
     turn = torch.tensor([0, 0, 0, 0, 0, roll], dtype=torch.float64)
-    return pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)) @ pose.se3_exp(turn)
+    return AHEAD @ pose.se3_exp(turn)
 
 
 def _wall(distance_m, value):
@@ -111,15 +111,8 @@ def far_pole(ratio: float) -> World:
     low, high = [-0.17 * half, distance, -half], [0.17 * half, distance, half]
     pole = _shape("cylinder", 200, p0=low, p1=high, radius=RADIUS_M)
     shapes = {"wall": _wall(1.5 * distance, 40), "pole": pole}
-    narrow = min(1.0, 20.0 / ratio)
-    return World(
-        MitsubaScene(shapes),
-        _ahead(),
-        distance,
-        focus_m=distance,
-        narrow=narrow,
-        kinds=("pinhole",),
-    )
+    seen = {"narrow": min(1.0, 20.0 / ratio), "kinds": ("pinhole",)}
+    return World(MitsubaScene(shapes), _ahead(), distance, focus_m=distance, **seen)
 
 
 def facets() -> World:
@@ -158,9 +151,8 @@ def sphere_in_floor() -> World:
 
 def cylinder_in_floor() -> World:
     """A leaning cylinder that passes through a floor."""
-    return _in_floor(
-        _shape("cylinder", 200, p0=[-0.05, 1.2, -0.5], p1=[0.15, 1.3, 0.15], radius=0.08)
-    )
+    ends = {"p0": [-0.05, 1.2, -0.5], "p1": [0.15, 1.3, 0.15]}
+    return _in_floor(_shape("cylinder", 200, **ends, radius=0.08))
 
 
 def crossing_mesh() -> World:
@@ -187,17 +179,15 @@ def ball_ahead() -> World:
     begins must not depend on the point of the pupil it is seen from."""
     ball = _shape("sphere", 200, center=[0.2, 1.5, 0.2], radius=0.3)
     world = MitsubaScene({"wall": _wall(3.0, 60), "ball": ball})
-    ahead = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-    return World(world, ahead, 1.2, kinds=("pinhole", "thin", "traced"))
+    return World(world, AHEAD, 1.2, kinds=("pinhole", "thin", "traced"))
 
 
 def robot_body() -> World:
     """A robot in the room with two boxes, with its own deck and mast before the camera that stands
     on it: motions of the camera are those of its mount, under which both the room and the robot
     move in the picture."""
-    T_world_robot = pose.se3_exp(
-        torch.tensor([[0.05, -1.2, 1.0, 0.0, 0.0, 0.1]], dtype=torch.float64)
-    )
+    twist = torch.tensor([[0.05, -1.2, 1.0, 0.0, 0.0, 0.1]], dtype=torch.float64)
+    T_world_robot = pose.se3_exp(twist)
     T_robot_cam = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, -0.15))
     world = MovingScene(silhouettes.room(), {"robot": (silhouettes.robot(), T_world_robot)})
     return World(world, T_world_robot[0] @ T_robot_cam, 0.4)
@@ -205,10 +195,7 @@ def robot_body() -> World:
 
 CASES: dict[str, Callable[[], World]] = {
     "poles": poles,
-    **{
-        f"far_pole_{ratio}": (lambda ratio=ratio: far_pole(ratio))
-        for ratio in (20, 100, 250, 500, 600)
-    },
+    **{f"far_pole_{ratio}": partial(far_pole, ratio) for ratio in (20, 100, 250, 500, 600)},
     "facets": facets,
     "t_junction": t_junction,
     "sphere_in_floor": sphere_in_floor,

@@ -52,9 +52,8 @@ def draw(seed: int) -> Draw:
     half = _between(rng, 0.02, WIDEST)
     depth = _between(rng, 0.5, 100)
     background = str(rng.choice(BACKGROUNDS, p=(0.4, 0.25, 0.25, 0.1)))
-    T_world_first = _rigid(
-        Rotation.random(random_state=rng), rng.standard_normal(3) * _between(rng, 0.1, 30)
-    )
+    turn = Rotation.random(random_state=rng)
+    T_world_first = _rigid(turn, rng.standard_normal(3) * _between(rng, 0.1, 30))
     world = _World(rng, T_world_first, half, depth)
     world.add_background(background)
     for _ in range(int(rng.integers(1, 4))):
@@ -66,17 +65,9 @@ def draw(seed: int) -> Draw:
     if moving:
         scene = MovingScene(scene, moving)
     # a walk of some pixels a frame
-    turns = (
-        2 * half / WIDTH_PX * _between(rng, 0.3, 6) * np.cumsum(rng.standard_normal((FRAMES, 3)), 0)
-    )
-    ways = (
-        2
-        * half
-        / WIDTH_PX
-        * depth
-        * _between(rng, 0.3, 3)
-        * np.cumsum(rng.standard_normal((FRAMES, 3)), 0)
-    )
+    pixel = 2 * half / WIDTH_PX
+    turns = pixel * _between(rng, 0.3, 6) * np.cumsum(rng.standard_normal((FRAMES, 3)), 0)
+    ways = pixel * depth * _between(rng, 0.3, 3) * np.cumsum(rng.standard_normal((FRAMES, 3)), 0)
     path = [
         T_world_first @ _rigid(Rotation.from_rotvec(t - turns[0]), w - ways[0])
         for t, w in zip(turns, ways, strict=True)
@@ -85,16 +76,10 @@ def draw(seed: int) -> Draw:
     # pixels at most
     scale = min(_between(rng, 1, 10), 8 * half / WIDTH_PX * depth / 2.2e-3)
     focus_m = max(depth * _between(rng, 0.5, 3), 0.03 * scale)
-    facts = {
-        "background": background,
-        "depth_m": depth,
-        "half_slope": half,
-        "moving": len(moving),
-        "things": world.told,
-    }
-    return Draw(
-        seed, scene, torch.as_tensor(np.stack(path)), half, max(scale, 0.05), focus_m, facts
-    )
+    facts = {"background": background, "depth_m": depth, "half_slope": half}
+    facts |= {"moving": len(moving), "things": world.told}
+    poses = torch.as_tensor(np.stack(path))
+    return Draw(seed, scene, poses, half, max(scale, 0.05), focus_m, facts)
 
 
 def _between(rng, low, high):
@@ -127,18 +112,15 @@ class _World:
             self.shapes["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": level}}
         if kind == "wall":
             self.furthest = self.depth * _between(rng, 1.3, 5)
-            lean = Rotation.from_rotvec([np.pi, 0, 0]) * Rotation.from_rotvec(
-                rng.uniform(-0.3, 0.3, 3)
-            )
+            aside = Rotation.from_rotvec(rng.uniform(-0.3, 0.3, 3))
+            lean = Rotation.from_rotvec([np.pi, 0, 0]) * aside
             placed = _rigid(lean, [0, 0, self.furthest]) @ np.diag([3 * self.furthest] * 2 + [1, 1])
             self.add("wall", "card", placed, 20)
         if kind == "room":
             self.furthest = self.depth * _between(rng, 2, 4)
             size = np.array([1.1, 1.2, 1.3]) * self.furthest
-            inside = _rigid(Rotation.from_rotvec(rng.uniform(-0.5, 0.5, 3)), [0, 0, 0]) @ np.diag(
-                [*size, 1]
-            )
-            self.add("room", "cube", inside, 20, flip_normals=True)
+            inside = _rigid(Rotation.from_rotvec(rng.uniform(-0.5, 0.5, 3)), [0, 0, 0])
+            self.add("room", "cube", inside @ np.diag([*size, 1]), 20, flip_normals=True)
 
     def add_cluster(self):
         """One to four things, each apart from, stuck in or within the first."""
@@ -150,11 +132,8 @@ class _World:
             centre, size = self.somewhere(px)
             if first is not None and how != "apart":
                 away = rng.standard_normal(3)
-                away *= (
-                    first[1]
-                    * (rng.uniform(0.5, 1.1) if how == "stuck" else 0.3)
-                    / np.linalg.norm(away)
-                )
+                reach = rng.uniform(0.5, 1.1) if how == "stuck" else 0.3
+                away *= first[1] * reach / np.linalg.norm(away)
                 centre = first[0] + away
                 size = first[1] * rng.uniform(0.1, 0.6) if how == "nested" else size
             if np.linalg.norm(centre) < 1.5 * size or centre[2] < 0.1 * self.depth:
@@ -175,9 +154,8 @@ class _World:
         kind = str(rng.choice(EDGED if small else KINDS))
         mirrored = bool(rng.random() < 0.2)
         px = 2 * size / np.linalg.norm(centre) * WIDTH_PX / (2 * self.half)
-        placed = _rigid(Rotation.random(random_state=rng), centre) @ np.diag(
-            [-size if mirrored else size, size, size, 1]
-        )
+        sides = [-size if mirrored else size, size, size, 1]
+        placed = _rigid(Rotation.random(random_state=rng), centre) @ np.diag(sides)
         self.balls.append((centre, size))
         self.told.append([kind, how, round(float(px), 2), *(["mirrored"] if mirrored else [])])
         self.add(name, kind, placed, px)
@@ -189,10 +167,8 @@ class _World:
             centre, size = self.somewhere(_between(rng, 1, 10))
             way = np.cumsum(rng.standard_normal((FRAMES, 3)), 0) * size * 0.5
             reach = size + np.linalg.norm(way - way[0], axis=1).max()
-            clear = all(
-                np.linalg.norm(centre - c) > reach + r
-                for c, r in [*self.balls, (np.zeros(3), 0.1 * size)]
-            )
+            balls = [*self.balls, (np.zeros(3), 0.1 * size)]
+            clear = all(np.linalg.norm(centre - c) > reach + r for c, r in balls)
             if clear and centre[2] + reach < 0.6 * self.furthest:
                 break
         else:
@@ -219,9 +195,8 @@ class _World:
         slim = max(0.03, float(np.linalg.norm(placed[:3, 3])) / ROUNDEST / size)
         placed = self.T_world_first @ placed
         unit = np.eye(4)
-        plugin = {"ball": "sphere", "cube": "cube", "disc": "disk", "card": "rectangle"}.get(
-            kind, "cylinder"
-        )
+        plugins = {"ball": "sphere", "cube": "cube", "disc": "disk", "card": "rectangle"}
+        plugin = plugins.get(kind, "cylinder")
         if kind == "cube" and name != "room":
             sides = rng.uniform(0.2, 1, 3)
             unit[:3, :3] = np.diag(sides / np.linalg.norm(sides))
@@ -234,10 +209,8 @@ class _World:
             unit[2, 3] = -np.cos(angle)
             if kind == "can":
                 for end, sign in (("low", -1), ("high", 1)):
-                    lid = _rigid(
-                        Rotation.from_rotvec([np.pi if sign < 0 else 0, 0, 0]),
-                        [0, 0, sign * np.cos(angle)],
-                    )
+                    turn = Rotation.from_rotvec([np.pi if sign < 0 else 0, 0, 0])
+                    lid = _rigid(turn, [0, 0, sign * np.cos(angle)])
                     lid = placed @ lid @ np.diag([np.sin(angle), np.sin(angle), 1, 1])
                     self.shapes[f"{name} {end}"] = self._plain("disk", lid, px)
         if kind in ("hull", "ring", "sheet", "fine", "bowl"):
@@ -245,12 +218,10 @@ class _World:
             vertices = vertices @ placed[:3, :3].T + placed[:3, 3]
             if np.linalg.det(placed[:3, :3]) < 0:
                 faces = faces[:, ::-1]
-            by_face = rng.random() < 0.5
-            light = (
-                rng.uniform(20, 240) * rng.uniform(0.4, 1, len(faces))
-                if by_face
-                else self._light(px, False)
-            )
+            if rng.random() < 0.5:
+                light = rng.uniform(20, 240) * rng.uniform(0.4, 1, len(faces))
+            else:
+                light = self._light(px, False)
             self.shapes[name] = emissive_mesh(mi, vertices, faces, light)
             return
         self.shapes[name] = {**self._plain(plugin, placed @ unit, px), **options}
@@ -265,10 +236,8 @@ class _World:
     def _light(self, px, textured):
         """One radiance, or a picture without detail below some pixels."""
         rng = self.rng
-        radiance: Any = {
-            "type": "rgb",
-            "value": 0.0 if rng.random() < 0.1 else float(rng.uniform(5, 240)),
-        }
+        level = 0.0 if rng.random() < 0.1 else float(rng.uniform(5, 240))
+        radiance: Any = {"type": "rgb", "value": level}
         if textured and px > 6 and rng.random() < 0.4:
             coarse = torch.as_tensor(rng.uniform(20, 220, (1, 1, 4, 4)))
             fine = torch.nn.functional.interpolate(
@@ -290,9 +259,8 @@ def _fine(rng):
     k = np.arange(int(rng.integers(40, 400))) + 0.5
     z = 1 - 2 * k / len(k)
     turn = np.pi * (1 + 5**0.5) * k
-    return convex(
-        np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], 1)
-    )
+    wide = np.sqrt(1 - z**2)
+    return convex(np.stack([wide * np.cos(turn), wide * np.sin(turn), z], 1))
 
 
 def _bowl(rng):
@@ -310,11 +278,7 @@ def convex(corners):
 
 def _grid(rows, columns, around_rows, around_columns):
     """Faces of a grid of vertices, closed where it says so."""
-    i, j = np.meshgrid(
-        np.arange(rows - (not around_rows)),
-        np.arange(columns - (not around_columns)),
-        indexing="ij",
-    )
+    i, j = np.mgrid[: rows - (not around_rows), : columns - (not around_columns)]
     a, b, c, d = (
         ((i + p) % rows * columns + (j + q) % columns).reshape(-1)
         for p, q in ((0, 0), (1, 0), (1, 1), (0, 1))
@@ -326,10 +290,8 @@ def _ring(rng):
     u, v = np.meshgrid(2 * np.pi * np.arange(18) / 18, 2 * np.pi * np.arange(9) / 9, indexing="ij")
     thick = rng.uniform(0.15, 0.45)
     reach = 1 - thick + thick * np.cos(v)
-    vertices = np.stack([reach * np.cos(u), reach * np.sin(u), thick * np.sin(v)], -1).reshape(
-        -1, 3
-    )
-    return vertices, _grid(18, 9, True, True)
+    vertices = np.stack([reach * np.cos(u), reach * np.sin(u), thick * np.sin(v)], -1)
+    return vertices.reshape(-1, 3), _grid(18, 9, True, True)
 
 
 def _sheet(rng):

@@ -62,22 +62,16 @@ def meaningless(value, depth=0):
             check_stream(value)
         except CodesignError as error:
             return str(error)
-        return (
-            ""
-            if max(value.height_px, value.width_px) <= 2**15
-            else f"a sensor of {value.height_px} rows"
-        )
+        large = max(value.height_px, value.width_px) > 2**15
+        return f"a sensor of {value.height_px} rows" if large else ""
     if isinstance(value, torch.nn.Module):
         value = value.state_dict()
     if isinstance(value, torch.Tensor):
         value = value.detach().cpu().numpy() if value.layout == torch.strided else None
     if isinstance(value, np.ndarray | np.generic | float | complex):
         array = np.asarray(value)
-        return (
-            ""
-            if array.dtype.kind not in "fc" or np.isfinite(array).all()
-            else "a number that is not finite"
-        )
+        wrong = array.dtype.kind in "fc" and not np.isfinite(array).all()
+        return "a number that is not finite" if wrong else ""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = [getattr(value, field.name) for field in dataclasses.fields(value)]
     if isinstance(value, dict):
@@ -108,10 +102,8 @@ def judged(path, reader):
         return ("sentence", said[:300]) if wrong else ("", "")
     except BaseException as error:  # noqa: BLE001 - what is looked for
         where = traceback.extract_tb(error.__traceback__)[-1]
-        return (
-            "foreign",
-            f"{type(error).__name__}: {str(error)[:200]} ({Path(where.filename).name}:{where.lineno})",
-        )
+        place = f"{Path(where.filename).name}:{where.lineno}"
+        return "foreign", f"{type(error).__name__}: {str(error)[:200]} ({place})"
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0)
 
@@ -124,11 +116,8 @@ def seed_of(module, name):
 
 def numbered(content, name, seed, index):
     """Mutant number ``index``; 0 is the file itself."""
-    return (
-        content
-        if index == 0
-        else mutant(content, np.random.default_rng([seed, zlib.crc32(name.encode()), index]))
-    )
+    dice = np.random.default_rng([seed, zlib.crc32(name.encode()), index])
+    return mutant(content, dice) if index else content
 
 
 def main(module, name, seed, first, count):
@@ -150,10 +139,8 @@ def main(module, name, seed, first, count):
                 path.write_bytes(numbered(content, each, int(seed), index))
                 kind, found = judged(path, reader)
                 if kind:
-                    print(
-                        json.dumps({"index": index, "name": each, "kind": kind, "found": found}),
-                        flush=True,
-                    )
+                    told = {"index": index, "name": each, "kind": kind, "found": found}
+                    print(json.dumps(told), flush=True)
     print(json.dumps({"done": True}), flush=True)
 
 

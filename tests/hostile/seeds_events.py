@@ -4,6 +4,7 @@ import io
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import PIL.Image
@@ -35,68 +36,68 @@ def made(name: str, write: Callable[[Path], object]) -> Callable[[], bytes]:
     return content
 
 
+def buffered(write: Callable[[io.BytesIO], object]) -> Callable[[], bytes]:
+    """What ``write`` puts into a file."""
+
+    def content():
+        buffer = io.BytesIO()
+        write(buffer)
+        return buffer.getvalue()
+
+    return content
+
+
 def written(suffix: str, **options) -> Callable[[], bytes]:
     """A file that ``events.write`` makes."""
     name = f"events{suffix}"
     return made(name, lambda folder: events.write(folder / name, stream(), **options))
 
 
+def h5(fill: Callable[[Any], object]) -> Callable[[], bytes]:
+    """An HDF5 file that ``fill`` is given open."""
+
+    def write(buffer):
+        import h5py
+
+        with h5py.File(buffer, "w") as file:
+            fill(file)
+
+    return buffered(write)
+
+
 def dsec(packing=None) -> Callable[[], bytes]:
     """HDF5 without checksums, as published files are."""
 
-    def made():
-        import h5py
+    def fill(file):
         import hdf5plugin
 
-        options = {
-            "blosc": dict(hdf5plugin.Blosc(cname="zstd", clevel=1)),
-            "gzip": {"compression": "gzip"},
-        }
-        buffer = io.BytesIO()
-        given = stream()
-        with h5py.File(buffer, "w") as file:
-            for name, values in (
-                ("t", given.t_us),
-                ("x", given.x),
-                ("y", given.y),
-                ("p", given.p > 0),
-            ):
-                data = values.numpy().astype(np.uint32)
-                file.create_dataset(
-                    f"events/{name}", data=data, chunks=(64,), **options.get(packing, {})
-                )
-            file["t_offset"] = 0
-        return buffer.getvalue()
+        blosc = dict(hdf5plugin.Blosc(cname="zstd", clevel=1))
+        options = {"blosc": blosc, "gzip": {"compression": "gzip"}}.get(packing, {})
+        for name, values in zip("txyp", rows("txyp", False).T, strict=True):
+            data = values.astype(np.uint32)
+            file.create_dataset(f"events/{name}", data=data, chunks=(64,), **options)
+        file["t_offset"] = 0
 
-    return made
+    return h5(fill)
 
 
 def rows(order: str, seconds: bool) -> np.ndarray:
     """[N, 4] events, the columns in this order; times in seconds, or all whole numbers."""
     given = stream()
-    columns = {
-        "t": given.t_us * 1e-6 if seconds else given.t_us,
-        "x": given.x,
-        "y": given.y,
-        "p": given.p > 0,
-    }
+    t = given.t_us * 1e-6 if seconds else given.t_us
+    columns = {"t": t, "x": given.x, "y": given.y, "p": given.p > 0}
     return np.stack([columns[letter].numpy() for letter in order], 1)
 
 
 def hdf5(name: str, order: str, seconds: bool) -> Callable[[], bytes]:
     """A file of v2e's or MVSEC's layout."""
 
-    def made():
-        import h5py
+    def fill(file):
+        data = rows(order, seconds) if seconds else rows(order, seconds).astype(np.uint32)
+        file.create_dataset(name, data=data, compression="gzip", chunks=(50, 4))
+        file["davis/left/image_raw" if seconds else "frame"] = np.zeros((1, *SIZE), np.uint8)
 
-        buffer = io.BytesIO()
-        with h5py.File(buffer, "w") as file:
-            data = rows(order, seconds) if seconds else rows(order, seconds).astype(np.uint32)
-            file.create_dataset(name, data=data, compression="gzip", chunks=(50, 4))
-            file["davis/left/image_raw" if seconds else "frame"] = np.zeros((1, *SIZE), np.uint8)
-        return buffer.getvalue()
-
-    return made
+    return h5(fill)
 
 
 def text(order: str, form: str, head: str = "") -> Callable[[], bytes]:
@@ -109,38 +110,27 @@ def text(order: str, form: str, head: str = "") -> Callable[[], bytes]:
 
 def arrays(packed: bool, **values) -> Callable[[], bytes]:
     """An .npz of arrays, or an .npy of the one called ``only``."""
-
-    def made():
-        buffer = io.BytesIO()
-        if "only" in values:
-            np.save(buffer, values["only"])
-        else:
-            (np.savez_compressed if packed else np.savez)(buffer, **values)
-        return buffer.getvalue()
-
-    return made
+    save = np.savez_compressed if packed else np.savez
+    if "only" in values:
+        return buffered(lambda buffer: np.save(buffer, values["only"]))
+    return buffered(lambda buffer: save(buffer, **values))
 
 
 def picture(kind: str, dtype=np.uint8, colour=True, **options) -> Callable[[], bytes]:
     """A picture that Pillow or tifffile writes."""
 
-    def made():
-        pixels = np.arange(9 * 12 * 3).reshape(9, 12, 3)[..., : 3 if colour else 1].squeeze()
-        buffer = io.BytesIO()
+    pixels = np.arange(9 * 12 * 3).reshape(9, 12, 3)[..., : 3 if colour else 1].squeeze()
+
+    def write(buffer):
         if kind == "TIFF":
             import tifffile
 
-            tifffile.imwrite(
-                buffer,
-                (pixels * 150).astype(dtype),
-                photometric="rgb" if colour else "minisblack",
-                **options,
-            )
+            light = "rgb" if colour else "minisblack"
+            tifffile.imwrite(buffer, (pixels * 150).astype(dtype), photometric=light, **options)
         else:
             PIL.Image.fromarray(pixels.astype(dtype)).save(buffer, kind, **options)
-        return buffer.getvalue()
 
-    return made
+    return buffered(write)
 
 
 def frames(path: Path):
@@ -162,6 +152,7 @@ def folder_frames(path: Path):
     return read_picture(path)
 
 
+XYTP = "{x:.0f},{y:.0f},{t:.6f},{p:.0f}\n"
 STACK = np.arange(4 * 6 * 8).reshape(4, 6, 8)
 SEEDS: dict[str, Seed] = {
     "dsec.h5": (written(".h5"), events.read),
@@ -171,14 +162,11 @@ SEEDS: dict[str, Seed] = {
     "v2e.h5": (hdf5("events", "txyp", False), events.read),
     "mvsec.hdf5": (hdf5("davis/left/events", "xytp", True), events.read),
     "ecd.txt": (text("txyp", "{t:.9f} {x:.0f} {y:.0f} {p:.0f}\n"), events.read),
-    "headed.txt": (
-        text("xytp", "{x:.0f},{y:.0f},{t:.6f},{p:.0f}\n", "346 260\nx,y,t_s,p\n"),
-        events.read,
-    ),
-    "xytp.csv": (text("xytp", "{x:.0f},{y:.0f},{t:.6f},{p:.0f}\n"), events.read),
+    "headed.txt": (text("xytp", XYTP, "346 260\nx,y,t_s,p\n"), events.read),
+    "xytp.csv": (text("xytp", XYTP), events.read),
     "rows.npy": (arrays(False, only=rows("txyp", True)), events.read),
     "names.npz": (
-        lambda: arrays(True, **dict(zip("xytp", rows("xytp", True).T, strict=True)))(),
+        arrays(True, **dict(zip("xytp", rows("xytp", True).T, strict=True))),
         events.read,
     ),
     "events.aedat4": (written(".aedat4"), events.read),

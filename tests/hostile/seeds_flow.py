@@ -13,11 +13,12 @@ from codesign.flow.sources import truth
 from codesign.flow.sources.camera import read_calibration, read_gyroscope, read_poses
 from codesign.flow.sources.packet import PacketOptions
 from codesign.flow.sources.packets import read_packets
-from tests.hostile.seeds_events import Seed, arrays, made
+from tests.hostile.seeds_events import Seed, arrays, buffered, made
 from tests.recording_case import ETH_CALIBRATION, eth_text
 from tests.recording_case import made as recording
 
 SIZE = (9, 12)
+TIMES = {"t0": np.array(1.0), "t1": np.array(1.5)}
 FLOW = np.random.default_rng(0).normal(size=(2, *SIZE)).astype(np.float32)
 
 
@@ -31,16 +32,13 @@ def flow(suffix: str) -> Callable[[], bytes]:
 def matlab(packed: bool) -> Callable[[], bytes]:
     """What SciPy writes."""
 
-    def written():
+    def write(buffer):
         import scipy.io
 
-        buffer = io.BytesIO()
-        scipy.io.savemat(
-            buffer, {"flow": FLOW, "t0": 1.0, "t1": 1.5, "who": "me"}, do_compression=packed
-        )
-        return buffer.getvalue()
+        values = {"flow": FLOW, "t0": 1.0, "t1": 1.5, "who": "me"}
+        scipy.io.savemat(buffer, values, do_compression=packed)
 
-    return written
+    return buffered(write)
 
 
 def read_truth(path: Path):
@@ -48,32 +46,20 @@ def read_truth(path: Path):
     return truth.read_truth(path, SIZE)
 
 
-def table() -> bytes:
+def table() -> Callable[[], bytes]:
     """``x y u v`` of every pixel."""
     y, x = np.mgrid[: SIZE[0], : SIZE[1]]
-    buffer = io.StringIO()
-    np.savetxt(
-        buffer,
-        np.column_stack([x.ravel(), y.ravel(), *FLOW.reshape(2, -1)]),
-        header="x y u v",
-        fmt="%.6g",
-    )
-    return buffer.getvalue().encode()
+    rows = np.column_stack([x.ravel(), y.ravel(), *FLOW.reshape(2, -1)])
+    return buffered(lambda buffer: np.savetxt(buffer, rows, header="x y u v", fmt="%.6g"))
 
 
 def motion(columns: int) -> Callable[[], bytes]:
     """Lines of times and numbers: of a gyroscope (7) or of poses (8)."""
-
-    def written():
-        rows = np.random.default_rng(1).normal(size=(12, columns))
-        rows[:, 0] = np.arange(12) * 0.01
-        if columns == 8:
-            rows[:, 4:] /= np.linalg.norm(rows[:, 4:], axis=1, keepdims=True)
-        buffer = io.StringIO()
-        np.savetxt(buffer, rows)
-        return buffer.getvalue().encode()
-
-    return written
+    rows = np.random.default_rng(1).normal(size=(12, columns))
+    rows[:, 0] = np.arange(12) * 0.01
+    if columns == 8:
+        rows[:, 4:] /= np.linalg.norm(rows[:, 4:], axis=1, keepdims=True)
+    return buffered(lambda buffer: np.savetxt(buffer, rows))
 
 
 def turned(reader):
@@ -89,16 +75,13 @@ def turned(reader):
     return read
 
 
-def archive() -> bytes:
+def archive(buffer: io.BytesIO) -> None:
     """A recording in a zip archive."""
-    buffer = io.BytesIO()
+    motion = "\n".join(f"{1 + k * 0.01:.3f} 0 0 9.8 0.1 0 0.2" for k in range(12))
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as packed:
         packed.writestr("shapes/events.txt", eth_text(recording(60, start_s=1.0)))
         packed.writestr("shapes/calib.txt", ETH_CALIBRATION)
-        packed.writestr(
-            "shapes/imu.txt", "\n".join(f"{1 + k * 0.01:.3f} 0 0 9.8 0.1 0 0.2" for k in range(12))
-        )
-    return buffer.getvalue()
+        packed.writestr("shapes/imu.txt", motion)
 
 
 def packets(path: Path):
@@ -122,16 +105,13 @@ SEEDS: dict[str, Seed] = {
     "flow.flo": (flow(".flo"), files.read_flow),
     "flow.png": (flow(".png"), files.read_flow),
     "truth.npy": (arrays(False, only=FLOW), read_truth),
-    "truth.npz": (
-        arrays(True, x_flow=FLOW[0], y_flow=FLOW[1], t0=np.array(1.0), t1=np.array(1.5)),
-        read_truth,
-    ),
+    "truth.npz": (arrays(True, x_flow=FLOW[0], y_flow=FLOW[1], **TIMES), read_truth),
     "truth.mat": (matlab(True), read_truth),
     "open.mat": (matlab(False), read_truth),
-    "truth.txt": (table, read_truth),
+    "truth.txt": (table(), read_truth),
     "imu.txt": (motion(7), turned(read_gyroscope)),
     "groundtruth.txt": (motion(8), turned(read_poses)),
     "calib.txt": (ETH_CALIBRATION.encode, read_calibration),
-    "recording.zip": (archive, packets),
+    "recording.zip": (buffered(archive), packets),
     "network.safetensors": (made("network.safetensors", network), read_network),
 }

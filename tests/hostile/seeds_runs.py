@@ -1,7 +1,6 @@
 """Small whole files of runs, trainings, generators and hand-overs, and who reads each."""
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -13,24 +12,16 @@ from codesign.reading import read_json, read_text
 from codesign.system import HandOver, load_hand_over, save_hand_over
 from codesign.train import checkpoint
 from codesign.train.loop import Progress
-from studies.frame.config import StudyConfig
 from studies.frame.run import Run, open_run
 from tests.hostile.seeds_events import Seed, made
-
-
-@dataclass(frozen=True)
-class Config(StudyConfig):
-    limit: float = 1.0
-    sizes: tuple[int, ...] = (1, 2)
+from tests.studies.smallest_study import Config
 
 
 def run(folder: Path) -> Run[Config]:
     """A run with a state and a number."""
     begun = open_run("hostile", Config(out=folder / "run", device="cpu"))
-    begun.save_state(
-        {"x": torch.arange(3.0), "g": torch.Generator().get_state()},
-        {"step": 3, "rows": {"a": [1.0]}},
-    )
+    tensors = {"x": torch.arange(3.0), "g": torch.Generator().get_state()}
+    begun.save_state(tensors, {"step": 3, "rows": {"a": [1.0]}})
     begun.record(loss=0.5)
     return begun
 
@@ -43,12 +34,8 @@ def resumed(path: Path):
     again = open_run("hostile", Config(resume=path.parent, device="cpu"))
     state = again.load_state()
     # a state may hold an infinite best
-    return [
-        again.config.limit,
-        again.config.sizes,
-        again.metrics,
-        sorted(state.tensors) if state else None,
-    ]
+    names = sorted(state.tensors) if state else None
+    return [again.config.limit, again.config.sizes, again.metrics, names]
 
 
 class Learner:
@@ -63,9 +50,8 @@ class Learner:
 
 def training(folder: Path):
     """A checkpoint of three steps."""
-    checkpoint.save(
-        folder, Learner(), Progress(3, 1.0, 2.0, 0.5, 0, 0, [1.0], [1.0], [0.1]), {"seed": 0}
-    )  # type: ignore[arg-type]
+    progress = Progress(3, 1.0, 2.0, 0.5, 0, 0, [1.0], [1.0], [0.1])
+    checkpoint.save(folder, Learner(), progress, {"seed": 0})  # type: ignore[arg-type]
 
 
 def trained(path: Path):
@@ -81,9 +67,8 @@ def hand_over(folder: Path):
     """A mount with a thin lens and a sensor."""
     mount = Mount((0.2, 0.0, 0.4), (0.1, 0.0, 0.2), yaw_rad=0.3)
     camera = render.Camera(lens.ThinLens(8.0, 2.0).focus_at(1.3), 32, 24, 0.1, 4, falloff=True)
-    save_hand_over(
-        folder / "mount.yaml", HandOver(mount, camera, events.SensorModel(), notes={"by": "me"})
-    )
+    given = HandOver(mount, camera, events.SensorModel(), notes={"by": "me"})
+    save_hand_over(folder / "mount.yaml", given)
 
 
 def handed(path: Path):

@@ -1,7 +1,6 @@
 """Small whole files of every format that worlds are made of, and who reads each: what mutants are
 made of."""
 
-import io
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -11,8 +10,8 @@ import PIL.Image
 
 from scenes import mesh_files, robots, textures, tum, worlds
 from scenes.robots.page import read_own
+from tests.hostile.seeds_events import Seed, buffered
 
-Seed = tuple[Callable[[], bytes], Callable[[Path], object]]
 LIGHT = np.random.default_rng(0).uniform(0, 255, (6, 12, 3)).astype(np.uint8)
 POSES = "0,0,0,0,0,0,0,1\n0.5,1,0,0,0,0,0.6,0.8\n1.5,1,2,0,0,0,0,1\n"
 URDF = """<robot name="r"><material name="red"><color rgba="0.8 0.1 0.1 1"/></material>
@@ -50,13 +49,7 @@ velocities: planar
 
 def picture(kind: str) -> Callable[[], bytes]:
     """A picture that Pillow writes."""
-
-    def made():
-        file = io.BytesIO()
-        PIL.Image.fromarray(LIGHT).save(file, kind)
-        return file.getvalue()
-
-    return made
+    return buffered(lambda buffer: PIL.Image.fromarray(LIGHT).save(buffer, kind))
 
 
 def hdr() -> bytes:

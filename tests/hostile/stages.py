@@ -146,20 +146,16 @@ def speed(before=same, **spoilt):
 def checked(batch=BATCH, only=None, may_cut=(), **parts):
     """``check`` of the chain with other parts, on a batch of its own; ``only`` variables of one
     stage."""
-    usual = of(
-        camera=Camera(glass()), mount=held(), render=picture(), events=layer(), flow=network()
-    )
-    system = System(
-        **{**usual, "bins": 2, "estimate": speed(), "objectives": {"error": error}, **parts}
-    )
+    usual = of(camera=Camera(glass()), mount=held(), render=picture(), events=layer())
+    usual |= of(flow=network(), bins=2, estimate=speed(), objectives={"error": error})
+    system = System(**{**usual, **parts})
     poses = None if batch.T_world_body is None else batch.T_world_body.clone()
     batch = replace(batch, T_world_body=poses, t_s=batch.t_s.clone())
-    variables = (
-        [p for name, p in system.named_parameters() if name.startswith(only)] if only else None
-    )
-    return system, check(system, batch, variables, may_cut=may_cut)
+    variables = [p for name, p in system.named_parameters() if only and name.startswith(only)]
+    return system, check(system, batch, variables if only else None, may_cut=may_cut)
 
 
+STAGES = {"events": layer, "flow": network, "estimate": speed}
 CUTS = {
     "detach": lambda t: t.detach(),
     "data": lambda t: t.data,
@@ -188,7 +184,7 @@ THROUGH = {
         part,
         {part: make(before=cut, own=own)},
     )
-    for part, make in (("events", layer), ("flow", network), ("estimate", speed))
+    for part, make in STAGES.items()
     for own in (True, False)
 }
 SHAPES = {
@@ -209,14 +205,13 @@ SHAPED_AT = {
         "events",
         of(events=lambda frames: entry("counts", change)(volume_of(frames))),
     ),
-    "flow": lambda change: (
-        "flow",
-        of(flow=lambda volume: entry("flow_px", change)(flow_of(volume))),
-    ),
-    "valid": lambda change: (
-        "flow",
-        of(flow=lambda volume: entry("valid", change)(flow_of(volume))),
-    ),
+    **{
+        name: lambda change, part=part: (
+            "flow",
+            of(flow=lambda volume: entry(part, change)(flow_of(volume))),
+        )
+        for name, part in (("flow", "flow_px"), ("valid", "valid"))
+    },
     "rays": lambda change: ("camera", of(camera=Camera(glass(), entry("direction", change)))),
     "mount": lambda change: ("mount", of(mount=held(change))),
 }
@@ -248,7 +243,7 @@ HIDINGS = {
 }
 HIDDEN_AT = {
     part: lambda hide, part=part, make=make: ("does not see", {part: hide(make().method)})
-    for part, make in (("events", layer), ("flow", network), ("estimate", speed))
+    for part, make in STAGES.items()
 }
 PRODUCTS = ((CUTS, CUT_AT), (CUTS | HARD, THROUGH), (SHAPES, SHAPED_AT), (IN_PLACE, TOUCHED_AT))
 # axes before, a square film

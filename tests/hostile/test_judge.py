@@ -12,6 +12,7 @@ import torch
 from codesign import backend, lens, pose
 from codesign.render import MitsubaScene
 from tests.hostile import judge, listed, outline_cases, random_worlds, worlds
+from tests.studies.runs import lines
 
 QUICK = judge.Effort(seeds=(4,))
 
@@ -97,38 +98,37 @@ def test_a_square_is_judged_by_its_closed_form():
 
 def test_a_verdict_weighs_errors_by_their_noise():
     truth = torch.ones(4, 6, dtype=torch.float64)
-    assert judge.compared(truth, 1.04 * truth, 0 * truth[0]).verdict == "right"
-    assert judge.compared(truth, 1.08 * truth, 0 * truth[0]).verdict == "near"
-    assert judge.compared(truth, 0.88 * truth, 0 * truth[0]).verdict == "wrong"
-    assert judge.compared(0 * truth, 0 * truth, 0 * truth[0]).verdict == "empty"
-    shaken = truth * torch.tensor([0.4, 1.5, 0.7, 1.4], dtype=torch.float64)[:, None]
-    assert judge.compared(shaken, truth, 0 * truth[0]).verdict == "doubtful"
-    assert judge.compared(truth, shaken, 0 * truth[0]).verdict == "noisy"
-    found = judge.compared(truth, shaken, 0 * truth[0])
-    spread = float(torch.tensor([0.4, 1.5, 0.7, 1.4]).std()) / 2
-    assert found.noise == pytest.approx(spread, rel=1e-6)
+    sizes = torch.tensor([0.4, 1.5, 0.7, 1.4], dtype=torch.float64)
+    shaken = truth * sizes[:, None]
+    for verdict, differences, gradient in (
+        ("right", truth, 1.04 * truth),
+        ("near", truth, 1.08 * truth),
+        ("wrong", truth, 0.88 * truth),
+        ("empty", 0 * truth, 0 * truth),
+        ("doubtful", shaken, truth),
+        ("noisy", truth, shaken),
+    ):
+        found = judge.compared(differences, gradient, 0 * truth[0])
+        assert found.verdict == verdict
+    assert found.noise == pytest.approx(float(sizes.std()) / 2, rel=1e-6)
 
 
 def test_random_worlds_are_judged_once_and_counted(tmp_path):
     """Two worlds of which one is known from an earlier call, as wrong and refused as it can be."""
     path = tmp_path / "worlds.jsonl"
-    known = {
-        "pinhole": judge.Judged("near", 0.08, 0.01),
-        "thin": judge.Judged("refused", sentence="too thin"),
-    }
-    known["traced"] = judge.Judged("doubtful", 0.3, 0.2)
-    lines = [json.dumps({"world": 0, "lens": kind, **found.row()}) for kind, found in known.items()]
-    path.write_text("\n".join(lines) + "\n")
+    known = {"pinhole": judge.Judged("near", 0.08, 0.01)}
+    known |= {"thin": judge.Judged("refused", sentence="too thin")}
+    known |= {"traced": judge.Judged("doubtful", 0.3, 0.2)}
+    rows = [{"world": 0, "lens": kind, **found.row()} for kind, found in known.items()]
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
     told = []
     figures, findings = worlds.measure(2, 0, told.append, path)
     assert (figures["worlds_judged"], figures["worlds_right"], figures["worlds_wrong"]) == (4, 3, 1)
     assert figures["worlds_noisy"] == figures["worlds_refused"] == 1
     assert findings[0] == "world 0 through the lens 'pinhole' is 8.0% wrong at a noise of 1.0%."
     assert findings[1:] == ["1 of 6 random worlds are refused, 3% may be."]
-    rows = [json.loads(line) for line in path.read_text().splitlines()]
-    assert all(
-        row["verdict"] == "right" and row["interior"] > 0.5 for row in rows if row["world"] == 1
-    )
+    judged = [row for row in lines(path) if row["world"] == 1]
+    assert all(row["verdict"] == "right" and row["interior"] > 0.5 for row in judged)
     assert worlds.measure(2, 0, told.append, path) == (figures, findings)
     assert told == []
 

@@ -68,17 +68,15 @@ def _path(seed, start=START):
 def traced(seed: int) -> list[Tensor]:
     bent = (_lens().curvature_per_mm.detach() * (1 + 0.001 * seed)).requires_grad_()
     camera = _camera(seed)
-    return _gradients(
-        camera.with_lens(_lens().replace(curvature_per_mm=bent)).rays().direction, bent
-    )
+    rays = camera.with_lens(_lens().replace(curvature_per_mm=bent)).rays()
+    return _gradients(rays.direction, bent)
 
 
 def rendered(seed: int) -> list[Tensor]:
     """Of a scene that is built and freed in the thread itself."""
     twist = torch.zeros(6, dtype=D, requires_grad=True)
-    return _gradients(
-        render.frames(_camera(seed), _wall(), _path(seed) @ pose.se3_exp(twist)), twist
-    )
+    frames = render.frames(_camera(seed), _wall(), _path(seed) @ pose.se3_exp(twist))
+    return _gradients(frames, twist)
 
 
 def outlined(seed: int) -> list[Tensor]:
@@ -105,9 +103,8 @@ def spiked(seed: int) -> list[Tensor]:
 
 def simulated(seed: int) -> list[Tensor]:
     frames = (100 + 30 * _drawn(seed, 6, 24, 24)).clamp_min(1)
-    stream = events.simulate(
-        frames, torch.linspace(0, 0.1, 6, dtype=D), events.SensorModel(theta_on=0.2)
-    )
+    t_s = torch.linspace(0, 0.1, 6, dtype=D)
+    stream = events.simulate(frames, t_s, events.SensorModel(theta_on=0.2))
     return [stream.t_us, stream.x, stream.p]
 
 
@@ -171,9 +168,8 @@ def run(threads: int, rounds: int, kinds: tuple[str, ...] = tuple(KINDS)) -> dic
             for _ in range(rounds):
                 for kind in order.sample(kinds, len(kinds)):
                     seed = order.randrange(SEEDS)
-                    worst[kind] = max(
-                        worst[kind], _difference(KINDS[kind](seed), serial[kind, seed])
-                    )
+                    away = _difference(KINDS[kind](seed), serial[kind, seed])
+                    worst[kind] = max(worst[kind], away)
         except (CodesignError, RuntimeError, ValueError, TypeError, AssertionError) as error:
             raised.append(error)
 
@@ -225,35 +221,20 @@ def measure(
     """``count`` rounds of all kinds in every thread, in a process that is ended where they do
     not."""
     limit_s = 120 + 3.0 * threads * count
-    command = [
-        sys.executable,
-        "-m",
-        "tests.hostile.threads",
-        str(threads),
-        str(count),
-        str(limit_s),
-    ]
+    numbers = map(str, (threads, count, limit_s))
+    command = [sys.executable, "-m", "tests.hostile.threads", *numbers]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    say(f"{threads} threads, {count} rounds: exit code {done.returncode}")
+    told = f"{threads} threads, {count} rounds"
+    say(f"{told}: exit code {done.returncode}")
     if done.returncode:
-        return {}, [
-            f"{threads} threads, {count} rounds: ends with {done.returncode}: {done.stderr[-300:]}"
-        ]
-    found = {f"threads_{name}": value for name, value in json.loads(done.stdout).items()}
-    wrong = [
-        f"{name} differs by {found[f'threads_{name}']}"
-        for name in KINDS
-        if found[f"threads_{name}"] > TOLERANCE
-    ]
-    return {**found, "threads": threads, "threads_rounds": count, **lock()}, wrong
+        return {}, [f"{told}: ends with {done.returncode}: {done.stderr[-300:]}"]
+    found = json.loads(done.stdout)
+    wrong = [f"{name} differs by {found[name]}" for name in KINDS if found[name] > TOLERANCE]
+    figures = {f"threads_{name}": value for name, value in found.items()}
+    return {**figures, "threads": threads, "threads_rounds": count, **lock()}, wrong
 
 
 if __name__ == "__main__":
     faulthandler.dump_traceback_later(float(sys.argv[3]), exit=True)
-    print(
-        json.dumps(
-            run(
-                int(sys.argv[1]), int(sys.argv[2]), *([tuple(sys.argv[4:])] if sys.argv[4:] else [])
-            )
-        )
-    )
+    chosen = tuple(sys.argv[4:]) or tuple(KINDS)
+    print(json.dumps(run(int(sys.argv[1]), int(sys.argv[2]), chosen)))

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from tests.hostile import random_worlds
 from tests.hostile.judge import HIGHEST, LENSES, RIGHT, Case, Effort, judge, nearest_m, optics_of
+from tests.studies.runs import lines
 
 EFFORT = Effort(samples=512, per_px=24.0, seeds=(3, 10), directions=2, enough=0.06)
 EACH = 10_000  # worlds of one seed
@@ -36,8 +37,7 @@ def measure(
     line each, else CODESIGN_WORLDS, else runs/hostile/worlds.jsonl."""
     path = Path(path or os.environ.get("CODESIGN_WORLDS", "runs/hostile/worlds.jsonl"))
     path.parent.mkdir(parents=True, exist_ok=True)
-    lines = path.read_text().splitlines() if path.exists() else []
-    rows = {(row["world"], row["lens"]): row for row in map(json.loads, lines)}
+    rows = {(row["world"], row["lens"]): row for row in lines(path)}
     wanted = [(EACH * seed + k, kind) for k in range(count) for kind in LENSES]
     for world, kind in wanted:
         if (world, kind) in rows:
@@ -54,16 +54,14 @@ def measure(
 def summary(rows: list[dict]) -> tuple[dict[str, float], list[str]]:
     """Figures and findings of judged cases."""
     counts = Counter(map(_fate, rows))
-    figures = {
-        f"worlds_{name}": float(counts[name]) for name in ("right", "wrong", "noisy", "refused")
-    }
+    names = ("right", "wrong", "noisy", "refused")
+    figures = {f"worlds_{name}": float(counts[name]) for name in names}
     figures["worlds_judged"] = figures["worlds_right"] + figures["worlds_wrong"]
     figures["cpu_s"] = sum(row["cpu_s"] for row in rows)
     findings = [_told(row) for row in rows if _fate(row) == "wrong"]
     if counts["refused"] > REFUSED * len(rows):
-        findings.append(
-            f"{counts['refused']} of {len(rows)} random worlds are refused, {REFUSED:.0%} may be."
-        )
+        told = f"{counts['refused']} of {len(rows)} random worlds are refused"
+        findings.append(f"{told}, {REFUSED:.0%} may be.")
     return figures, findings
 
 

@@ -1,8 +1,9 @@
-"""Runs of the smallest study."""
+"""Runs of the smallest study, and what any study refuses."""
 
 import pytest
 
 from studies.frame.run import main, open_run
+from tests.studies.runs import ran
 from tests.studies.smallest_study import Config, record_one
 
 
@@ -25,3 +26,21 @@ def command(capsys):
         return code, capsys.readouterr().err
 
     return called
+
+
+@pytest.fixture
+def refuses(tmp_path, monkeypatch, capsys):
+    """Sees that a study refuses the words of a row of refusals.txt, typed in ``tmp_path`` after
+    options that are right: exit code 2, one line, and no table of what was looked at."""
+    monkeypatch.chdir(tmp_path)
+
+    def seen(study, row, options=""):
+        capsys.readouterr()
+        assert ran(study, f"{options} {row.call} --out", tmp_path / "run") == 2
+        said = capsys.readouterr().err
+        assert said.startswith("error: ")
+        assert row.sentence in said
+        assert said.count("\n") == 1
+        assert not list((tmp_path / "run").glob("*.jsonl"))
+
+    return seen

@@ -1,8 +1,6 @@
-"""The smallest study, whose runs tests of the frame look at, and what its folder holds."""
+"""The smallest study, whose runs tests of the frame look at."""
 
-import json
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar
 
 from studies.frame.config import StudyConfig
@@ -20,15 +18,3 @@ def record_one(run: Run[Config]):
     """The smallest study."""
     run.record(limit=run.config.limit)
     run.finish("One number", "It was recorded.")
-
-
-def stored(folder, name):
-    return json.loads((folder / f"{name}.json").read_text())
-
-
-def numbers(folder):
-    return {k: v for k, v in stored(folder, "metrics").items() if k not in ("versions", "hardware")}
-
-
-def contents(folder):
-    return {path.name: path.read_bytes() for path in Path(folder).rglob("*") if path.is_file()}

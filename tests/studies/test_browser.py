@@ -1,6 +1,5 @@
 """The page of every study as a browser shows it, and the faults that a browser would find."""
 
-import importlib
 import re
 from pathlib import Path
 
@@ -11,11 +10,10 @@ from matplotlib.figure import Figure
 from codesign import events
 from codesign.report import page, prose
 from studies.frame.listing import studies
-from studies.frame.run import main
 from studies.stability import __main__ as stability
-from tests.processes import ROOT
 from tests.studies import browser
 from tests.studies.browser import BROWSER, WIDTHS_PX, check_page, faults
+from tests.studies.runs import module_of, ran
 
 TESTS = Path(__file__).parents[1]
 # studies that no other test runs to their page
@@ -116,9 +114,7 @@ def uncounted(case, tries, seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ALONE)
 def test_pages_of_studies_that_no_other_test_runs(name, tmp_path, monkeypatch):
-    path = f"studies.{name}" + ".__main__" * (ROOT / "studies" / name).is_dir()
-    module = importlib.import_module(path)
     monkeypatch.setattr(stability, "cells", uncounted)
     out = tmp_path / "run"
-    assert main(module.study, module.Config, [*ALONE[name].split(), "--out", str(out)]) == 0
+    assert ran(module_of(name), f"{ALONE[name]} --out", out) == 0
     check_page(name, out)

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from codesign import lens
-from codesign.errors import DomainError
 from scenes.robots import pair as robot_pair
 from scenes.robots.costs import Costs
 from scenes.robots.pairs import PAIRS
@@ -23,8 +22,10 @@ from studies.codesign.page import every_ratio
 from studies.codesign.problem import Drawn
 from studies.codesign.race import NEAR, Judge, compared, kept, start
 from studies.frame.config import StudyConfig
-from studies.frame.run import main, open_run
+from studies.frame.run import open_run
+from tests import refusals
 from tests.studies.browser import check_page
+from tests.studies.runs import lines, numbers, page, ran
 
 F = torch.float64
 
@@ -57,17 +58,9 @@ def test_numbers_are_held_where_they_are_told_to_be():
     assert space.costs.gain(4.0) == pytest.approx(0.09)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        ({"free": ("colour",)}, "no number 'colour'"),
-        ({"bounds": {"fno": (2.0, 2.0)}}, "give it room"),
-        ({"bounds": {"efl_mm": (7.0, 12.0)}}, "starts at 6.5, outside"),
-    ],
-)
-def test_spaces_that_cannot_be_are_refused(wrong, said):
-    with pytest.raises(DomainError, match=said):
-        Space(PAIRS["outdoors"](), **wrong)
+@refusals.table(__file__, "spaces of designs")
+def test_spaces_that_cannot_be_are_refused(row):
+    row.holds(globals())
 
 
 def test_what_is_carried_to_the_same_design_is_what_was_seen(drawn, space):
@@ -241,32 +234,9 @@ def test_the_comparison_is_of_pairs():
         assert [back.value, back.low, back.high] == pytest.approx(ends, rel=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        (["--pair", "moon"], "choose from outdoors"),
-        (["--light", "0"], "light is 0"),
-        (["--steps", "10"], "multiple of 16"),
-        (["--arms", "book"], "needs joint"),
-        (["--arms", "joint", "luck"], "choose from joint"),
-        (["--per-draw", "7", "--worlds", "3"], "spread evenly"),
-        (["--family", "fisheye-9"], "no lens family"),
-        (["--speed", "2"], "speed is 2"),
-        (["--hold", "fno"], "such as fno=4"),
-        (["--hold", "fno=40"], "give a value within 1.2 to 8"),
-        (["--arms", "joint"], "another one"),
-        (["--processes", "-1"], "0 or more"),
-        (["--raw", "nowhere.jsonl"], "no such file"),
-        (["--judged-drives", "100"], "a world has 48"),
-        (["--worlds", "1", "--per-draw", "60"], "a world has 48"),
-        (["--worlds", "300", "--per-draw", "300"], "at most 200"),
-        (["--cluster", "127.0.0.1:1"], "no Ray cluster at '127.0.0.1:1'"),
-    ],
-)
-def test_wrong_command_lines_end_with_a_sentence(wrong, said, tmp_path, capsys):
-    assert main(codesign.study, codesign.Config, [*wrong, "--out", str(tmp_path / "run")]) == 2
-    assert said in capsys.readouterr().err
-    assert not list((tmp_path / "run").glob("*.jsonl"))  # nothing was looked at before
+@refusals.table(__file__, "codesign")
+def test_wrong_command_lines_end_with_a_sentence(row, refuses):
+    refuses(codesign, row)
 
 
 def test_a_way_keeps_the_last_rounds_that_were_recorded():
@@ -320,7 +290,7 @@ def test_a_held_lens_is_focused_by_the_book_as_what_it_is():
 
 SMALL = (
     "--quick --steps 2 --worlds 1 --per-draw 1 --judged-worlds 1 --judged-drives 1 --family thin "
-    "--free efl_mm z_m theta --arms joint default"
+    "--free efl_mm z_m theta --arms joint default --out"
 )
 
 
@@ -336,12 +306,10 @@ def race(tmp_path_factory):
 
     def raced(*more):
         folder = tmp_path_factory.mktemp("race") / "run"
-        given = [*SMALL.split(), *more, "--out", str(folder)]
         with pytest.MonkeyPatch.context() as patched:
             patched.setattr(codesign, "landscape", landscape)
-            code = main(codesign.study, codesign.Config, given)
-        path = folder / "answers.jsonl"
-        return code, folder, path.read_text().splitlines() if path.exists() else []
+            code = ran(codesign, SMALL, folder, *more)
+        return code, folder, lines(folder / "answers.jsonl")
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(codesign, "LEAST_STEPS", 2)
@@ -357,20 +325,20 @@ def here(race):
 def test_a_small_race_says_that_it_decides_nothing(here):
     code, folder, _ = here
     assert code == 0
-    assert "decides nothing" in (folder / "report.html").read_text()
+    assert "decides nothing" in page(folder)
     check_page("codesign", folder)
-    numbers = json.loads((folder / "metrics.json").read_text())
-    ratio = numbers["race_joint_median"] / numbers["race_default_median"]
+    found = numbers(folder)
+    ratio = found["race_joint_median"] / found["race_default_median"]
     for name, value in (("joint_over_default", ratio), ("default_over_joint", 1 / ratio)):
-        assert numbers[f"{name}_median_outdoors"] == pytest.approx(value)
-    assert numbers["joint_over_best_order_median_outdoors"] == pytest.approx(ratio)
-    assert numbers["race_joint_drives"] == 2
-    assert 0 < numbers["race_joint_median"] <= 1
-    assert numbers["race_joint_median_with_head"] != numbers["race_joint_median"]
-    assert 0 <= numbers["parts_lens_and_mount_coupling"] < 1
-    assert numbers["hand_over_score_again"] == pytest.approx(numbers["hand_over_score"], abs=1e-6)
+        assert found[f"{name}_median_outdoors"] == pytest.approx(value)
+    assert found["joint_over_best_order_median_outdoors"] == pytest.approx(ratio)
+    assert found["race_joint_drives"] == 2
+    assert 0 < found["race_joint_median"] <= 1
+    assert found["race_joint_median_with_head"] != found["race_joint_median"]
+    assert 0 <= found["parts_lens_and_mount_coupling"] < 1
+    assert found["hand_over_score_again"] == pytest.approx(found["hand_over_score"], abs=1e-6)
     before = (folder / "race.jsonl").read_bytes()
-    assert main(codesign.study, codesign.Config, ["--resume", str(folder)]) == 0
+    assert ran(codesign, "--resume", folder) == 0
     assert (folder / "race.jsonl").read_bytes() == before
 
 
@@ -389,7 +357,7 @@ def test_a_traced_design_is_handed_over_with_its_lens(tmp_path):
 def test_a_race_of_another_robot_is_not_gone_on_with(here, monkeypatch, capsys):
     _, folder, _ = here
     monkeypatch.setattr(codesign, "fingerprints", lambda pair: {"the robot's page": "another"})
-    assert main(codesign.study, codesign.Config, ["--resume", str(folder)]) == 2
+    assert ran(codesign, "--resume", folder) == 2
     assert "the robot's page changed since this run was begun" in capsys.readouterr().err
 
 
@@ -410,15 +378,15 @@ def test_answers_of_an_earlier_run_are_not_raced_again(race, here, tmp_path, cap
     # a process of its own finds the same
     code, _, other = race("--processes", "1")
     assert code == 0
-    for a, b in zip(one, other, strict=True):
-        assert json.loads(a)[1][0]["share"] == json.loads(b)[1][0]["share"]
+    for (_, (mine,)), (_, (theirs,)) in zip(one, other, strict=True):
+        assert mine["share"] == theirs["share"]
     known = tmp_path / "known.jsonl"
-    cell, rows = json.loads(one[0])
-    known.write_text(json.dumps([cell, [{**rows[0], "cpu_s": 1e6}]]) + "\n")
-    code, _, again = race("--raw", str(known))
+    cell, (row,) = one[0]
+    known.write_text(json.dumps([cell, [{**row, "cpu_s": 1e6}]]) + "\n")
+    code, _, again = race("--raw", known)
     assert code == 0
-    assert json.loads(again[0])[1][0]["cpu_s"] == 1e6
+    assert again[0][1][0]["cpu_s"] == 1e6
     assert len(again) == 2
-    assert race("--raw", str(folder / "race.jsonl"))[0] == 0
-    assert race("--raw", str(known), "--light", "0.5")[0] == 2
+    assert race("--raw", folder / "race.jsonl")[0] == 0
+    assert race("--raw", known, "--light", "0.5")[0] == 2
     assert "light is 1.0 there and 0.5 here" in capsys.readouterr().err

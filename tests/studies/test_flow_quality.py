@@ -1,7 +1,6 @@
 """Measures of the study of flow's quality, against numbers worked out by hand; and its quick form
 from the command line."""
 
-import json
 import math
 
 import numpy as np
@@ -14,7 +13,7 @@ from codesign.flow.checkpoint import DELIVERED
 from codesign.flow.export import evenly_timed
 from codesign.types import FlowField, FlowWindows
 from studies.flow_quality import __main__ as flow_quality
-from studies.flow_quality.__main__ import Config, judged, study
+from studies.flow_quality.__main__ import Config, judged
 from studies.flow_quality.measures import (
     SHARES,
     figures,
@@ -24,8 +23,9 @@ from studies.flow_quality.measures import (
     spearman,
     warp_loss,
 )
-from studies.frame.run import main
+from tests import refusals
 from tests.studies.browser import check_page
+from tests.studies.runs import numbers, ran
 
 
 def one_window(error_px, confidence=None, variance_px2=None, truth_px=2.0):
@@ -122,9 +122,9 @@ def test_quick_form(tmp_path, monkeypatch):
     # pictures and their tables take a third of the time
     monkeypatch.setattr(flow_quality, "SHOWN", 1)
     chosen = "fine_theta_0.1 worlds layers_0.3 mixed_theta_0.2_noise_0.002"
-    options = f"--quick --models affine constant --sets {chosen}".split()
-    assert main(study, Config, [*options, "--out", str(tmp_path)]) == 0
-    found = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))
+    options = f"--quick --models affine constant --sets {chosen} --out"
+    assert ran(flow_quality, options, tmp_path) == 0
+    found = numbers(tmp_path)
     assert found["fine_theta_0.1_refiner_ratio"] < 0.2
     assert found["worlds_refiner_ratio"] < 0.8
     assert found["worlds_windows"] == 5
@@ -138,21 +138,9 @@ def test_quick_form(tmp_path, monkeypatch):
     check_page("flow_quality", tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (["--windows", "1"], "--windows is 1; at least 2 is needed"),
-        (["--sets", "roads"], "--sets roads is unknown"),
-        (["--models", "constant"], "affine is needed"),
-        (
-            ["--recording", "nowhere", "--packets", "1", "--packet-events", "400"],
-            "nothing lies at nowhere",
-        ),
-    ],
-)
-def test_unfit_options_are_refused(tmp_path, capsys, options, said):
-    assert main(study, Config, [*options, "--out", str(tmp_path)]) == 2
-    assert said in capsys.readouterr().err
+@refusals.table(__file__, "flow_quality")
+def test_unfit_options_are_refused(row, refuses):
+    refuses(flow_quality, row)
 
 
 def test_cells_of_single_planes_are_sets():

@@ -1,7 +1,6 @@
 """The study of event flow on a recording: its made-up recording against its homographies, its
 figures against known cases, its errors."""
 
-import json
 from dataclasses import replace
 
 import imageio_ffmpeg
@@ -14,9 +13,10 @@ from codesign.flow.sources import PacketOptions, read_packets, read_recording
 from codesign.types import FlowField
 from studies.flow_recording import __main__ as study
 from studies.flow_recording import made, video
-from studies.frame.run import main
+from tests import refusals
 from tests.recording_case import poses
 from tests.studies.browser import check_page
+from tests.studies.runs import numbers, page, ran
 
 SIZE = (45, 60)
 
@@ -48,15 +48,11 @@ def true(packet):
     return packet.truth
 
 
-PIXELS = ("--width-px", "60", "--height-px", "45")
-
-
 def run(folder, recording, options=""):
     """Exit code, and what was measured."""
-    given = ["--out", str(folder), "--estimator", "lk", "--recording", str(recording), *PIXELS]
-    code = main(study.study, study.Config, [*given, *options.split()])
-    metrics = folder / "metrics.json"
-    return code, json.loads(metrics.read_text()) if metrics.is_file() else {}
+    given = f"--estimator lk --width-px 60 --height-px 45 {options} --out"
+    code = ran(study, given, folder, "--recording", recording)
+    return code, numbers(folder) if (folder / "metrics.json").is_file() else {}
 
 
 def test_figures_of_a_run(recording, tmp_path):
@@ -80,9 +76,9 @@ def test_figures_of_a_run(recording, tmp_path):
     assert metrics["lk_zero_aee_px"] == pytest.approx(np.mean(zero), rel=1e-5)
     assert metrics["packets"] == 2
     assert metrics["events"] == sum(len(packet.stream) for packet in packets)
-    page = (tmp_path / "run" / "report.html").read_text()
-    assert "rotation alone" in page
-    assert "The recording is synthetic" not in page
+    shown = page(tmp_path / "run")
+    assert "rotation alone" in shown
+    assert "The recording is synthetic" not in shown
     check_page("flow_recording", tmp_path / "run")
     assert (tmp_path / "run" / "packet_01.png").is_file()
 
@@ -150,7 +146,7 @@ def test_a_video_of_all_windows(recording, tmp_path):
     )
     frames = imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "run" / "flow.mp4"))[0]
     assert frames == metrics["video_windows"] == -(-(held.t_us[-1] - held.t_us[0]) // 5000)
-    assert "real-time factor" in (tmp_path / "run" / "report.html").read_text()
+    assert "real-time factor" in page(tmp_path / "run")
 
 
 def test_arrows_are_the_flow_per_second_where_events_are(recording):
@@ -184,33 +180,16 @@ def test_a_slider_has_no_error_against_its_rotation(tmp_path):
     assert metrics["left_out_events_off_sensor"] == 1
     assert not [name for name in metrics if name.endswith("aee_px")]
     assert metrics["lk_rotation_difference_px"] >= 0
-    page = (tmp_path / "run" / "report.html").read_text()
-    assert "The camera translates" in page
-    assert "1 events off sensor" in page
-    assert "AEE where events are, lk" not in page  # no card
+    shown = page(tmp_path / "run")
+    assert "The camera translates" in shown
+    assert "1 events off sensor" in shown
+    assert "AEE where events are, lk" not in shown  # no card
 
 
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        (["--recording", "absent"], "nothing lies at absent"),
-        (["--recording", "absent"], "DSEC at dsec.ifi.uzh.ch"),
-        (["--estimator", "nothing"], "nothing"),
-        (["--width-px", "60"], "give both"),
-        (["--window-ms", "-1"], "number > 0"),
-        (["--truth", "absent.flo"], "no ground truth lies"),
-    ],
-)
-def test_bad_input_is_one_sentence_and_exit_code_2(options, sentence, recording, tmp_path, capsys):
-    base = [] if "--recording" in options else ["--recording", str(recording[0])]
-    size = [] if "--width-px" in options else PIXELS
-    assert (
-        main(study.study, study.Config, ["--out", str(tmp_path / "run"), *base, *size, *options])
-        == 2
-    )
-    error = capsys.readouterr().err
-    assert sentence in error
-    assert error.count("\n") == 1
+@refusals.table(__file__, "flow_recording")
+def test_bad_input_is_one_sentence_and_exit_code_2(row, refuses, recording, tmp_path):
+    (tmp_path / "made").symlink_to(recording[0])
+    refuses(study, row)
 
 
 def test_packets_of_events_of_the_made_recording_have_no_length_in_time():

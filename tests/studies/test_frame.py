@@ -1,7 +1,6 @@
 """What studies share: sweeps that go on where they ended, intervals against closed forms, times,
 charts."""
 
-import json
 import math
 import os
 import sys
@@ -13,13 +12,7 @@ import pytest
 import torch
 from matplotlib.patches import Rectangle
 
-from codesign.errors import (
-    CodesignError,
-    DomainError,
-    FileFormatError,
-    MissingPackageError,
-    ShapeError,
-)
+from codesign.errors import CodesignError, DomainError, FileFormatError, MissingPackageError
 from studies.frame import bench, compare, show
 from studies.frame.bench import Timing, apart, measure, turns
 from studies.frame.compare import Interval, bootstrap, student
@@ -27,8 +20,10 @@ from studies.frame.config import StudyConfig
 from studies.frame.run import open_run
 from studies.frame.show import Asked, Panel
 from studies.frame.sweep import column, metrics, select, sweep
+from tests import refusals
 from tests.processes import ROOT, python
 from tests.studies.called_apart import killed, killed_once, power, slow, told
+from tests.studies.runs import numbers, page
 
 
 @pytest.fixture
@@ -123,17 +118,9 @@ def test_an_interruption_ends_the_processes_and_keeps_what_is_done(run):
     assert (run.folder / "table.jsonl").read_text() == '[{"seconds": 0}, [{"slept": 0}]]\n'
 
 
-@pytest.mark.parametrize(
-    ("cell", "sentence"),
-    [
-        (lambda seed: {"value": math.nan}, "no finite number"),
-        (lambda seed: {"value": torch.ones(2)}, "no finite number"),
-        (lambda seed: {"seed": 1}, "named as an axis"),
-    ],
-)
-def test_rows_that_no_table_can_keep_are_refused(run, cell, sentence):
-    with pytest.raises(DomainError, match=sentence):
-        sweep(run, cell, seed=(0,))
+@refusals.table(__file__, "rows of tables")
+def test_rows_that_no_table_can_keep_are_refused(run, row):
+    row.holds({**globals(), "run": run})
     assert not (run.folder / "table.jsonl").exists()
 
 
@@ -165,10 +152,8 @@ def test_turns_meet_all_cells_and_rows_have_their_medians(run):
 
     rows = sweep(run, cell, turns=3, given={"scale": 10}, letter="ab")
     assert "".join(asked) == "ababab"
-    assert rows == [
-        {"letter": "a", "value": 30, "text": "a"},
-        {"letter": "b", "value": 40, "text": "b"},
-    ]
+    medians = (("a", 30), ("b", 40))
+    assert rows == [{"letter": each, "value": value, "text": each} for each, value in medians]
     assert sweep(run, cell, turns=3, given={"scale": 10}, letter="ab") == rows
 
 
@@ -248,18 +233,9 @@ def test_intervals_print_and_record():
     assert student([2.0]).metrics("x") == {"x": 2}
 
 
-@pytest.mark.parametrize(
-    ("call", "kind", "sentence"),
-    [
-        (lambda: student([]), ShapeError, "at least one"),
-        (lambda: compare.ratio_of_means([1.0], [1.0, 2.0]), ShapeError, "paired samples"),
-        (lambda: compare.log_ratio([1.0], []), ShapeError, "one of each"),
-        (lambda: compare.log_ratio([0.0], [1.0]), DomainError, "above 0"),
-    ],
-)
-def test_comparisons_that_are_none_are_refused(call, kind, sentence):
-    with pytest.raises(kind, match=sentence):
-        call()
+@refusals.table(__file__, "comparisons")
+def test_comparisons_that_are_none_are_refused(row):
+    row.holds(globals())
 
 
 # bench
@@ -282,9 +258,8 @@ def test_processor_time_leaves_waiting_out():
 
 def test_functions_take_turns():
     order = []
-    found = turns(
-        {name: lambda name=name: order.append(name) for name in "ab"}, rounds=2, repeats=2, warm=0
-    )
+    calls = {name: lambda name=name: order.append(name) for name in "ab"}
+    found = turns(calls, rounds=2, repeats=2, warm=0)
     assert "".join(order) == "aaabbbaabb"
     assert {len(timing.wall_s) for timing in found.values()} == {4}
 
@@ -304,9 +279,7 @@ def test_a_function_in_its_own_process_and_the_memory_that_it_takes():
 
 def test_a_function_of_a_script_is_not_found_elsewhere(tmp_path):
     script = tmp_path / "mine.py"
-    script.write_text(
-        "from studies.frame.bench import apart\ndef cell():\n    return 1\napart(cell)\n"
-    )
+    script.write_text("from studies.frame.bench import apart\ndef cell(): return 1\napart(cell)\n")
     done = python(str(script), PYTHONPATH=str(ROOT))
     assert "move it into a module and import it" in done.stderr
 
@@ -330,19 +303,15 @@ def test_tables_out_of_long_rows():
 
 
 def test_what_was_asked_and_missed(run):
-    figures = [
-        Asked("speed", 12.0, least=10),
-        Asked("memory, MB", 6.0, most=5),
-        Asked("error", 0.5),
-    ]
+    bounded = [Asked("speed", 12.0, least=10), Asked("memory, MB", 6.0, most=5)]
+    figures = [*bounded, Asked("error", 0.5)]
     assert show.asked(run, figures) == "**Missed in this run:** memory, MB 6 (≤ 5)."
     assert show.asked(run, figures[:1]) == "All figures are met."
     assert not Asked("number", math.nan, most=1).met
     show.tabulate(run, "T", ROWS[::2], "lens", "method", prefix="x", error="px")
     run.finish("T", "L")
-    page = (run.folder / "report.html").read_text()
-    assert "<td>≤ 5</td>" in page.replace(' class="number"', "")
-    recorded = json.loads((run.folder / "metrics.json").read_text())
+    assert "<td>≤ 5</td>" in page(run.folder).replace(' class="number"', "")
+    recorded = numbers(run.folder)
     names = ("speed", "memory_mb", "x_a_flow_error", "x_a_spots_error")
     assert [recorded[name] for name in names] == [12, 6, 1, 3]
 
@@ -362,9 +331,7 @@ def test_figures_hold_what_they_are_given():
     low, high = grid.axes[1].images[0].get_clim()
     assert low == -high == pytest.approx(-0.5, abs=0.01)
     drawn = show.bars({"a": 2.0, "b": Interval(1, 0.5, 2, 9)}, "s", log=True, level=1.5)
-    assert [bar.get_width() for bar in drawn.axes[0].patches if isinstance(bar, Rectangle)] == [
-        2,
-        1,
-    ]
+    widths = [bar.get_width() for bar in drawn.axes[0].patches if isinstance(bar, Rectangle)]
+    assert widths == [2, 1]
     for figure in (chart, grid, drawn):
         show.plt.close(figure)

@@ -8,49 +8,47 @@ import pytest
 import torch
 
 from codesign.system import check
-from studies.frame.run import main
 from studies.gradient_flow import __main__ as study
 from studies.gradient_flow import chain, silhouettes
 from studies.gradient_flow.topic import Row
+from tests import refusals
 from tests.studies.browser import check_page
+from tests.studies.runs import page, ran
 
 D = torch.float64
 
 
 def test_the_study_goes_on_where_it_was_cut(tmp_path, monkeypatch):
-    ran = []
+    measured = []
     topic = study.CASES["silhouettes"]
 
     def measure(config, *job):
-        ran.append(job)
-        if len(ran) == 2:
+        measured.append(job)
+        if len(measured) == 2:
             raise KeyboardInterrupt
         error = 0.5 if job[0] == "cubes" else 0.01
         yield Row(job, {"with_boundary": error, "one_estimate": 0.05})
 
     monkeypatch.setitem(study.CASES, "silhouettes", dataclasses.replace(topic, measure=measure))
-    options = ["--quick", "--cases", "silhouettes"]
-    assert main(study.study, study.Config, [*options, "--out", str(tmp_path / "run")]) == 130
-    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
-    assert "Interrupted" in page
-    assert [f"<td>{job[2]}</td>" in page for job in ran] == [True, False]
-    assert main(study.study, study.Config, ["--resume", str(tmp_path / "run")]) == 0
+    out = tmp_path / "run"
+    assert ran(study, "--quick --cases silhouettes --out", out) == 130
+    assert "Interrupted" in page(out)
+    assert [f"<td>{job[2]}</td>" in page(out) for job in measured] == [True, False]
+    assert ran(study, "--resume", out) == 0
     jobs = topic.jobs(True)
-    assert ran == [*jobs[:2], *jobs[1:]]
-    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert measured == [*jobs[:2], *jobs[1:]]
     short = sum(job[0] == "cubes" for job in jobs)
     assert 0 < short < len(jobs)
-    assert f"silhouettes: {short} of {len(jobs)} rows" in page
-    first = (
-        f"{len(jobs)} of {len(jobs)} gradients (silhouettes) are judged, and {len(jobs) - short} of"
-    )
-    assert first in page[: page.index("Below what is asked")]
-    check_page("gradient_flow", tmp_path / "run")
+    assert f"silhouettes: {short} of {len(jobs)} rows" in page(out)
+    first, _ = page(out).split("Below what is asked", 1)
+    assert f"{len(jobs)} of {len(jobs)} gradients (silhouettes) are judged" in first
+    assert f"are judged, and {len(jobs) - short} of" in first
+    check_page("gradient_flow", out)
 
 
-@pytest.mark.parametrize("wrong", [["--cases", "none"], ["--cases"], ["--seeds", "1"]])
-def test_wrong_options_are_refused(tmp_path, wrong):
-    assert main(study.study, study.Config, [*wrong, "--out", str(tmp_path / "other")]) == 2
+@refusals.table(__file__, "gradient_flow")
+def test_wrong_options_are_refused(row, refuses):
+    refuses(study, row)
 
 
 def test_a_silhouette_makes_a_row_that_is_judged():

@@ -8,27 +8,24 @@ import shlex
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
-from studies.frame.run import Run, main
+from studies.frame.run import Run
+from tests.processes import ROOT
 from tests.studies import walk
-from tests.studies.smallest_study import Config, numbers
+from tests.studies.runs import numbers, ran
+from tests.studies.smallest_study import Config
 
-ROOT = Path(__file__).resolve().parents[2]
+ELSEWHERE = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "4000"}
 
 
 def started(folder, *arguments):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
     command = [sys.executable, "-W", "error", "-m", "tests.studies.walk", *arguments]
+    environment = {**ELSEWHERE, "PYTHONUNBUFFERED": "1"}
+    pipe = subprocess.PIPE
     return subprocess.Popen(
-        command,
-        cwd=folder,
-        env=environment,
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+        command, cwd=folder, env=environment, text=True, stdout=pipe, stderr=pipe
     )
 
 
@@ -36,7 +33,7 @@ def started(folder, *arguments):
 def whole(tmp_path_factory):
     """Numbers of a walk that nothing interrupted."""
     folder = tmp_path_factory.mktemp("whole") / "out"
-    assert main(walk.study, walk.Config, ["--out", str(folder)]) == 0
+    assert ran(walk, "--out", folder) == 0
     return numbers(folder)
 
 
@@ -50,7 +47,7 @@ def test_interrupted_and_resumed_gives_the_same_numbers(tmp_path, whole, number,
     if number == signal.SIGINT:
         # it is there, and gets no further
         broken.send_signal(signal.SIGSTOP)
-        assert main(walk.study, walk.Config, ["--resume", str(folder)]) == 2
+        assert ran(walk, "--resume", folder) == 2
         complaint = capsys.readouterr().err
         assert complaint.startswith(f"error: another process works on the run in '{folder}'")
         broken.send_signal(signal.SIGCONT)
@@ -64,7 +61,7 @@ def test_interrupted_and_resumed_gives_the_same_numbers(tmp_path, whole, number,
     left = [folder / name for name in (".decay-a_b3c4d5.mp4", ".state-abcdefgh.npz", ".mine")]
     for path in left:
         path.write_bytes(b"half")
-    assert main(walk.study, walk.Config, ["--resume", str(folder)]) == 0
+    assert ran(walk, "--resume", folder) == 0
     assert "walking  40/40  loss" in capsys.readouterr().out
     found = numbers(folder)
     assert 5 <= found["first_step"] < 40
@@ -114,12 +111,9 @@ def test_what_libraries_make_of_a_full_disk_or_a_signal(
 
 
 def test_a_reader_that_goes_away_gets_no_traceback(tmp_path):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "4000"}
     for line in ("-m tests.studies.walk --help", "-m codesign --help", "-m studies"):
         shell = f"{shlex.quote(sys.executable)} {line} | head -c 1"
-        done = subprocess.run(
-            shell, shell=True, cwd=tmp_path, env=environment, capture_output=True, check=False
-        )
+        done = subprocess.run(shell, shell=True, cwd=tmp_path, env=ELSEWHERE, capture_output=True)
         assert done.stderr == b"", line
 
 

@@ -11,8 +11,9 @@ from scenes.robots import pair as robot_pair
 from studies import joint_controls
 from studies.codesign.design import Space
 from studies.codesign.problem import Drawn
-from studies.frame.run import main
+from tests import refusals
 from tests.studies.browser import check_page
+from tests.studies.runs import numbers, ran
 
 F = torch.float64
 SETTING = {"pair": "outdoors", "family": None, "light": 1.0, "speed": 1.0, "free": [], "held": {}}
@@ -69,7 +70,7 @@ def raw(path):
         for (seed, arm), error in rows.items():
             row = {"setting": SETTING, "share": [error], "errors": [error]}
             file.write(json.dumps([{"seed": seed, "arm": arm}, [row]]) + "\n")
-    return str(path)
+    return path
 
 
 def test_ratios_are_those_of_the_errors_under_each_control(tmp_path, monkeypatch):
@@ -78,32 +79,19 @@ def test_ratios_are_those_of_the_errors_under_each_control(tmp_path, monkeypatch
         "worse for the one": lambda drawn, share, seed: share * (2 if share[0] < 0.3 else 1),
     }
     monkeypatch.setattr(joint_controls, "CONTROLS", known)
-    monkeypatch.setattr(
-        joint_controls,
-        "space_of",
-        lambda setting: SimpleNamespace(
-            made=lambda share: share.repeat(4), pair=SimpleNamespace(name="x")
-        ),
-    )
+    space = SimpleNamespace(made=lambda share: share.repeat(4), pair=SimpleNamespace(name="x"))
+    monkeypatch.setattr(joint_controls, "space_of", lambda setting: space)
     monkeypatch.setattr(joint_controls, "Drawn", lambda *_: None)
-    given = ["--raw", raw(tmp_path / "raw.jsonl"), "--arms", "joint", "book"]
-    given += ["--judged-worlds", "2", "--out", str(tmp_path / "run")]
-    assert main(joint_controls.study, joint_controls.Config, given) == 0
-    numbers = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert numbers["as_designed_joint_over_book"] == pytest.approx(0.25)
-    assert numbers["worse_for_the_one_joint_over_book"] == pytest.approx(0.5)
+    given = "--arms joint book --judged-worlds 2 --out"
+    answers = ("--raw", raw(tmp_path / "raw.jsonl"))
+    assert ran(joint_controls, given, tmp_path / "run", *answers) == 0
+    found = numbers(tmp_path / "run")
+    assert found["as_designed_joint_over_book"] == pytest.approx(0.25)
+    assert found["worse_for_the_one_joint_over_book"] == pytest.approx(0.5)
     check_page("joint_controls", tmp_path / "run")
 
 
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        (["--raw", "nowhere.jsonl"], "no such file"),
-        (["--arms", "joint", "luck"], "choose from joint, book"),
-        (["--arms", "joint"], "fewer than two"),
-    ],
-)
-def test_answers_that_are_not_there_are_refused(tmp_path, given, said, capsys):
-    given = ["--raw", raw(tmp_path / "raw.jsonl"), *given, "--out", str(tmp_path / "run")]
-    assert main(joint_controls.study, joint_controls.Config, given) == 2
-    assert said in capsys.readouterr().err
+@refusals.table(__file__, "joint_controls")
+def test_answers_that_are_not_there_are_refused(row, refuses, tmp_path):
+    raw(tmp_path / "raw.jsonl")
+    refuses(joint_controls, row)

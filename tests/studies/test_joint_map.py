@@ -1,7 +1,6 @@
 """The map of joint design and the shares of its parts: known valleys, known errors, one small
 race."""
 
-import json
 import math
 from itertools import product
 
@@ -12,28 +11,15 @@ from studies import joint_levers, joint_map
 from studies.codesign import cells, couplings
 from studies.codesign.design import BLOCKS
 from studies.codesign.race import start
-from studies.frame.run import main
+from tests import refusals
 from tests.studies.browser import check_page
+from tests.studies.runs import lines, numbers, page, ran
 
 F = torch.float64
-SMALL = [
-    "--worlds",
-    "1",
-    "--per-draw",
-    "1",
-    "--judged-worlds",
-    "2",
-    "--judged-drives",
-    "1",
-    "--steps",
-    "2",
-    "--settling",
-    "5",
-]
-
-
-def raced(study, *given):
-    return main(study.study, study.Config, list(given))
+SMALL = (
+    "--worlds 1 --per-draw 1 --judged-worlds 2 --judged-drives 1 --steps 2 --settling 5 --seeds 1 "
+    "--fnos 4 --lights 0.5 --speeds 1 --couplings 0 --out"
+)
 
 
 def test_a_map_says_which_cells_are_won_and_what_their_valleys_foretell(tmp_path, monkeypatch):
@@ -70,15 +56,14 @@ def test_a_map_says_which_cells_are_won_and_what_their_valleys_foretell(tmp_path
 
     monkeypatch.setattr(joint_map, "answers", answers)
     monkeypatch.setattr(joint_map, "pulls_of", pulls)
-    out = ["--out", str(tmp_path / "map"), "--fnos", "0", "--speeds", "1", "0.5", "0.3"]
-    assert raced(joint_map, *out) == 0
-    numbers = json.loads((tmp_path / "map" / "metrics.json").read_text())
-    assert (numbers["cells"], numbers["cells_won"], numbers["cells_lost"]) == (6, 3, 3)
+    assert ran(joint_map, "--fnos 0 --speeds 1 0.5 0.3 --out", tmp_path / "map") == 0
+    figures = numbers(tmp_path / "map")
+    assert (figures["cells"], figures["cells_won"], figures["cells_lost"]) == (6, 3, 3)
     day, night = ("cell_light_1_f_free_speed_1", "cell_light_0_1_f_free_speed_1")
-    assert numbers[f"{day}_value"] == pytest.approx(0.8)
-    assert numbers[f"{night}_value"] == pytest.approx(1.25)
+    assert figures[f"{day}_value"] == pytest.approx(0.8)
+    assert figures[f"{night}_value"] == pytest.approx(1.25)
     # one pass over parts that stand alone ends at the bottom
-    assert numbers[f"{night}_at_the_bottom"] == pytest.approx(1.0)
+    assert figures[f"{night}_at_the_bottom"] == pytest.approx(1.0)
     given = asked["light 1, f free, speed 1"]
     space = cells.space_of(given)
     b = space.block("mount")[0]
@@ -90,11 +75,11 @@ def test_a_map_says_which_cells_are_won_and_what_their_valleys_foretell(tmp_path
         height = (lens**2 + mount**2 + 1.6 * lens * mount) / 2
         left.append(1 + height * 0.9 / (height + 0.9) / 0.1)
     expected = 1 / float(torch.tensor(left, dtype=F).quantile(0.5))
-    assert numbers[f"{day}_at_the_bottom"] == pytest.approx(expected)
+    assert figures[f"{day}_at_the_bottom"] == pytest.approx(expected)
     # equal values share their rank
-    assert numbers["rank_of_foretold"] == pytest.approx(1.0)
-    assert -1 <= numbers["rank_of_foretold_low"] <= numbers["rank_of_foretold_high"] <= 1.0 + 1e-9
-    assert "in 3, loses in 3, and is undecided in 0" in (tmp_path / "map/report.html").read_text()
+    assert figures["rank_of_foretold"] == pytest.approx(1.0)
+    assert -1 <= figures["rank_of_foretold_low"] <= figures["rank_of_foretold_high"] <= 1.0 + 1e-9
+    assert "in 3, loses in 3, and is undecided in 0" in page(tmp_path / "map")
     check_page("joint_map", tmp_path / "map")
 
 
@@ -116,42 +101,29 @@ def test_parts_that_act_by_themselves_have_their_own_factors(tmp_path, monkeypat
 
     monkeypatch.setattr(joint_levers, "answers", answers)
     monkeypatch.setattr(joint_levers, "judged_errors", lambda *_: {"errors": [0.4, 0.4, 0.4]})
-    assert raced(joint_levers, "--out", str(tmp_path / "levers")) == 0
-    numbers = json.loads((tmp_path / "levers" / "metrics.json").read_text())
+    assert ran(joint_levers, "--out", tmp_path / "levers") == 0
+    figures = numbers(tmp_path / "levers")
     for part, factor in factors.items():
-        assert numbers[f"share_{joint_levers.NAMES[part]}"] == pytest.approx(factor)
-    assert (
-        "the lens brings most (lens over sensor"
-        in (tmp_path / "levers" / "report.html").read_text()
-    )
+        assert figures[f"share_{joint_levers.NAMES[part]}"] == pytest.approx(factor)
+    assert "the lens brings most (lens over sensor" in page(tmp_path / "levers")
     check_page("joint_levers", tmp_path / "levers")
 
 
 def test_cells_are_raced_judged_and_taken_up_again(tmp_path):
-    given = ["--seeds", "1", "--fnos", "4", "--lights", "0.5", "--speeds", "1", "--couplings", "0"]
-    assert raced(joint_map, *SMALL, *given, "--out", str(tmp_path / "map")) == 0
+    assert ran(joint_map, SMALL, tmp_path / "map") == 0
     table = tmp_path / "map" / "answers.jsonl"
-    rows = [json.loads(line) for line in table.read_text().splitlines()]
+    rows = lines(table)
     assert [axes["arm"] for axes, _ in rows] == ["joint", *joint_map.ORDERS]
     assert all(found["fno"] == 4.0 for _, (found,) in rows if "fno" in found)
     assert all(len(found["errors"]) == 2 and found["drives"] == 2 for _, (found,) in rows)
     before = table.read_bytes()
-    assert raced(joint_map, "--resume", str(tmp_path / "map")) == 0
+    assert ran(joint_map, "--resume", tmp_path / "map") == 0
     assert table.read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        (["--pair", "moon"], "choose from"),
-        (["--seeds", "0"], "--seeds is 0"),
-        (["--speeds", "2"], "speed is 2"),
-        (["--fnos", "40"], "held at 40"),
-    ],
-)
-def test_a_cell_that_cannot_be_is_refused(tmp_path, given, said, capsys):
-    assert raced(joint_map, *given, "--out", str(tmp_path / "map")) == 2
-    assert said in capsys.readouterr().err
+@refusals.table(__file__, "joint_map")
+def test_a_cell_that_cannot_be_is_refused(row, refuses):
+    refuses(joint_map, row)
 
 
 def test_the_best_answer_of_a_cell_is_that_of_which_least_is_expected():

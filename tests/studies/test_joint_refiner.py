@@ -1,7 +1,6 @@
 """Designs and the refiner's weights in one optimiser: the slope that weights get, and what is left
 of it where one of the two does not move."""
 
-import json
 from copy import deepcopy
 
 import pytest
@@ -14,8 +13,8 @@ from studies.codesign.cells import setting, space_of
 from studies.codesign.design import Space
 from studies.codesign.race import Judge
 from studies.codesign.refined import AFTERWARDS, JOINT, Refined, descended, raced
-from studies.frame.run import main
 from tests.studies.browser import check_page
+from tests.studies.runs import numbers, page, ran
 
 SETTING = {"steps": 2, "updates": 2, "rate": 1e-4, "settling": 6}
 
@@ -110,11 +109,10 @@ def test_ratios_are_those_of_the_errors_and_few_starts_decide_nothing(tmp_path, 
         ]
 
     monkeypatch.setattr(joint_refiner, "raced", known)
-    given = ["--seeds", "2", "--out", str(tmp_path / "run")]
-    assert main(joint_refiner.study, joint_refiner.Config, given) == 0
+    assert ran(joint_refiner, "--seeds 2 --out", tmp_path / "run") == 0
     check_page("joint_refiner", tmp_path / "run")
-    assert "decide nothing" in (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
-    numbers = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert numbers["joint_over_design_then_weights"] == pytest.approx(0.4)
-    assert numbers["joint_over_default"] == pytest.approx(0.25)
-    assert numbers["arm_default_closed_form"] == pytest.approx(0.5)
+    assert "decide nothing" in page(tmp_path / "run")
+    found = numbers(tmp_path / "run")
+    assert found["joint_over_design_then_weights"] == pytest.approx(0.4)
+    assert found["joint_over_default"] == pytest.approx(0.25)
+    assert found["arm_default_closed_form"] == pytest.approx(0.5)

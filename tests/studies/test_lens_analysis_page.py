@@ -2,15 +2,13 @@
 names exists."""
 
 import re
-from pathlib import Path
 
 import matplotlib.pyplot as plt
 
 from codesign.lens import analysis, paraxial, seidel
+from tests.processes import ROOT
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "lens_analysis.md").read_text(
-    encoding="utf-8"
-)
+PAGE = (ROOT / "docs" / "lens_analysis.md").read_text(encoding="utf-8")
 
 
 def test_the_examples_run(tmp_path, monkeypatch):
@@ -29,16 +27,8 @@ def test_the_examples_run(tmp_path, monkeypatch):
 def test_the_page_names_every_function():
     missing = [name for name in analysis.__all__ if name[0].islower() and name not in PAGE]
     # what the others are made of
-    assert missing == [
-        "chief_height_mm",
-        "chief_ray",
-        "field_rays",
-        "pupil_grid",
-        "spectral_lines",
-    ]
+    assert missing == ["chief_height_mm", "chief_ray", "field_rays", "pupil_grid", "spectral_lines"]
     named = re.findall(r"`(paraxial|seidel)\.(\w+)\(", PAGE)
     assert named
-    assert all(
-        hasattr({"paraxial": paraxial, "seidel": seidel}[module], function)
-        for module, function in named
-    )
+    rooms = {"paraxial": paraxial, "seidel": seidel}
+    assert all(hasattr(rooms[module], function) for module, function in named)

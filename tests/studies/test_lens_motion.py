@@ -1,7 +1,6 @@
 """A lens for the motion: contrast along a direction, flow directions, forms, what is chosen, a
 quick run, refusals."""
 
-import json
 import math
 
 import pytest
@@ -12,7 +11,6 @@ from codesign.errors import DomainError, FileFormatError
 from codesign.pose import se3_exp
 from scenes.tum import write_tum
 from studies.frame.compare import log_ratio
-from studies.frame.run import main
 from studies.lens_motion import __main__ as lens_motion
 from studies.lens_motion import rivals
 from studies.lens_motion.forms import BENDING, STEPS, make_form
@@ -20,7 +18,9 @@ from studies.lens_motion.motions import HEIGHT_PX, SPEED_PX, Motion, drawn_world
 from studies.lens_opt import __main__ as lens_opt
 from studies.lens_opt.spots import SpotRays
 from studies.lens_opt.task import DISTANCE_M, PITCH_MM
+from tests import refusals
 from tests.studies.browser import check_page
+from tests.studies.runs import lines, numbers, page, ran
 
 
 def cloud(x_px, y_px):
@@ -68,11 +68,9 @@ def test_forward_flow_is_radial_and_that_of_a_turn_horizontal():
     assert torch.allclose(moved[:, 1], -1e-4 * 9.0 / PITCH_MM * sideways, rtol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("name", "turned", "axial"), [("forward", False, 1.0), ("forward", True, 0.0)]
-)
-def test_directions_lie_along_the_radius_and_across_it_when_turned(name, turned, axial):
-    motion = Motion(name, 9.0, turned)
+@pytest.mark.parametrize(("turned", "axial"), [(False, 1.0), (True, 0.0)])
+def test_directions_lie_along_the_radius_and_across_it_when_turned(turned, axial):
+    motion = Motion("forward", 9.0, turned)
     along = motion.directions_rad(200).cos().abs()
     assert float((along - axial).abs().median()) < 0.1  # the stray tenth of the speed
     case = motion.case([None], 5)
@@ -141,47 +139,28 @@ def test_the_smallest_detectable_change_is_seen_four_times_in_five():
     assert float((mean + half < 0).double().mean()) == pytest.approx(0.8, abs=0.02)
 
 
-def test_a_quick_run_is_reached_from_the_main_job_and_says_that_it_decides_nothing(
-    tmp_path, capsys
-):
+def test_a_quick_run_is_reached_from_the_main_job_and_says_that_it_decides_nothing(tmp_path):
     out = tmp_path / "run"
-    command = "--motion turn --quick --steps=2 --developed=1 --judged=2 --judged-turned=2"
-    assert lens_opt.start([*command.split(), "--out", str(out)]) == 0
-    metrics = json.loads((out / "metrics.json").read_text())
+    command = "--motion turn --quick --steps=2 --developed=1 --judged=2 --judged-turned=2 --out"
+    assert ran(lens_opt.start, command, out) == 0
+    metrics = numbers(out)
     for name in ("refocused", "spots", "mtf", "mtf_along", "edge"):
         low, value, high = (metrics[f"log_ratio_{name}{end}"] for end in ("_low", "", "_high"))
         assert low <= value <= high
-    assert "decides nothing" in (out / "report.html").read_text()
+    assert "decides nothing" in page(out)
     check_page("lens_motion", out)
-    rows = [json.loads(line) for line in (out / "judged.jsonl").read_text().splitlines()]
+    rows = [row for _, case in lines(out / "judged.jsonl") for row in case]
     own, other = (
-        [row["error_mrad"] for _, case in rows for row in case if row["lens"] == name]
-        for name in ("flow", "spots")
+        [row["error_mrad"] for row in rows if row["lens"] == name] for name in ("flow", "spots")
     )
     assert metrics["log_ratio_spots"] == pytest.approx(log_ratio(own, other).value)
-    assert main(lens_motion.study, lens_motion.Config, ["--resume", str(out)]) == 0
-    assert (
-        json.loads((out / "metrics.json").read_text())["log_ratio_spots"]
-        == metrics["log_ratio_spots"]
-    )
-    capsys.readouterr()
+    assert ran(lens_motion, "--resume", out) == 0
+    assert numbers(out)["log_ratio_spots"] == metrics["log_ratio_spots"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (["--motion", "sideways"], "neither a file of poses nor one of any, forward, turn, hover"),
-        (["--motion", "turn", "--lens", "zoom"], "none of singlet, achromat, pair, triplet"),
-        (["--motion", "turn", "--fno", "0.5"], "give a number above 1"),
-        (["--motion", "turn", "--judged", "1"], "--judged is 1; at least 2 is needed"),
-    ],
-)
-def test_bad_input_is_refused_in_a_sentence_before_the_first_frame(
-    arguments, sentence, tmp_path, capsys
-):
-    assert lens_opt.start([*arguments, "--out", str(tmp_path / "run")]) == 2
-    assert sentence in capsys.readouterr().err
-    assert not list((tmp_path / "run").glob("*.jsonl"))
+@refusals.table(__file__, "lens_motion")
+def test_bad_input_is_refused_in_a_sentence_before_the_first_frame(row, refuses):
+    refuses(lens_opt.start, row)
 
 
 def test_what_has_no_direction_cannot_be_turned_and_a_bad_file_is_named(tmp_path):
@@ -204,9 +183,3 @@ def test_a_verdict_is_that_of_textures_where_cases_of_one_are_alike():
     found = lens_motion.ratios(rows, "flow")["spots"]
     assert found.count == 60
     assert found.high - found.low > 0.3 > 4 * 0.3 / 60**0.5
-
-
-def test_a_table_that_is_not_there_is_said(tmp_path, capsys):
-    given = ["--raw", str(tmp_path / "none.csv"), "--out", str(tmp_path / "run")]
-    assert main(lens_motion.study, lens_motion.Config, given) == 2
-    assert "there is no such file" in capsys.readouterr().err

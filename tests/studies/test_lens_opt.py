@@ -2,7 +2,6 @@
 resumed after its end."""
 
 import html
-import json
 import math
 from types import SimpleNamespace
 
@@ -10,22 +9,25 @@ import pytest
 import torch
 
 from codesign import events, flow, lens
-from codesign.errors import DomainError
 from codesign.lens.analysis import polychromatic_spot, spot_radius_mm
 from codesign.lens.design import edge_thickness_mm
 from studies.frame.compare import log_ratio
 from studies.frame.config import configured
-from studies.frame.run import QUICK, main
+from studies.frame.run import QUICK
 from studies.lens_opt import __main__ as lens_opt
 from studies.lens_opt import rivals
 from studies.lens_opt.page import verdict
 from studies.lens_opt.spots import spot_rays
 from studies.lens_opt.stages import estimator, weights_of
 from studies.lens_opt.task import DISTANCE_M, LIGHT, PITCH_MM, LensTask, make_task
+from tests import refusals
 from tests.studies.browser import check_page
+from tests.studies.runs import numbers, page, ran
 
-SMALL = ["--quick", *(f"--{name}=1" for name in ("after-steps", "cases", "scored", "spot-steps"))]
-SMALL += ["--steps=2", "--judged=2", "--samples=4"]
+SMALL = (
+    "--quick --after-steps=1 --cases=1 --scored=1 --spot-steps=1 --steps=2 --judged=3 --samples=4 "
+    "--out"
+)
 
 
 @pytest.fixture(scope="module")
@@ -122,23 +124,9 @@ def test_the_first_words_say_who_wins():
     assert said.endswith("and +0.0 % (+0.0 to +0.0 %) on 3 unseen cases.")
 
 
-@pytest.mark.parametrize(
-    ("name", "train", "objective", "sentence"),
-    [
-        ("closed-form", True, "flow", "has no weights, so there is nothing to train"),
-        ("flownet", False, "flow", "random weights, whose flow means nothing; add --train-network"),
-        ("refiner", True, "edge", "looks at event frames only"),
-        (
-            "nothing.safetensors",
-            False,
-            "flow",
-            "neither a network file nor one of closed-form, refiner",
-        ),
-    ],
-)
-def test_what_makes_no_sense_is_refused_with_the_reason(name, train, objective, sentence):
-    with pytest.raises(DomainError, match=sentence):
-        estimator(name, train, objective, 10_000, 0)
+@refusals.table(__file__, "estimators of lens_opt")
+def test_what_makes_no_sense_is_refused_with_the_reason(row):
+    row.holds(globals())
 
 
 def test_networks_come_trained_or_to_be_trained():
@@ -179,40 +167,30 @@ def test_a_run_killed_while_it_judges_goes_on_there_and_ends_with_the_same_figur
     with monkeypatch.context() as patched:
         patched.setattr(LensTask, "judge", watched)
         with pytest.raises(Killed):
-            main(lens_opt.study, lens_opt.Config, [*SMALL, "--judged=3", "--out", str(folder)])
+            ran(lens_opt, SMALL, folder)
         assert last - 1 in asked
         asked.clear()
         # what was judged before is not judged again
-        assert main(lens_opt.study, lens_opt.Config, ["--resume", str(folder)]) == 0
+        assert ran(lens_opt, "--resume", folder) == 0
         assert last in asked
         assert last - 1 not in asked
-    first = json.loads((folder / "metrics.json").read_text())
+    first = numbers(folder)
     said = capsys.readouterr().out.splitlines()[-1]
-    lead = (folder / "report.html").read_text().split('<div class="lead">')[1]
+    lead = page(folder).split('<div class="lead">')[1]
     assert html.unescape(lead).startswith(f"<p>{QUICK} <strong>{said}</strong></p>")
     monkeypatch.setattr(rivals, "refocus", None)  # the rivals are stored: nobody makes them again
     monkeypatch.setattr(rivals, "shrink_spots", None)
     (folder / "report.html").unlink()
-    assert main(lens_opt.study, lens_opt.Config, ["--resume", str(folder)]) == 0
-    again = json.loads((folder / "metrics.json").read_text())
+    assert ran(lens_opt, "--resume", folder) == 0
+    again = numbers(folder)
     check_page("lens_opt", folder)
     for name in (
-        "flow_error_mrad_hard_optimised",
-        "rms_spot_um_optimised",
-        "rms_spot_um_spots",
-        "steps",
+        *("flow_error_mrad_hard_optimised", "rms_spot_um_optimised", "rms_spot_um_spots", "steps"),
+        *("seconds_per_step", "log_ratio_edge", "log_ratio_after_spots_over_spots_high"),
     ):
-        assert again[name] == pytest.approx(first[name], rel=1e-6)
-    for name in ("seconds_per_step", "log_ratio_edge", "log_ratio_after_spots_over_spots_high"):
-        assert again[name] == pytest.approx(first[name], rel=1e-6)
+        assert again[name] == pytest.approx(first[name], rel=1e-6), name
 
 
-def test_sizes_below_one_are_refused(tmp_path, capsys):
-    assert (
-        main(lens_opt.study, lens_opt.Config, ["--steps", "0", "--out", str(tmp_path / "x")]) == 2
-    )
-    assert "--steps is 0; at least 1 is needed" in capsys.readouterr().err
-    assert (
-        main(lens_opt.study, lens_opt.Config, ["--samples", "6", "--out", str(tmp_path / "y")]) == 2
-    )
-    assert "--samples is 6; the light has 4 wavelengths" in capsys.readouterr().err
+@refusals.table(__file__, "lens_opt")
+def test_sizes_that_cannot_be_are_refused(row, refuses):
+    refuses(lens_opt, row)

@@ -2,14 +2,15 @@
 wrong name."""
 
 import dataclasses
-import importlib
 
 import pytest
 
 from studies.frame import listing
 from studies.frame.config import StudyConfig, configured, to_json
 from studies.frame.run import _name
+from tests import refusals
 from tests.processes import ROOT, python
+from tests.studies.runs import module_of
 
 NAMES = list(listing.studies())
 
@@ -75,31 +76,19 @@ def test_run_starts_the_module_and_hands_over_its_options():
     assert "--colour" in wrong.stderr
 
 
-@pytest.mark.parametrize(
-    ("name", "sentence"),
-    [
-        ("lens_op", "there is no study 'lens_op'; did you mean lens_opt?"),
-        ("lens-opt", "there is no study 'lens-opt'; did you mean lens_opt?"),
-        ("xylophone", "there is no study 'xylophone'; 'codesign list' lists them."),
-        ("lens_opt.page", "studies.lens_opt.page is a part of the studies and no study"),
-        ("frame.config", "studies.frame.config is a part of the studies and no study"),
-    ],
-)
-def test_what_is_no_study_is_refused_in_a_sentence(name, sentence):
-    for command in (("codesign", "run", name), (f"studies.{name}",)):
+@refusals.table(__file__, "names of studies")
+def test_what_is_no_study_is_refused_in_a_sentence(row):
+    for command in (("codesign", "run", row.call), (f"studies.{row.call}",)):
         done = python("-m", *command)
         assert done.returncode == 2
         assert done.stdout == ""
-        assert done.stderr.startswith(f"error: {sentence}")
+        assert done.stderr.startswith(f"error: {row.sentence}")
         assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_quick_sets_options_of_the_study(name):
-    folder = listing.studies()[name].name == "__main__.py"
-    kind = importlib.import_module(
-        f"studies.{name}.__main__" if folder else f"studies.{name}"
-    ).Config
+    kind = module_of(name).Config
     assert issubclass(kind, StudyConfig)
     usual = configured(kind, quick=False)
     quick = configured(kind, quick=True)
@@ -116,7 +105,4 @@ def test_quick_sets_options_of_the_study(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_run_has_the_name_of_its_study(name):
-    module = importlib.import_module(
-        f"studies.{name}" + ".__main__" * (ROOT / "studies" / name).is_dir()
-    )
-    assert _name(module.Config) == name
+    assert _name(module_of(name).Config) == name

@@ -2,7 +2,6 @@
 are killed at any moment."""
 
 import hashlib
-import json
 import os
 import re
 import signal
@@ -11,7 +10,6 @@ import sys
 import time
 from contextlib import nullcontext
 from dataclasses import fields
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -30,15 +28,17 @@ from scenes import dataset_motion as motions
 from scenes import worlds
 from scenes.dataset_motion import Stage, make_world
 from scenes.tum import read_tum
-from studies.frame.run import main
 from studies.make_dataset import __main__ as study
 from studies.make_dataset import store
 from studies.make_dataset.segments import Segments
+from tests import refusals
+from tests.processes import ROOT
 from tests.rounding_case import RoundsByPlace
 from tests.studies.browser import check_page
+from tests.studies.runs import ran, stored
 
 D = torch.float64
-ROOT = Path(__file__).resolve().parents[2]
+
 # frames 0.0111 s apart: no whole microseconds
 SMALL = "--trajectories 2 --frames 14 --size 24 --samples 2 --chunk 4 --rate-hz 90"
 
@@ -133,40 +133,31 @@ def test_every_world_has_a_clear_path_of_every_family(world):
                 assert float(seen.depth_m[seen.valid].min()) > 0.8 * motions.CLEAR_M
 
 
-def run_study(folder, *more):
-    return main(study.study, study.Config, [*SMALL.split(), "--out", str(folder), *more])
-
-
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     threads = torch.get_num_threads()
     folder = tmp_path_factory.mktemp("data") / "set"
-    assert run_study(folder, "--flo") == 0
+    assert ran(study, f"{SMALL} --flo --out", folder) == 0
     torch.set_num_threads(threads)
     return folder
 
 
 def names(folder):
-    return json.loads((folder / "manifest.json").read_text())["sequences"]
+    return stored(folder, "manifest")["sequences"]
 
 
 def test_the_manifest_holds_the_hash_of_every_file(dataset):
     check_page("make_dataset", dataset)
-    manifest = json.loads((dataset / "manifest.json").read_text())
+    manifest = stored(dataset, "manifest")
     assert manifest["sequences"] == ["sequence_000_orbital", "sequence_001_radial"]
     own = {"camera.h5", "events.h5", "frames.h5", "lens.json", "poses.txt", "sequence.json"}
     own |= {f"flow/forward/{k:06d}.{kind}" for k in range(13) for kind in ("png", "flo")}
     own.add("flow/forward_timestamps.txt")
     for name in manifest["sequences"]:
-        files = {
-            path.relative_to(dataset / name)
-            for path in (dataset / name).rglob("*")
-            if path.is_file()
-        }
-        assert {path.as_posix() for path in files} == own
-    assert set(manifest["files"]) == {
-        f"{name}/{file}" for name in manifest["sequences"] for file in own
-    }
+        files = [path for path in (dataset / name).rglob("*") if path.is_file()]
+        assert {path.relative_to(dataset / name).as_posix() for path in files} == own
+    every = {f"{name}/{file}" for name in manifest["sequences"] for file in own}
+    assert set(manifest["files"]) == every
     for name, entry in manifest["files"].items():
         content = (dataset / name).read_bytes()
         assert entry == {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
@@ -290,9 +281,9 @@ def test_a_run_killed_many_times_ends_with_the_same_bytes(dataset, tmp_path):
         assert kill_when(folder, appears, *resume)
     # a finished one is finished
     for _ in range(2):
-        assert main(study.study, study.Config, list(resume)) == 0
+        assert ran(study, "--resume", folder) == 0
         assert (folder / "manifest.json").read_bytes() == (dataset / "manifest.json").read_bytes()
-    for name in json.loads((folder / "manifest.json").read_text())["files"]:
+    for name in stored(folder, "manifest")["files"]:
         assert (folder / name).read_bytes() == (dataset / name).read_bytes()
     assert not [
         path for path in folder.rglob("*") if path.name.startswith(".") or path.name == store.PARTS
@@ -301,7 +292,7 @@ def test_a_run_killed_many_times_ends_with_the_same_bytes(dataset, tmp_path):
 
 def test_folders_with_other_things_and_damaged_parts_are_refused_in_one_sentence(tmp_path, capsys):
     (tmp_path / "notes.txt").write_text("mine")
-    assert run_study(tmp_path) == 2
+    assert ran(study, f"{SMALL} --out", tmp_path) == 2
     assert "holds other things (notes.txt)" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
     part = store.part_path(tmp_path, 0)
@@ -311,22 +302,9 @@ def test_folders_with_other_things_and_damaged_parts_are_refused_in_one_sentence
         store.read_state(part)
 
 
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        (["--frames", "1"], "--frames is 1"),
-        (["--rate-hz", "0"], "--rate-hz is 0"),
-        (["--world", "moon"], "there are checkerboard"),
-        (["--lens", "none"], "none"),
-        (["--world", "checkerboard", "--light", "baked"], "has no lamps"),
-        (["--focal-length-mm", "0"], "--focal-length-mm"),
-    ],
-)
-def test_impossible_options_end_with_one_sentence(options, sentence, tmp_path, capsys):
-    assert main(study.study, study.Config, [*options, "--out", str(tmp_path / "set")]) == 2
-    error = capsys.readouterr().err
-    assert sentence in error
-    assert error.count("\n") == 1
+@refusals.table(__file__, "make_dataset")
+def test_impossible_options_end_with_one_sentence(row, refuses):
+    refuses(study, row)
 
 
 def test_paths_that_cannot_keep_clear_are_refused():

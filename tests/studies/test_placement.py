@@ -15,7 +15,6 @@ from codesign.errors import DomainError
 from codesign.system import load_hand_over
 from scenes.robots import pair as robot_pair
 from scenes.robots.pairs import PAIRS
-from studies.frame.run import main
 from studies.placement import __main__ as placement
 from studies.placement import outcome
 from studies.placement.controls import controls, looking_back
@@ -23,7 +22,9 @@ from studies.placement.page import answer
 from studies.placement.problem import Problem, traced_camera
 from studies.placement.race import FINAL_DRAWS, Race, check_same, feasible, fingerprints, kept
 from studies.placement.searches import descend
+from tests import refusals
 from tests.studies.browser import check_page
+from tests.studies.runs import numbers, page, ran
 
 F = torch.float64
 
@@ -134,25 +135,9 @@ def test_controls_see_nothing(problem):
     assert all(looking_back(Problem(each(), range(1)))[2, 2] < 0.5 for each in PAIRS.values())
 
 
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        (["--pair", "submarine"], "--pair submarine: choose from outdoors"),
-        (["--seeds", "0"], "--seeds is 0"),
-        (["--seed", "-1"], "--seed is -1"),
-        (["--judged-drives", "49"], "a world has 48 drives"),
-        (["--searches", "oracle"], "search 'oracle' is unknown"),
-        (["--searches", "random", "random"], "names one twice"),
-        (["--robot", "nowhere.yaml"], "nowhere.yaml"),
-        (["--lens", "nowhere.zmx"], "nowhere.zmx"),
-        (["--focal-mm", "8"], "give --lens too"),
-        (["--lens", "cooke-triplet", "--focal-mm", "-1"], "--focal-mm is -1"),
-        (["--lens", "double-gauss"], "larger image circle"),
-    ],
-)
-def test_wrong_input_is_one_sentence_before_the_first_frame(given, said, tmp_path, capsys):
-    assert main(placement.study, placement.Config, [*given, "--out", str(tmp_path / "run")]) == 2
-    assert said in capsys.readouterr().err
+@refusals.table(__file__, "placement")
+def test_wrong_input_is_one_sentence_before_the_first_frame(row, refuses):
+    refuses(placement, row)
 
 
 def test_ratios_are_of_paired_starts_and_worlds():
@@ -168,10 +153,8 @@ def test_ratios_are_of_paired_starts_and_worlds():
     errors = torch.arange(4.0, dtype=F).repeat_interleave(6)
     assert outcome.standard_error(errors, 4) == pytest.approx((5 / 3) ** 0.5 / 2)
     assert outcome.standard_error(errors[:1], 1) == 0.0
-    ours, theirs = (
-        torch.tensor([0.5, 1.5, 2.0, 4.0], dtype=F),
-        torch.tensor([1.0, 3.0, 4.0, 4.0], dtype=F),
-    )
+    ours = torch.tensor([0.5, 1.5, 2.0, 4.0], dtype=F)
+    theirs = torch.tensor([1.0, 3.0, 4.0, 4.0], dtype=F)
     assert outcome.over_worlds(ours, theirs, 2) == pytest.approx((4 / 6, 0.5, 0.75))
 
 
@@ -181,15 +164,11 @@ def test_a_run_that_goes_on_is_the_one_that_was_begun(tmp_path):
     pair = replace(PAIRS["outdoors"](), files=(world,))
     begun = json.loads(json.dumps(fingerprints(pair)))
     check_same(begun, fingerprints(pair))
-    for changed, said in (
-        (
-            replace(pair, page="world_unit_m=0.01"),
-            "the robot's page changed since this run was begun",
-        ),
-        (replace(pair, files=()), r"room\.obj' changed since .*, now not there"),
-    ):
-        with pytest.raises(DomainError, match=said):
-            check_same(begun, fingerprints(changed))
+    other = replace(pair, page="world_unit_m=0.01")
+    with pytest.raises(DomainError, match="the robot's page changed since this run was begun"):
+        check_same(begun, fingerprints(other))
+    with pytest.raises(DomainError, match=r"room\.obj' changed since .*, now not there"):
+        check_same(begun, fingerprints(replace(pair, files=())))
     world.write_text("v 0 0 1")
     with pytest.raises(DomainError, match=r"room\.obj' changed"):
         check_same(begun, fingerprints(pair))
@@ -302,9 +281,8 @@ def test_a_traced_lens_has_the_focal_length_and_focus_asked_for():
 def test_the_whole_study_and_its_resumption(tmp_path):
     out = tmp_path / "run"
     sizes = "--seeds 1 --steps 2 --worlds 1 --per-world 1 --judged-worlds 1 --judged-drives 2"
-    arguments = [*sizes.split(), "--searches", "random", "--out", str(out)]
-    assert main(placement.study, placement.Config, arguments) == 0
-    found = json.loads((out / "metrics.json").read_text())
+    assert ran(placement, f"{sizes} --searches random --out", out) == 0
+    found = numbers(out)
     assert found["hand_over_score_again"] == pytest.approx(found["hand_over_score"], rel=1e-9)
     before = (out / "race.csv").read_text()
     rows = list(csv.DictReader(before.splitlines()))
@@ -317,13 +295,13 @@ def test_the_whole_study_and_its_resumption(tmp_path):
     assert handed.mount()[2, 3].item() == pytest.approx(float(row["z_m"]), abs=1e-4)
     assert 0 < found["forward_error_p50_m_s"] < found["forward_error_p90_m_s"]
     (out / "report.html").unlink()
-    assert main(placement.study, placement.Config, ["--resume", str(out)]) == 0
+    assert ran(placement, "--resume", out) == 0
     assert (out / "race.csv").read_text() == before
-    page = (out / "report.html").read_text()
-    assert ("may be better off at" in page) == (found["hand_over_score"] < found["default_error"])
+    shown = page(out)
+    assert ("may be better off at" in shown) == (found["hand_over_score"] < found["default_error"])
     assert not any(name.endswith("90") for name in found)
-    assert ("stays at" in page) == (found["chosen_start"] < 0)
-    assert "tensor(" not in page
+    assert ("stays at" in shown) == (found["chosen_start"] < 0)
+    assert "tensor(" not in shown
     check_page("placement", out)
 
 

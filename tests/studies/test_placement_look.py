@@ -1,16 +1,14 @@
 """A robot and its camera before a search: its page, and how robots and views are drawn."""
 
-import json
-
 import numpy as np
 import torch
 
 from codesign import lens, render
 from codesign.report import robot_figures
 from scenes import robots
-from studies.frame.run import main
 from studies.placement import __main__ as placement
 from tests.studies.browser import check_page
+from tests.studies.runs import numbers, ran
 
 
 def test_the_page_shows_the_robot_and_counts_its_body_in_view(tmp_path):
@@ -21,11 +19,8 @@ def test_the_page_shows_the_robot_and_counts_its_body_in_view(tmp_path):
         "camera:\n  low_m: [0.1, -0.1, 0.5]\n  high_m: [0.3, 0.1, 0.9]\n"
     )
     out = tmp_path / "run"
-    assert (
-        main(placement.study, placement.Config, ["--robot", str(page), "--look", "--out", str(out)])
-        == 0
-    )
-    metrics = json.loads((out / "metrics.json").read_text())
+    assert ran(placement, "--look --out", out, "--robot", page) == 0
+    metrics = numbers(out)
     # four wheels and a mast of 48-gons (2 x 48 + 2 x 48 triangles), two boxes of 12 without the
     # camera's
     assert metrics["faces"] == 5 * 4 * 48 + 2 * 12

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.errors import CodesignError, DomainError, FileFormatError, NonFiniteError, ShapeError
+from codesign.errors import FileFormatError, ShapeError
 from codesign.state import write_state
-from studies.flow_quality import __main__ as flow_quality
-from studies.flow_recording import __main__ as flow_recording
-from studies.frame.run import main, open_run
-from studies.lens_opt import __main__ as lens_opt
-from tests.studies.smallest_study import Config, numbers
+from studies.frame.run import open_run
+from tests import refusals
+from tests.studies.runs import module_of, numbers, ran
+from tests.studies.smallest_study import Config
 
 
 def test_state_returns_every_bit(run, generator):
@@ -78,31 +77,23 @@ def test_the_state_of_another_run_is_refused(tmp_path):
         resumed()
 
 
-@pytest.mark.parametrize(
-    ("study", "words"),
-    [
-        (flow_recording, ["--recording", ""]),
-        (flow_recording, ["--quick", "--truth="]),
-        (flow_recording, ["--out", "", "--quick"]),
-        (flow_quality, ["--recording", "a.h5", ""]),
-        (lens_opt, ["--resume", ""]),
-    ],
-)
-def test_an_empty_path_is_not_the_present_folder(study, words, capsys):
-    assert main(study.study, study.Config, words) == 2
-    option = next(word for word in words if word != "--quick").rstrip("=")
-    assert f"the path of {option} is empty; give one" in capsys.readouterr().err
+@refusals.table(__file__, "empty paths")
+def test_an_empty_path_is_not_the_present_folder(row, capsys):
+    name, words = row.call.split(" ", 1)
+    assert ran(module_of(name), words) == 2
+    assert row.sentence in capsys.readouterr().err
 
 
 def test_metrics_are_finite_numbers(run):
     run.record(good_mm=np.float64(2.5), count=torch.tensor(3), flag=True)
-    for bad in (float("nan"), torch.tensor(torch.inf), np.float32(-np.inf)):
-        with pytest.raises(NonFiniteError, match="metric bad"):
-            run.record(fine=1.0, bad=bad)
-    for name, value in (("versions", 1), ("spot", "12"), ("spots", torch.ones(2))):
-        with pytest.raises(DomainError):
-            run.record(**{name: value})
     assert numbers(run.folder) == {"good_mm": 2.5, "count": 3, "flag": 1}
+
+
+@refusals.table(__file__, "metrics")
+def test_what_is_no_metric_is_refused_and_nothing_recorded(run, row):
+    row.holds({**globals(), "run": run})
+    run.finish("A page", "That holds none.")
+    assert numbers(run.folder) == {}
 
 
 def test_page_holds_everything_and_loads_nothing(run):
@@ -143,19 +134,6 @@ def test_page_holds_everything_and_loads_nothing(run):
     assert plt.imread(path).shape[1] > 600, "figures are sharp enough to print"
 
 
-@pytest.mark.parametrize(
-    ("call", "kind", "sentence"),
-    [
-        (lambda run: run.video("scene.exr", "A scene."), FileFormatError, "one of"),
-        (lambda run: run.video("absent.mp4", "Nothing."), FileFormatError, "cannot be read"),
-        (
-            lambda run: run.table("T", ["a", "b"], [[1, 2], [3]]),
-            ShapeError,
-            "row 1 has 1 cells for 2 columns",
-        ),
-        (lambda run: run.path("../elsewhere.png"), CodesignError, "leads out of the run's folder"),
-    ],
-)
-def test_page_refuses_what_it_cannot_show(run, call, kind, sentence):
-    with pytest.raises(kind, match=sentence):
-        call(run)
+@refusals.table(__file__, "pages")
+def test_page_refuses_what_it_cannot_show(run, row):
+    row.holds({"run": run})

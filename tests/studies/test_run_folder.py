@@ -11,9 +11,10 @@ import torch
 
 from codesign.errors import DomainError
 from studies.frame.run import main, open_run
-from tests.studies.smallest_study import Config, contents, numbers, record_one, stored
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests import refusals
+from tests.processes import ROOT
+from tests.studies.runs import contents, numbers, stored
+from tests.studies.smallest_study import Config, record_one
 
 
 def test_command_leaves_what_the_contract_names(tmp_path, monkeypatch, command):
@@ -24,15 +25,8 @@ def test_command_leaves_what_the_contract_names(tmp_path, monkeypatch, command):
     config = stored(folder, "config")
     # the device is the one that computed
     assert config.pop("device") in ("cpu", "cuda")
-    given = {
-        "quick": False,
-        "out": None,
-        "seed": 0,
-        "resume": None,
-        "limit": 0.5,
-        "sizes": [3, 4, 5],
-    }
-    assert config == {"study": "smallest_study", **given}
+    frame = {"study": "smallest_study", "quick": False, "out": None, "seed": 0, "resume": None}
+    assert config == {**frame, "limit": 0.5, "sizes": [3, 4, 5]}
     metrics = stored(folder, "metrics")
     assert metrics["limit"] == 0.5
     packages = {"codesign", "torch", "mitsuba", "drjit", "numpy", "kornia"}
@@ -46,26 +40,13 @@ def test_command_leaves_what_the_contract_names(tmp_path, monkeypatch, command):
         assert metrics["versions"]["commit"].removesuffix("+changes") == head.stdout.strip()
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("limit", True),
-        ("limit", None),
-        ("sizes", [1, "2"]),
-        ("sizes", 3),
-        ("seed", 0.5),
-        ("quick", 1),
-        ("device", "tpu"),
-        ("device", ["cpu"]),
-        ("out", 7),
-    ],
-)
-def test_a_configuration_of_other_types_is_one_sentence(run, command, name, value):
+@refusals.table(__file__, "configurations")
+def test_a_configuration_of_other_types_is_one_sentence(run, command, row):
     path = run.folder / "config.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), name: value}))
+    path.write_text(json.dumps(stored(run.folder, "config") | json.loads(row.call)))
     code, complaint = command("--resume", run.folder)
     assert code == 2
-    assert re.search(f": {name} is .*, which is no ", complaint)
+    assert f": {row.sentence}" in complaint
     assert complaint.count("\n") == 1
 
 
@@ -112,8 +93,7 @@ def test_bad_input_can_be_repaired_in_the_same_folder(out, command):
 
 def test_resume_needs_a_run_of_the_same_study(tmp_path, command):
     other = open_run("other", Config(out=tmp_path / "other")).folder
-    path = other / "config.json"
-    newer = json.dumps({**json.loads(path.read_text()), "study": "smallest_study", "colour": "red"})
+    newer = stored(other, "config") | {"study": "smallest_study", "colour": "red"}
     for folder, sentence in (
         (tmp_path / "nowhere", "is not a run that can be resumed"),
         (other, "study 'other'"),
@@ -121,7 +101,7 @@ def test_resume_needs_a_run_of_the_same_study(tmp_path, command):
         code, complaint = command("--resume", folder)
         assert code == 2
         assert sentence in complaint
-    path.write_text(newer)
+    (other / "config.json").write_text(json.dumps(newer))
     code, complaint = command("--resume", other)
     assert code == 2
     assert "another version of this study (fields that differ: colour)" in complaint
@@ -149,11 +129,8 @@ def test_resume_takes_the_stored_configuration_and_metrics(tmp_path):
 def test_what_is_typed_comes_before_what_quick_sets(out, command, typed, ran):
     assert command("--out", out, *typed)[0] == 0
     config = stored(out, "config")
-    assert (numbers(out)["limit"], config["limit"], config["quick"]) == (
-        ran,
-        ran,
-        "--quick" in typed,
-    )
+    assert numbers(out)["limit"] == config["limit"] == ran
+    assert config["quick"] == ("--quick" in typed)
 
 
 def test_resume_refuses_only_what_differs_from_the_stored_run(out, command):
@@ -197,15 +174,9 @@ def test_wrong_options_exit_with_two_and_help_explains_them(command, capsys, mon
             main(record_one, Config, arguments)
         assert ended.value.code == code
     shown = capsys.readouterr().out
-    for option in (
-        "--quick",
-        "--out",
-        "--seed",
-        "--device",
-        "--limit",
-        "Folder of an interrupted run",
-    ):
-        assert option in shown
+    for option in ("quick", "out", "seed", "device", "limit"):
+        assert f"--{option}" in shown
+    assert "Folder of an interrupted run" in shown
     said = "error: option --limit is inf; give a finite number, or leave the option out.\n"
     assert command("--limit", "inf") == (2, said)
     said = "error: this study computes on the processor; leave --device out.\n"

@@ -8,9 +8,9 @@ import torch
 
 from codesign import events
 from codesign.events import SensorModel, SpikeEsim
-from studies.frame.run import main
 from studies.spike_esim import __main__ as study
 from studies.spike_esim import judge, train
+from tests import refusals
 
 D = torch.float64
 DT_S = 2e-3
@@ -145,6 +145,6 @@ def test_the_objective_is_zero_for_the_target_and_one_and_a_tenth_for_silence():
     assert float(train.objective(torch.zeros_like(target), target, DT_S)) == pytest.approx(1.1)
 
 
-def test_too_small_a_study_is_refused(tmp_path, capsys):
-    assert main(study.study, study.Config, ["--steps", "1", "--out", str(tmp_path / "a")]) == 2
-    assert "at least" in capsys.readouterr().err
+@refusals.table(__file__, "spike_esim")
+def test_too_small_a_study_is_refused(row, refuses):
+    refuses(study, row)

@@ -15,18 +15,14 @@ from codesign.system import load_hand_over
 from scenes.dataset_motion import LEAD_S
 from scenes.robots import pair as robot_pair
 from scenes.robots.pairs import PAIRS
-from studies.frame.run import main
 from studies.make_dataset import __main__ as make_dataset
 from studies.placement import __main__ as placement
 from studies.placement.problem import Problem, Samples
+from tests import refusals
 from tests.studies.browser import check_page
-from tests.studies.smallest_study import numbers, stored
+from tests.studies.runs import numbers, ran, stored
 
 SET = "--trajectories 2 --frames 14 --size 32 --samples 8 --chunk 7 --rate-hz 90"
-
-
-def made(folder, *options):
-    return main(make_dataset.study, make_dataset.Config, [*options, "--out", str(folder)])
 
 
 def rms(field):
@@ -49,14 +45,13 @@ def flows(config, tries):
 
 
 def test_a_data_set_keeps_its_tolerance_on_paths_that_were_not_looked_at(tmp_path, monkeypatch):
-    given = [*SET.split(), "--tolerance", "0.3"]
     with monkeypatch.context() as patched:
         patched.setattr(make_dataset.Sequence, "finish", interrupted)
-        assert made(tmp_path / "set", *given) == 130
+        assert ran(make_dataset, f"{SET} --tolerance 0.3 --out", tmp_path / "set") == 130
     levels = stored(tmp_path / "set", "fidelity")["the data set"]["levels"]
     # a resumed run asks nobody
     monkeypatch.setattr(codesign, "select", None)
-    assert main(make_dataset.study, make_dataset.Config, ["--resume", str(tmp_path / "set")]) == 0
+    assert ran(make_dataset, "--resume", tmp_path / "set") == 0
     with h5py.File(next((tmp_path / "set").glob("*/camera.h5"))) as file:
         assert file.attrs["level"] == levels["camera"] == "pinhole"
     found = numbers(tmp_path / "set")
@@ -73,19 +68,9 @@ def interrupted(sequence):
     raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize(
-    ("tolerance", "sentence"),
-    [
-        ("-1", "--tolerance is -1; give pixels of flow above 0, or 0 for"),
-        ("nan", "option --tolerance is nan; give a finite number"),
-        ("1e-6", "no combination keeps flow within 1e-06 px; the best found, "),
-    ],
-)
-def test_a_tolerance_that_cannot_be_kept_is_one_sentence(tolerance, sentence, tmp_path, capsys):
-    assert made(tmp_path / "set", *SET.split(), "--tolerance", tolerance) == 2
-    said = capsys.readouterr().err
-    assert said.startswith(f"error: {sentence}")
-    assert said.count("\n") == 1
+@refusals.table(__file__, "tolerances")
+def test_a_tolerance_that_cannot_be_kept_is_one_sentence(row, refuses, tmp_path):
+    refuses(make_dataset, row, SET)
     left = [path.name for path in tmp_path.rglob("*") if path.is_file()]
     assert set(left) <= {"config.json", ".lock"}
 
@@ -94,8 +79,7 @@ def test_a_tolerance_that_cannot_be_kept_is_one_sentence(tolerance, sentence, tm
 def test_searches_for_a_mount_use_what_is_chosen_and_judges_do_not(tmp_path):
     sizes = "--pair outdoors --seeds 1 --steps 1 --worlds 1 --per-world 2 --judged-worlds 1 --judged-drives 1"
     out = tmp_path / "run"
-    given = [*sizes.split(), "--searches", "random", "--tolerance", "2", "--out", str(out)]
-    assert main(placement.study, placement.Config, given) == 0
+    assert ran(placement, f"{sizes} --searches random --tolerance 2 --out", out) == 0
     levels = Fidelity(**stored(out, "fidelity")["the searches"]["levels"])
     pair = PAIRS["outdoors"]()
     problem = Problem(pair, robot_pair.unseen(1), 1, 8)

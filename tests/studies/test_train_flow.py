@@ -10,12 +10,13 @@ import pytest
 import torch
 
 from codesign.flow import checkpoint, losses
-from studies.frame.run import main
 from studies.train_flow import __main__ as train_flow
 from studies.train_flow import race as races
 from studies.train_flow import setup as train_flow_setup
+from tests import refusals
 from tests.flow_training_case import (
     BASE,
+    OPTIONS,
     TRUE_WEIGHTS,
     Linear,
     Made,
@@ -30,6 +31,7 @@ from tests.flow_training_case import (
     undraw,
 )
 from tests.studies.browser import check_page
+from tests.studies.runs import ran, stored
 
 
 @pytest.fixture(autouse=True)
@@ -80,8 +82,7 @@ def test_three_steps_and_three_are_six_bit_for_bit(tmp_path, capsys):
 
     register(before=interrupt)
     assert train(parts, options) == 130
-    stored = json.loads((parts / "checkpoint" / "checkpoint.json").read_text())
-    assert stored["progress"]["step"] == 3
+    assert stored(parts / "checkpoint", "checkpoint")["progress"]["step"] == 3
     # cut short while it was written
     (parts / "checkpoint" / "step_0000009.safetensors").write_bytes(b"cut short")
     register()
@@ -219,11 +220,8 @@ def test_a_race_trains_every_network_with_every_seed_and_judges_them_alike(tmp_p
 
     monkeypatch.setattr(races, "_trained", trained)
     own = "tests.flow_training_case:Own"
-    options = (
-        f"--race --own {own} --seeds 0 1 --cpu-minutes 3 --learning-rate 0.01 --final-windows 6"
-    )
-    given = ["--out", str(tmp_path / "run"), *options.split()]
-    assert main(train_flow.study, train_flow.Config, given) == 0
+    options = f"--own {own} --seeds 0 1 --cpu-minutes 3 --learning-rate 0.01 --final-windows 6"
+    assert ran(train_flow, f"--race {options} --out", tmp_path / "run") == 0
     check_page("train_flow", tmp_path / "run")
     assert sorted(commands) == [("refiner", "0"), ("refiner", "1"), (own, "0"), (own, "1")]
     assert commands[own, "1"]["--learning-rate"] == "0.01"
@@ -240,60 +238,26 @@ def test_a_race_trains_every_network_with_every_seed_and_judges_them_alike(tmp_p
 
 
 def edit(folder, **changes):
-    path = folder / "checkpoint.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+    changed = stored(folder, "checkpoint") | changes
+    (folder / "checkpoint.json").write_text(json.dumps(changed))
 
 
-@pytest.mark.parametrize(
-    ("damage", "sentence"),
-    [
-        (lambda folder: (folder / "checkpoint.json").write_text("{"), "is no whole JSON file"),
-        (lambda folder: next(folder.glob("*.safetensors")).write_bytes(b"short"), "is damaged"),
-        (lambda folder: edit(folder, version=9), "format version 9"),
-        (
-            lambda folder: edit(folder, network="refiner"),
-            "written with network refiner, this run has linear",
-        ),
-        (lambda folder: edit(folder, tensors="../network.safetensors"), "outside its folder"),
-    ],
-)
+@refusals.table(__file__, "checkpoints of train_flow")
 @pytest.mark.usefixtures("undrawn")
-def test_a_checkpoint_that_does_not_fit_is_named(tmp_path, capsys, damage, sentence):
+def test_a_checkpoint_that_does_not_fit_is_named(tmp_path, capsys, row):
     assert train(tmp_path / "run", "--steps 1") == 0
-    damage(tmp_path / "run" / "checkpoint")
+    eval(row.call, {"folder": tmp_path / "run" / "checkpoint", "edit": edit})
     capsys.readouterr()
     assert resume(tmp_path / "run") == 2
-    assert sentence in capsys.readouterr().err
+    assert row.sentence in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        ("--network refinr", "the network must be one of 'ecn', 'flownet-events'"),
-        ("--options depth=3", "has no option 'depth'; it has bins, gain"),
-        ("--weights 500", "which 'linear' does not"),
-        ("--mix fog", "--mix fog is unknown; choose from"),
-        ("--loss photometric", "needs frames, and these windows have none"),
-        ("--bins 5", "the windows have 2 time bins, the network 5"),
-        ("--steps 0", "--steps is 0; at least 1"),
-        ("--height-px 15", "--height-px is 15; at least 16 is needed"),
-        ("--width-px 0", "--width-px is 0; at least 16 is needed"),
-        ("--cpu-minutes -1", "--cpu-minutes is -1.0; more than 0"),
-        ("--mixed-precision", "--mixed-precision needs CUDA"),
-        ("--start nowhere.safetensors", "no file lies at nowhere.safetensors"),
-        ("--race --jobs 0", "one of --jobs"),
-        ("--race", "leave --network out"),
-        ("--steps 2 --options gain=1e30", "step 0: loss inf"),
-    ],
-)
+@refusals.table(__file__, "train_flow")
 @pytest.mark.usefixtures("undrawn")
-def test_what_is_unfit_is_refused_before_the_first_step(tmp_path, capsys, options, sentence):
+def test_what_is_unfit_is_refused_before_the_first_step(tmp_path, refuses, row):
     made = []
     register(before=lambda indices: made.append(list(indices)), frames=False)
-    assert train(tmp_path / "run", options) == 2
-    complaint = capsys.readouterr().err
-    assert sentence in complaint
-    assert len(complaint.splitlines()) == 1
-    if "gain=1e30" not in options:
+    refuses(train_flow, row, OPTIONS)
+    if "gain=1e30" not in row.call:
         assert made in ([], [[0]]), "one window may be looked at, no more"
     assert not (tmp_path / "run" / "checkpoint").exists()

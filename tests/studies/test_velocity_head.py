@@ -1,6 +1,5 @@
 """The study of the velocity head: its designs, and a little training on evidence in closed form."""
 
-import json
 from dataclasses import fields
 
 import pytest
@@ -9,9 +8,10 @@ import torch
 from codesign.mount import EgoVelocity, Evidence, VelocityHead
 from scenes.robots.pairs import PAIRS
 from studies import velocity_head
-from studies.frame.run import main
 from studies.velocity_head import designs
+from tests import refusals
 from tests.studies.browser import check_page
+from tests.studies.runs import numbers, ran
 
 D = torch.float64
 WINDOWS = 4
@@ -68,13 +68,11 @@ def test_a_little_training_lowers_the_error_on_worlds_kept_from_it_and_what_it_s
         return made(config.worlds * config.motions, index)
 
     monkeypatch.setattr(velocity_head, "rendered", rendered)
-    sizes = {"designs": 60, "worlds": 4, "motions": 6, "steps": 120, "width": 16, "batch": 96}
-    arguments = [word for name, value in sizes.items() for word in (f"--{name}", str(value))]
+    sizes = "--designs 60 --worlds 4 --motions 6 --steps 120 --width 16 --batch 96"
     out = tmp_path / "run"
-    arguments += ["--pair", "corridor", "--out", str(out)]
-    assert main(velocity_head.study, velocity_head.Config, arguments) == 0
+    assert ran(velocity_head, f"{sizes} --pair corridor --out", out) == 0
     check_page("velocity_head", out)
-    metrics = json.loads((out / "metrics.json").read_text())
+    metrics = numbers(out)
     assert metrics["corridor_head_error"] < 0.6 * metrics["corridor_plain_error"]
     head = VelocityHead.load(EgoVelocity(tuple(range(6)), (1.0,) * 6), out / "head.safetensors")
     again = {name: tensor.double() for name, tensor in made(600, 1000).items()}
@@ -87,15 +85,6 @@ def test_a_little_training_lowers_the_error_on_worlds_kept_from_it_and_what_it_s
     assert error == pytest.approx(metrics["corridor_head_error"], rel=0.3)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (["--pair", "attic"], "choose from outdoors, corridor, flight"),
-        (["--worlds", "1"], "--worlds is 1; at least 2"),
-        (["--motions", "7"], "a design has 1 to 6 in a world"),
-    ],
-)
-def test_sizes_and_names_are_checked(arguments, sentence, tmp_path, capsys):
-    arguments = [*arguments, "--out", str(tmp_path / "run")]
-    assert main(velocity_head.study, velocity_head.Config, arguments) == 2
-    assert sentence in capsys.readouterr().err
+@refusals.table(__file__, "velocity_head")
+def test_sizes_and_names_are_checked(row, refuses):
+    refuses(velocity_head, row)

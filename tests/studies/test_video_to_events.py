@@ -3,7 +3,6 @@ stop, and sentences for what cannot be."""
 
 import dataclasses
 import itertools
-import json
 import math
 from typing import Any
 
@@ -17,15 +16,17 @@ from codesign import events
 from codesign.errors import DomainError, FileFormatError
 from codesign.events.stream import ordered
 from codesign.types import EventStream
-from studies.frame.run import Run, main
+from studies.frame.run import Run
 from studies.video_to_events import __main__ as study
 from studies.video_to_events.input import Light, read_times
 from studies.video_to_events.options import chosen_sensor
 from studies.video_to_events.state import RECORD, EventLog, Progress
+from tests import refusals
 from tests.studies.browser import check_page
+from tests.studies.runs import numbers, page, ran
 
 FIELDS = ("t_us", "x", "y", "p")
-IDEAL = ("--preset", "ideal", "--events", "e.npz")
+IDEAL = "--preset ideal --events e.npz"
 
 
 @pytest.fixture
@@ -33,14 +34,6 @@ def plain(monkeypatch):
     """No figures and videos: they are looked at by a test of their own."""
     monkeypatch.setattr(study.pages, "pictures", lambda view: None)
     monkeypatch.setattr(Run, "figure", lambda *arguments: None)
-
-
-def call(folder, *arguments):
-    return main(study.study, study.Config, ["--out", str(folder), *map(str, arguments)])
-
-
-def metrics_of(folder):
-    return json.loads((folder / "metrics.json").read_text())
 
 
 def write_folder(folder, stack):
@@ -80,9 +73,10 @@ def test_a_ramp_of_gray_values_fires_at_known_microseconds(tmp_path, plain, caps
         [30, 31, 33, 36, 39, 42],
     ]
     folder = write_folder(tmp_path / "in", np.array(pixels, np.uint8).T[:, None, :])
-    assert call(tmp_path / "run", "--input", folder, "--fps", 200, *IDEAL, "e.csv") == 0
+    out = tmp_path / "run"
+    assert ran(study, f"--fps 200 {IDEAL} e.csv --out", out, "--input", folder) == 0
     for name in ("e.npz", "e.csv"):
-        stream = events.read(tmp_path / "run" / name)
+        stream = events.read(out / name)
         for x, values in enumerate(pixels):
             truth = crossings(values, 200, 0.2)
             mine = stream.x == x
@@ -92,13 +86,13 @@ def test_a_ramp_of_gray_values_fires_at_known_microseconds(tmp_path, plain, caps
             np.testing.assert_allclose(
                 stream.t_us[mine].numpy(), [t for t, _ in truth], atol=0.5 + 5000 * 5e-7 / 0.03
             )
-    metrics = metrics_of(tmp_path / "run")
+    metrics = numbers(out)
     every = [sign for values in pixels for _, sign in crossings(values, 200, 0.2)]
     found = [metrics[name] for name in ("frames", "events_on", "events_off")]
     assert found == [6, every.count(1), every.count(-1)]
     assert metrics["rate_on_hz"] == pytest.approx(every.count(1) / 0.025)
     assert "too slow" in capsys.readouterr().out
-    assert not (tmp_path / "run" / study.LOG).exists()
+    assert not (out / study.LOG).exists()
 
 
 # imageio leaves FFmpeg's pipes open
@@ -114,12 +108,10 @@ def test_a_video_gives_the_events_of_its_frames_as_imageio_decodes_them(tmp_path
     for frame in waves(40, 24, 32):
         writer.send(np.ascontiguousarray(np.stack([frame, frame[::-1], frame[:, ::-1]], -1)))
     writer.close()
-    clock = ("--slow-motion", 10, "--start-s", 0.02, "--stop-s", 0.1)
-    options = ("--preset", "clean", "--seed", 3, "--events", "e.npz")
-    assert call(tmp_path / "run", "--input", path, *clock, *options) == 0
-    decoded = iio.imread(path, plugin="FFMPEG").astype(np.float64) @ np.array(
-        [0.2126, 0.7152, 0.0722]
-    )
+    clock = "--slow-motion 10 --start-s 0.02 --stop-s 0.1"
+    options = f"{clock} --preset clean --seed 3 --events e.npz --out"
+    assert ran(study, options, tmp_path / "run", "--input", path) == 0
+    decoded = iio.imread(path, plugin="FFMPEG").astype(np.float64) @ [0.2126, 0.7152, 0.0722]
     t_s = np.arange(40) / 250
     used = (t_s >= 0.02) & (t_s <= 0.1 + 1e-9)
     sensor = events.SensorModel(theta_sigma=0.02)
@@ -143,9 +135,8 @@ def test_an_interrupted_run_goes_on_with_the_same_events(tmp_path, monkeypatch, 
     monkeypatch.setattr(study, "PIXELS_PER_CHUNK", 4 * 12 * 16)
     monkeypatch.setattr(study, "SECONDS_BETWEEN_SAVES", 0.0 if how == "killed" else 1e9)
     folder = write_folder(tmp_path / "in", waves())
-    options = "--fps 300 --preset noisy --events e.npz --seed 7"
-    common = ["--input", folder, *options.split()]
-    assert call(tmp_path / "whole", *common) == 0
+    options = "--fps 300 --preset noisy --events e.npz --seed 7 --out"
+    assert ran(study, options, tmp_path / "whole", "--input", folder) == 0
     real = events.simulate
     calls = []
 
@@ -163,34 +154,34 @@ def test_an_interrupted_run_goes_on_with_the_same_events(tmp_path, monkeypatch, 
     with monkeypatch.context() as patched:
         if how == "killed at the end":
             patched.setattr(study, "write_outputs", stop)
-        assert call(tmp_path / "cut", *common) == 130
+        assert ran(study, options, tmp_path / "cut", "--input", folder) == 130
     assert "--resume" in capsys.readouterr().err
     # what a killed run wrote after its state was stored does not count
     with (tmp_path / "cut" / study.LOG).open("ab") as file:
         file.write(b"rubbish")
-    assert main(study.study, study.Config, ["--resume", str(tmp_path / "cut")]) == 0
+    assert ran(study, "--resume", tmp_path / "cut") == 0
     # of eight chunks the killed run made one again
     assert len(calls) == (9 if how == "killed" else 8)
     assert (tmp_path / "whole" / "e.npz").read_bytes() == (tmp_path / "cut" / "e.npz").read_bytes()
-    assert main(study.study, study.Config, ["--resume", str(tmp_path / "cut")]) == 0
+    assert ran(study, "--resume", tmp_path / "cut") == 0
     assert "complete" in capsys.readouterr().out
 
 
 def test_everything_is_drawn_and_shown(tmp_path):
-    looks = ["--preview-slowdown", 100, "--sensor-size", 20, 10, "--linear"]
-    folder = write_folder(tmp_path / "in", waves(12))
-    assert call(tmp_path / "run", "--input", folder, "--fps", 1000, *looks) == 0
-    stream = events.read(tmp_path / "run" / "events.h5")
+    looks = "--fps 1000 --preview-slowdown 100 --sensor-size 20 10 --linear --out"
+    out = tmp_path / "run"
+    assert ran(study, looks, out, "--input", write_folder(tmp_path / "in", waves(12))) == 0
+    stream = events.read(out / "events.h5")
     assert (stream.width_px, stream.height_px) == (20, 10)
-    page = (tmp_path / "run" / "report.html").read_text()
-    assert page.count("data:image/png") == 3
-    assert page.count("data:video/mp4") == 2
-    assert "sRGB gamma is undone" in page
-    assert "stretched to 20 x 10" in page
-    check_page("video_to_events", tmp_path / "run")
+    shown = page(out)
+    assert shown.count("data:image/png") == 3
+    assert shown.count("data:video/mp4") == 2
+    assert "sRGB gamma is undone" in shown
+    assert "stretched to 20 x 10" in shown
+    check_page("video_to_events", out)
     # 11 ms at 100 times slower and 30 pictures a second
-    assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "run" / "events.mp4"))[0] == 33
-    metrics = metrics_of(tmp_path / "run")
+    assert imageio_ffmpeg.count_frames_and_secs(str(out / "events.mp4"))[0] == 33
+    metrics = numbers(out)
     assert metrics["events_on"] + metrics["events_off"] == len(stream)
     assert metrics["mpixel_per_s"] == pytest.approx(12 * 200 / metrics["seconds"] / 1e6)
 
@@ -248,13 +239,8 @@ OFF = {"cutoff_hz": 0, "leak_rate_hz": 0, "shot_rate_hz": 0, "refractory_s": 0}
 V2E = {
     "clean": {"theta_sigma": 0.02, **OFF},
     "noisy": OFF | {"theta_sigma": 0.05, "cutoff_hz": 30, "leak_rate_hz": 0.1, "shot_rate_hz": 5},
-    "default": {
-        "theta_sigma": 0.03,
-        "cutoff_hz": 300,
-        "leak_rate_hz": 0.01,
-        "shot_rate_hz": 0.001,
-        "refractory_s": 5e-4,
-    },
+    "default": {"theta_sigma": 0.03, "cutoff_hz": 300, "leak_rate_hz": 0.01}
+    | {"shot_rate_hz": 0.001, "refractory_s": 5e-4},
 }
 
 
@@ -263,10 +249,8 @@ def test_presets_are_those_of_v2e_and_every_parameter_is_an_option():
         sensor = chosen_sensor(study.Config(preset=name))
         assert {field: getattr(sensor, field) for field in values} == values
         assert (sensor.theta_on, sensor.theta_off) == (0.2, 0.2)
-    given: dict[str, Any] = dataclasses.asdict(events.SensorModel()) | {
-        "theta_off": 0.35,
-        "timing": "v2e",
-    }
+    given: dict[str, Any] = dataclasses.asdict(events.SensorModel())
+    given |= {"theta_off": 0.35, "timing": "v2e"}
     assert chosen_sensor(study.Config(preset="noisy", **given)) == events.SensorModel(**given)
     with pytest.raises(DomainError, match="ideal, clean, noisy, default"):
         chosen_sensor(study.Config(preset="best"))
@@ -279,15 +263,15 @@ def test_the_log_finds_events_by_time_and_forgets_what_does_not_count(tmp_path):
     log = EventLog(tmp_path / "log", 0, 7, 9)
     for part in (slice(0, 200), slice(200, 500)):
         log.append(
-            EventStream(stream.t_us[part], stream.x[part], stream.y[part], stream.p[part], 7, 9)
+            EventStream(*(getattr(stream, name)[part] for name in FIELDS), height_px=7, width_px=9)
         )
     times = [1_700_000_000_000_000 + k for k in (-1, 0, 57, 299, 400)]
-    assert (
-        log.positions(times) == np.searchsorted(stream.t_us.numpy(), times, side="right").tolist()
-    )
+    found = np.searchsorted(stream.t_us.numpy(), times, side="right")
+    assert log.positions(times) == found.tolist()
+    picked = [3, 77, 499]
     for read, part in (
         (log.read(123, 321), slice(123, 321)),
-        (log.pick(torch.tensor([3, 77, 499])), [3, 77, 499]),
+        (log.pick(torch.tensor(picked)), picked),
     ):
         assert all(torch.equal(getattr(read, name), getattr(stream, name)[part]) for name in FIELDS)
     EventLog(tmp_path / "log", 450, 7, 9)
@@ -308,12 +292,16 @@ def test_an_upsampled_grating_fires_when_its_closed_form_crosses_in_any_chunks(
     tmp_path, monkeypatch, plain
 ):
     np.save(tmp_path / "in.npy", grating(9))
-    options = ("--input", tmp_path / "in.npy", "--fps", 100, *IDEAL)
-    assert call(tmp_path / "up", *options, "--upsample", 0.5) == 0
-    assert call(tmp_path / "kept", *options) == 0
+
+    def run(name, options=""):
+        given = f"--fps 100 {IDEAL} {options} --out"
+        return ran(study, given, tmp_path / name, "--input", tmp_path / "in.npy")
+
+    assert run("up", "--upsample 0.5") == 0
+    assert run("kept") == 0
     found, kept = (events.read(tmp_path / name / "e.npz") for name in ("up", "kept"))
     monkeypatch.setattr(study, "PIXELS_PER_CHUNK", 2 * 24 * 56)
-    assert call(tmp_path / "chunks", *options, "--upsample", 0.5) == 0
+    assert run("chunks", "--upsample 0.5") == 0
     assert (tmp_path / "chunks" / "e.npz").read_bytes() == (tmp_path / "up" / "e.npz").read_bytes()
 
     # the truth: 2000 steps per second of the same grating; pixels whose light of the last frame was
@@ -330,46 +318,26 @@ def test_an_upsampled_grating_fires_when_its_closed_form_crosses_in_any_chunks(
     assert abs(float(totals[1] / totals[0]) - 1) < 0.05
     # straight lines over 3 of 14 px cut 1 - cos(3 pi / 14) = 22 % off half of the peaks
     assert float(totals[2] / totals[0]) < 0.95
-    metrics = metrics_of(tmp_path / "up")
+    metrics = numbers(tmp_path / "up")
     assert metrics["frames"] == 9
     assert metrics["simulated_frames"] >= 1 + 8 * 6  # 3 px in steps of half a pixel
 
 
-FPS = ("--input", "in", "--fps", 30)
-TIMES = ("--input", "in", "--timestamps")
-WRONG = [
-    ((), "no input"),
-    (("--input", "none"), "no file or folder"),
-    (("--input", "in"), "--fps"),
-    ((*TIMES, "back.txt"), "increase strictly"),
-    ((*TIMES, "few.txt"), "2 times, the input 4"),
-    ((*TIMES, "word.txt"), "line 3: 'noon'"),
-    ((*TIMES, "close.txt"), "0.1 us apart"),
-    ((*TIMES, "few.txt", "--fps", 5), "both given"),
-    (("--input", "nan.npy", "--fps", 30), "frame 2 holds nan at row 3, column 4"),
-    ((*FPS, "--stop-s", -1), "0 frame"),
-    ((*FPS, "--events", "a.doc"), ".doc"),
-    ((*FPS, "--theta-on", -1), "theta_on"),
-    ((*FPS, "--events", "../e.npz"), "plain name"),
-    ((*FPS, "--sensor-size", 0, 5), "--sensor-size"),
-    ((*FPS, "--upsample", 0), "--upsample is 0"),
-]
-
-
-def test_what_cannot_be_is_one_sentence_and_exit_code_2(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write_folder(tmp_path / "in", waves(4))
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    """Pictures, a stack with NaN, and tables of times that do not fit."""
+    folder = tmp_path_factory.mktemp("inputs")
+    write_folder(folder / "in", waves(4))
     stack = waves(4).astype(np.float32)
     stack[2, 3, 4] = np.nan
-    np.save("nan.npy", stack)
-    lines = {
-        "back": "0\n0.1\n0.05\n0.2",
-        "few": "0\n0.1",
-        "word": "0\n0.1\nnoon\n0.2",
-        "close": "0\n0.1\n0.1000001\n0.2",
-    }
-    for name, text in lines.items():
-        (tmp_path / f"{name}.txt").write_text(text)
-    for index, (arguments, words) in enumerate(WRONG):
-        assert call(tmp_path / f"run{index}", *arguments) == 2, words
-        assert words in capsys.readouterr().err
+    np.save(folder / "nan.npy", stack)
+    lines = {"back": "0\n0.1\n0.05\n0.2", "few": "0\n0.1", "word": "0\n0.1\nnoon\n0.2"}
+    for name, text in {**lines, "close": "0\n0.1\n0.1000001\n0.2"}.items():
+        (folder / f"{name}.txt").write_text(text)
+    return folder
+
+
+@refusals.table(__file__, "video_to_events")
+def test_what_cannot_be_is_one_sentence_and_exit_code_2(row, refuses, inputs, monkeypatch):
+    monkeypatch.chdir(inputs)
+    refuses(study, row)

@@ -22,7 +22,6 @@ from scenes.robots.costs import Costs
 from scenes.robots.pairs import PAIRS
 from studies.codesign.design import Space
 from studies.codesign.gallery import save
-from studies.frame.run import main
 from studies.placement.figures import tiled
 from studies.viewer import __main__ as viewer
 from studies.viewer import window as window_of
@@ -30,6 +29,7 @@ from studies.viewer.certificate import certificate
 from studies.viewer.opened import opened
 from studies.viewer.state import SLIDERS, Drive, Setting
 from studies.viewer.window import Window
+from tests.studies.runs import page, ran
 
 SIZE = 24
 
@@ -163,10 +163,8 @@ def test_the_first_line_says_what_was_seen_and_how_many_updates_a_second(tmp_pat
     )
     seen = []
     monkeypatch.setattr(Window, "serve", lambda window: seen.append(window.setting.words()))
-    given = ["--size", str(SIZE), "--frames", "3", "--port", "0", "--out", str(tmp_path / "run")]
-    assert main(viewer.study, viewer.Config, given) == 0
-    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
-    assert f"The camera sees {seen[0]}; no slider was moved." in page
+    assert ran(viewer, f"--size {SIZE} --frames 3 --port 0 --out", tmp_path / "run") == 0
+    assert f"The camera sees {seen[0]}; no slider was moved." in page(tmp_path / "run")
 
 
 def test_the_button_shows_the_verdict_of_the_certificate(window, monkeypatch):
@@ -213,8 +211,7 @@ def test_a_port_in_use_and_a_missing_viser_are_one_sentence(tmp_path, capsys, mo
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        given = ["--size", str(SIZE), "--port", str(port), "--out", str(tmp_path / "run")]
-        assert main(viewer.study, viewer.Config, given) == 2
+        assert ran(viewer, f"--size {SIZE} --port {port} --out", tmp_path / "run") == 2
     said = capsys.readouterr().err.strip()
     assert said.startswith(f"error: port {port} is in use; give another one")
     monkeypatch.setitem(sys.modules, "viser", None)
