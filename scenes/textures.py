@@ -63,6 +63,15 @@ def photo(source: str | Path, size_px: int = 512) -> np.ndarray:
     return _radiance(reduced(linear(_stored(source)), size_px), str(source))
 
 
+def file_size(source: str | Path) -> tuple[int, int] | None:
+    """Rows and columns of an image file before it is made smaller; None of what is no file."""
+    if not Path(source).is_file():
+        return None
+    if Path(source).suffix.lower() in HDR:
+        return _unscaled(source, "texture").shape[:2]
+    return _stored(source).shape[:2]
+
+
 def _stored(path):
     """Values of an image file as they are stored: [H, W] or [H, W, 3]."""
     if not Path(path).is_file():

@@ -75,7 +75,8 @@ def wall(
     device: str = "cpu",
 ) -> MitsubaScene:
     """One endless-looking wall, the plane y = 0 seen from y < 0, tiled (wrap "mirror" or "repeat")
-    with a picture (an array, a path such as "photo.jpg", or a name) at ``texel_m`` per texel."""
+    with a picture (an array, a path such as "photo.jpg", or a name) at ``texel_m`` per texel, of a
+    file: per pixel of the file. The first tile begins at the wall's corner, x = -half_width_m."""
     return _plane("wall", texture, texel_m, half_width_m, (0, -1, 0), (0, 0, 1), wrap, device)
 
 
@@ -93,14 +94,12 @@ def ground(
 
 def _plane(name, texture, texel_m, half_width_m, towards, up, wrap, device):
     check_sizes(name, texel_m=texel_m, half_width_m=half_width_m)
-    named = isinstance(texture, str | Path)
+    named_as, named = texture, isinstance(texture, str | Path)
     texture = (
         textures.picture(texture) if named else textures.check_texture(texture, "of the scene")
     )
-    repeat = (
-        2 * half_width_m / (texel_m * texture.shape[1]),
-        2 * half_width_m / (texel_m * texture.shape[0]),
-    )
+    height, width = (named and textures.file_size(named_as)) or texture.shape
+    repeat = (2 * half_width_m / (texel_m * width), 2 * half_width_m / (texel_m * height))
     shape = rectangle(
         backend.mitsuba(device), (0, 0, 0), towards, 2 * half_width_m, 2 * half_width_m, up
     )

@@ -259,7 +259,7 @@ class Glass:
             offers = ", ".join(list(dict.fromkeys(known[key].name for key in near))[:3])
             raise DomainError(
                 f"glass {_cut(name)} is not in the catalogue; the nearest names are {offers}; else give "
-                "Glass.from_indices or Glass.from_abbe."
+                "Glass.from_indices or Glass.from_abbe, in a .zmx a line such as GLAS ___BLANK 1 0 nd Vd."
             )
         return glass
 

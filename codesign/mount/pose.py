@@ -13,7 +13,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from codesign.checks import check_finite, check_positive
+from codesign.checks import check_finite, check_number, check_positive
 from codesign.errors import DomainError, ShapeError
 from codesign.mount.observability import chief_lines, flow_of_points
 from codesign.pose import check_poses, se3_exp
@@ -28,6 +28,7 @@ MOST_PIXELS = 255  # of a film, spread over it, at which the motion of the image
 NAMES = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "roll_rad")
 # yaw and roll come round again after a turn
 TURNS = [3, 5]
+TURN = 2 * math.pi
 PITCH = 4
 # m and rad by which a mount may be outside
 ROUNDING = 1e-9
@@ -86,7 +87,10 @@ class Mount(nn.Module):
         self.register_buffer("nominal_m", nominal)
         self.register_buffer("half_range_m", half)
         self.register_buffer("unit", torch.ones(6, dtype=torch.float64))
-        self.register_buffer("start_attitude", attitude(yaw_rad, pitch_rad, roll_rad))
+        angles = {"yaw_rad": yaw_rad, "pitch_rad": pitch_rad, "roll_rad": roll_rad}
+        for name, angle in angles.items():
+            check_number(angle, f"mount: {name}", -TURN, TURN, remedy="give radians")
+        self.register_buffer("start_attitude", attitude(**angles))
         start = torch.zeros(6, dtype=torch.float64)
         start[:3] = self._unbounded(
             nominal

@@ -10,6 +10,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 import torch
 from matplotlib.figure import Figure
@@ -44,7 +45,8 @@ class Shown(Figure):
     def image(self, kind: str, dpi: int) -> bytes:
         """The figure as a file of that kind, such as "png"."""
         buffer = BytesIO()
-        self.savefig(buffer, format=kind, dpi=dpi)
+        with matplotlib.rc_context({"pdf.fonttype": 42, "ps.fonttype": 42}):  # as journals ask
+            self.savefig(buffer, format=kind, dpi=dpi)
         return buffer.getvalue()
 
     def _repr_png_(self):
@@ -73,7 +75,7 @@ def show(
       path: file to write, of a kind that matplotlib knows (.png, .svg, .pdf).
       camera: that a mount carries. body: meshes with vertices_m [V, 3] and faces [F, 3], in body
         axes.
-      width_in: width of the figure, inches, 1 to 100, such as that of a column of a paper: the
+      width_in: width of the figure, inches, 1 to 30, such as that of a column of a paper: the
         height follows, letters keep their size in points. None: 3.4 for each picture.
     Raises: DomainError for something else, or another width.
 
@@ -106,7 +108,7 @@ def show(
             raise ShapeError(
                 f"frames are {x.dtype} {list(x.shape)}; real [..., H, W] with a pixel is needed."
             )
-        films = x.detach().reshape(-1, *x.shape[-2:])
+        films = x.detach().float().reshape(-1, *x.shape[-2:])
         picked = np.unique(np.linspace(0, len(films) - 1, MOST).round().astype(int)).tolist()
         figure = _row([(f"frame {k}", (films[k], films[picked]), _frame) for k in picked])
     elif isinstance(x, Pass):
@@ -116,7 +118,7 @@ def show(
     else:
         raise DomainError(f"nothing is known of how to draw {type(x).__name__}; give {HANDLED}.")
     if width_in is not None:
-        width_in = check_number(width_in, "width_in", 1.0, 100.0, remedy="give it in inches")
+        width_in = check_number(width_in, "width_in", 1.0, 30.0, remedy="give it in inches")
         figure.set_size_inches(width_in, figure.get_figheight() * width_in / figure.get_figwidth())
     if path is not None:
         write_atomic(Path(path), figure.image(Path(path).suffix[1:] or "png", 150))
@@ -131,7 +133,7 @@ def _has_section(x):
 
 def _sample(field, k):
     flow = field.flow_px[k].detach()
-    return torch.where(field.valid[k], flow, 0.0).double().numpy()
+    return torch.where(field.valid[k], flow, math.nan).double().numpy()
 
 
 def _row(parts):
@@ -168,7 +170,9 @@ def _longest(flow_px):
 
 def _flow(axis, flow_and_full):
     flow_px, full = flow_and_full
-    axis.imshow(flow_colours(flow_px, full))
+    known = np.isfinite(flow_px).all(0)
+    colours = flow_colours(np.where(known, flow_px, 0.0), full)
+    axis.imshow(np.where(known[..., None], colours, 0))  # black where it is not known
     across = np.linspace(-1, 1, 61)
     wheel = np.stack(np.meshgrid(across, across))
     inside = np.hypot(*wheel) <= 1

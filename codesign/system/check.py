@@ -185,9 +185,10 @@ def _check_fresh(system: System) -> None:
 
 def _tensors(system: System, variables: Any) -> list[Tensor]:
     if variables is None:
-        return [p for p in system.parameters() if p.requires_grad]
+        return [p for p in system.parameters() if p.requires_grad and p.numel()]
     if isinstance(variables, torch.optim.Optimizer):
-        return [p for group in variables.param_groups for p in group["params"]]
+        # a lens without aspheres has a parameter without numbers for them
+        return [p for group in variables.param_groups for p in group["params"] if p.numel()]
     found = [variables] if torch.is_tensor(variables) else list(variables)
     other = next((each for each in found if not torch.is_tensor(each)), None)
     if other is not None or not found:

@@ -46,7 +46,7 @@ class Result:
 
     def __repr__(self):
         told = ", ".join(
-            f"{name}={float(value):.4g}" if value.numel() == 1 else f"{name}{list(value.shape)}"
+            f"{name}={value.item():.4g}" if value.numel() == 1 else f"{name}{list(value.shape)}"
             for name, value in self.objectives.items()
         )
         return f"Result({told})"

@@ -174,12 +174,17 @@ def _bodies(own):
     if path.suffix.lower() == ".urdf":
         with _entry("robot"):
             robot = robots.from_urdf(path, packages=own.packages)
-        parts, frame = list(robot.parts), robot.base
+        parts, frame, links = list(robot.parts), robot.base, set(robot.frames)
     else:
         with _entry("robot"):
-            parts, frame = mesh_files.read(path, own.unit_m, materials=False), "base_link"
+            parts, frame, links = (
+                mesh_files.read(path, own.unit_m, materials=False),
+                "base_link",
+                set(),
+            )
     names = sorted({part.name for part in parts})
-    unknown = [name for name in own.without if name not in names]
+    # a link may be a frame without a shape
+    unknown = [name for name in own.without if name not in {*names, *links}]
     if unknown:
         raise DomainError(
             f"without: no part belongs to '{unknown[0]}'; there are {', '.join(names) or 'none'}."

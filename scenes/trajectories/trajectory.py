@@ -147,6 +147,7 @@ def body_twist(start: Tensor, twist_per_s: Tensor, t_s: Tensor) -> Tensor:
     return start @ se3_exp(t_s[:, None] * twist_per_s[..., None, :])
 
 
-def translation(start: Tensor, velocity_m_s: Sequence[float], t_s: Tensor) -> Tensor:
-    """Straight motion along camera axes: velocity_m_s three numbers."""
-    return body_twist(start, torch.tensor([*velocity_m_s, 0.0, 0.0, 0.0], dtype=torch.float64), t_s)
+def translation(start: Tensor, velocity_m_s: Sequence[float] | Tensor, t_s: Tensor) -> Tensor:
+    """Straight motion along camera axes: velocity_m_s three numbers. Gradient: start, velocity."""
+    velocity = [torch.as_tensor(each, dtype=torch.float64) for each in velocity_m_s]
+    return body_twist(start, torch.stack([*velocity, *torch.zeros(3, dtype=torch.float64)]), t_s)

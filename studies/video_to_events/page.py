@@ -165,10 +165,12 @@ def warnings(view, state, sensor, slow):
         "one frame to the next. What happens inside such a step is not in the video: its events lie on a "
         "straight line of log intensity between two frames."
     )
-    remedy = (
-        f"Record at about {math.ceil(state.remedy)} times the frame rate, or put frames between with "
-        "--upsample 0.5."
+    finer = (
+        "smaller steps of --upsample"
+        if view.config.upsample
+        else "frames between with --upsample 0.5"
     )
+    remedy = f"Record at about {math.ceil(state.remedy)} times the frame rate, or take {finer}."
     yield f"**Too slow for its motion.** {share} {remedy}" if slow else share
     if not state.events:
         yield (

@@ -107,6 +107,7 @@ SAME = {
     ),
     "v2e.h5": in_hdf5({"events": np.stack([T_US, *EVENTS[1:3], ON], 1).astype(np.uint32)}),
     "dsec.hdf5": in_hdf5(DSEC),
+    "plain.h5": in_hdf5(DSEC | {"events/t": T_US, "t_offset": None}),
 }
 
 

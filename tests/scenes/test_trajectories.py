@@ -84,6 +84,11 @@ def test_times_and_body_twists_are_even_steps_in_the_cameras_own_axes():
     rates[:, :3, 3] = twists[:, :3]
     expected = START @ torch.linalg.matrix_exp(t[:, None, None] * rates[:, None])
     assert_close(trajectories.body_twist(START, twists, t), expected, rtol=0, atol=1e-14)
+    velocity = torch.tensor([0.5, -0.2, 0.1], dtype=torch.float64, requires_grad=True)
+    path = trajectories.translation(START, velocity, t)
+    way = path[-1, :3, 3] - START[:3, 3]
+    (slope,) = torch.autograd.grad(way.square().sum() / 2, velocity)
+    assert_close(slope, velocity.detach() * t[-1] ** 2, rtol=1e-12, atol=0)
     path = trajectories.translation(START, (0.5, -0.2, 0.1), t)
     assert_close(path[:, :3, :3], START[:3, :3].expand(9, 3, 3), rtol=0, atol=1e-15)
     expected = 0.5 * START[:3, 0] - 0.2 * START[:3, 1] + 0.1 * START[:3, 2]

@@ -4,6 +4,7 @@ from files."""
 import itertools
 
 import numpy as np
+import PIL.Image
 import pytest
 import torch
 
@@ -172,6 +173,16 @@ def test_a_robot_stands_on_the_ground(shared):
 
 
 # ---- skies
+
+
+def test_a_texel_of_a_large_file_is_a_pixel_of_the_file(tmp_path):
+    """Stripes of 256 px in a file that is made four times smaller."""
+    stripes = np.tile(np.repeat(np.array([40, 200], np.uint8), 256), 4)[None].repeat(64, 0)
+    PIL.Image.fromarray(stripes).save(tmp_path / "stripes.png")
+    wall = worlds.wall(tmp_path / "stripes.png", texel_m=0.001, wrap="repeat")
+    camera = Camera(lens.Pinhole(8.0), 256, 4, 0.03)  # 1.92 m of the wall
+    row = render.frames(camera, wall, look_at((0.03, -2, 0), (0.03, 0, 0))[None])[0, 2]
+    assert int((row > 60).int().diff().abs().sum()) == 7  # at every 0.256 m
 
 
 def test_a_sky_from_a_file_has_its_mean_and_its_east_in_the_east(tmp_path):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from codesign.errors import DomainError
+from codesign.errors import DomainError, FileFormatError
 from studies.frame.run import main, open_run
 from tests import refusals
 from tests.processes import ROOT
@@ -115,6 +115,9 @@ def test_resume_takes_the_stored_configuration_and_metrics(tmp_path):
     assert again.config == made.config
     again.record(late=2)
     assert numbers(tmp_path / "out") == {"early": 1, "late": 2}
+    (tmp_path / "out" / "metrics.json").write_text('{"loss": "0.5"}')
+    with pytest.raises(FileFormatError, match="is damaged; remove it to go on"):
+        open_run("smallest_study", Config(resume=tmp_path / "out"))
 
 
 @pytest.mark.parametrize(

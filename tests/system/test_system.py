@@ -266,6 +266,8 @@ def test_check_finds_a_frozen_variable_and_one_that_no_objective_sees():
     assert check(
         system, BATCH, torch.optim.SGD([lens.efl_mm], lr=0.1)
     ).loss.item() == pytest.approx(9.0)
+    # as a lens without aspheres has them
+    check(system, BATCH, torch.optim.SGD([lens.efl_mm, nn.Parameter(torch.zeros(3, 0))], lr=0.1))
     stray = nn.Parameter(torch.zeros(2))
     with pytest.raises(
         GradientError,

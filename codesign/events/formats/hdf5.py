@@ -111,7 +111,7 @@ class Hdf5Events:
             raise FileFormatError(
                 f"{path}: t, x, y, p under events are no whole numbers, as in DSEC's layout."
             )
-        self.offset_us = scalar(path, "t_offset")
+        self.offset_us = scalar(path, "t_offset") if "t_offset" in names else 0
         if "ms_to_idx" in names:
             index = Rows(path, "ms_to_idx", [])
             self.index = index.read(0, len(index)).astype(np.int64)
