@@ -171,9 +171,11 @@ def higher_thresholds(drawn, whole, seed):
 
 
 def without_blur(drawn, whole, seed):
-    """Behind a pinhole of the same focal length that passes as much light."""
+    """Behind a pinhole of the same focal length that passes as much light, evenly."""
     other = replace(whole)
-    vars(other)["camera"] = whole.camera.with_lens(lens.Pinhole(whole.numbers["efl_mm"]))
+    pinhole = whole.camera.with_lens(lens.Pinhole(whole.numbers["efl_mm"]))
+    # the falloff of a pinhole is the fourth power of a cosine, which the lens has not
+    vars(other)["camera"] = pinhole.in_one_colour()
     return looked(drawn, other).hard()
 
 

@@ -8,6 +8,7 @@ every order of the blocks, alternating, nested, by the book, and by searches wit
 Single events of the hard sensor in worlds that no arm saw judge them.
 """
 
+import json
 import math
 import sys
 from collections.abc import Sequence
@@ -133,7 +134,8 @@ def study(run: Run[Config]) -> None:
         "judge": [size.judged_worlds, size.judged_drives],
     }
     space = Space.of(**{name: setting[name] for name in SPACE})
-    setting["page"] = space.pair.page
+    # of an own robot, and of the files that its page names
+    setting["page"] = json.dumps(fingerprints(space.pair)) if space.pair.page else ""
     same_robot(run, space.pair)
     if size.raw is not None:
         taken_up(size.raw, setting)  # before hours of the rest
@@ -220,6 +222,8 @@ def held(told: Sequence[str]) -> dict[str, float]:
             found[name] = float(value)
         except ValueError as error:
             raise DomainError(f"--hold {each}: give a number by name, such as fno=4.") from error
+    if len(found) < len(told):
+        raise DomainError(f"--hold {' '.join(told)}: give each number once.")
     return found
 
 
@@ -235,9 +239,9 @@ def checked(size: Config) -> None:
         raise DomainError(f"--seeds is {size.seeds}; 0 or more are needed.")
     check_least(size, 2, "designs")
     check_sizes(size)
-    if size.grid < 2 or size.slopes == 1 or min(size.slopes, size.couplings) < 0:
+    if size.grid < 2 or 1 in (size.slopes, size.couplings) or min(size.slopes, size.couplings) < 0:
         raise DomainError(
-            f"--grid needs 2 or more, --slopes 0, or 2 and more, --couplings 0 or more; they are "
+            f"--grid needs 2 or more, --slopes and --couplings 0, or 2 and more; they are "
             f"{size.grid}, {size.slopes} and {size.couplings}."
         )
     if size.steps < LEAST_STEPS or size.steps % LEAST_STEPS:

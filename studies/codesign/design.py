@@ -87,10 +87,12 @@ class Space:
             ]
             roomy = [name for name in own if name in self.bounds or self._has_room(name)]
             object.__setattr__(self, "free", tuple(roomy))
+        if len(set(self.free)) < len(self.free):
+            raise DomainError(f"free are {', '.join(self.free)}; give each number once.")
         for name in (*self.free, *self.held, *self.bounds):
             if name not in known:
                 raise DomainError(f"a design has no number '{name}'; there are {', '.join(known)}.")
-        if "bending" in self.free and not self.pair.family:
+        if "bending" in (*self.free, *self.held) and not self.pair.family:
             raise DomainError(
                 "a thin lens has no bending; give a family of traced lenses, or leave bending out."
             )

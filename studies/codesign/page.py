@@ -50,7 +50,8 @@ def answer(
     if size.seeds < ENOUGH:
         return f"{counted(size.seeds, 'start')} shows that everything works, and decides nothing ({where})."
     name = best_order(found)
-    said = [f"In {where}, against the best order of single blocks ({name}):"]
+    rival = f"the best order of single blocks ({name})" if ">" in name else f"'{name}'"
+    said = [f"In {where}, against {rival}:"]
     ways = {"joint": "One descent along all numbers"}
     if "nested" in found and name != "nested":
         ways["nested"] = "Lens and mount together, with sensor and estimator solved at every step,"
@@ -109,7 +110,7 @@ def race(
         best = best_order(found)
         named = {plain(arm, "over", other): ratio for (arm, other), ratio in every.items()}
         for arm in ("joint", "nested"):
-            if (arm, best) in every:
+            if (arm, best) in every and ">" in best:
                 named[f"{arm}_over_best_order"] = every[arm, best]
         for name, ratio in named.items():
             ends = {"median": ratio.value, "low95": ratio.low, "high95": ratio.high}

@@ -17,7 +17,7 @@ from codesign.errors import DomainError, FileFormatError
 from codesign.mount import VelocityHead
 from codesign.mount.requirements import first_missed
 from scenes.robots import pair as robot_pair
-from studies.codesign.arms import ARMS, Task, read_out
+from studies.codesign.arms import ARMS, Task, Way, read_out
 from studies.codesign.calibration import Calibration
 from studies.codesign.design import BLOCKS, Space, Whole
 from studies.codesign.objective import Objective
@@ -71,6 +71,21 @@ def last_kept(drawn: Drawn, shares: Sequence[Tensor]) -> Tensor:
     return next(share for share in reversed(shares) if kept(drawn.space, share, drawn.requirements))
 
 
+def settled_and_kept(task: Task, answer: Tensor, way: Way) -> tuple[Tensor, bool]:
+    """An answer [V], or the last lens and mount on its way that keep what is required (the start
+    does), with sensor and estimator settled on the drives recorded last; whether it is the
+    answer's."""
+    drawn = task.objective.drawn
+    settled = read_out(task, answer, way)
+    if kept(task.space, settled, drawn.requirements):
+        return settled, True
+    if not way.shares:
+        raise DomainError(
+            "the pair's own design, as it is held, misses a requirement, so there is no default; leave its arm out."
+        )
+    return read_out(task, last_kept(drawn, [task.start, *way.shares]), way), False
+
+
 def run_arm(
     drawn: Drawn,
     arm: str,
@@ -79,17 +94,15 @@ def run_arm(
     settling: int,
     near: Sequence[float] | None = None,
 ) -> dict[str, Any]:
-    """One arm from one start: its answer, sensor and estimator settled once more on the drives
-    recorded last; or the last design on its way that keeps what is required."""
+    """One arm from one start (``settled_and_kept``)."""
     begun, rendered = time.process_time(), drawn.rendered
     space = drawn.space
     task = Task(Objective(drawn), start(space, seed, near), steps, 10_000 * seed, seed, settling)
     answer, way = ARMS[arm](task)
-    answer = read_out(task, answer, way)
-    chosen = last_kept(drawn, [task.start, *way.shares, answer])
+    chosen, keeps = settled_and_kept(task, answer, way)
     return {
         "share": chosen.tolist(),
-        "kept": bool(chosen is answer),
+        "kept": keeps,
         "expected": way.errors[-1] if way.errors else None,
         "trail": [round(error, 5) for error in way.errors],
         "drives": drawn.rendered - rendered,
@@ -152,14 +165,26 @@ def answers(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     rows = [row for line in path.read_bytes().splitlines() for row in _parsed(path, line)]
     if not rows or not all("errors" in row for row in rows):
         raise FileFormatError(f"'{path}' has no judged answers; give answers.jsonl of a run.")
-    return rows[0]["setting"], rows
+    setting = rows[0]["setting"]
+    if not all(_alike(row["setting"][name], setting[name]) for row in rows for name in SPACE):
+        raise FileFormatError(f"'{path}' has answers of several settings; give those of one run.")
+    if len({(row["seed"], row["arm"]) for row in rows}) < len(rows):
+        raise FileFormatError(f"'{path}' has an answer twice; give answers.jsonl of a run.")
+    return setting, rows
 
 
 def _parsed(path, line):
     """Rows of a line, with the seed and the arm that they are of."""
     try:
         axes, rows = json.loads(line)
-        return [{**axes, **row, "setting": dict(row["setting"])} for row in rows]
+        found = [{**axes, **row, "setting": dict(row["setting"])} for row in rows]
+        for row in found:
+            space = Space.of(**{name: row["setting"][name] for name in SPACE})
+            numbers = [*row["share"], *row.get("errors", ()), *row.get("head_errors", ())]
+            whole = len(row["share"]) == len(space.free) and {"seed", "arm"} <= row.keys()
+            if not whole or not all(0 <= number <= 1 for number in numbers):
+                raise ValueError
+        return found
     except (ValueError, TypeError, KeyError) as error:
         raise FileFormatError(
             f"'{path}' is no table of answers, or damaged; give answers.jsonl of a run."

@@ -49,7 +49,7 @@ def descended(
     design: bool,
     weights: bool,
 ) -> tuple[Tensor, list[Looked]]:
-    """Shares [V] after all steps, sensor settled, or the last on the way that keep what is required;
+    """Shares [V] after all steps, or the last on the way that keep what is required, sensor settled;
     and what was rendered on the way. The weights of ``drawn.network`` change in place."""
     objective, share = Objective(drawn), begun.clone().requires_grad_(design)
     groups = [{"params": [share], "lr": FIRST}] if design else []
@@ -78,8 +78,8 @@ def descended(
     if not design:
         return begun, seen
     answer = torch.stack(way[-max(1, round(END * len(way))) :]).mean(0)
-    answer = objective.settled(answer, seen[-RECORDED:], setting["settling"])
-    return last_kept(drawn, [begun, *way, answer]), seen
+    answer = last_kept(drawn, [begun, *way, answer])
+    return objective.settled(answer, seen[-RECORDED:], setting["settling"]), seen
 
 
 def trained(

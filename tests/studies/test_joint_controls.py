@@ -6,10 +6,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from codesign import render
+from codesign.pose import look_at
 from codesign.types import EventVolume
 from scenes.robots import pair as robot_pair
 from studies import joint_controls
-from studies.codesign.design import Space
+from studies.codesign.design import Space, Whole
 from studies.codesign.problem import Drawn
 from tests import refusals
 from tests.studies.browser import check_page
@@ -49,6 +51,17 @@ def test_frames_without_contrast_have_no_events(frames):
     assert float(made.counts.sum()) == 0
 
 
+def test_the_pinhole_shows_an_even_wall_evenly(monkeypatch):
+    space = Space.of(**{**SETTING, "family": "retrofocus-4"})
+    seen = []
+    monkeypatch.setattr(joint_controls, "looked", lambda drawn, whole: seen.append(whole) or whole)
+    monkeypatch.setattr(Whole, "hard", lambda whole: whole, raising=False)
+    joint_controls.without_blur(None, space.made(space.start), 0)
+    wall = render.TexturedPlane([[0.0, 0.0]], [0.0], [0.0])
+    films = render.frames(seen[0].camera, wall, look_at((0, -2, 0), (0, 0, 0))[None])
+    assert float(films.max() / films.min()) < 1 + 1e-6
+
+
 def test_a_mount_without_errors_is_judged_as_designed_and_one_with_a_turn_is_not(monkeypatch):
     space = Space.of(**SETTING)
     drawn = Drawn(space, robot_pair.unseen(1), 1, 1)
@@ -68,7 +81,7 @@ def raw(path):
     rows = {(0, "joint"): 0.1, (0, "book"): 0.4, (1, "joint"): 0.2, (1, "book"): 0.8}
     with path.open("w") as file:
         for (seed, arm), error in rows.items():
-            row = {"setting": SETTING, "share": [error], "errors": [error]}
+            row = {"setting": SETTING | {"free": ["z_m"]}, "share": [error], "errors": [error]}
             file.write(json.dumps([{"seed": seed, "arm": arm}, [row]]) + "\n")
     return path
 
