@@ -27,12 +27,12 @@ BUDGETS = {
     "setup": 6_020,  # four more parts of evidence, limits beside what is timed
     "studies": 7_810,  # joint_refiner
     "studies/chain_picture": 1_650,  # each stage alone, for the gallery
-    "studies/codesign": 14_730,  # a refiner in the joint optimiser
+    "studies/codesign": 15_000,  # a refiner in the joint optimiser, answers that give way, tables checked whole
     "studies/flow_quality": 5_580,  # names of recordings, no truth of rotation alone
     "studies/flow_recording": 3_350,
     "studies/frame": 8_790,  # functions of scripts are named
     "studies/gradient_flow": 6_350,  # a first line that answers
-    "studies/lens_motion": 4_150,
+    "studies/lens_motion": 4_250,  # a table read case by case
     "studies/lens_opt": 6_370,  # where windows lie
     "studies/lens_report": 2_350,
     "studies/make_dataset": 4_000,
@@ -56,7 +56,7 @@ BUDGETS = {
     "tests/optimise": 3_650,  # a state is a copy; steps in single precision
     "tests/render": 30_920,  # intermediate images, lenses changed after their map
     "tests/scenes": 20_330,  # texels of large files
-    "tests/studies": 32_930,
+    "tests/studies": 33_400,  # tables that are damaged
     "tests/system": 7_120,
     "tests/train": 5_010,
 }

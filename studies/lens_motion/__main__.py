@@ -15,13 +15,14 @@ import sys
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from scipy.stats import t as student_t
 
 from codesign import flow, lens, render
-from codesign.errors import DomainError
+from codesign.checks import check_positive
+from codesign.errors import DomainError, FileFormatError
 from codesign.events import HardSensor
 from codesign.report.prose import counted
 from codesign.system import System
@@ -29,7 +30,7 @@ from codesign.system.objectives import angular_error_mrad, edge_energy
 from studies.frame.compare import Interval, grouped, log_ratio, log_ratios
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.show import bars, table
-from studies.frame.sweep import column, plain, select, sweep
+from studies.frame.sweep import Row, column, plain, select, sweep
 from studies.lens_motion import page, rivals
 from studies.lens_motion.forms import Form, make_form
 from studies.lens_motion.motions import TALL_PX, WIDE_PX, Motion, drawn_world
@@ -283,16 +284,39 @@ def _finish(run, lenses, motion, rows):
     run.say(said)
 
 
+def _read(path: Path) -> list[Row]:
+    """Rows of a table of finished runs by setting, motion, case and lens.
+
+    Raises: FileFormatError where a number is none, or a lens lacks a case or has one twice.
+    """
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = [
+                {**row, "case": int(row["case"]), "turned": int(row["turned"])}
+                | {"error_mrad": check_positive(float(row["error_mrad"]), "error_mrad")}
+                for row in csv.DictReader(file)
+            ]
+    except (KeyError, TypeError, ValueError, DomainError) as error:
+        raise FileFormatError(
+            f"--raw {path} is no table of this study, or damaged: {error}."
+        ) from error
+    cases: dict[tuple[Any, ...], list[int]] = {}
+    for row in sorted(rows, key=lambda row: row["case"]):
+        cases.setdefault((row["setting"], row["turned"], row["lens"]), []).append(row["case"])
+    for (setting, turned, name), own in cases.items():
+        if own != cases.get((setting, turned, "spots")) or len(set(own)) < len(own):
+            raise FileFormatError(f"--raw {path}: '{setting}' has not every case of '{name}' once.")
+    if not rows:
+        raise FileFormatError(f"--raw {path} has no row.")
+    return sorted(rows, key=lambda row: row["case"])
+
+
 def _redraw(run):
     """The figure of all settings out of the table of finished runs: ratios of the design along the
     motion."""
     if not run.config.raw.is_file():
         raise DomainError(f"--raw {run.config.raw}: there is no such file.")
-    with run.config.raw.open(encoding="utf-8", newline="") as file:
-        rows = [
-            {**row, "turned": int(row["turned"]), "error_mrad": float(row["error_mrad"])}
-            for row in csv.DictReader(file)
-        ]
+    rows = _read(run.config.raw)
     values, lines = {}, []
     for setting in dict.fromkeys(row["setting"] for row in rows):
         own = select(rows, setting=setting)

@@ -183,3 +183,24 @@ def test_a_verdict_is_that_of_textures_where_cases_of_one_are_alike():
     found = lens_motion.ratios(rows, "flow")["spots"]
     assert found.count == 60
     assert found.high - found.low > 0.3 > 4 * 0.3 / 60**0.5
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda rows: rows + rows[1:2], "every case of 'spots' once"),
+        (lambda rows: rows[:-1], "every case of 'flow' once"),
+        (lambda rows: [rows[0], *(row[:-1] + "x" for row in rows[1:])], "damaged"),
+        (lambda rows: rows[:1], "has no row"),
+        (lambda rows: [row.replace("turned", "way") for row in rows], "'turned'"),
+    ],
+)
+def test_a_table_is_read_case_by_case_and_a_damaged_one_refused(change, sentence, tmp_path):
+    rows = [f"a,0,{case},{name},{case + 1}.5" for case in (1, 0) for name in ("spots", "flow")]
+    rows = ["setting,turned,case,lens,error_mrad", *rows]
+    (tmp_path / "whole.csv").write_text("\n".join(rows))
+    found = lens_motion._read(tmp_path / "whole.csv")
+    assert [row["error_mrad"] for row in found] == [1.5, 1.5, 2.5, 2.5]
+    (tmp_path / "raw.csv").write_text("\n".join(change(rows)))
+    with pytest.raises(FileFormatError, match=sentence):
+        lens_motion._read(tmp_path / "raw.csv")
