@@ -64,12 +64,14 @@ def photo(source: str | Path, size_px: int = 512) -> np.ndarray:
 
 
 def file_size(source: str | Path) -> tuple[int, int] | None:
-    """Rows and columns of an image file before it is made smaller; None of what is no file."""
-    if not Path(source).is_file():
+    """Rows and columns of an image file that ``photo`` reads, before it is made smaller; None of
+    what is no file."""
+    if str(source) in PHOTOS or not Path(source).is_file():
         return None
     if Path(source).suffix.lower() in HDR:
         return _unscaled(source, "texture").shape[:2]
-    return _stored(source).shape[:2]
+    with PIL.Image.open(source, formats=FORMATS) as image:  # its header alone
+        return image.height, image.width
 
 
 def _stored(path):

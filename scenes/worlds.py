@@ -94,15 +94,15 @@ def ground(
 
 def _plane(name, texture, texel_m, half_width_m, towards, up, wrap, device):
     check_sizes(name, texel_m=texel_m, half_width_m=half_width_m)
-    named_as, named = texture, isinstance(texture, str | Path)
-    texture = (
-        textures.picture(texture) if named else textures.check_texture(texture, "of the scene")
-    )
-    height, width = (named and textures.file_size(named_as)) or texture.shape
-    repeat = (2 * half_width_m / (texel_m * width), 2 * half_width_m / (texel_m * height))
-    shape = rectangle(
-        backend.mitsuba(device), (0, 0, 0), towards, 2 * half_width_m, 2 * half_width_m, up
-    )
+    size = None
+    if isinstance(texture, str | Path):
+        size, texture = textures.file_size(texture), textures.picture(texture)
+    else:
+        texture = textures.check_texture(texture, "of the scene")
+    height, width = size or texture.shape
+    side_m = 2 * half_width_m
+    repeat = (side_m / (texel_m * width), side_m / (texel_m * height))
+    shape = rectangle(backend.mitsuba(device), (0, 0, 0), towards, side_m, side_m, up)
     return emissive(World({name: (shape, Paint(texture, repeat, wrap))}), device)
 
 

@@ -113,7 +113,12 @@ def kernel_levels(frames, front_end):
 
 def log_levels(frames: Tensor, log_input: bool, minimum: int) -> Tensor:
     """Check frames and bring them to log intensity; ``log_input`` says that they already are."""
+    return front_end_of(frames, log_input, minimum).level(frames)
+
+
+def front_end_of(frames: Tensor, log_input: bool, minimum: int) -> FrontEnd:
+    """Check frames; how they become log levels."""
     front_end = FrontEnd(log_input)
     check_frames(frames, minimum, non_negative=not log_input)
     warn_of_scale(frames, log_input)
-    return front_end.level(frames)
+    return front_end

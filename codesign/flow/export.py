@@ -162,9 +162,8 @@ def _solve_ex(matrix, right, *, left=True, check_errors=False):
 
 
 def _inverse_ex(matrix, *, check_errors=False):
-    return eliminate(matrix, torch.eye(matrix.shape[-1]).to(matrix).expand_as(matrix)), matrix[
-        ..., 0, 0
-    ].to(torch.int32)
+    unit = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+    return eliminate(matrix, unit.expand_as(matrix)), matrix[..., 0, 0].to(torch.int32)
 
 
 # ONNX has neither

@@ -62,6 +62,20 @@ def psf_frames(
     """
     if psf is None:
         psf = psf_map(camera)
+    else:
+        _check_map(psf, camera)
+    if pairs := scenes_and_poses(scene, T_world_cam):
+        return torch.stack([psf_frames(camera, one, poses, psf) for one, poses in pairs])
+    views = views_of(scene, T_world_cam, psf.sharp)
+    light, per_m = light_and_nearness(psf.sharp, views)
+    lit = (psf.sharp.weight.detach() > 0).to(light)
+    numbers, step = _layers(psf, per_m.detach(), lit)
+    found = [_frame(psf, *frame, lit, numbers, step) for frame in zip(light, per_m, strict=True)]
+    return torch.stack(found).reshape(*views.batch, *camera.film.shape)
+
+
+def _check_map(psf, camera):
+    """Raise for a map that is of another camera, or of this one before its lens changed."""
     if psf.camera.film != camera.film:
         raise ShapeError(
             f"psf frames: the map is of the film {psf.camera.film}, the camera has {camera.film}; make the "
@@ -78,14 +92,6 @@ def psf_frames(
             f"psf frames: {' and '.join(name for name in same if not same[name])} of the camera are not "
             "those of the map; make the map of this camera, psf_map(camera)."
         )
-    if pairs := scenes_and_poses(scene, T_world_cam):
-        return torch.stack([psf_frames(camera, one, poses, psf) for one, poses in pairs])
-    views = views_of(scene, T_world_cam, psf.sharp)
-    light, per_m = light_and_nearness(psf.sharp, views)
-    lit = (psf.sharp.weight.detach() > 0).to(light)
-    numbers, step = _layers(psf, per_m.detach(), lit)
-    found = [_frame(psf, *frame, lit, numbers, step) for frame in zip(light, per_m, strict=True)]
-    return torch.stack(found).reshape(*views.batch, *camera.film.shape)
 
 
 def _layers(psf, per_m, lit):

@@ -298,20 +298,19 @@ class Learner:
         for held, now in of.values():
             held.copy_(held + (1 - decay) * (now - held) if held.is_floating_point() else now)
 
-    def _moved(self):
-        groups = self.optimiser.param_groups
-        return [parameter for group in groups for parameter in group["params"]]
-
     def _fill_optimiser(self, tensors, path):
         held: dict[str, dict[str, Tensor]] = {}
-        axes = {name: weight.ndim for name, weight in zip(self._names, self._moved(), strict=True)}
+        moved = _moved(self.optimiser)
+        axes = {name: weight.ndim for name, weight in zip(self._names, moved, strict=True)}
         for name, tensor in tensors.items():
             moment, _, weight = name.partition("/")
             held.setdefault(weight, {})[moment] = tensor
+        # of weights of as many axes: Adafactor keeps others of a matrix than of a vector
+        moments: dict[int | None, set[str]] = {}
         for weight, found in held.items():
-            # of weights of as many axes: Adafactor keeps others of a matrix than of a vector
-            alike = (held[name] for name in held if axes.get(name) == axes.get(weight))
-            lost = sorted(set().union(*alike) - set(found))
+            moments.setdefault(axes.get(weight), set()).update(found)
+        for weight, found in held.items():
+            lost = sorted(moments[axes.get(weight)] - set(found))
             if weight not in self._names or lost:
                 raise FileFormatError(
                     f"'{path}' does not fit this optimiser (weight '{weight}', "
@@ -319,11 +318,14 @@ class Learner:
                 )
         state = {index: held[name] for index, name in enumerate(self._names) if name in held}
         self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": state})
-        moved = self._moved()
         # numbers keep their dtype, which torch takes from the weights
-        for index, moments in state.items():
-            numbers = {name: value.clone() for name, value in moments.items() if value.ndim == 0}
+        for index, own in state.items():
+            numbers = {name: value.clone() for name, value in own.items() if value.ndim == 0}
             self.optimiser.state[moved[index]].update(numbers)
+
+
+def _moved(optimiser):
+    return [parameter for group in optimiser.param_groups for parameter in group["params"]]
 
 
 def _names(network, optimiser):
@@ -333,7 +335,7 @@ def _names(network, optimiser):
             "LBFGS asks for the loss several times a step; choose an optimiser that asks once."
         )
     known = {id(parameter): name for name, parameter in network.named_parameters()}
-    moved = [parameter for group in optimiser.param_groups for parameter in group["params"]]
+    moved = _moved(optimiser)
     if any(id(parameter) not in known for parameter in moved):
         raise DomainError(
             "the optimiser has parameters that are not the network's; put all that is trained into one "

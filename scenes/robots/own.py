@@ -177,14 +177,11 @@ def _bodies(own):
         parts, frame, links = list(robot.parts), robot.base, set(robot.frames)
     else:
         with _entry("robot"):
-            parts, frame, links = (
-                mesh_files.read(path, own.unit_m, materials=False),
-                "base_link",
-                set(),
-            )
+            parts = mesh_files.read(path, own.unit_m, materials=False)
+        frame, links = "base_link", set()
     names = sorted({part.name for part in parts})
-    # a link may be a frame without a shape
-    unknown = [name for name in own.without if name not in {*names, *links}]
+    known = {*names, *links}  # a link may be a frame without a shape
+    unknown = [name for name in own.without if name not in known]
     if unknown:
         raise DomainError(
             f"without: no part belongs to '{unknown[0]}'; there are {', '.join(names) or 'none'}."

@@ -27,15 +27,14 @@ from scenes.robots.pair import RobotPair
 from scenes.robots.pairs import PAIRS
 from studies.codesign import couplings, page, slopes
 from studies.codesign.arms import ARMS
-from studies.codesign.design import Space
 from studies.codesign.landscape import landscape
 from studies.codesign.problem import Drawn
 from studies.codesign.race import (
-    SPACE,
     Judge,
     check_sizes,
     compared,
     racing,
+    space_of,
     start,
     taken_up,
     training,
@@ -133,7 +132,7 @@ def study(run: Run[Config]) -> None:
         "held": held(size.hold),
         "judge": [size.judged_worlds, size.judged_drives],
     }
-    space = Space.of(**{name: setting[name] for name in SPACE})
+    space = space_of(setting)
     # of an own robot, and of the files that its page names
     setting["page"] = json.dumps(fingerprints(space.pair)) if space.pair.page else ""
     same_robot(run, space.pair)

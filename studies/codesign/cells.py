@@ -13,7 +13,7 @@ from codesign.errors import DomainError
 from scenes.robots.pairs import PAIRS
 from studies.codesign import couplings
 from studies.codesign.design import Space
-from studies.codesign.race import SPACE, Judge, check_sizes, racing, training
+from studies.codesign.race import Judge, check_sizes, racing, space_of, training
 from studies.frame.config import check_least
 from studies.frame.run import Run, StudyConfig
 from studies.frame.sweep import Row, select, sweep
@@ -119,11 +119,6 @@ def _pulled(regime, draw):
     shares = [torch.tensor(share, dtype=torch.float64) for share in regime["shares"]]
     at = couplings.best_of(drawn, shares).clamp(couplings.STEP, 1 - couplings.STEP)
     return [{**row, "at": at.tolist()} for row in couplings.curvatures(drawn, at, draw)]
-
-
-def space_of(cell: Mapping[str, Any]) -> Space:
-    """Designs of a cell."""
-    return Space.of(**{name: cell[name] for name in SPACE})
 
 
 def judged_errors(

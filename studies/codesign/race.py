@@ -35,6 +35,11 @@ MOST_WORLDS = 200  # from 500 on are those of the landscape
 JUDGED = 7_700_000  # number of the judge's draw
 
 
+def space_of(setting: Mapping[str, Any]) -> Space:
+    """Designs of a setting."""
+    return Space.of(**{name: setting[name] for name in SPACE})
+
+
 def start(space: Space, seed: int, near: Sequence[float] | None = None) -> Tensor:
     """Shares [V] at random, sensor and estimator as they are by default, that keep what is
     required; those of ``near`` [V], each moved by NEAR at most, where it is given. All numbers of
@@ -179,9 +184,11 @@ def _parsed(path, line):
         axes, rows = json.loads(line)
         found = [{**axes, **row, "setting": dict(row["setting"])} for row in rows]
         for row in found:
-            space = Space.of(**{name: row["setting"][name] for name in SPACE})
             numbers = [*row["share"], *row.get("errors", ()), *row.get("head_errors", ())]
-            whole = len(row["share"]) == len(space.free) and {"seed", "arm"} <= row.keys()
+            whole = (
+                len(row["share"]) == _count(json.dumps(row["setting"]))
+                and {"seed", "arm"} <= row.keys()
+            )
             if not whole or not all(0 <= number <= 1 for number in numbers):
                 raise ValueError
         return found
@@ -189,6 +196,12 @@ def _parsed(path, line):
         raise FileFormatError(
             f"'{path}' is no table of answers, or damaged; give answers.jsonl of a run."
         ) from error
+
+
+@lru_cache(maxsize=1)
+def _count(told):
+    """How many numbers of a setting are free: built once for all rows of a table."""
+    return len(space_of(json.loads(told)).free)
 
 
 def _alike(one, other):
@@ -208,7 +221,7 @@ def training(setting: Mapping[str, Any]) -> Drawn:
 @lru_cache(maxsize=1)
 def _training(told):
     setting = json.loads(told)
-    space = Space.of(**{name: setting[name] for name in SPACE})
+    space = space_of(setting)
     spread = spread_over(setting["worlds"], setting["per_draw"])
     calibration = Calibration(*setting["calibration"])
     return Drawn(space, robot_pair.training(setting["worlds"]), *spread, calibration)

@@ -300,15 +300,16 @@ def _read(path: Path) -> list[Row]:
         raise FileFormatError(
             f"--raw {path} is no table of this study, or damaged: {error}."
         ) from error
+    if not rows:
+        raise FileFormatError(f"--raw {path} has no row.")
+    rows.sort(key=lambda row: row["case"])
     cases: dict[tuple[Any, ...], list[int]] = {}
-    for row in sorted(rows, key=lambda row: row["case"]):
+    for row in rows:
         cases.setdefault((row["setting"], row["turned"], row["lens"]), []).append(row["case"])
     for (setting, turned, name), own in cases.items():
         if own != cases.get((setting, turned, "spots")) or len(set(own)) < len(own):
             raise FileFormatError(f"--raw {path}: '{setting}' has not every case of '{name}' once.")
-    if not rows:
-        raise FileFormatError(f"--raw {path} has no row.")
-    return sorted(rows, key=lambda row: row["case"])
+    return rows
 
 
 def _redraw(run):

@@ -195,8 +195,8 @@ class Race:
         return found
 
     def chosen(self, count: int) -> tuple[int, str]:
-        """Start and search of the answer that errs least on training drives, (0, DEFAULT) where the pair's own mount errs less than all of them: what is judged on unseen
-        samples has not been chosen by them."""
+        """Start and search of the answer that errs least on training drives, (0, DEFAULT) where the
+        pair's own mount errs less than all of them: what is judged on unseen samples has not been chosen by them."""
         names = (GRADIENT, *self.run.config.searches)
         answers = [(number, name) for number in range(count) for name in names]
         if "final_errors" not in self.tensors:

@@ -148,11 +148,10 @@ class Hdf5Events:
         if self.index is not None:
             edges = (t0_us - self.offset_us) // 1000, (t1_us - self.offset_us) // 1000 + 1
             # an index may end before the events do: behind its last entry lie all that follow
+            last = self.index[-1] if len(self.index) else 0
             low, high = (
-                int(np.append(self.index, end)[min(max(k, 0), len(self.index))])
-                for k, end in zip(
-                    edges, (self.index[-1] if len(self.index) else 0, len(self)), strict=True
-                )
+                int(self.index[k] if k < len(self.index) else beyond)
+                for k, beyond in zip((max(k, 0) for k in edges), (last, len(self)), strict=True)
             )
         else:
             low, high = self._place(t0_us - DISORDER_US), self._place(t1_us + DISORDER_US + 1)

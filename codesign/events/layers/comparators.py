@@ -88,8 +88,8 @@ class Sigmoid:
 
     def __call__(self, frames, theta_on, theta_off, state, log_input):
         frames = _with_last(frames, state)
-        given = {"sharpness": self.sharpness, "log_input": log_input}
-        return soft(frames, theta_on, theta_off, **given), frames[-1].clone()
+        counts = soft(frames, theta_on, theta_off, sharpness=self.sharpness, log_input=log_input)
+        return counts, frames[-1].clone()
 
 
 @dataclass

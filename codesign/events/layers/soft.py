@@ -11,8 +11,8 @@ from torch.autograd import Function
 
 from codesign.backend import run_kernel
 from codesign.checks import check_number, check_positive
-from codesign.events.entry import check_frames, check_level, check_per_pixel, warn_of_scale
-from codesign.events.intensity import FrontEnd, log_levels
+from codesign.events.entry import check_level, check_per_pixel
+from codesign.events.intensity import front_end_of, log_levels
 
 # a pixel without change fires sigmoid(-5) = 0.67 % of an event per polarity and frame
 GHOST_LOGIT = -5.0
@@ -53,9 +53,7 @@ def soft(
     >>> [[round(count, 3) for count in step] for step in counts.flatten(1).tolist()]
     [[1.0, 0.0], [0.0, 1.0]]
     """
-    front_end = FrontEnd(log_input)
-    frames = check_frames(frames, 2, non_negative=not log_input)
-    warn_of_scale(frames, log_input)
+    front_end = front_end_of(frames, log_input, minimum=2)
     if sharpness is not None:
         check_positive(sharpness, "sharpness")
     before, after = frames[:-1], frames[1:]
