@@ -96,7 +96,8 @@ def _plane(name, texture, texel_m, half_width_m, towards, up, wrap, device):
     check_sizes(name, texel_m=texel_m, half_width_m=half_width_m)
     size = None
     if isinstance(texture, str | Path):
-        size, texture = textures.file_size(texture), textures.picture(texture)
+        # a damaged file gets the sentence of the picture
+        texture, size = textures.picture(texture), textures.file_size(texture)
     else:
         texture = textures.check_texture(texture, "of the scene")
     height, width = size or texture.shape
