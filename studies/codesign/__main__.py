@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
+from torch import Tensor
 
 from codesign import lens
 from codesign.atomic import write_atomic
@@ -157,7 +158,8 @@ def study(run: Run[Config]) -> None:
         around(run, drawn, rows, setting["near"])
     page.looked(run, space, gates)
     if size.slopes:
-        places = {"best": gates.best, "start": start(space, size.seed, setting["near"])}
+        place = {"answer": best_joint(drawn, rows)} if rows else {"best": gates.best}
+        places = {**place, "start": start(space, size.seed, setting["near"])}
         slopes.show(run, space, slopes.slopes(run, space, drawn, places, size.slopes))
     if rows:
         page.designs(run, space, rows)
@@ -174,15 +176,20 @@ def same_robot(run: Run[Config], pair: RobotPair) -> None:
     run.save_state({}, now)
 
 
+def best_joint(drawn: Drawn, rows: Sequence[Row]) -> Tensor:
+    """The joint answer [V] of which least is expected."""
+    shares = [
+        torch.tensor(row["share"], dtype=torch.float64) for row in rows if row["arm"] == "joint"
+    ]
+    return couplings.best_of(drawn, shares)
+
+
 def around(
     run: Run[Config], drawn: Drawn, rows: Sequence[Row], near: Sequence[float] | None
 ) -> None:
     """Couplings around the joint answer of which least is expected, and what the orders would leave
     by them."""
-    shares = [
-        torch.tensor(row["share"], dtype=torch.float64) for row in rows if row["arm"] == "joint"
-    ]
-    at = couplings.best_of(drawn, shares).clamp(couplings.STEP, 1 - couplings.STEP)
+    at = best_joint(drawn, rows).clamp(couplings.STEP, 1 - couplings.STEP)
     seeds = dict.fromkeys(row["seed"] for row in rows)
     starts = [start(drawn.space, seed, near) for seed in seeds]
     measured = {arm: math.exp(-over.value) for arm, (over, _) in compared(rows).items()}

@@ -126,8 +126,8 @@ def show(run: Run[Any], space: Space, rows: Sequence[Row]) -> None:
             numbers.append(line)
     run.section(
         "Is the slope right?",
-        f"At the best design that was looked at and at the first start, over {draws} draws of fresh drives: the slope by geometry, "
-        f"trend and recorded frames against differences of rendered errors over {STEP} of the bounds to either side, on the same "
+        "At the first start and at the best joint answer (of a run without a race: the best design that was looked at), over "
+        f"{draws} draws of fresh drives: the slope by geometry, trend and recorded frames against differences of rendered errors over {STEP} of the bounds to either side, on the same "
         "drives.",
     )
     tabulate(run, "Agreement", lines, "at", "block", "against", prefix="slope")
