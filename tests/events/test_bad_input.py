@@ -145,6 +145,12 @@ def potential(drive):
     return responding(drive)[1].sum()
 
 
+def level(rise, seconds, **sensor):
+    """A pixel whose log level rises by so much, instead of counting for ever."""
+    levels = torch.tensor([0.0, rise])[:, None, None]
+    return events.simulate(levels, [0.0, seconds], SensorModel(**sensor), log_input=True)
+
+
 def streamed(frames, t_s):
     return list(events.upsample_stream(frames, t_s))
 

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from codesign import events
-from codesign.errors import DomainError
 from codesign.events import SensorModel, SensorState, lin_log, memory, simulate, to_counts
 from codesign.events.stream import ordered
 from tests.event_streams import same, stream_of
@@ -113,22 +112,6 @@ def test_a_leak_below_the_last_digit_of_a_level_still_leaks():
     assert stream.p.tolist() == [1, 1]
     # a last digit of the level: 48 us
     assert np.abs(stream.t_us.numpy() - np.array([100_000, 200_000])).max() <= 20
-
-
-@pytest.mark.parametrize(
-    ("rise", "sensor", "gap_s"),
-    [
-        (1e30, SensorModel(), 1.0),
-        (3e4, SensorModel(1e-3, 1e-3), 1.0),
-        (0.0, SensorModel(shot_rate_hz=1e6), 1e4),
-        (0.0, SensorModel(leak_rate_hz=1e6), 1e4),
-    ],
-)
-def test_more_events_than_a_pixel_can_make_are_refused_instead_of_counted_for_ever(
-    rise, sensor, gap_s
-):
-    with pytest.raises(DomainError, match="would fire more than 1000000 events"):
-        simulate(torch.tensor([0.0, rise])[:, None, None], [0.0, gap_s], sensor, log_input=True)
 
 
 EPS = float(torch.finfo(torch.float32).eps)

@@ -110,10 +110,12 @@ def test_the_mean_is_that_of_noisy_neurons_where_only_the_last_spike_counts():
 
 def test_the_share_of_the_beginning_is_one_and_its_last_spike_three_time_constants_old():
     h = f64([0.2])
-    shares, states = rested(200, 1, h)[..., 0]
-    age = (torch.arange(200, dtype=D) + 0.5) * h
+    shares, states, counted = rested(200, 2, h)[..., 0]
+    steps = torch.arange(200, dtype=D) + 0.5  # since the spike
+    age = steps * h
     assert float(shares.sum()) == pytest.approx(1, abs=1e-12)
     torch.testing.assert_close(states, (-age).exp())
+    torch.testing.assert_close(counted, steps * states)
     # exponential, in steps of 0.2 / 3 of its mean
     assert float((shares * age).sum()) == pytest.approx(3, rel=1e-2)
 

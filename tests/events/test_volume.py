@@ -6,7 +6,6 @@ import math
 import pytest
 import torch
 
-from codesign.errors import DomainError
 from codesign.events import decay, from_counts, from_stream, surface_from_counts
 from codesign.events.stream import ordered
 from codesign.events.volumes.surface import decay_from_stream, surface_from_stream
@@ -152,16 +151,3 @@ def test_traces_of_counts_fade_exponentially():
     on = [3, 3 * math.exp(-1), 3 * math.exp(-1.5) + 1, (3 * math.exp(-1.5) + 1) * math.exp(-2.5)]
     off = [0, 2, 2 * math.exp(-0.5), 2 * math.exp(-3)]
     torch.testing.assert_close(traces, f64([on, off]).T)
-
-
-@pytest.mark.parametrize(
-    "made",
-    [
-        lambda stream: from_stream(stream, 0, 100, 3, dtype=torch.int64),
-        lambda stream: surface_from_stream(stream, [100], TAU_S, dtype=torch.int32),
-        lambda stream: decay_from_stream(stream, [100], TAU_S, dtype=torch.int32),
-    ],
-)
-def test_fractions_are_not_cut_to_whole_numbers(made):
-    with pytest.raises(DomainError, match="a floating type is needed"):
-        made(at_one_pixel(7))

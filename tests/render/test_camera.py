@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from codesign import lens, render
-from codesign.errors import DomainError
 from codesign.pose import look_at
 from codesign.render import Camera, Film, angular_miss_rad, project
 from scenes import worlds
@@ -144,13 +143,6 @@ def test_windows_equal_the_crops_of_the_full_frame():
         whole = tell(full)
         crops = [whole[..., top : top + 9, left : left + 12] for left, top in corners]
         close(tell(part), torch.stack(crops, -3), atol=1e-10)
-
-
-def test_a_film_beside_other_sizes_is_refused():
-    with pytest.raises(
-        DomainError, match=r"640 x 480 px of 0\.01 mm are given beside a film of 32"
-    ):
-        Camera(lens.Pinhole(8.0), 640, 480, 0.01, film=Film(32, 24, 32, 24, 0.1))
 
 
 def test_pixels_are_in_image_order_with_the_axis_in_the_middle():

@@ -7,7 +7,7 @@ import torch
 from codesign import lens, render
 from codesign.errors import DomainError
 from codesign.pose import look_at, se3_exp
-from codesign.render import Camera, Film, TexturedPlane
+from codesign.render import Camera, TexturedPlane
 from codesign.types import Rays
 from scenes import silhouettes, textures
 from tests.numbers import D, close, f64, rand64
@@ -193,9 +193,3 @@ def test_a_film_larger_than_the_image_circle_is_named_with_its_share(wide_px):
     reach_mm = float(str(raised.value).split("far as ")[1].split(" mm")[0])
     radius_mm = camera.film_mm(camera.film.pixels()).norm(dim=1)
     assert abs(reach_mm - radius_mm[lit].max()) < 2 * 80.0 / min(wide_px, 32)
-
-
-def test_a_window_in_the_dark_is_named_too():
-    film = Film(200, 200, 8, 8, 0.4, ((96, 96), (0, 0)))
-    with pytest.raises(DomainError, match="about 50% of the film's pixels get no light"):
-        Camera(lens.load("cooke-triplet"), 8, 8, 0.4, 4, film=film).check()

@@ -138,13 +138,6 @@ def test_a_rolling_shutter_shifts_a_moving_grating_row_by_row(exposure, samples)
         close(windows[:, number], whole[:, top : top + 4, left : left + 10], rtol=1e-12)
 
 
-def test_a_line_time_without_end_is_refused():
-    with pytest.raises(
-        DomainError, match="line_s must be a finite number, got inf; the seconds from one row"
-    ):
-        render.exposed_frames(camera(), grating(9.0), still, [0.0], 0.0, line_s=math.inf)
-
-
 def test_objects_that_would_stand_still_within_an_exposure_are_refused():
     scene = sweeping(100.0)(torch.zeros(1, dtype=D))
     for exposure_s, line_s in ((0.01, 0.0), (0.0, 1e-3)):

@@ -6,11 +6,11 @@ import math
 import pytest
 import torch
 
-from codesign.errors import DomainError
 from codesign.pose import se3_exp
 from codesign.types import EventVolume
 from scenes.robots.costs import Costs, Exposed, noise_rate_hz, threshold_to_noise
 from scenes.robots.pair import SENSOR
+from tests import refusals
 from tests.numbers import D, f64, seeded
 
 
@@ -102,9 +102,6 @@ def test_a_mast_bends_as_a_cantilever():
     assert not Costs().sway(pose, 0.8, torch.ones(2, dtype=D), deviates).any()
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"light": 0.0}, {"light": 1.5}, {"bus_hz": 0.0}, {"sway_per_m_s": -1.0}]
-)
-def test_costs_out_of_range_are_refused(wrong):
-    with pytest.raises(DomainError, match=next(iter(wrong))):
-        Costs(**wrong)
+@refusals.table(__file__, "costs")
+def test_costs_out_of_range_are_refused(row):
+    row.holds(globals())
