@@ -87,6 +87,15 @@ def test_light_that_grows_is_shared_evenly_and_kept_within_the_bound():
     assert lin_log(made).diff(dim=0).abs().max() <= 0.1
 
 
+def test_an_edge_between_pixels_is_neither_darker_nor_brighter_than_its_sides():
+    edge = torch.where(torch.arange(16) < 8, 1.0, 200.0).double().expand(16, 16)
+    flows = f64([[0.5, 0], [-0.5, 0]])[..., None, None].expand(2, 2, 16, 16)
+    seen = torch.ones(2, 16, 16, dtype=D)
+    frame = between(edge, edge, flows, seen, 0.3)
+    assert frame.min() == 1
+    assert frame.max() == 200
+
+
 def test_what_a_moving_square_hides_and_bares_is_background():
     # a textured square passes 8 px before a still, textured wall; in the middle the strips beside
     # it show wall, that one of the frames still or already shows
