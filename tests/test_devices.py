@@ -16,7 +16,7 @@ from codesign.train.batches import to_device
 from codesign.train.learner import Learner
 from codesign.types import FlowField, FlowWindows
 from scenes import textures, trajectories, worlds
-from tests.events.slopes import seeded
+from tests.numbers import seeded
 from tests.second_device import Host, MixedDevices, second_device
 
 T_S = torch.linspace(0, 0.02, 9, dtype=torch.float64)

@@ -1,10 +1,4 @@
-"""How alike derivatives and differences are, and seeds of what they are taken of."""
-
-import torch
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
+"""How alike derivatives and differences are."""
 
 
 def cosine_and_scale(found, truth):

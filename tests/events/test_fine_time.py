@@ -14,8 +14,8 @@ from codesign.events.level_path import finer
 from codesign.system import Batch
 from codesign.types import FlowField
 from tests.events.slopes import cosine_and_scale
+from tests.numbers import D, f64, rand64, seeded
 
-D = torch.float64
 C = 0.15
 SPAN_S = 0.1
 BINS = 5
@@ -27,7 +27,7 @@ def times(intervals):
     return torch.linspace(0, SPAN_S, intervals + 1, dtype=D)
 
 
-PHASE, SECOND, OFFSET = torch.rand(3, 4000, generator=torch.Generator().manual_seed(3), dtype=D)
+PHASE, SECOND, OFFSET = rand64(seeded(3), 3, 4000)
 # pixels of like phase together, [4, N]: over all of them a shift in time changes nothing
 GROUPS = torch.cat(
     [torch.stack((x.sin(), x.cos())) for x in (PHASE * 2 * math.pi, SECOND * 2 * math.pi)]
@@ -88,20 +88,20 @@ def test_eight_intervals_steer_a_volume_as_the_stream_at_10_khz_does(name, move)
 
 
 def test_events_of_one_long_interval_lie_where_the_level_crosses():
-    level = torch.tensor([4.0, 4.0 + 20.5 * C], dtype=D).reshape(2, 1, 1)
-    t_s = torch.tensor([0.0, SPAN_S], dtype=D)
+    level = f64([4.0, 4.0 + 20.5 * C]).reshape(2, 1, 1)
+    t_s = f64([0.0, SPAN_S])
     layer = events.layer("memory", SENSOR, log_input=True)
     volume = layer.volume(level, t_s, BINS).counts[0, 0, :, 0, 0].detach()
     crossing = torch.arange(1, 21, dtype=D) / 20.5 * (BINS - 1)  # in node spacings
     nodes = torch.arange(BINS, dtype=D)
     truth = (1 - (crossing - nodes[:, None]).abs()).clamp(min=0).sum(1)
-    assert float(volume.sum()) == 20
+    assert volume.sum() == 20
     # four parts from node to node: an event lies at most an eighth of that from its place, early as
     # often as late
-    assert abs(float(nodes @ (volume - truth))) < 20 / 8 / 4
+    assert abs(nodes @ (volume - truth)) < 20 / 8 / 4
     # a node shares the events of both spacings beside it, and so does one part's worth of them at
     # most
-    assert float((volume - truth).abs().max()) < 20.5 / (4 * (BINS - 1)) / 4
+    assert (volume - truth).abs().max() < 20.5 / (4 * (BINS - 1)) / 4
 
 
 @pytest.mark.parametrize("log_input", [True, False])
@@ -128,15 +128,15 @@ def test_smooth_curves_between_frames_are_met_to_the_third_order(log_input):
 def test_a_step_rings_by_seven_percent_of_it_beside_and_nowhere_else_and_has_its_gradient(
     generator,
 ):
-    level = torch.tensor([1.0, 1.0, 1.0, 3.0, 3.0, 3.0], dtype=D).reshape(-1, 1)
+    level = f64([1.0, 1.0, 1.0, 3.0, 3.0, 3.0]).reshape(-1, 1)
     found, times_s = finer(level, torch.arange(6.0), 1 / 96, log_input=True)
-    assert bool((found[times_s <= 1] == 1).all())
-    assert bool((found[times_s >= 4] == 3).all())
+    assert (found[times_s <= 1] == 1).all()
+    assert (found[times_s >= 4] == 3).all()
     # half a step per interval of slope at the end of a cubic: s^2 (1 - s) is at most 4/27
     assert float(found.min()) == pytest.approx(1 - 4 / 27, abs=1e-4)
     assert float(found.max()) == pytest.approx(3 + 4 / 27, abs=1e-4)
-    t_s = torch.tensor([0.0, 0.1, 0.25, 0.3, 0.5], dtype=D)
-    frames = (torch.rand(5, 2, 2, generator=generator, dtype=D) * 60).requires_grad_()
+    t_s = f64([0.0, 0.1, 0.25, 0.3, 0.5])
+    frames = (rand64(generator, 5, 2, 2) * 60).requires_grad_()
     assert torch.autograd.gradcheck(lambda frames: finer(frames, t_s, 0.04)[0], (frames,))
 
 
@@ -229,8 +229,8 @@ def test_the_steady_rate_of_a_ramp_is_read_after_the_lead(hard):
     # time constant, which goes as one over the light, is shorter at the end of the ramp than at its
     # beginning
     slow = replace(IDEAL, cutoff_hz=100.0)
-    assert float(volume(slow, 0.0).counts.sum()) / 200 <= STEADY - 0.5
-    assert STEADY < float(volume(slow, 0.02).counts.sum()) / 200 < STEADY + 0.2
+    assert volume(slow, 0.0).counts.sum() / 200 <= STEADY - 0.5
+    assert STEADY < volume(slow, 0.02).counts.sum() / 200 < STEADY + 0.2
 
 
 def test_the_gradient_of_a_settled_sensor_is_that_of_the_steady_count():

@@ -128,20 +128,6 @@ def test_one_file_gives_the_same_numbers_through_both_doors(name, tmp_path):
     ]
 
 
-def test_recordings_of_cameras_are_the_same_through_both_doors(shared):
-    for name in ("davis346_newton_cradle/demo-01", "prophesee_gen3_vga/faery_evt2"):
-        path = shared(f"data/{name}.npz")
-        with np.load(path) as file:
-            t_us, x, y, p = (file[key].astype(np.int64) for key in "txyp")
-        stream, held = read(path), read_recording(path)
-        for found, true in zip(
-            (held.t_us, held.x, held.y, held.on), (t_us, x, y, p > 0), strict=True
-        ):
-            assert np.array_equal(found, true)
-        assert np.array_equal(stream.t_us.numpy(), t_us)
-        assert int((stream.x * stream.p).sum()) == int((x * (2 * (p > 0) - 1)).sum())
-
-
 @pytest.mark.parametrize(
     ("text", "options", "times_us"),
     [

@@ -331,7 +331,7 @@ def test_hdf5_that_is_written_follows_the_layout(tmp_path):
         found = [np.asarray(file[name]) for name in names]
     assert [one.dtype.str for one in found] == ["<u4", "<u2", "<u2", "|u1", "<i8", "<u8"]
     since_us, x, y, on, offset_us, index = found
-    assert int(offset_us) == int(STREAM.t_us[0])
+    assert offset_us == STREAM.t_us[0]
     wanted = (SINCE_US - SINCE_US[0], STREAM.x, STREAM.y, STREAM.p > 0)
     assert all(np.array_equal(a, b) for a, b in zip((since_us, x, y, on), wanted, strict=True))
     assert index.tolist() == [np.count_nonzero(since_us < 1000 * k) for k in range(len(index))]

@@ -11,10 +11,10 @@ from torch.autograd.functional import jacobian
 
 from codesign.events import LAYERS, SensorModel, expected, layer, memory, naive, sensor_counts
 from tests.event_streams import rows
-from tests.events.slopes import cosine_and_scale, seeded
+from tests.events.slopes import cosine_and_scale
 from tests.events.test_memory import plain_loop
+from tests.numbers import D, close, f64, rand64, randn64, seeded
 
-D = torch.float64
 CLIP = (0.0, 255.0, 0.0, 1e4, 1e-6, 20.0, 20.0, 300.0)
 # for the layer of one event per step, which after those jumps only hurries after the level
 SLOWER_CLIP = (100.0, 255.0, 300.0, 255.0, 1e-6, 20.0, 20.0, 300.0)
@@ -120,7 +120,7 @@ ACCOUNTS = {
 def test_values_and_gradients_of_every_layer_on_the_worst_clip_are_those_of_its_account(
     kind, generator
 ):
-    clip = torch.tensor(SLOWER_CLIP if kind == "srm" else CLIP, dtype=D)
+    clip = f64(SLOWER_CLIP if kind == "srm" else CLIP)
     theta_off = 0.2 if kind == "srm" else 0.25
     sensor = SensorModel(
         0.2, theta_off, cutoff_hz=50.0, refractory_s=DEAD_S if kind == "physical" else 0.0
@@ -128,7 +128,7 @@ def test_values_and_gradients_of_every_layer_on_the_worst_clip_are_those_of_its_
     names = ("theta_on", "theta_off", "cutoff_hz")
     learnt = layer(kind, sensor, learn=names)
     frames = clip[:, None, None].expand(-1, 2, 3).clone().requires_grad_()
-    weights = torch.randn(len(clip) - 1, 2, generator=generator, dtype=D)
+    weights = randn64(generator, len(clip) - 1, 2)
     found = learnt(frames, torch.arange(len(clip), dtype=D) * STEP_S)
     variables = [learnt.learnt.raw[name] for name in names]
     by_frames, *by_variables = torch.autograd.grad(
@@ -145,7 +145,7 @@ def test_values_and_gradients_of_every_layer_on_the_worst_clip_are_those_of_its_
     # the low-pass leaves a^5 / 720 out of a series for paces a below 0.05: 4e-8 of a step in the
     # derivative
     expanded = truth[:, None, None].expand_as(by_frames)
-    torch.testing.assert_close(by_frames, expanded, rtol=1e-6, atol=1e-9 * float(truth.abs().max()))
+    close(by_frames, expanded, rtol=1e-6, atol=1e-9 * float(truth.abs().max()))
     for mine, slope, value in zip(by_variables, by_values, values, strict=True):
         # six pixels; a unit of a variable is a tenth of the value's logarithm
         assert float(mine) == pytest.approx(6 * 0.1 * value.item() * slope.item(), rel=1e-6)
@@ -154,9 +154,9 @@ def test_values_and_gradients_of_every_layer_on_the_worst_clip_are_those_of_its_
 def moving_pattern(fps=240, size=36):
     """Sum of plane waves drifting over the sensor: log levels [T, size, size]."""
     generator = seeded()
-    wave = torch.randn(12, 2, generator=generator, dtype=D) * 0.25
-    phase = torch.rand(12, generator=generator, dtype=D) * 2 * math.pi
-    strength = torch.rand(12, generator=generator, dtype=D) * 0.3 + 0.1
+    wave = randn64(generator, 12, 2) * 0.25
+    phase = rand64(generator, 12) * 2 * math.pi
+    strength = rand64(generator, 12) * 0.3 + 0.1
     t_s = torch.arange(0, 0.25, 1 / fps, dtype=D)
     place = torch.arange(size, dtype=D)
     t, y, x = torch.meshgrid(t_s, place, place, indexing="ij")
@@ -190,8 +190,8 @@ def test_gradients_to_the_sensor_follow_differences_of_hard_counts(
         counts, _ = sensor_counts(level, t_s, sensor, **options)
         return counts[:56].reshape(4, 14, 2, 3, 12, 3, 12).sum((1, 4, 6)).flatten()
 
-    slope = jacobian(pooled, torch.tensor(before, dtype=D))
-    ends = [pooled(torch.tensor(before * (1 + sign * step), dtype=D)) for sign in (1, -1)]
+    slope = jacobian(pooled, f64(before))
+    ends = [pooled(f64(before * (1 + sign * step))) for sign in (1, -1)]
     difference = (ends[0] - ends[1]) / (2 * step * before)
     found_cosine, scale = cosine_and_scale(slope, difference)
     assert found_cosine > cosine
@@ -202,35 +202,33 @@ def test_gradients_to_the_sensor_follow_differences_of_hard_counts(
 def test_expected_counts_are_means_over_thresholds(spread):
     # hard counts of one step, 200,000 drawn thresholds each: standard error below 0.4 % of the
     # spread
-    steps = torch.tensor([0.0, 0.05, 0.1, 0.19, 0.21, 0.5, 1.5, 3.0, -0.3, -2.0], dtype=D)
+    steps = f64([0.0, 0.05, 0.1, 0.19, 0.21, 0.5, 1.5, 3.0, -0.3, -2.0])
     level = torch.stack((torch.zeros_like(steps), steps))
-    drawn = torch.exp(spread * torch.randn(200_000, 1, generator=seeded(2), dtype=D))
+    drawn = torch.exp(spread * randn64(seeded(2), 200_000, 1))
     counts, reference = expected(level, 0.2, 0.25, spread, log_input=True)
     hard, after = memory(
         level[:, None].expand(2, 200_000, 10), 0.2 * drawn, 0.25 * drawn, log_input=True
     )
     for found, sample in ((counts[0], hard[0]), (reference, after[0])):
         error = 4 * sample.std(-2) / math.sqrt(200_000) + 1e-5
-        assert bool(((found - sample.mean(-2)).abs() <= error).all())
+        assert ((found - sample.mean(-2)).abs() <= error).all()
 
 
 def test_expected_counts_stay_smooth_through_the_series_end():
     # the sum over events is left for its integral at 1.2/spread events
-    around = 0.2 * 1.2 / 0.15 * torch.tensor([1 - 1e-9, 1 + 1e-9], dtype=D)
+    around = 0.2 * 1.2 / 0.15 * f64([1 - 1e-9, 1 + 1e-9])
     level = torch.stack((torch.zeros(2, dtype=D), around))
     counts, reference = expected(level, 0.2, 0.2, 0.15, log_input=True)
-    assert float(counts[0, 0].diff().abs()) < 1e-7
-    assert float(reference.diff().abs()) < 1e-7
+    assert counts[0, 0].diff().abs() < 1e-7
+    assert reference.diff().abs() < 1e-7
     thetas = [torch.tensor(value, dtype=D, requires_grad=True) for value in (0.07, 0.09, 0.2)]
-    frames = 50 + 30 * torch.rand(4, 2, generator=seeded(1), dtype=D)
+    frames = 50 + 30 * rand64(seeded(1), 4, 2)
     assert torch.autograd.gradcheck(lambda *a: expected(*a), (frames.requires_grad_(), *thetas))
 
 
 def test_frame_difference_caps_at_one_and_forgets():
     # per pixel: a slow ramp (never seen), one step of 1.1 (one event), exactly -theta, below -theta
-    level = torch.tensor(
-        [[0.0, 0, 0, 0], [0.15, 1.1, -0.25, -0.24], [0.3, 1.1, -0.5, -0.48]], dtype=D
-    )
+    level = f64([[0.0, 0, 0, 0], [0.15, 1.1, -0.25, -0.24], [0.3, 1.1, -0.5, -0.48]])
     found = naive(level[:, None], [0.0, 0.01, 0.02], 0.25, log_input=True)
     assert (found.height_px, found.width_px) == (1, 4)
     assert rows(found) == [(10_000, 1, 0, 1), (10_000, 2, 0, -1), (20_000, 2, 0, -1)]

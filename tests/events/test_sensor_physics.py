@@ -27,17 +27,16 @@ from codesign.events import (
 from codesign.events.low_pass import coefficients
 from codesign.events.sensor.crossing import hashed, normal_pair, uniform
 from tests.event_streams import same
-from tests.events.slopes import seeded
 from tests.events.test_layers import PHYSICAL
+from tests.numbers import D, close, rand64, seeded
 
-D = torch.float64
 EVERYTHING = replace(PHYSICAL, hot_pixel_share=0.05, hot_pixel_rate_hz=80.0)
 NOISY = SensorModel(0.2, 0.2, 0.02, 50.0, shot_rate_hz=2.0, photoreceptor_noise=True)
 
 
 def clip(frames=30, dtype=torch.float32):
     drift = torch.randn(frames, 9, 8, generator=seeded(1), dtype=dtype).cumsum(0) * 0.1
-    steps_s = 2e-3 * (torch.rand(frames, generator=seeded(1), dtype=D) + 0.2)
+    steps_s = 2e-3 * (rand64(seeded(1), frames) + 0.2)
     return (4 + drift).exp(), steps_s.cumsum(0)
 
 
@@ -47,7 +46,7 @@ def test_the_low_pass_of_sensor_and_layers_solves_its_differential_equation(cuto
     state = SensorState()
     simulate(frames, t_s, SensorModel(cutoff_hz=cutoff_hz), state=state)
     by_function = low_pass(lin_log(frames), frames, t_s.diff(), cutoff_hz)[-1]
-    torch.testing.assert_close(by_function, state.level, rtol=0, atol=1e-12)
+    close(by_function, state.level, atol=1e-12)
     intensity = frames[:, 3, 4].numpy()
     level = np.log(intensity)
     filtered = level[0]
@@ -72,7 +71,7 @@ def test_gradients_of_the_low_pass_are_differences_and_a_ramp_lags_by_its_time_c
     tau_s = 0.007
     ramp = one_pole(3 * t_s[:, None], t_s.diff()[:, None] / tau_s, 3 * t_s[:1])[:, 0]
     truth = 3 * (t_s - tau_s * (1 - torch.exp((t_s[0] - t_s) / tau_s)))
-    torch.testing.assert_close(ramp, truth, rtol=0, atol=1e-12)
+    close(ramp, truth, atol=1e-12)
 
 
 @pytest.mark.parametrize("pace", [0.0, 1e-9, 0.01, 0.0499, 0.0501, 2.0])
@@ -108,26 +107,38 @@ def test_any_chunking_gives_the_events_of_the_whole_and_dense_counts_are_theirs(
             assert torch.equal(counts.reshape(29, 2, 9, 8), to_counts(whole, t_s))
 
 
+# what is wrong, from which chunk on, and what is said
+REFUSED = [
+    (lambda frames, t_s: (frames, t_s - 1), 1, "go on increasing"),
+    (lambda frames, t_s: (frames, t_s[-1].expand(30)), 0, "increase"),
+    (lambda frames, t_s: (frames.index_fill(0, torch.tensor([20]), math.nan), t_s), 0, "NaN"),
+    (lambda frames, t_s: (frames - 300, t_s), 0, "frames must be >= 0"),
+    (lambda frames, t_s: (frames[:, :2], t_s), 1, "keep their size"),
+]
+TOO_LONG = (lambda frames, t_s: (frames, t_s * 1e15), 0, "exceed 64-bit")
+
+
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("timing", "change", "earliest", "words"),
     [
-        (lambda frames, t_s: (frames, t_s - 1), "go on increasing"),
-        (lambda frames, t_s: (frames, t_s[-1].expand(30)), "increase"),
-        (lambda frames, t_s: (frames.index_fill(0, torch.tensor([20]), math.nan), t_s), "NaN"),
-        (lambda frames, t_s: (frames - 300, t_s), "frames must be >= 0"),
-        (lambda frames, t_s: (frames[:, :2], t_s), "keep their size"),
-        (lambda frames, t_s: (frames, t_s * 1e15), "exceed 64-bit"),
+        *((timing, *row) for timing in ("interpolated", "v2e") for row in REFUSED),
+        ("interpolated", *TOO_LONG),
     ],
 )
-def test_refused_frames_leave_a_stream_as_it_was(change, words):
+def test_refused_frames_leave_a_stream_and_its_noise_as_they_were(timing, change, earliest, words):
     frames, t_s = clip()
-    state = SensorState()
-    simulate(frames, t_s, EVERYTHING, state=state)
-    before = {name: tensor.clone() for name, tensor in state.tensors().items()}
-    with pytest.raises(CodesignError, match=words):
-        simulate(*change(frames, t_s + 1), EVERYTHING, state=state)
-    assert state.time_s == float(t_s[-1])
-    assert all(torch.equal(tensor, before[name]) for name, tensor in state.tensors().items())
+    sensor = replace(EVERYTHING, timing=timing)
+    streams = []
+    for refused in (False, True):
+        state = SensorState(generator=seeded(5))
+        for chunk in range(2):
+            if refused and chunk >= earliest:
+                with pytest.raises(CodesignError, match=words):
+                    simulate(*change(frames, t_s + chunk), sensor, state=state)
+            streams.append(simulate(frames, t_s + chunk, sensor, state=state))
+    assert len(streams[1]) > 100
+    assert same(streams[0], streams[2])
+    assert same(streams[1], streams[3])
 
 
 def test_thresholds_follow_a_clamped_normal_distribution():
@@ -168,7 +179,7 @@ def test_noise_events_are_a_poisson_process_at_every_frame_rate(fps):
     assert abs(int(events.p.sum())) < 4 * math.sqrt(len(events))
     histogram = torch.histc(events.t_us.double(), bins=20, min=0, max=1e6)
     # chi-squared, 19 degrees: passed once in a thousand
-    assert float(((histogram - len(events) / 20) ** 2 / (len(events) / 20)).sum()) < 45
+    assert ((histogram - len(events) / 20) ** 2 / (len(events) / 20)).sum() < 45
     per_pixel = torch.bincount(events.y * 80 + events.x, minlength=2000).double()
     # Poisson: variance = mean
     ratio = float(per_pixel.var() / per_pixel.mean())
@@ -190,7 +201,7 @@ def test_noise_events_scale_with_thresholds_and_reset_the_memorised_level():
     split = state.theta_on.flatten() < 0.2
     for half in (split, ~split):
         total = float(expected[half].sum())
-        assert abs(float(on[half].sum()) - total) < 4 * math.sqrt(total)
+        assert abs(on[half].sum() - total) < 4 * math.sqrt(total)
     # a drift below every threshold: each noise event sets the memorised level to the level seen
     state = SensorState()
     noisy = SensorModel(shot_rate_hz=1e3)
@@ -227,7 +238,7 @@ def test_noise_events_and_crossings_come_in_order_of_time(sign):
         assert max(int(gap_us.max()), 1_000_000 - int(t_us[-1])) <= 200_001
         crossing = (gap_us - 200_000).abs() <= 1
         noise += int((~crossing).sum())
-        assert bool((p[crossing] == sign).all())
+        assert (p[crossing] == sign).all()
     light = (0.5 * (math.exp(4) + math.exp(4 + sign)) + 20) / 275
     expected = 3600 * rate_hz * (1 - 0.75 * light)
     assert abs(noise - expected) < 4 * math.sqrt(expected)
@@ -290,7 +301,7 @@ def test_hot_pixels_fire_on_at_their_rate_and_others_are_silent():
     hot = per_pixel > 0
     assert abs(int(hot.sum()) - 1000) < 4 * math.sqrt(900)
     assert set(per_pixel[hot].tolist()) <= {49, 50}
-    assert bool((events.p == 1).all())
+    assert (events.p == 1).all()
     gaps = events.t_us[(events.y * 100 + events.x) == int(hot.nonzero()[0])].diff()
     assert (gaps - 20_000).abs().max() <= 2
 
@@ -305,12 +316,12 @@ def test_normal_numbers_follow_their_law_and_neighbours_are_uncorrelated():
     pair = normal_pair(dr, arr, dr.arange(arr.UInt32, count))
     normals = [value.torch().double() for value in pair]
     error = 4 / math.sqrt(count)
-    assert 0 < float(even.min()) < float(even.max()) < 1
+    assert 0 < even.min() < even.max() < 1
     for normal in normals:
         for power, moment, spread in ((1, 0, 1), (2, 1, 2), (4, 3, 96)):
             found = float((normal**power).mean())
             assert found == pytest.approx(moment, abs=error * math.sqrt(spread))
     flat = even - even.mean()
     for lag in (1, 2, 16, 346):
-        assert abs(float((flat[lag:] * flat[:-lag]).mean() / flat.var())) < error
-    assert abs(float((normals[0] * normals[1]).mean())) < error
+        assert abs((flat[lag:] * flat[:-lag]).mean() / flat.var()) < error
+    assert abs((normals[0] * normals[1]).mean()) < error

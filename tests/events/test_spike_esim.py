@@ -16,10 +16,8 @@ from codesign.events.spiking.spike_esim import SpikeEsim
 from codesign.events.spiking.srm import srm
 from codesign.events.spiking.surrogate import Laplace
 from codesign.events.spiking.thesis_network import TwoBranchSpikes
-from tests.events.slopes import seeded
+from tests.numbers import D, close, f64, rand64, seeded
 from tests.rounding_case import RoundsByPlace
-
-D = torch.float64
 
 
 def clip(frames=40, side=12, seed=0, dtype=D, step=0.15):
@@ -80,7 +78,7 @@ def test_chunks_equal_the_whole_bit_for_bit_on_a_processor_that_rounds_by_place(
         for first, last in ((0, 3), (3, 4), (4, 21), (21, 41)):
             counts, state = model(frames[first:last], t_s[first:last], state)
             parts.append(counts)
-    assert float(whole.detach().mean()) > 0.01
+    assert whole.detach().mean() > 0.01
     assert torch.equal(torch.cat(parts), whole)
     for name in () if options is None else ("level", "filtered", "slow", "frame"):
         assert torch.equal(getattr(state, name), getattr(end, name))
@@ -100,7 +98,7 @@ def test_batches_are_sequences_of_their_own_and_a_still_scene_gives_nothing():
         moved = (together[:, :, index] - alone).cumsum(0)
         assert alone.sum() > 1000
         assert moved.abs().max() <= 1
-        assert int((moved != 0).sum()) <= 1
+        assert (moved != 0).sum() <= 1
     assert model(one[:1].expand(30, -1, -1), t_s[:30])[0].sum() == 0
 
 
@@ -130,7 +128,7 @@ def test_bandwidth_tone_and_scaled_thresholds_are_those_of_the_hard_sensor(chang
     moved = (found - events.dense_counts(frames, t_s, sensor)).cumsum(0)
     # rounding (1e-14) moves an event by a frame, and loses none
     assert moved.abs().max() <= 1
-    assert int((moved != 0).sum()) <= 3
+    assert (moved != 0).sum() <= 3
 
 
 def test_levels_have_exact_gradients_in_every_parameter():
@@ -157,16 +155,16 @@ def test_drawn_noise_is_poisson_of_the_expected_rate():
     frames = torch.full((201, 30, 30), 117.5, dtype=D)
     t_s = torch.arange(201, dtype=D) / 500
     # (117.5 + 20)/275 = 1/2
-    expected = torch.tensor([30.0, 10.0], dtype=D) * math.exp(-2.0 * 0.5) / 500
+    expected = f64([30.0, 10.0]) * math.exp(-2.0 * 0.5) / 500
     found = model.expected_noise(frames, t_s)[0, :, 0, 0]
-    torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)
+    close(found, expected, rtol=1e-6)
     # a still scene: nothing but noise
     counts, _ = model.draw(frames, t_s, seeded(0))
     for found, mean in zip(counts.unbind(1), expected.tolist(), strict=True):
         error = math.sqrt(mean / found.numel())
-        assert abs(float(found.mean()) - mean) < 4 * error
+        assert abs(found.mean() - mean) < 4 * error
         # variance of the sample variance: (m + 2 m^2)/n
-        assert abs(float(found.var()) - mean) < 4 * error * 1.1
+        assert abs(found.var() - mean) < 4 * error * 1.1
 
 
 @pytest.mark.bits
@@ -237,7 +235,7 @@ def test_network_of_the_thesis_equals_the_reference(shared, through_reset, name)
 
 
 def test_a_woken_network_reaches_its_threshold_with_the_share_asked():
-    frames = torch.rand(30, 16, 16, generator=seeded(2), dtype=D)
+    frames = rand64(seeded(2), 30, 16, 16)
     network = TwoBranchSpikes(1, theta=0.7, kernel="step").double()
     network.wake(frames, share=0.1)
     drive, _ = network._drive(frames, None)
@@ -257,4 +255,4 @@ def test_losses_have_their_closed_forms():
     target[0, 0, 0, 0] = 3  # block (0, 0, 0) of ON holds 3
     found[1, 0, 1, 1] = 1  # the same block: 1 against 3, (1 - 3)^2/(3 + 1) = 1
     found[3, 1, 3, 3] = 2  # OFF, another block: 2 against 0, 4/1
-    assert float(count_loss(found, target, side_px=2, steps=2)) == 2.5
+    assert count_loss(found, target, side_px=2, steps=2) == 2.5

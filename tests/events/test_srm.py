@@ -9,9 +9,8 @@ import torch
 
 from codesign.events.spiking.srm import SrmState, alpha_response, drive_scale, srm
 from codesign.events.spiking.surrogate import FastSigmoid, Laplace, Triangular
-from tests.events.slopes import seeded
+from tests.numbers import D, close, f64, seeded
 
-D = torch.float64
 FADING = {"theta": 0.2, "kernel": "exp", "response": "alpha", "tau_s": 2.4, "tau_r": 1.2}
 STEP = {"theta": 0.2, "kernel": "step", "response": "step", "reset_scale": 1.0, "coupled": True}
 BOUNDED = {"coupled": True, "through_reset": "bounded", "surrogate": Laplace(2.0, 1.0)}
@@ -144,7 +143,7 @@ def test_chunks_give_the_whole_and_its_gradient_and_spikes_are_those_without(mod
     for a, b, c in zip(whole, parts, without, strict=True):
         assert torch.equal(a, b)
         assert torch.equal(a, c)
-    torch.testing.assert_close(slopes_of_parts, slopes, rtol=1e-9, atol=1e-12)
+    close(slopes_of_parts, slopes, rtol=1e-9, atol=1e-12)
     if "surrogate" in mode:
         assert all(torch.equal(a, b) for a, b in zip(slopes, slopes_without, strict=True))
 
@@ -156,8 +155,8 @@ def test_float32_spikes_equal_float64_over_20000_steps():
     truth, exact, _ = srm(drive.double(), **settings)
     # the recursion runs in float64 for both; the potential is rounded once, to 2^-24
     assert torch.equal(single.double(), truth)
-    assert bool(((potential.double() - exact).abs() <= exact.abs() * 2**-24 + 1e-40).all())
-    assert 0.01 < float(truth.mean()) < 0.99
+    assert ((potential.double() - exact).abs() <= exact.abs() * 2**-24 + 1e-40).all()
+    assert 0.01 < truth.mean() < 0.99
 
 
 @pytest.mark.bits
@@ -176,7 +175,7 @@ def test_gradient_through_the_reset_explodes_in_full_and_not_when_bounded():
         assert 3.2**190 < last("full")[:10].abs().max() < 3.5**199
     # each pass through the reset multiplies by at most 0.9, and the first gradient is at most
     # 1/alpha
-    assert float(last("bounded").abs().sum()) <= 1 / 0.7 / (1 - 0.9)
+    assert last("bounded").abs().sum() <= 1 / 0.7 / (1 - 0.9)
     # below the bound the two are one function: sum of |nu| is 4 e h a / (1 - a)^2 = 21.3 for h =
     # 1/2
     settings["surrogate"] = Laplace(24.0, 0.3)
@@ -186,7 +185,7 @@ def test_gradient_through_the_reset_explodes_in_full_and_not_when_bounded():
 
 
 def test_ties_spike_and_one_pixel_needs_no_axis():
-    drive = torch.tensor([0.5, 0.25, 0.0], dtype=D)
+    drive = f64([0.5, 0.25, 0.0])
     settings = STEP | {"theta": torch.tensor(0.5), "reset_scale": 0.0, "coupled": False}
     assert srm(drive, **settings)[0].tolist() == [1, 1, 1]
     # 0.5 - 1 ulp, then 0.75, then a sum that stays
@@ -202,7 +201,7 @@ def test_drive_scale_brings_the_asked_share_to_threshold(response, tau_s):
     # either side
     options = STEP | {"theta": 0.7, "response": response, "reset_scale": 0.0, "coupled": False}
     free, *_ = srm(drive * factor, tau_s=tau_s, **options)
-    assert abs(float(free.mean()) - 0.1) <= 1.5 / 12_000
+    assert abs(free.mean() - 0.1) <= 1.5 / 12_000
 
 
 def test_outputs_own_their_memory():
@@ -241,7 +240,7 @@ def test_a_surrogate_is_a_density_of_its_height_and_its_integral_rises_from_zero
     assert (slope - surrogate.torch_density(x)).abs().max() < 1e-9
     height = float(surrogate.torch_density(torch.zeros(1, dtype=D)))
     assert height == pytest.approx(1 / 1.4, rel=1e-15)
-    ends = kind.unit(width=0.3).torch_integral(torch.tensor([-1e9, 0.0, 1e9], dtype=D))
+    ends = kind.unit(width=0.3).torch_integral(f64([-1e9, 0.0, 1e9]))
     assert ends.tolist() == pytest.approx([0, 0.5, 1], abs=1e-9)
     if kind is Laplace:  # as published
         torch.testing.assert_close(surrogate.torch_density(x), (-2.2 * x.abs()).exp() / 1.4)

@@ -10,6 +10,7 @@ import torch
 
 from codesign.errors import FileFormatError
 from codesign.events.sources.opening import open_frames
+from tests.numbers import f64
 
 # imageio leaves FFmpeg's pipes to the garbage collector
 IMAGEIO_LEAKS = pytest.mark.filterwarnings(
@@ -72,7 +73,7 @@ def test_uneven_frames_keep_their_times(tmp_path):
     milliseconds = [20, 50, 30, 100, 40, 70]
     iio.imwrite(tmp_path / "e.gif", moving(6), plugin="pillow", duration=milliseconds, loop=0)
     source = open_frames(tmp_path / "e.gif")
-    assert torch.equal(source.t_s, torch.tensor([0, 2, 7, 10, 20, 24], dtype=torch.float64) / 100)
+    assert torch.equal(source.t_s, f64([0, 2, 7, 10, 20, 24]) / 100)
     assert np.stack(list(source.read(0))).shape == (6, 48, 64, 3)
 
 
@@ -154,7 +155,7 @@ def test_a_real_recording_is_what_is_known_of_it(shared):
     frames = np.stack(list(ball.read(0)))
     assert frames.shape == (15, 384, 384)
     assert (frames.min(), frames.max(), ball.white) == (84, 4095, 4095.0)
-    assert float(ball.t_s[1]) == 1 / 30_000
+    assert ball.t_s[1] == 1 / 30_000
     # the disc above the floor falls by a steady 2.65 pixels per frame
     rows = np.array([np.nonzero(frame[:280] < 1000)[0].mean() for frame in frames])
     np.testing.assert_allclose(np.diff(rows), 2.65, atol=0.1)

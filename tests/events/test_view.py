@@ -14,6 +14,7 @@ from codesign.events import decay_video, gray_picture, picture, rates, write_vid
 from codesign.events.stream import ordered
 from codesign.events.views.figures import rate_figure, sample, space_time_figure
 from tests.event_streams import stream_of
+from tests.numbers import f64
 
 # [2, 1, 4]: four ON, four OFF, two of each, none
 COUNTS = torch.tensor([[[4.0, 0, 2, 0]], [[0, 4, 2, 0]]])
@@ -65,8 +66,8 @@ def test_rates_are_events_per_second_and_drawn_in_their_units():
     counts = torch.zeros(2, 2, 3, 3)
     counts[0, 0], counts[1, 1, 0, 0] = 1, 500
     middle_s, rate_hz = rates(counts, [0.0, 0.5, 0.6])
-    torch.testing.assert_close(middle_s, torch.tensor([0.25, 0.55], dtype=torch.float64))
-    torch.testing.assert_close(rate_hz, torch.tensor([[18, 0], [0, 5000]], dtype=torch.float64))
+    torch.testing.assert_close(middle_s, f64([0.25, 0.55]))
+    torch.testing.assert_close(rate_hz, f64([[18, 0], [0, 5000]]))
     axis = rate_figure(middle_s, rate_hz).axes[0]
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("time (ms)", "kevents per second")
     for line, values in zip(axis.lines, ([0.018, 0], [0, 5]), strict=True):
@@ -96,5 +97,5 @@ def test_a_sample_holds_every_event_equally_often(count, generator):
         hits[chosen] += 1
     expected = 2000 * 20 / count
     # binomial: five standard deviations
-    assert float((hits - expected).abs().max()) < 5 * math.sqrt(expected * (1 - 20 / count))
+    assert (hits - expected).abs().max() < 5 * math.sqrt(expected * (1 - 20 / count))
     assert sample(7, 20, generator).tolist() == list(range(7))

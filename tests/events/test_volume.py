@@ -6,14 +6,13 @@ import math
 import pytest
 import torch
 
-from codesign.errors import DomainError
 from codesign.events import decay, from_counts, from_stream, surface_from_counts
 from codesign.events.stream import ordered
 from codesign.events.volumes.surface import decay_from_stream, surface_from_stream
 from codesign.events.volumes.volume import spikes_from_stream
 from tests.event_streams import part, random_stream, rows, stream_of
+from tests.numbers import D, close, f64, rand64
 
-D = torch.float64
 EPOCH_US = 1_700_000_000_000_000
 TAU_S = 0.013
 
@@ -27,15 +26,13 @@ def at_one_pixel(*t_us):
 def test_counts_are_conserved_and_centroids_are_mean_times_also_of_uneven_frames(
     bins, batch, generator
 ):
-    steps_s = 0.005 + 0.01 * torch.rand(19, generator=generator, dtype=D)
+    steps_s = 0.005 + 0.01 * rand64(generator, 19)
     edges_s = 7 + torch.cat((torch.zeros(1, dtype=D), steps_s.cumsum(0)))
     counts = torch.randint(0, 4, (19, 2, *batch, 4, 6), generator=generator).double()
     flat = counts.reshape(19, 2, -1, 4, 6)
     volume = from_counts(counts, edges_s, bins)
     assert volume.counts.shape == (flat.shape[2], 2, bins, 4, 6)
-    torch.testing.assert_close(
-        volume.counts.sum(2), flat.sum(0).transpose(0, 1), rtol=1e-13, atol=1e-13
-    )
+    close(volume.counts.sum(2), flat.sum(0).transpose(0, 1), rtol=1e-13, atol=1e-13)
     # shares of each interval's middle between the two nearest nodes
     middle_s = (edges_s[1:] + edges_s[:-1]) / 2 - 7
     place = middle_s / (edges_s[-1] - 7) * (bins - 1)
@@ -43,9 +40,7 @@ def test_counts_are_conserved_and_centroids_are_mean_times_also_of_uneven_frames
     torch.testing.assert_close(volume.counts, torch.einsum("kt,tpnyx->npkyx", share, flat))
     # even rate: each interval holds events in proportion to its length
     mass = share * steps_s
-    torch.testing.assert_close(
-        volume.centroid_s, (mass @ middle_s) / mass.sum(1), rtol=1e-12, atol=0
-    )
+    close(volume.centroid_s, (mass @ middle_s) / mass.sum(1), rtol=1e-12)
 
 
 @pytest.mark.parametrize("bins", [1, 2, 5])
@@ -58,16 +53,16 @@ def test_stream_events_are_conserved_and_shared_by_time(bins, offset_us):
         place = (t_us - offset_us) / 100_000 * (bins - 1)
         for node in range(bins):
             truth[int(p < 0), node, y, x] += max(1 - abs(place - node), 0)
-    torch.testing.assert_close(volume.counts[0], truth, rtol=1e-12, atol=1e-12)
-    assert abs(float(volume.counts.sum()) - 500) < 1e-9
+    close(volume.counts[0], truth, rtol=1e-12, atol=1e-12)
+    assert abs(volume.counts.sum() - 500) < 1e-9
 
 
 def test_the_window_of_a_stream_holds_both_ends_and_its_centroids_are_those_of_an_even_rate():
     volume = from_stream(at_one_pixel(9, 10, 15, 20, 21), 10, 20, 2)
     assert volume.counts[0, 0, :, 0, 0].tolist() == [1.5, 1.5]
     volume = from_stream(at_one_pixel(0), 0, 120_000, 4, dtype=D)
-    truth = torch.tensor([0.04 / 3, 0.04, 0.08, 0.12 - 0.04 / 3], dtype=D)
-    torch.testing.assert_close(volume.centroid_s, truth, rtol=1e-14, atol=0)
+    truth = f64([0.04 / 3, 0.04, 0.08, 0.12 - 0.04 / 3])
+    close(volume.centroid_s, truth, rtol=1e-14)
 
 
 def test_spikes_are_events_per_step():
@@ -103,14 +98,14 @@ def test_streams_give_surface_and_trace_as_defined_at_any_time(offset_us):
     surface, trace = by_hand(stream, at_us, True), by_hand(stream, at_us, False)
     # one rounding of an exponential, and a sum of at most 30 of them
     found = surface_from_stream(stream, at_us, TAU_S, dtype=D)
-    torch.testing.assert_close(found, surface, rtol=1e-14, atol=0)
+    close(found, surface, rtol=1e-14)
     found = decay_from_stream(stream, at_us, TAU_S, dtype=D)
-    torch.testing.assert_close(found, trace, rtol=1e-12, atol=1e-14)
+    close(found, trace, rtol=1e-12, atol=1e-14)
     # a trace goes on where an earlier chunk ended
     first = decay_from_stream(part(stream, stream.t_us <= cut_us), [cut_us], TAU_S, dtype=D)[0]
     late = part(stream, stream.t_us > cut_us)
     found = decay_from_stream(late, at_us[3:], TAU_S, start=(first, cut_us), dtype=D)
-    torch.testing.assert_close(found, trace[3:], rtol=1e-12, atol=1e-14)
+    close(found, trace[3:], rtol=1e-12, atol=1e-14)
 
 
 def test_whole_counts_give_the_surface_of_events_at_the_middles_of_their_intervals(generator):
@@ -123,13 +118,11 @@ def test_whole_counts_give_the_surface_of_events_at_the_middles_of_their_interva
     truth = by_hand(stream, times_us[1:].tolist(), True)
     t_s = times_us.to(D) * 1e-6
     # twelve products and roots of float64
-    torch.testing.assert_close(
-        surface_from_counts(counts.to(D), t_s, TAU_S), truth, rtol=1e-12, atol=0
-    )
+    close(surface_from_counts(counts.to(D), t_s, TAU_S), truth, rtol=1e-12)
 
 
 def test_a_share_of_an_event_mixes_the_surfaces_with_and_without_it():
-    counts = torch.tensor([1.0, 0.3, 0.0], dtype=D)[:, None, None, None].repeat(1, 2, 1, 1)
+    counts = f64([1.0, 0.3, 0.0])[:, None, None, None].repeat(1, 2, 1, 1)
     surface = surface_from_counts(counts, [0.0, 0.01, 0.02, 0.03], 0.01)[2, 0, 0, 0]
     assert float(surface) == pytest.approx(0.7 * math.exp(-2.5) + 0.3 * math.exp(-1.5), rel=1e-14)
 
@@ -144,8 +137,8 @@ def test_a_share_of_an_event_mixes_the_surfaces_with_and_without_it():
 )
 def test_gradients_to_soft_counts(function, generator):
     # on both sides of the bend at 1
-    counts = torch.tensor([0.2, 0.9, 0.4, 1.6, 0.7], dtype=D)[:, None, None, None]
-    counts = counts * torch.rand(5, 2, 2, 3, dtype=D, generator=generator) + 0.01
+    counts = f64([0.2, 0.9, 0.4, 1.6, 0.7])[:, None, None, None]
+    counts = counts * rand64(generator, 5, 2, 2, 3) + 0.01
     assert int((counts > 1).sum())
     t_s = [0.0, 0.01, 0.015, 0.03, 0.031, 0.04]
     assert torch.autograd.gradcheck(lambda c: function(c, t_s), (counts.requires_grad_(),))
@@ -157,17 +150,4 @@ def test_traces_of_counts_fade_exponentially():
     traces = decay(counts, [0.0, 0.01, 0.03, 0.04, 0.09], tau_s=0.02)[:, :, 0, 0]
     on = [3, 3 * math.exp(-1), 3 * math.exp(-1.5) + 1, (3 * math.exp(-1.5) + 1) * math.exp(-2.5)]
     off = [0, 2, 2 * math.exp(-0.5), 2 * math.exp(-3)]
-    torch.testing.assert_close(traces, torch.tensor([on, off], dtype=D).T)
-
-
-@pytest.mark.parametrize(
-    "made",
-    [
-        lambda stream: from_stream(stream, 0, 100, 3, dtype=torch.int64),
-        lambda stream: surface_from_stream(stream, [100], TAU_S, dtype=torch.int32),
-        lambda stream: decay_from_stream(stream, [100], TAU_S, dtype=torch.int32),
-    ],
-)
-def test_fractions_are_not_cut_to_whole_numbers(made):
-    with pytest.raises(DomainError, match="a floating type is needed"):
-        made(at_one_pixel(7))
+    torch.testing.assert_close(traces, f64([on, off]).T)

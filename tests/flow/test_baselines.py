@@ -10,23 +10,13 @@ from codesign.flow import checkpoint
 from codesign.flow.baselines import FlowNetEvents, SpikeFlowNet
 from codesign.flow.baselines.parts import count_weights
 from codesign.flow.entry import normalise, presence
-from codesign.types import EventVolume
 from studies.train_flow.peers import ECN, IDNet
+from tests.flow.volumes import drawn, in_even_bins
+from tests.numbers import D, close, f64, randn64, seeded
 
-D = torch.float64
 BINS = 4
+SPAN_S = 0.05
 NETWORKS = [FlowNetEvents, SpikeFlowNet, ECN, IDNet]
-
-
-def as_volume(counts):
-    bins = counts.shape[2]
-    centroid_s = (torch.arange(bins, dtype=D) + 0.5) * 0.05 / bins
-    return EventVolume(counts, centroid_s, torch.full((bins,), 0.05 / bins, dtype=D))
-
-
-def busy(batch=1, height=32, width=32, mean=0.3):
-    counts = torch.full((batch, 2, BINS, height, width), mean, dtype=D)
-    return torch.poisson(counts, generator=torch.Generator().manual_seed(0))
 
 
 def small(network, **options):
@@ -40,32 +30,30 @@ def test_any_size_is_padded_with_emptiness_and_cropped_back(network, size):
     # multiple of the stride
     height, width = size
     net = small(network)
-    counts = busy(1, height, width)
+    counts = drawn(1, 2, BINS, height, width, rate=0.3)
     large = torch.zeros(
         1, 2, BINS, height + -height % net.STRIDE, width + -width % net.STRIDE, dtype=D
     )
     large[..., :height, :width] = counts
-    found = net.predictions(as_volume(counts))
-    for a, b in zip(found, net.predictions(as_volume(large)), strict=True):
+    found = net.predictions(in_even_bins(counts, SPAN_S))
+    for a, b in zip(found, net.predictions(in_even_bins(large, SPAN_S)), strict=True):
         assert a.flow_px.shape == (1, 2, height, width)
-        torch.testing.assert_close(
-            a.flow_px, b.flow_px[..., :height, :width], rtol=1e-12, atol=1e-12
-        )
-    assert torch.equal(found[-1].flow_px, net(as_volume(counts)).flow_px)
+        close(a.flow_px, b.flow_px[..., :height, :width], rtol=1e-12, atol=1e-12)
+    assert torch.equal(found[-1].flow_px, net(in_even_bins(counts, SPAN_S)).flow_px)
     assert found[-1].interval_s == pytest.approx(0.05)
 
 
 @pytest.mark.parametrize("network", [FlowNetEvents, SpikeFlowNet, ECN])
 def test_predictions_are_the_levels_in_full_resolution_pixels(network):
     net = small(network)
-    volume = as_volume(busy(2, 32, 48))
+    volume = in_even_bins(drawn(2, 2, BINS, 32, 48, rate=0.3), SPAN_S)
     levels = net.levels(normalise(volume.counts).flatten(1, 2), volume)
     shown = presence(volume.counts)
     for factor, level, field in zip((8, 4, 2, 1), levels, net.predictions(volume), strict=True):
         assert level.shape == (2, 2, 32 // factor, 48 // factor)
         # a bilinear resampling keeps the mean of a field whose border repeats; the vectors grow
         # with the grid
-        torch.testing.assert_close(
+        close(
             field.flow_px.mean((2, 3)), factor * (level * shown).mean((2, 3)), rtol=1e-9, atol=1e-12
         )
 
@@ -73,9 +61,7 @@ def test_predictions_are_the_levels_in_full_resolution_pixels(network):
 def test_the_flow_fades_in_with_the_square_of_the_events():
     counts = torch.zeros(3, 2, BINS, 16, 16, dtype=D)
     counts[1, 0, 0, 3, 4], counts[2, 1, 2, 5, 5] = 10.0, 1.0
-    torch.testing.assert_close(
-        presence(counts).flatten(), torch.tensor([0.0, 0.5, 1 / 101], dtype=D)
-    )
+    torch.testing.assert_close(presence(counts).flatten(), f64([0.0, 0.5, 1 / 101]))
 
 
 @pytest.mark.parametrize("network", NETWORKS)
@@ -106,7 +92,7 @@ def test_weights_by_hand():
 @pytest.mark.parametrize("network", NETWORKS)
 def test_configuration_and_file_make_the_same_network(network, tmp_path):
     net = network(bins=BINS, width=8.0, seed=3)
-    volume = as_volume(busy().float())
+    volume = in_even_bins(drawn(1, 2, BINS, 32, 32, rate=0.3).float(), SPAN_S)
     right = net(volume).flow_px
     # the seed alone draws the weights
     assert torch.equal(network(**net.config)(volume).flow_px, right)
@@ -119,7 +105,7 @@ def test_the_recurrent_unit_written_out():
     """On one cell the 3 x 3 kernels touch their centre alone: z and r by the logistic function, h'
     = tanh(U (r h) + W x), h <- (1 - z) h + z h'."""
     net = small(IDNet)
-    read = torch.randn(1, BINS, 32, 1, 1, dtype=D, generator=torch.Generator().manual_seed(5))
+    read = randn64(seeded(5), 1, BINS, 32, 1, 1)
     held = net.state_dict()
     gates, candidate = (
         (held[f"{name}.weight"][:, :, 1, 1].numpy(), held[f"{name}.bias"].numpy())
@@ -146,10 +132,10 @@ def test_the_second_iteration_reads_what_the_first_one_deblurred():
     counts = torch.zeros(1, 2, BINS, 24, 40, dtype=D)
     for k in range(BINS):
         counts[0, 0, k, 4:20, 9 + 2 * k] = 1.0  # times 1/8, 3/8, ...: at 8 + 8 t
-    flows = net.predictions(as_volume(counts))
+    flows = net.predictions(in_even_bins(counts, SPAN_S))
     assert torch.allclose(flows[1].flow_px[:, 0], 2 * flows[0].flow_px[:, 0])
     first, second = (bins.unflatten(0, (1, BINS)) for bins in seen)
     torch.testing.assert_close(first.transpose(1, 2)[..., :24, :40], normalise(counts))
     for k in range(1, BINS):
         torch.testing.assert_close(second[:, k], second[:, 0])
-    assert bool((second[0, 0, 0, 4:20, 8] > 0).all())
+    assert (second[0, 0, 0, 4:20, 8] > 0).all()

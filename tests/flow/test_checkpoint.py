@@ -11,6 +11,7 @@ from torch import nn
 
 from codesign.errors import DomainError, FileFormatError
 from codesign.flow import checkpoint
+from tests.numbers import f64
 
 
 class Tiny(nn.Module):
@@ -22,7 +23,7 @@ class Tiny(nn.Module):
             raise DomainError("width is at most 9")
         self.config = {"bins": bins, "width": width}
         self.layer = nn.Conv2d(2 * bins, width, 3)
-        self.register_buffer("scale", torch.tensor(1 / 3, dtype=torch.float64))
+        self.register_buffer("scale", f64(1 / 3))
         self.low = nn.Parameter(torch.tensor([1.5, -0.0], dtype=torch.bfloat16))
 
 

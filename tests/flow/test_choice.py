@@ -12,6 +12,7 @@ from codesign import flow
 from codesign.flow.metrics import aee, zero_flow_error
 from scenes.windows.sets import HARSH
 from tests.flow.test_lk import mean_error, moving
+from tests.numbers import randn64, seeded
 
 SEED = 4242  # of no study
 
@@ -68,14 +69,12 @@ def test_gradient_is_that_of_the_closed_form_that_was_chosen():
     gradient, as long as the choice stays."""
     volume = HARSH["roll_fine"](SEED, 8).batch([0]).volume
     counts = volume.counts.double().requires_grad_()
-    weight = torch.randn(
-        1, 2, 128, 128, generator=torch.Generator().manual_seed(1), dtype=torch.float64
-    )
+    weight = randn64(seeded(1), 1, 2, 128, 128)
 
     def value(counts):
         return (weight * flow.estimate(replace(volume, counts=counts)).flow_px).mean()
 
-    way = torch.rand(counts.shape, generator=torch.Generator().manual_seed(2)) * (counts > 0)
+    way = torch.rand(counts.shape, generator=seeded(2)) * (counts > 0)
     followed = value(counts)
     (grad,) = torch.autograd.grad(followed, counts)
     with torch.no_grad():

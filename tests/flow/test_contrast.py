@@ -10,8 +10,7 @@ from codesign.flow.warp import pixel_grid
 from codesign.types import EventVolume
 from tests.event_streams import stream_of
 from tests.flow.test_losses import check_gradients
-
-D = torch.float64
+from tests.numbers import D, close, f64, rand64, randn64
 
 
 def window(counts):
@@ -35,7 +34,7 @@ def centred(size):
 
 
 def uniform(u, v, height, width):
-    return torch.tensor([u, v], dtype=D)[None, :, None, None].repeat(1, 1, height, width)
+    return f64([u, v])[None, :, None, None].repeat(1, 1, height, width)
 
 
 def moving_dots():
@@ -53,11 +52,11 @@ def test_dots_become_sharp_exactly_under_their_own_flow(at, moved):
     tracks = contrast.volume_tracks(moving_dots(), uniform(8.0, 0.0, 8, 16))
     expected = torch.zeros(1, 2, 8, 16, dtype=D)
     expected[0, 0, 4, 3 + moved], expected[0, 1, 1, 2 + moved] = 5, 10
-    torch.testing.assert_close(contrast.count_image(tracks, at), expected, rtol=0, atol=1e-12)
-    mean_time = torch.tensor([0.5, 0.5], dtype=D)  # of 0, 1/4, 1/2, 3/4, 1
+    close(contrast.count_image(tracks, at), expected, atol=1e-12)
+    mean_time = f64([0.5, 0.5])  # of 0, 1/4, 1/2, 3/4, 1
     counts, times = contrast.nearest_images(tracks, at)
-    torch.testing.assert_close(counts, expected, rtol=0, atol=1e-12)
-    torch.testing.assert_close(times[expected > 0], mean_time, rtol=0, atol=1e-12)
+    close(counts, expected, atol=1e-12)
+    close(times[expected > 0], mean_time, atol=1e-12)
     assert not times[expected == 0].any()
 
 
@@ -70,7 +69,7 @@ def test_shares_of_an_event_between_pixels_and_what_leaves():
     ):
         tracks = contrast.volume_tracks(volume, uniform(*flow, 3, 3))
         assert contrast.count_image(tracks, 1.0)[0, 0].tolist() == image
-        assert 4 - float(contrast.count_image(tracks, 1.0).sum()) == left
+        assert 4 - contrast.count_image(tracks, 1.0).sum() == left
 
 
 def test_a_stream_uses_exact_time_stamps_and_both_ends_of_the_interval():
@@ -94,13 +93,13 @@ def test_tracks_are_carried_back_to_the_pixel_they_start_from(zoom):
     flow = zoom * centred(17)[None]
     volume = window(torch.ones(1, 2, 3, 17, 17, dtype=D))
     inside = (..., slice(3, 14), slice(3, 14))
-    tau = torch.tensor([0.0, 0.5, 1.0], dtype=D)[:, None, None]
+    tau = f64([0.0, 0.5, 1.0])[:, None, None]
     exact = (flow[0, :, None] / (1 + tau * zoom))[inside]
     for steps in (0, 1, 3):
         tracks = contrast.volume_tracks(volume, flow, steps)
         found = tracks.flow_px.unflatten(2, (3, 17, 17))[0][inside]
         left = (exact * (-tau * zoom) ** (steps + 1)).abs().amax((0, 2, 3))
-        torch.testing.assert_close((found - exact).abs().amax((0, 2, 3)), left, rtol=0, atol=1e-12)
+        close((found - exact).abs().amax((0, 2, 3)), left, atol=1e-12)
 
 
 def test_the_smooth_spread_is_alike_wherever_an_event_falls():
@@ -116,13 +115,13 @@ def test_the_smooth_spread_is_alike_wherever_an_event_falls():
 
 
 def test_area_change_of_an_affine_flow_is_its_determinant():
-    matrix = torch.tensor([[0.3, -0.4], [0.2, -0.5]], dtype=D)
+    matrix = f64([[0.3, -0.4], [0.2, -0.5]])
     flow = torch.einsum("ij,jhw->ihw", matrix, centred(6))[None]
     tracks = contrast.volume_tracks(window(torch.ones(1, 2, 3, 6, 6, dtype=D)), flow)
-    away = torch.tensor([0.8, 0.3, -0.2], dtype=D)[:, None, None]  # from the bins to 0.8
+    away = f64([0.8, 0.3, -0.2])[:, None, None]  # from the bins to 0.8
     exact = torch.linalg.det(torch.eye(2, dtype=D) + away * matrix)[:, None, None].expand(3, 6, 6)
     found = contrast.area_change(contrast.warp_jacobian(tracks, 3, 0.8))[0]
-    torch.testing.assert_close(found, exact, rtol=0, atol=1e-12)
+    close(found, exact, atol=1e-12)
 
 
 @pytest.mark.parametrize("carry_steps", [0, 1])
@@ -138,8 +137,8 @@ def test_gradcheck_in_counts_and_flow(image, carry_steps, generator):
     def call(counts, flow):
         return image(contrast.volume_tracks(window(counts), flow, carry_steps), 0.8)
 
-    counts = 0.5 + torch.rand(1, 2, 3, 4, 4, generator=generator, dtype=D)
-    flow = 1.5 * torch.randn(1, 2, 4, 4, generator=generator, dtype=D)
+    counts = 0.5 + rand64(generator, 1, 2, 3, 4, 4)
+    flow = 1.5 * randn64(generator, 1, 2, 4, 4)
     check_gradients(call, counts, flow)
 
 

@@ -15,12 +15,13 @@ from codesign import flow
 from codesign.errors import CodesignError
 from codesign.flow.export import evenly_timed
 from studies.train_flow.peers import ECN, IDNet
+from tests.flow.volumes import drawn
+from tests.numbers import D, close, f64, randn64
 
-D = torch.float64
 BINS = 4
 
 
-def drawn(network):
+def stirred(network):
     """The network with random weights also where a fresh one has zeros."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
@@ -31,11 +32,11 @@ def drawn(network):
 
 
 NETWORKS = {
-    "refiner": drawn(flow.Refiner(BINS, width=16, steps=1)),
-    "flownet": drawn(flow.FlowNetEvents(BINS, width=4.0)),
-    "spiking": drawn(flow.SpikeFlowNet(BINS, width=4.0)),
-    "ecn": drawn(ECN(BINS, width=4.0)),
-    "idnet": drawn(IDNet(BINS, width=4.0)),
+    "refiner": stirred(flow.Refiner(BINS, width=16, steps=1)),
+    "flownet": stirred(flow.FlowNetEvents(BINS, width=4.0)),
+    "spiking": stirred(flow.SpikeFlowNet(BINS, width=4.0)),
+    "ecn": stirred(ECN(BINS, width=4.0)),
+    "idnet": stirred(IDNet(BINS, width=4.0)),
 }
 WIDE = {name: deepcopy(network).double() for name, network in NETWORKS.items()}
 CLOSED = {
@@ -45,12 +46,7 @@ CLOSED = {
 CLOSED |= {"choice": flow.estimate}
 
 
-def busy(*shape, rate=1.0, seed=0):
-    draw = torch.Generator().manual_seed(seed)
-    return torch.poisson(torch.full((shape[0], 2, BINS, *shape[1:]), rate, dtype=D), generator=draw)
-
-
-VOLUME = evenly_timed(busy(2, 20, 24).float())
+VOLUME = evenly_timed(drawn(2, 2, BINS, 20, 24).float())
 COUNTS = VOLUME.counts
 
 
@@ -59,8 +55,8 @@ COUNTS = VOLUME.counts
 def test_a_batch_is_its_samples_and_an_empty_one_shows_nothing(name, size):
     """Few events, none, a hundred each, one each; sums in another order in double precision."""
     estimate = {**WIDE, **CLOSED}[name]
-    counts = busy(4, *size)
-    counts[:3] *= torch.tensor([0.01, 0.0, 100.0], dtype=D)[:, None, None, None, None]
+    counts = drawn(4, 2, BINS, *size)
+    counts[:3] *= f64([0.01, 0.0, 100.0])[:, None, None, None, None]
     counts.requires_grad_()
     if min(size) < 2 and name in ("refiner", *CLOSED):  # a single row or column has no slope
         with pytest.raises(CodesignError, match="at least 2 x 2"):
@@ -69,21 +65,17 @@ def test_a_batch_is_its_samples_and_an_empty_one_shows_nothing(name, size):
     field = estimate(evenly_timed(counts))
     assert field.flow_px.shape == (4, 2, *size)
     assert field.valid.flatten(1).all(1).tolist() == [True, False, True, True]
-    assert (
-        0 <= float(field.confidence.detach().min()) <= float(field.confidence.detach().max()) <= 1
-    )
+    assert 0 <= field.confidence.detach().min() <= field.confidence.detach().max() <= 1
     assert not field.flow_px[1].any()
-    assert float(field.confidence[1].detach().abs().max()) < 1e-12
+    assert field.confidence[1].detach().abs().max() < 1e-12
     (grad,) = torch.autograd.grad(field.flow_px.square().sum() + field.flow_px.sum(), counts)
     assert not grad[1].any()
     for sample in (0, 3):
         alone = counts[[sample]].detach().requires_grad_()
         found = estimate(evenly_timed(alone)).flow_px
         (own,) = torch.autograd.grad(found.square().sum() + found.sum(), alone)
-        torch.testing.assert_close(found[0], field.flow_px[sample], rtol=1e-9, atol=1e-9)
-        torch.testing.assert_close(
-            own[0], grad[sample], rtol=1e-8, atol=1e-8 * float(own.abs().max())
-        )
+        close(found[0], field.flow_px[sample], rtol=1e-9, atol=1e-9)
+        close(own[0], grad[sample], rtol=1e-8, atol=1e-8 * float(own.abs().max()))
 
 
 @pytest.mark.parametrize(
@@ -106,9 +98,9 @@ def test_gradients_of_counts_and_weights_are_those_of_differences(name, rate, ge
     spiking network those weights alone that no spike depends on."""
     net = WIDE[name.split()[0]]
     options = {"clock": "events"} if "by events" in name else {}
-    counts = busy(1, 20, 24, rate=rate) + 0.5 * (rate > 0)
+    counts = drawn(1, 2, BINS, 20, 24, rate=rate) + 0.5 * (rate > 0)
     counts[0, 0, 1, 7, 9] += 1
-    weight = torch.randn(1, 6, 20, 24, generator=generator, dtype=D)
+    weight = randn64(generator, 1, 6, 20, 24)
     learnt = list(net.parameters())
     places = [counts.requires_grad_(), *(learnt[k] for k in (0, len(learnt) // 2, -4, -1))]
     if name == "spiking":
@@ -125,7 +117,7 @@ def test_gradients_of_counts_and_weights_are_those_of_differences(name, rate, ge
     found = torch.autograd.grad(loss(), places, allow_unused=True, materialize_grads=True)
     step = 1e-6
     for value, grad in zip(places, found, strict=True):
-        tangent = torch.randn(value.shape, generator=generator, dtype=D)
+        tangent = randn64(generator, value.shape)
         with torch.no_grad():
             value += step * tangent
             above = loss()
@@ -149,10 +141,10 @@ def test_a_network_takes_both_types_and_gives_that_of_the_events_back(name):
             assert (value is None) == (wide is None)
             if value is not None:
                 # single precision, gathered over some tens of layers
-                torch.testing.assert_close(value, wide.to(dtype), rtol=1e-3, atol=1e-4)
+                close(value, wide.to(dtype), rtol=1e-3, atol=1e-4)
         (own,) = torch.autograd.grad(found.flow_px.square().sum(), counts)
         assert own.dtype == dtype
-        assert float((own - grad).abs().max()) < 1e-3 * float(grad.abs().max())
+        assert (own - grad).abs().max() < 1e-3 * grad.abs().max()
 
 
 def counted(counts):

@@ -10,6 +10,7 @@ from torch import nn
 from codesign.errors import DomainError
 from codesign.flow.export import eliminate, evenly_timed, export
 from codesign.types import FlowField
+from tests.numbers import randn64
 
 needs_onnx = pytest.mark.skipif(
     importlib.util.find_spec("onnxscript") is None or importlib.util.find_spec("onnx") is None,
@@ -75,13 +76,13 @@ def test_the_program_gives_the_numbers_of_the_network(tmp_path, generator, name)
     expected = network(evenly_timed(counts))
     assert torch.allclose(flow, expected.flow_px, atol=0 if name.endswith("pt2") else 1e-5, rtol=0)
     assert torch.equal(confidence, expected.valid.float())
-    assert float(flow.abs().max()) > 0.1
+    assert flow.abs().max() > 0.1
 
 
 def test_solving_by_elimination_is_solving(generator):
     """Positive definite matrices of condition below 100: float64 rounding stays below 1e-12."""
-    root = torch.randn(3, 6, 6, generator=generator, dtype=torch.float64)
+    root = randn64(generator, 3, 6, 6)
     matrix = root @ root.mT + torch.eye(6)
-    right = torch.randn(3, 6, 4, generator=generator, dtype=torch.float64)
+    right = randn64(generator, 3, 6, 4)
     truth = torch.linalg.solve(matrix, right)
     assert torch.allclose(eliminate(matrix, right), truth, rtol=1e-12, atol=1e-12)

@@ -13,15 +13,15 @@ from codesign.flow.export import evenly_timed
 from codesign.flow.warp import pixel_grid
 from scenes.windows.rendered import RenderedWindows, planes
 from tests.certain_case import certain
+from tests.numbers import D, close, f64, rand64, randn64, seeded
 
-D = torch.float64
 SIZE = 48
 SPAN_S = 0.05
 
 
 def pattern(seed, finest_px=6.0, coarsest_px=24.0, count=40):
     """Band-limited random function of (x, y) with unit variance."""
-    u = torch.rand(3, count, generator=torch.Generator().manual_seed(seed), dtype=D)
+    u = rand64(seeded(seed), 3, count)
     wave = 2 * math.pi / (finest_px * (coarsest_px / finest_px) ** u[0])
     kx = wave * (2 * math.pi * u[1]).cos()
     ky = wave * (2 * math.pi * u[1]).sin()
@@ -51,8 +51,8 @@ def moving(
     A point seen at a at the start is at x with a = x - (matrix x + shift) / 2 at mid-interval, so
     the flow on the pixels of the start is matrix (1 - matrix / 2)^-1 (a + shift / 2) + shift.
     """
-    matrix = torch.tensor(matrix, dtype=D)
-    shift = torch.tensor(shift, dtype=D)
+    matrix = f64(matrix)
+    shift = f64(shift)
     unit = torch.eye(2, dtype=D)
     at = pixels().movedim(0, -1) - (SIZE - 1) / 2
     rate = pattern(seed, *waves_px)
@@ -118,9 +118,9 @@ def test_flow_changes_sign_with_time_turns_with_the_image_and_knows_no_polarity(
     counts = volume.counts
     right = found(counts)
     one = found(counts, "constant")
-    torch.testing.assert_close(found(counts.flip(2), "constant"), -one, rtol=0, atol=1e-9)
-    torch.testing.assert_close(found(counts.flip(1)), right, rtol=0, atol=1e-12)
-    torch.testing.assert_close(found(counts.mT), right.flip(1).mT, rtol=0, atol=1e-9)
+    close(found(counts.flip(2), "constant"), -one, atol=1e-9)
+    close(found(counts.flip(1)), right, atol=1e-12)
+    close(found(counts.mT), right.flip(1).mT, atol=1e-9)
 
 
 @pytest.mark.parametrize("count", [1, 20, 1000])
@@ -129,11 +129,11 @@ def test_scattered_noise_gives_almost_no_flow(count):
     # damping gives some 9 px here.)
     shell, _ = moving(0, steps=10)
     for seed in range(3):
-        draw = torch.Generator().manual_seed(seed)
+        draw = seeded(seed)
         cells = torch.randint(shell.counts.numel(), (count,), generator=draw)
         counts = cells.bincount(minlength=shell.counts.numel()).to(D).reshape(shell.counts.shape)
         flow = estimate_lk(replace(shell, counts=counts)).flow_px
-        assert float(flow.norm(dim=1).max()) <= 0.3
+        assert flow.norm(dim=1).max() <= 0.3
 
 
 def test_confidence_follows_from_the_covariance_and_is_zero_without_events():
@@ -142,12 +142,10 @@ def test_confidence_follows_from_the_covariance_and_is_zero_without_events():
     field = certain(estimate_lk(replace(volume, counts=both), "constant", prior_px=2.0))
     variance = field.covariance_px2[:, 0] + field.covariance_px2[:, 2]
     # the empty sample has the prior's: 2^2 + 2^2, and a little for what no polynomial explains
-    assert 8 < float(variance[1].min()) <= float(variance[1].max()) < 8.5
-    torch.testing.assert_close(
-        field.confidence, 1 - variance / variance[1:], rtol=1e-12, atol=1e-12
-    )
+    assert 8 < variance[1].min() <= variance[1].max() < 8.5
+    close(field.confidence, 1 - variance / variance[1:], rtol=1e-12, atol=1e-12)
     assert not field.confidence[1].any()
-    assert float(field.confidence[0].min()) > 0.99
+    assert field.confidence[0].min() > 0.99
 
 
 @pytest.mark.parametrize(("kind", "most"), [("fine", 0.23), ("mixed", 0.55)])
@@ -162,10 +160,8 @@ def test_squared_errors_are_those_of_the_covariance(kind, most):
     x, y = (field.flow_px - truth).unbind(1)
     xx, xy, yy = field.covariance_px2.unbind(1)
     normalised = (yy * x**2 - 2 * xy * x * y + xx * y**2) / (2 * (xx * yy - xy**2))
-    assert 1 / 3 <= float(normalised.mean()) <= 3
-    assert float((field.flow_px - truth).norm(dim=1).mean()) <= most * float(
-        truth.norm(dim=1).mean()
-    )
+    assert 1 / 3 <= normalised.mean() <= 3
+    assert (field.flow_px - truth).norm(dim=1).mean() <= most * truth.norm(dim=1).mean()
 
 
 @pytest.mark.parametrize("case", ["constant", "affine", "quadratic", "local", "affine events"])
@@ -177,7 +173,7 @@ def test_gradients_are_those_of_differences(case, generator):
     counts = volume.counts[..., 10:24, 8:22] * 0.3
     if clock == "events":
         counts = torch.cat([counts, counts.flip(1, 2)[:, :, 1:4]], 2)
-    weights = torch.randn(6, 14, 14, generator=generator, dtype=D)
+    weights = randn64(generator, 6, 14, 14)
 
     def loss(counts):
         field = certain(estimate_lk(evenly_timed(counts), model, clock=clock))
@@ -187,9 +183,9 @@ def test_gradients_are_those_of_differences(case, generator):
     counts = counts.clone().requires_grad_()
     (found,) = torch.autograd.grad(loss(counts), counts)
     for _ in range(3):
-        tangent = torch.randn(counts.shape, generator=generator, dtype=D)
+        tangent = randn64(generator, counts.shape)
         ahead, behind = (float(loss((counts + s * 1e-6 * tangent).detach())) for s in (1, -1))
         truth = (ahead - behind) / 2e-6
         # steps of 1e-6 events; the warp is only piecewise smooth, but so short a step crosses no
         # kink
-        assert abs(float((found * tangent).sum()) - truth) <= 1e-5 * abs(truth) + 1e-6
+        assert abs((found * tangent).sum() - truth) <= 1e-5 * abs(truth) + 1e-6

@@ -25,8 +25,8 @@ from codesign.flow.lk.polynomials import Polynomials
 from codesign.flow.lk.slopes import cell_sums
 from codesign.flow.lk.start import at_start
 from codesign.flow.lk.warp import moving
+from tests.numbers import D, close, f64, rand64, randn64
 
-D = torch.float64
 FADE_PX = 2.3
 TAPS = (0.4, 0.2, 0.1)
 
@@ -44,7 +44,7 @@ def drawn(case, generator):
     batch, bins, height, width, stride, cell = case
     grid = Grid(height, width, stride)
     # batch first, then bins: two of flow, density, three of weights
-    numbers = torch.randn(bins + 6, batch, *grid.shape, generator=generator, dtype=D)
+    numbers = randn64(generator, bins + 6, batch, *grid.shape)
     rate, flow = numbers[:-6].transpose(0, 1), 4 * numbers[-6:-4].transpose(0, 1)
     return grid, cell, rate.contiguous(), flow.contiguous(), numbers[-4].abs(), numbers[-3:]
 
@@ -93,7 +93,7 @@ def test_kernels_are_the_plain_operations_and_their_gradients(case, dtype, gener
     for one, other in zip(found, truth, strict=True):
         assert one.dtype == dtype
         off = (one.detach().to(D) - other.detach()).abs().max()
-        assert float(off) <= 100 * torch.finfo(dtype).eps * float(other.detach().abs().max())
+        assert off <= 100 * torch.finfo(dtype).eps * other.detach().abs().max()
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_kernels_are_the_plain_operations_and_their_gradients(case, dtype, gener
 def test_the_blur_is_that_of_scipy(shape, stride, generator):
     # more rows than a lane goes down; squares cut off; images smaller than the kernel
     taps = (0.4, 0.15, 0.1, 0.05)
-    images = torch.randn(shape, generator=generator, dtype=D)
+    images = randn64(generator, shape)
     grid = Grid(*shape[2:], stride)
     rows, columns = grid.shape
     cut = images.numpy()[..., : rows * stride, : columns * stride]
@@ -124,7 +124,7 @@ def test_groups_of_bins_give_the_gradient_of_all_at_once(generator, monkeypatch)
 
     whole = gradients()
     monkeypatch.setattr(warp, "MOST_VALUES", 2 * (4 * 2 * 10 * 9))  # two bins, two bins, one
-    torch.testing.assert_close(gradients(), whole, rtol=1e-13, atol=1e-13)
+    close(gradients(), whole, rtol=1e-13, atol=1e-13)
 
 
 def test_other_sizes_need_no_new_kernel_but_for_copies_to_scatter_into(generator):
@@ -178,7 +178,7 @@ def test_no_garbage_is_collected_in_a_recording():
 def test_replaying_runs_no_python_while_drjit_holds_its_lock(generator):
     """Another thread that got Python's lock meanwhile would wait for drjit's, and this one for
     Python's, for ever."""
-    (counts,) = leaves(torch.rand(2, 2, 5, 32, 32, dtype=D, generator=generator))
+    (counts,) = leaves(rand64(generator, 2, 2, 5, 32, 32))
 
     def passes():
         found = flow.estimate_lk(evenly_timed(counts))
@@ -221,7 +221,7 @@ def test_a_gpu_gives_what_the_processor_gives(generator):
     grid, cell, *given = drawn((2, 4, 33, 40, 1, 8), generator)
     found = everything(nullcontext, grid, cell, *(x.cuda() for x in given))
     for one, other in zip(found, everything(nullcontext, grid, cell, *given), strict=True):
-        torch.testing.assert_close(one.cpu(), other, rtol=1e-11, atol=1e-11)
+        close(one.cpu(), other, rtol=1e-11, atol=1e-11)
 
 
 @pytest.mark.parametrize("joined", [False, True])
@@ -234,11 +234,11 @@ def test_the_step_to_the_start_is_that_of_plain_operations(model, height, width,
     cells = Cells(2, height, width, 3.0, torch.device("cpu"))
 
     def draw(*shape):
-        return torch.randn(*shape, generator=generator, dtype=D)
+        return randn64(generator, *shape)
 
     half = 0.3 * draw(2, 2 * shape.terms, 2 * shape.terms)
     value, covariance = draw(*cells.value.shape), draw(*cells.covariance.shape)
-    start = torch.tensor([-0.5, -0.4], dtype=D)
+    start = f64([-0.5, -0.4])
     given = leaves(1.5 * draw(2, 2 * shape.terms), half @ half.mT, value, covariance, start)
     weights = [draw(2, count, height, width) for count in (2, 3)]
 
@@ -254,7 +254,7 @@ def test_the_step_to_the_start_is_that_of_plain_operations(model, height, width,
             pulls += torch.autograd.grad(wanted, given, **options)
         return *found, *pulls
 
-    torch.testing.assert_close(run(nullcontext), run(plain_operations), rtol=1e-10, atol=1e-10)
+    close(run(nullcontext), run(plain_operations), rtol=1e-10, atol=1e-10)
 
 
 class Closed(nn.Module):
@@ -274,6 +274,6 @@ def test_a_program_follows_the_counts_it_is_given(generator):
     precision."""
     counts = torch.poisson(torch.full((1, 2, 2, 16, 20), 2.0), generator=generator)
     expected = Closed()(evenly_timed(counts))
-    assert float(expected.flow_px.abs().max()) > 0.01
+    assert expected.flow_px.abs().max() > 0.01
     found = trace(Closed(), 16, 20).module()(counts)
-    torch.testing.assert_close(found, (expected.flow_px, expected.confidence), rtol=0, atol=1e-4)
+    close(found, (expected.flow_px, expected.confidence), atol=1e-4)

@@ -11,6 +11,7 @@ from codesign.flow import estimate_lk
 from codesign.flow.lk import path
 from codesign.types import EventVolume
 from tests.flow.test_lk import D, length, mean_error, moving, pattern, pixels
+from tests.numbers import close, f64
 
 BINS = 8
 STEPS = 160  # of the quadrature, per bin 20
@@ -27,7 +28,7 @@ def along(seed, way):
     signed = 20 * levels.diff(dim=0).unflatten(0, (BINS, -1)).sum(1)
     counts = torch.stack([signed.clamp_min(0), (-signed).clamp_min(0)])[None]
     times = (torch.arange(BINS, dtype=D) + 0.5) / BINS, torch.full((BINS,), 1 / BINS, dtype=D)
-    whole = (way(edges[-1]) - way(edges[0])) * torch.tensor([4.0, -2.0], dtype=D)
+    whole = (way(edges[-1]) - way(edges[0])) * f64([4.0, -2.0])
     return EventVolume(counts, *times), whole[:, None, None].expand(2, *x.shape)
 
 
@@ -62,8 +63,8 @@ def test_a_sensor_that_begins_with_the_window_is_no_slow_start():
     )
     volume = events.from_counts(counts[:, :, None], t_s, 5)
     each = volume.counts.sum((0, 1, 3, 4))
-    assert float(each[0]) < 0.6 * float(each[4])
-    truth = torch.tensor([4.0, 2.0], dtype=D)[:, None, None]
+    assert each[0] < 0.6 * each[4]
+    truth = f64([4.0, 2.0])[:, None, None]
     assert mean_error(estimate_lk(volume, "constant"), truth) <= 0.09 * length(truth)
 
 
@@ -73,14 +74,14 @@ def test_even_motion_keeps_its_bins():
     span = volume.collected_s.sum()
     weight = volume.collected_s / span
     found = path.path(signed, 1000 * weight[None], weight, volume.centroid_s / span - 0.5)
-    torch.testing.assert_close(found.counts, signed, rtol=0, atol=1e-9)
+    close(found.counts, signed, atol=1e-9)
     assert found.net.tolist() == pytest.approx([1.0])
     assert found.start.tolist() == pytest.approx([-0.5])
 
 
 def test_bins_are_shared_so_that_their_place_stays():
-    nodes = torch.tensor([-0.4, -0.1, 0.2, 0.45], dtype=D)
-    place = torch.tensor([[-0.5, -0.3, 0.0, 0.2, 0.44, 0.5]], dtype=D)
+    nodes = f64([-0.4, -0.1, 0.2, 0.45])
+    place = f64([[-0.5, -0.3, 0.0, 0.2, 0.44, 0.5]])
     shares = path._shared(place, nodes)
     torch.testing.assert_close(shares.sum(2), torch.ones_like(place))
     torch.testing.assert_close(shares @ nodes, place)

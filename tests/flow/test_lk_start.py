@@ -9,6 +9,7 @@ import torch
 from codesign.flow import estimate_lk
 from codesign.flow.lk import polynomials
 from tests.flow.test_lk import D, length, mean_error, moving, pixels
+from tests.numbers import close, f64, randn64, seeded
 
 FINE_PX = (4.0, 8.0)  # a blur of 4 px leaves a thousandth of these textures
 
@@ -18,9 +19,9 @@ def test_a_polynomial_is_read_off_its_own_flow(size, generator):
     """Within the fixed point (a factor of 0.1 in each of 5 steps) and the ridge (1e-6 of the mean
     diagonal, where the least term counts some hundredth of the mean)."""
     shape = polynomials.Polynomials("affine", *size)
-    matrix = 0.05 * torch.randn(2, 2, 2, generator=generator, dtype=D)
-    shift = torch.randn(2, 2, generator=generator, dtype=D)
-    start = torch.tensor([-0.5, -0.3], dtype=D)
+    matrix = 0.05 * randn64(generator, 2, 2, 2)
+    shift = randn64(generator, 2, 2)
+    start = f64([-0.5, -0.3])
     x, y = pixels(*size)
     at = torch.stack([x - x.mean(), y - y.mean()])
     # w = M (a - s w) + t
@@ -28,7 +29,7 @@ def test_a_polynomial_is_read_off_its_own_flow(size, generator):
     inverse = torch.linalg.inv(torch.eye(2, dtype=D) + start[:, None, None] * matrix)
     found = shape.fitted(torch.einsum("bij,bjyx->biyx", inverse, right), start) @ shape.unit.T
     parameters = torch.cat([shift[:, :, None], matrix * shape.half], 2).flatten(1)
-    torch.testing.assert_close(found, parameters, rtol=0, atol=1e-3)
+    close(found, parameters, atol=1e-3)
 
 
 @pytest.mark.parametrize("model", ["affine", "local"])
@@ -40,7 +41,7 @@ def test_a_start_near_by_finds_what_the_coarse_blur_wipes_out(model):
     assert mean_error(found, truth) <= 0.01 * length(truth)
     whole = near[:, :, None, None].expand(-1, -1, *truth.shape[1:])
     again = estimate_lk(volume, model, start_px=whole)
-    torch.testing.assert_close(again.flow_px, found.flow_px, rtol=0, atol=1e-9)
+    close(again.flow_px, found.flow_px, atol=1e-9)
 
 
 @pytest.mark.parametrize("waves_px", [FINE_PX, (6.0, 24.0)])
@@ -61,12 +62,12 @@ def test_events_that_say_nothing_keep_no_start(count):
     # stay)
     shell, _ = moving(0, steps=10)
     for seed in range(2):
-        draw = torch.Generator().manual_seed(seed)
+        draw = seeded(seed)
         counts = torch.zeros_like(shell.counts)
         counts.view(-1)[torch.randint(counts.numel(), (count,), generator=draw)] += 1
         volume = replace(shell, counts=counts)
         warm = estimate_lk(volume, start_px=torch.tensor([[40.0, -20.0]])).flow_px
-        torch.testing.assert_close(warm, estimate_lk(volume).flow_px, rtol=0, atol=1e-6)
+        close(warm, estimate_lk(volume).flow_px, atol=1e-6)
 
 
 def test_starts_of_a_batch_are_each_their_own_and_have_no_gradient():
@@ -77,4 +78,4 @@ def test_starts_of_a_batch_are_each_their_own_and_have_no_gradient():
     assert not found.requires_grad
     for k, volume in enumerate((a, b)):
         alone = estimate_lk(volume, start_px=starts[k : k + 1]).flow_px[0]
-        torch.testing.assert_close(found[k], alone, rtol=0, atol=1e-9)
+        close(found[k], alone, atol=1e-9)

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-import torch
 from scipy.ndimage import correlate1d
 
 from codesign.flow import estimate_lk
@@ -14,6 +13,7 @@ from codesign.flow.lk import cells
 from codesign.flow.lk.polynomials import Polynomials
 from tests.certain_case import certain
 from tests.flow.test_lk import moving
+from tests.numbers import randn64
 
 PRIOR_PX = 3.0
 FLOOR = 0.02
@@ -172,7 +172,7 @@ def test_one_step_is_that_of_the_formulas_written_out(
 
 @pytest.mark.parametrize(("model", "terms"), [("constant", 1), ("affine", 3), ("quadratic", 6)])
 def test_the_length_of_a_step_is_its_mean_over_the_image(model, terms, generator):
-    parameters = torch.randn(5, 2 * terms, generator=generator, dtype=torch.float64)
+    parameters = randn64(generator, 5, 2 * terms)
     found = Polynomials(model, 40, 40).mean_square(parameters)
     assert found.tolist() == pytest.approx(
         [mean_square(p, terms) for p in parameters.numpy()], rel=1e-12

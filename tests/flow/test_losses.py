@@ -11,13 +11,12 @@ import torch
 from codesign.flow import losses, metrics
 from codesign.flow.export import evenly_timed
 from codesign.types import FlowField
-
-D = torch.float64
+from tests.numbers import D, f64, rand64, randn64
 
 
 def field(values, valid=None, **claims):
     """FlowField [B, 2, 1, N] of [B][N] pairs."""
-    flow = torch.tensor(values, dtype=D).permute(0, 2, 1)[:, :, None]
+    flow = f64(values).permute(0, 2, 1)[:, :, None]
     valid = (
         torch.ones_like(flow[:, 0], dtype=torch.bool)
         if valid is None
@@ -35,7 +34,7 @@ def check_gradients(function, *inputs):
 
 
 def test_charbonnier_by_hand():
-    squared = torch.tensor([0.0, 9.0, 16.0], dtype=D)
+    squared = f64([0.0, 9.0, 16.0])
     # sqrt(9 + 16) - 4
     assert losses.charbonnier(squared, 4.0).tolist() == pytest.approx([0, 1, math.sqrt(32) - 4])
     assert losses.charbonnier(squared, 4.0, 1.0).tolist() == pytest.approx([0, 9, 16])
@@ -60,7 +59,7 @@ ONE = (0.5 + math.sqrt(20) - 4) / 2
         # in half pixels: 6 of 8 costs sqrt(36 + 64) - 8 = 2, 4 of 8 costs sqrt(16 + 64) - 8
         ([FIRST], {"epsilon": 8.0, "unit_per_px": 2.0}, 2 * ONE),
         # 2 px of the second sample count 3
-        ([FIRST], {"unit_per_px": torch.tensor([1.0, 1.5], dtype=D)}, (0.5 + 1) / 2),
+        ([FIRST], {"unit_per_px": f64([1.0, 1.5])}, (0.5 + 1) / 2),
     ],
 )
 def test_supervised_loss_by_hand(predictions, options, right):
@@ -93,9 +92,9 @@ def test_samples_without_truth_count_zero_and_may_hold_anything():
 
 
 def test_gradcheck_of_the_supervised_losses(generator):
-    flow = torch.randn(2, 2, 1, 2, generator=generator, dtype=D)
-    factor = torch.randn(2, 3, 1, 2, generator=generator, dtype=D)
-    confidence = torch.rand(2, 1, 2, generator=generator, dtype=D)
+    flow = randn64(generator, 2, 2, 1, 2)
+    factor = randn64(generator, 2, 3, 1, 2)
+    confidence = rand64(generator, 2, 1, 2)
 
     def supervised(flow, unit=1.0):
         return losses.supervised_loss([FIRST, replace(LAST, flow_px=flow)], TRUTH, unit_per_px=unit)
@@ -121,9 +120,9 @@ def test_long_tailed_likelihood_is_that_of_a_density_with_the_covariance_claimed
     density = torch.exp(-math.sqrt(3) * radius) * radius
     moment = torch.trapezoid(density * radius**2, radius) / torch.trapezoid(density, radius)
     assert float(moment) == pytest.approx(2, rel=1e-8)
-    factor = torch.randn(4, 2, 2, generator=generator, dtype=D) + torch.eye(2, dtype=D)
+    factor = randn64(generator, 4, 2, 2) + torch.eye(2, dtype=D)
     matrix = factor @ factor.mT
-    flow, truth = 3 * torch.randn(2, 1, 4, 2, generator=generator, dtype=D)
+    flow, truth = 3 * randn64(generator, 2, 1, 4, 2)
     claim = torch.stack([matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 1]])[None, :, None]
     spare = matrix + 0.0025 * torch.eye(2, dtype=D)
     white = torch.linalg.solve(torch.linalg.cholesky(spare), (flow - truth)[0][..., None])
@@ -158,7 +157,7 @@ def test_a_degenerate_covariance_keeps_its_floor_in_single_precision():
 
 
 def test_photometric_loss_of_a_moved_picture(generator):
-    wide = 255 * torch.rand(9, 14, generator=generator, dtype=D)
+    wide = 255 * rand64(generator, 9, 14)
     # what is at x in the first is at x + 3 in the second
     frames = torch.stack([wide[:, 3:], wide[:, :-3]])[None]
     still = losses.charbonnier(((frames[:, 1] - frames[:, 0]) / 255).square(), 1e-3, 0.45)
@@ -166,7 +165,7 @@ def test_photometric_loss_of_a_moved_picture(generator):
     fitted = still[..., -3:].sum() / still.numel()
     for shift in (3.0, 1e3, -1e6, 0.0):
         right = fitted if shift == 3.0 else still.mean()
-        flow = torch.tensor([shift, 0.0], dtype=D)[None, :, None, None].expand(1, 2, 9, 11)
+        flow = f64([shift, 0.0])[None, :, None, None].expand(1, 2, 9, 11)
         assert float(losses.photometric_loss(frames, flow)) == pytest.approx(float(right))
 
 
@@ -178,12 +177,12 @@ def test_smoothness_of_a_ramp_by_hand():
     assert float(losses.smoothness_loss(torch.stack([3 * x, 4 * y])[None])) == pytest.approx(right)
     # two powers that are equal but for their last bits, 1e-3^0.9 each and good to two units or so
     eps = torch.finfo(torch.float32).eps
-    assert abs(float(losses.smoothness_loss(torch.ones(1, 2, 4, 5)))) <= 4 * eps * 1e-3**0.9
+    assert abs(losses.smoothness_loss(torch.ones(1, 2, 4, 5))) <= 4 * eps * 1e-3**0.9
 
 
 def test_gradcheck_of_the_frame_losses(generator):
-    frames = 255 * torch.rand(1, 2, 5, 6, generator=generator, dtype=D)
-    flow = 2 * torch.randn(1, 2, 5, 6, generator=generator, dtype=D)  # some of it leaves the image
+    frames = 255 * rand64(generator, 1, 2, 5, 6)
+    flow = 2 * randn64(generator, 1, 2, 5, 6)  # some of it leaves the image
     check_gradients(lambda f, g: losses.photometric_loss(255 * g, f), flow, frames / 255)
     check_gradients(losses.smoothness_loss, flow)
 

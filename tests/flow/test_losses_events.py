@@ -11,21 +11,20 @@ from codesign.flow import contrast, losses
 from codesign.flow.export import evenly_timed
 from tests.flow.test_contrast import centred
 from tests.flow.test_losses import check_gradients
-
-D = torch.float64
+from tests.numbers import D, f64, rand64, randn64, seeded
 
 
 def dots(zoom=0.0, shift=(0.0, 0.0), size=40, radius=12.0, count=24, bins=6, steps=36):
     """Volume of Gaussian dots (1.2 px) of both signs, scattered around the middle, that move and
     grow by zoom x + shift; the grid [2, H, W] from the middle."""
     x, y = grid = centred(size)
-    u = torch.rand(3, count, generator=torch.Generator().manual_seed(3), dtype=D)
+    u = rand64(seeded(3), 3, count)
     place = (
         radius * u[0].sqrt() * torch.stack([(2 * math.pi * u[1]).cos(), (2 * math.pi * u[1]).sin()])
     )
     tau = (torch.arange(steps, dtype=D)[:, None, None, None] + 0.5) / steps
     at = place[:, None, :, None, None] * (1 + tau * zoom)
-    at = at + tau * torch.tensor(shift, dtype=D)[:, None, None, None, None]
+    at = at + tau * f64(shift)[:, None, None, None, None]
     blob = (
         torch.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / (2 * (1.2 * (1 + tau * zoom)) ** 2))
         / steps
@@ -56,7 +55,7 @@ def test_translation_is_least_at_the_true_motion(loss):
     volume, grid = dots(shift=(4.0, -2.5))
 
     def along(u, v):
-        return loss(volume, (0 * grid + torch.tensor([u, v], dtype=D)[:, None, None])[None])
+        return loss(volume, (0 * grid + f64([u, v])[:, None, None])[None])
 
     # symmetric about the true motion but for the grid, whose phases the B-spline leaves visible in
     # third moments only
@@ -66,7 +65,7 @@ def test_translation_is_least_at_the_true_motion(loss):
     assert least(lambda v: along(4.0, v), [-3.5, -3.0, -2.5, -2.0, -1.5]) == pytest.approx(
         -2.5, abs=0.03
     )
-    assert float(along(4.0, -2.5)) < 0.6
+    assert along(4.0, -2.5) < 0.6
 
 
 @pytest.mark.parametrize("zoom", [0.3, -0.25])
@@ -97,13 +96,13 @@ def test_no_events_cost_as_much_as_zero_flow_and_give_no_gradient(generator):
 
 
 def test_gradcheck_in_events_and_flow(generator):
-    counts = torch.rand(1, 2, 2, 3, 4, generator=generator, dtype=D)
-    flow = 0.8 * torch.randn(1, 2, 3, 4, generator=generator, dtype=D)
+    counts = rand64(generator, 1, 2, 2, 3, 4)
+    flow = 0.8 * randn64(generator, 1, 2, 3, 4)
     check_gradients(lambda c, f: losses.contrast_loss(evenly_timed(c), f), counts, flow)
 
 
 def test_the_weight_of_an_area_is_itself_where_it_is_moderate():
-    area = torch.tensor([-3.0, 0.0, 0.2, 0.5, 1.0, 1.5, 1e6], dtype=D)
+    area = f64([-3.0, 0.0, 0.2, 0.5, 1.0, 1.5, 1e6])
     one = torch.ones_like(area)
     none = torch.zeros_like(area)
     assert losses._stretch((area, none, none, one)).tolist() == pytest.approx(
@@ -113,7 +112,7 @@ def test_the_weight_of_an_area_is_itself_where_it_is_moderate():
     assert not losses._stretch((-one, none, none, -area.abs())).any()
     # no corner at 0, 0.2 or 1.5
     check_gradients(lambda a: losses._stretch((a, none, none, one)), area)
-    turn = torch.tensor(0.8, dtype=D)  # a rotation by 46 degrees changes no area
+    turn = f64(0.8)  # a rotation by 46 degrees changes no area
     assert losses._stretch(
         (turn.cos(), -turn.sin(), turn.sin(), turn.cos())
     ).item() == pytest.approx(1)

@@ -24,12 +24,13 @@ from codesign.flow.refiner_evidence import (
     Evidence,
 )
 from codesign.flow.warp import pixel_grid
-from codesign.types import EventVolume, FlowField, FlowWindows
+from codesign.types import FlowField, FlowWindows
 from scenes.windows.sets import HARSH, SETS
 from scenes.windows.streams import turning
+from tests.flow.volumes import drawn, in_even_bins
+from tests.numbers import D, close, f64, randn64, seeded
 
 SEED = 4242  # of no study
-D = torch.float64
 
 
 def network(seed=0, dtype=D, **options):
@@ -43,19 +44,6 @@ def network(seed=0, dtype=D, **options):
     return made.eval()
 
 
-def volume(counts):
-    bins = counts.shape[2]
-    return EventVolume(
-        counts, (torch.arange(bins, dtype=D) + 0.5) / bins, torch.full((bins,), 1 / bins, dtype=D)
-    )
-
-
-def events(*shape, rate=0.3, seed=1):
-    return torch.poisson(
-        torch.full(shape, rate, dtype=D), generator=torch.Generator().manual_seed(seed)
-    )
-
-
 def begun(flow):
     """A start that may be off by a pixel."""
     covariance = (
@@ -66,7 +54,7 @@ def begun(flow):
 
 def signed(bins):
     """A volume of signed bins [n, H, W]."""
-    return volume(torch.stack([bins.clamp(min=0), (-bins).clamp(min=0)])[None])
+    return in_even_bins(torch.stack([bins.clamp(min=0), (-bins).clamp(min=0)])[None])
 
 
 def drifting(flow, side=64):
@@ -84,22 +72,23 @@ def drifting(flow, side=64):
 def test_a_fresh_network_is_the_closed_form(size):
     """Its last layers are zero: flow and, but for the 0.01 px^2 that are added, covariance come
     through; at any size, by events as the clock, from an expected flow."""
-    counts = events(2, 2, 8, *size) * torch.linspace(0.2, 3.0, 8, dtype=D)[:, None, None]
-    given = volume(counts)
+    counts = (
+        drawn(2, 2, 8, *size, rate=0.3, seed=1)
+        * torch.linspace(0.2, 3.0, 8, dtype=D)[:, None, None]
+    )
+    given = in_even_bins(counts)
     made = Refiner().double()
     start = estimate_lk(given, model="local")
     found = made.refined(given, start)[-1]
     assert torch.equal(found.flow_px, start.flow_px)
     shown = counts.flatten(1).sum(1).square() / (counts.flatten(1).sum(1).square() + 100)
-    expected = (0.01 * shown)[:, None, None, None] * torch.tensor([1.0, 0.0, 1.0], dtype=D)[
-        :, None, None
-    ]
+    expected = (0.01 * shown)[:, None, None, None] * f64([1.0, 0.0, 1.0])[:, None, None]
     added = found.covariance_px2 - start.covariance_px2
-    torch.testing.assert_close(added, expected.expand_as(added), rtol=0, atol=1e-12)
-    expected = torch.tensor([[5.0, -2.0]], dtype=D).expand(2, 2)
+    close(added, expected.expand_as(added), atol=1e-12)
+    expected = f64([[5.0, -2.0]]).expand(2, 2)
     for options in ({"clock": "events"}, {"start_px": expected}):
         closed = estimate_lk(given, model="local", **options).flow_px
-        assert float((closed - start.flow_px).abs().max()) > 1e-6
+        assert (closed - start.flow_px).abs().max() > 1e-6
         assert torch.equal(made(given, **options).flow_px, closed)
 
 
@@ -144,33 +133,17 @@ def test_the_correction_counts_as_far_as_events_bend_the_field(case, most_px, of
     assert error <= of_whole * of_all
 
 
-@pytest.mark.parametrize("missing", [(0.0, 0.0), (0.6, -0.4)])
-def test_the_evidence_says_what_is_missing(missing):
-    """A texture that drifts by (2, -1) px, looked at along a flow that is short by ``missing``:
-    what the finest blur asks for, within the 0.1 px that the prior and second differences take."""
-    short = torch.tensor([2.0 - missing[0], -1.0 - missing[1]], dtype=D)
-    unknown = torch.full((1, 1, 16, 16), MOST_PX**2 / MISFIT, dtype=D)
-    _, solved = Evidence(drifting((2.0, -1.0))).at(
-        short[None, :, None, None].expand(1, 2, 16, 16), unknown
-    )
-    for flow in solved[0, :4, :, 5:11, 5:11]:
-        assert flow.mean((1, 2)).tolist() == pytest.approx(missing, abs=0.1)
-
-
 def test_the_evidence_is_damped_least_squares(generator):
     """Sums of products of slopes over a window: the solutions of (w N + 1 / MOST^2) f = -w r and of
     the same with the claimed variance, with the weight of the module's docstring, bent towards 3 px
     at a blur of 1 px."""
     evidence = Evidence(drifting((0.0, 0.0), 16))
-    slopes = (
-        torch.randn(3, 60, generator=generator, dtype=D)
-        * torch.tensor([0.3, 0.2, 0.2], dtype=D)[:, None]
-    )
+    slopes = randn64(generator, 3, 60) * f64([0.3, 0.2, 0.2])[:, None]
     pairs = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
     products = [float((slopes[i] * slopes[j]).sum()) for i, j in pairs]
     seen = 59.0
     density = 0.7
-    sums = torch.tensor([*products, seen, density * (seen + 1) - (seen + 1) / 64], dtype=D)
+    sums = f64([*products, seen, density * (seen + 1) - (seen + 1) / 64])
     claimed = 0.03
     found = evidence._solved(
         sums[None, :, None, None], 1, torch.full((1, 1, 1, 1), claimed, dtype=D)
@@ -193,7 +166,7 @@ def test_beside_a_border_the_flow_of_the_other_side_is_told_true_from_false():
     """Two textures meet between the cells 7 and 8 and drift apart. Along the true flow every cell
     loses contrast by the flow of the other side; where the left flow reaches two cells too far, the
     right one gains."""
-    noise = torch.randn(64, 64, generator=torch.Generator().manual_seed(6), dtype=D)
+    noise = randn64(seeded(6), 64, 64)
     left, right = (torch.stack([noise.roll(way * k, 0) for k in range(8)]) for way in (1, -1))
     bins = torch.where(torch.arange(64) < 32, left, right)
     evidence = Evidence(signed(bins))
@@ -230,9 +203,7 @@ def test_cells_become_pixels_linearly_until_edges_are_learnt():
     own = torch.zeros(1, 9, CELL**2, 6, 7, dtype=D)
     own[:, 4] = 100.0
     steps = _on_pixels(image, own.flatten(1, 2))
-    torch.testing.assert_close(
-        steps, image.repeat_interleave(CELL, 2).repeat_interleave(CELL, 3), rtol=0, atol=1e-9
-    )
+    close(steps, image.repeat_interleave(CELL, 2).repeat_interleave(CELL, 3), atol=1e-9)
 
 
 def test_an_image_is_continued_on_cells_by_its_own_width_and_height():
@@ -247,8 +218,8 @@ def test_an_image_is_continued_on_cells_by_its_own_width_and_height():
 
 def test_gradient_to_a_start_passes_gradcheck(generator):
     made = network()
-    counts = volume(events(1, 2, 8, 16, 16, rate=1.0))
-    start = torch.randn(1, 2, 16, 16, dtype=D, generator=generator).requires_grad_()
+    counts = in_even_bins(drawn(1, 2, 8, 16, 16, seed=1))
+    start = randn64(generator, 1, 2, 16, 16).requires_grad_()
 
     def refined(start):
         return made.refined(counts, begun(start))[-1].flow_px
@@ -265,7 +236,7 @@ def test_motion_that_turns_back_keeps_the_closed_form_by_events_as_far_as_it_com
     found = network()(turned, clock="events")
     assert (found.flow_px - start).abs().max() < 1e-3
     spread = (found.covariance_px2[:, 0] + found.covariance_px2[:, 2]) / 2
-    torch.testing.assert_close(found.confidence, 9 / (9 + spread), rtol=1e-3, atol=0)
+    close(found.confidence, 9 / (9 + spread), rtol=1e-3)
     assert (network().refined(turned, begun(start))[-1].flow_px - start).abs().max() > 0.1
 
 

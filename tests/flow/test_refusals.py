@@ -21,6 +21,7 @@ from tests.flow.test_contrast import moving_dots, uniform, window
 from tests.flow.test_export import Small
 from tests.flow.test_losses import FIRST, TRUTH, D
 from tests.flow.test_tracker import SIZE
+from tests.numbers import f64
 
 FLOW = torch.zeros(2, 3, 3)
 CORNER = FLOW[:, :2, :2]
@@ -32,7 +33,7 @@ DOTS = moving_dots()
 STREAM = stream_of((10, 1, 1, 1), height_px=8, width_px=16)
 STILL = torch.zeros(2, 8, 16)
 UNKNOWN = torch.zeros(1, 2, 8, 16, dtype=D).index_fill(3, torch.tensor([2]), math.nan)
-TILTED = torch.tensor([1.0, 2.0, 1.0], dtype=D)[None, :, None, None].expand(2, 3, 1, 2)
+TILTED = f64([1.0, 2.0, 1.0])[None, :, None, None].expand(2, 3, 1, 2)
 
 
 def tracker(estimator=test_tracker.summed, **options):

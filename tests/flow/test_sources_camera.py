@@ -23,6 +23,7 @@ from codesign.flow.sources.camera import (
     signed_axes,
 )
 from codesign.flow.sources.rendered import CameraFit
+from tests.numbers import f64
 from tests.recording_case import DAVIS, ETH_CALIBRATION, eth_text, gyroscope, made, poses, recording
 
 
@@ -83,9 +84,7 @@ def test_distortion_is_that_of_another_implementation_and_its_inverse_brings_pix
     matrix[:2, :2] = torch.diag(torch.tensor(lens.focal_px))
     matrix[:2, 2] = torch.tensor(lens.centre_px)
     flat = torch.from_numpy(rays[..., :2] * lens.focal_px + lens.centre_px).reshape(1, -1, 2)
-    theirs = distort_points(
-        flat, matrix[None], torch.tensor([lens.distortion], dtype=torch.float64)
-    )
+    theirs = distort_points(flat, matrix[None], f64([lens.distortion]))
     np.testing.assert_allclose(theirs.reshape(180, 240, 2).numpy(), pixels, rtol=0, atol=1e-5)
 
 

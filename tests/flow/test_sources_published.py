@@ -16,6 +16,7 @@ from codesign.flow.sources import DsecWindows, MvsecWindows, open_windows
 from codesign.flow.sources.dsec import splatted
 from studies.make_dataset.store import h5
 from tests.event_streams import random_stream
+from tests.numbers import close
 from tests.recording_case import gone, halved, rewritten, stores
 
 # DSEC
@@ -67,7 +68,7 @@ def test_dsec_windows(two, tmp_path):
         plain = events.from_stream(DSEC, t0_us, t0_us + 100_000, 5).counts[0]
         moved = torch.zeros_like(plain)  # three to the right, two up; what leaves is gone
         moved[..., :-2, 3:] = plain[..., 2:, :-3]
-        torch.testing.assert_close(batch.volume.counts[k], moved, rtol=0, atol=1e-6)
+        close(batch.volume.counts[k], moved, atol=1e-6)
     assert batch.truth.interval_s == pytest.approx(0.1)
     assert batch.frames is None
 
@@ -80,7 +81,7 @@ def test_events_between_pixels_are_shared_and_none_is_lost():
     expected[0, 0, 1:3, 2], expected[0, 0, 1:3, 3] = 0.375, 0.125
     expected[1, 1, 2, 3] = 1.0
     expected[0, 2, 0, 0] = 0.5  # half of it lies outside
-    torch.testing.assert_close(counts, expected, rtol=0, atol=1e-7)
+    close(counts, expected, atol=1e-7)
 
 
 # MVSEC
@@ -126,7 +127,7 @@ def test_mvsec_windows(frames, chunks, length_s, grid, tmp_path):
     assert torch.equal(batch.volume.counts, expected)
     flow, valid = batch.truth.flow_px[0], batch.truth.valid[0]
     truth = torch.tensor([[8.0], [-4.0]]).expand(2, int(valid.sum())) * (length_s / 0.05)
-    torch.testing.assert_close(flow[:, valid], truth, rtol=1e-6, atol=1e-5)
+    close(flow[:, valid], truth, rtol=1e-6, atol=1e-5)
     # followed through as many intervals as the window touches: it ends where a lookup, one
     # interval's part before the end, leaves the picture
     edges = 10.02 + 0.05 * np.arange(12)

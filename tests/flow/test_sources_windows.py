@@ -19,6 +19,7 @@ from scenes import worlds
 from studies.frame.run import main
 from studies.make_dataset import __main__ as study
 from studies.make_dataset.store import h5
+from tests.numbers import close
 from tests.recording_case import eth_text, gone, halved, made, rewritten, stores
 
 
@@ -50,7 +51,7 @@ def test_windows_of_one_interval_are_what_is_stored(dataset):
         volume = events.from_stream(
             stream, *(int(t) for t in file["timestamps"][frame : frame + 2]), 4
         )
-        assert float(volume.counts.sum()) > 0
+        assert volume.counts.sum() > 0
         assert torch.equal(batch.volume.counts[k], volume.counts[0])
         for found, right in (
             (batch.truth.flow_px, file["flow"][frame]),
@@ -59,8 +60,8 @@ def test_windows_of_one_interval_are_what_is_stored(dataset):
         ):
             np.testing.assert_array_equal(found[k].numpy(), right)
         # frame times are whole microseconds: 11111 or 11112
-        torch.testing.assert_close(batch.volume.centroid_s, volume.centroid_s, rtol=1e-4, atol=0)
-        torch.testing.assert_close(batch.volume.collected_s, volume.collected_s, rtol=1e-4, atol=0)
+        close(batch.volume.centroid_s, volume.centroid_s, rtol=1e-4)
+        close(batch.volume.collected_s, volume.collected_s, rtol=1e-4)
     assert batch.truth.interval_s == pytest.approx(1 / 90, rel=1e-4)
 
 
@@ -72,16 +73,16 @@ def test_flow_over_several_frames_is_the_renderers(dataset):
             camera, worlds.room(), torch.from_numpy(file["poses"])[[6, 12]]
         )
     truth, seen = rendered.flow_px[0], rendered.valid[0]
-    assert float(truth.norm(dim=0).mean()) > 1
+    assert truth.norm(dim=0).mean() > 1
     source = DatasetWindows(dataset / "sequence_000_orbital", window_frames=6)
     assert len(source) == 2
     batch = source.batch([1])
     both = batch.truth.valid[0] & seen
     # points far outside the picture have no place in the fit
-    assert float((both == seen).double().mean()) > 0.99
+    assert (both == seen).double().mean() > 0.99
     # float32 depth to 6e-8 of some metres over a flow of some px, and the fit of the camera (1e-4
     # px, measured with traced rays)
-    assert float((batch.truth.flow_px[0].double() - truth).norm(dim=0)[both].max()) < 2e-4
+    assert (batch.truth.flow_px[0].double() - truth).norm(dim=0)[both].max() < 2e-4
     np.testing.assert_array_equal(batch.frames[0].numpy(), file["frames"][[6, 12]])
     ends = (int(file["timestamps"][k]) for k in (6, 12))
     assert torch.equal(batch.volume.counts, events.from_stream(stream, *ends, 8).counts)
@@ -129,9 +130,9 @@ def test_times_of_the_bins_are_those_of_from_stream():
     for bins in (1, 2, 5):
         volume = events.from_stream(ordered(one, one, one, one, 3, 3), 0, 1_000_000, bins)
         right = volume.centroid_s, volume.collected_s
-        torch.testing.assert_close(bin_times(bins, 1.0), right, rtol=1e-12, atol=0)
+        close(bin_times(bins, 1.0), right, rtol=1e-12)
         ours = evenly_timed(volume.counts) if bins > 1 else volume
-        torch.testing.assert_close((ours.centroid_s, ours.collected_s), right, rtol=1e-12, atol=0)
+        close((ours.centroid_s, ours.collected_s), right, rtol=1e-12)
 
 
 def test_a_recording_is_a_source_of_windows(tmp_path):

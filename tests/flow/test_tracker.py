@@ -15,12 +15,13 @@ from codesign.events.stream import ordered
 from codesign.flow.tracker import _carried_on
 from codesign.types import FlowField
 from tests.event_streams import part
+from tests.numbers import close, seeded
 
 SIZE = (12, 16)
 
 
 def stream_of(t_us, seed=0):
-    draw = torch.Generator().manual_seed(seed)
+    draw = seeded(seed)
     n = len(t_us)
     x, y = (torch.randint(side, (n,), generator=draw) for side in (SIZE[1], SIZE[0]))
     p = 2 * torch.randint(2, (n,), generator=draw) - 1
@@ -86,11 +87,11 @@ def test_windows_by_time_are_those_of_the_volume_and_empty_ones_are_handed_out()
     for k, window in enumerate(found[:-1]):
         assert (window.t0_us, window.t1_us) == (first + 4000 * k, first + 4000 * (k + 1))
         inside = (stream.t_us >= window.t0_us) & (stream.t_us < window.t1_us)
-        assert window.events == int(inside.sum())
+        assert window.events == inside.sum()
         right = summed(events.from_stream(part(stream, inside), window.t0_us, window.t1_us, 5))
         for name in ("flow_px", "valid", "confidence"):  # all zero without events
             assert torch.equal(getattr(window.field, name), getattr(right, name))
-    assert found[-1].t1_us == int(stream.t_us[-1])
+    assert found[-1].t1_us == stream.t_us[-1]
     skipping = flow.Tracker(summed, window_s=0.004, bins=5, skip=("windows_without_events",))
     assert told(skipping.track([stream])) == [one for one in told(found) if one[2]]
     empty = sum(not window.events for window in found)
@@ -133,7 +134,7 @@ def test_a_warm_start_has_the_speed_of_the_window_before():
     # the same px per second, another duration
     for start, window in zip(starts[1:], found[1:], strict=True):
         seconds = (window.t1_us - window.t0_us) * 1e-6
-        torch.testing.assert_close(start, speed * seconds, rtol=1e-5, atol=0)
+        close(start, speed * seconds, rtol=1e-5)
     for estimator, options in ((steady, {"warm_start": False}), (summed, {})):
         starts.clear()
         tracker = flow.Tracker(estimator, events=10, **options)
@@ -149,7 +150,7 @@ def test_the_flow_before_is_read_where_each_pixel_came_from():
     # one step back along the own flow: x - f(x), where the exact origin is (x - 1) / 1.1
     right = 0.1 * (x - (0.1 * x + 1)) + 1
     inside = x - (0.1 * x + 1) >= 0
-    torch.testing.assert_close(carried[0, 0][inside], right[inside], rtol=0, atol=1e-5)
+    close(carried[0, 0][inside], right[inside], atol=1e-5)
 
 
 def test_processor_time_over_event_time():

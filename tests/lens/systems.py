@@ -11,15 +11,11 @@ import torch
 
 from codesign import lens
 from codesign.lens import GeoLens, Glass, Surface
+from tests.numbers import f64, rand64, seeded
 
 NAMES = ("cooke-triplet", "double-gauss", "la1509")
 LINES = (0.5875618, 0.4861327, 0.6562725)
 PLANE = math.inf
-
-
-def f64(values):
-    """A tensor of doubles."""
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def close(found, truth, rtol=0.0, atol=0.0):
@@ -32,7 +28,7 @@ def close(found, truth, rtol=0.0, atol=0.0):
     truth = (torch.as_tensor(truth) * f64(1.0)).expand_as(found)
     allowed = torch.clamp(rtol * truth.abs(), min=atol)
     near = ((found - truth).abs() <= allowed) | (found == truth)
-    assert bool(near.all()), f"{found} is not {truth}"
+    assert near.all(), f"{found} is not {truth}"
 
 
 def glass(n):
@@ -86,12 +82,12 @@ def figure_of(geo, figure, parameters):
 def check_gradient(function, *values, step=1e-4, rel=1e-6, seed=0):
     """The slope of a scalar function along a direction drawn for every tensor, in proportion to its
     size, against central differences of fourth order."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     leaves = [v.detach().clone().requires_grad_() for v in values]
     slopes = torch.autograd.grad(function(*leaves), leaves)
     for at, (value, slope) in enumerate(zip(values, slopes, strict=True)):
         value = value.detach()
-        drawn = torch.rand(value.shape, generator=generator, dtype=torch.float64).to(value) + 0.5
+        drawn = rand64(generator, value.shape).to(value) + 0.5
         size = value.abs().mean() if value.any() else torch.ones_like(value.sum())
         direction = drawn * torch.where(value == 0, size, value)
 

@@ -13,9 +13,9 @@ from codesign.lens.aiming import aimed_rays
 from codesign.lens.analysis import field_rays, pupil_grid
 from codesign.lens.analysis.field_curves import relative_illumination
 from codesign.lens.trace import trace
-from tests.lens.systems import NAMES, PLANE, close, f64, half_field
+from tests.lens.systems import NAMES, PLANE, close, half_field
+from tests.numbers import D, f64
 
-D = torch.float64
 TURN = torch.arange(720, dtype=D) * math.pi / 360
 RIM = torch.stack([TURN.cos(), TURN.sin()], 1)
 

@@ -26,9 +26,9 @@ from codesign.lens.design.hits import (
     surface_hits,
     traced_semi_aperture_mm,
 )
-from tests.lens.systems import PLANE, check_gradient, check_lens_gradient, close, efl, f64, glass
+from tests.lens.systems import PLANE, check_gradient, check_lens_gradient, close, efl, glass
+from tests.numbers import D, f64, randn64, seeded
 
-D = torch.float64
 CROWN = glass(1.5)
 
 
@@ -285,7 +285,7 @@ def test_every_unit_variable_moves_the_rays_by_the_stated_rms_each_in_its_own_wa
     gram = jacobian.T @ jacobian / 0.01**2
     free = ~held
     # the strong modes: defocus and its kin
-    assert int(free.sum()) >= 3
+    assert free.sum() >= 3
     # differences over a hundredth of a step and those that made the modes bend by some 1e-5 of
     # their motion
     close(gram[free][:, free], torch.eye(int(free.sum()), dtype=D), atol=1e-3)
@@ -293,8 +293,8 @@ def test_every_unit_variable_moves_the_rays_by_the_stated_rms_each_in_its_own_wa
 
 
 def test_gradients_reach_every_variable(design, generator):
-    weights = torch.randn(2, 812, 2, dtype=D, generator=generator)
-    at = 0.1 * torch.randn(len(design.basis), dtype=D, generator=generator)
+    weights = randn64(generator, 2, 812, 2)
+    at = 0.1 * randn64(generator, len(design.basis))
     check_gradient(lambda v: (lens.spots(design.lens(v), FIELDS)[0] * weights).sum(), at)
 
 
@@ -313,7 +313,7 @@ def test_a_lens_with_a_zero_gap_makes_a_design_of_finite_steps():
     # one mode is nothing; three end at a tenth of the mean curvature or of a thickness (which of
     # those that move no ray comes first is for rounding to say), the last where it moves the rays
     # by the stated step
-    size = torch.tensor([0.0175, 0.0175, 3.0, 60.0], dtype=D)[:, None]
+    size = f64([0.0175, 0.0175, 3.0, 60.0])[:, None]
     share = (made.basis[[0, 1, 2, 4]].abs() / size).amax(0)
     close(share[:4].sort().values, [0.0, 0.1, 0.1, 0.1], atol=1e-12)
     last = torch.eye(5, dtype=D)[4]
@@ -321,7 +321,7 @@ def test_a_lens_with_a_zero_gap_makes_a_design_of_finite_steps():
     close(((ahead - behind) / 0.02).square().sum(-1).mean().sqrt(), 0.01, 1e-3)
     # a change relative to nothing
     assert not made.basis[3].any()
-    assert float(made.lens(torch.ones(5)).thickness_mm[1]) <= 2e-5
+    assert made.lens(torch.ones(5)).thickness_mm[1] <= 2e-5
 
 
 # one piece of glass, passed on the way to its mirrored back and on the way from it
@@ -371,9 +371,7 @@ def test_penalty_by_hand_and_its_slope():
 @pytest.mark.bits
 @pytest.mark.parametrize("seed", [0, 1])
 def test_detuning_reaches_its_target_and_keeps_the_other_thicknesses(design, seed):
-    geo, again = (
-        detune(design, FIELDS, 0.05, torch.Generator().manual_seed(seed)) for _ in range(2)
-    )
+    geo, again = (detune(design, FIELDS, 0.05, seeded(seed)) for _ in range(2))
     # forty halvings
     close(lens.rms_spot_mm(geo, FIELDS).mean(), 0.05, 1e-9)
     close(efl(geo), design.efl_mm, 1e-12)

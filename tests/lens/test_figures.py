@@ -22,7 +22,8 @@ from codesign.lens.design.hits import paraxial_semi_aperture_mm, traced_semi_ape
 from codesign.lens.design.tolerance import linear_figures, spot_errors, squared_spots
 from codesign.lens.seidel import seidel_sums
 from codesign.lens.solves import focus_paraxial, focus_rays, hold_efl
-from tests.lens.systems import LINES, check_gradient, check_lens_gradient, close, f64, glass
+from tests.lens.systems import LINES, check_gradient, check_lens_gradient, close, glass
+from tests.numbers import f64
 
 FIELDS = (0.0, 0.15)
 PICTURE = torch.linspace(1, 2, 64, dtype=torch.float64).reshape(8, 8)

@@ -13,7 +13,8 @@ from codesign.errors import CodesignError, DomainError, FileFormatError
 from codesign.lens import GeoLens, Glass, Surface
 from codesign.lens.files.text import LARGEST_BYTES, read_text
 from codesign.lens.surface import Phase
-from tests.lens.systems import FAULTS, close, f64, load_file
+from tests.lens.systems import FAULTS, close, load_file
+from tests.numbers import f64
 
 PLANE = float("inf")
 SPECIAL = [

@@ -9,7 +9,8 @@ import torch
 
 from codesign import lens
 from tests.lens.long_double_lens import by_frames
-from tests.lens.systems import close, f64
+from tests.lens.systems import close
+from tests.numbers import f64
 
 HEAD = "MODE SEQ\nUNIT MM\nENPD 4\nFTYP 0 0 2 1 0 0 0\nYFLN 0 8\nWAVM 1 0.5875618 1\nSURF 0\n  DISZ INFINITY"
 MEDIA = {

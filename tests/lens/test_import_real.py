@@ -12,7 +12,8 @@ import torch
 from codesign import lens
 from codesign.errors import CodesignError, DomainError, FileFormatError
 from codesign.lens.analysis.rays import field_rays
-from tests.lens.systems import close, f64
+from tests.lens.systems import close
+from tests.numbers import f64
 
 FOLDER = "data/lenses"
 EXTENSIONS = (".json", ".zmx", ".seq", ".txt")

@@ -8,7 +8,6 @@ from dataclasses import replace
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-import torch
 from matplotlib.patches import Rectangle
 
 from codesign import lens
@@ -19,10 +18,9 @@ from codesign.report import lens_curves, lens_figures
 from codesign.report.lens_layout import ray_paths
 from studies.frame.run import main
 from studies.lens_report import __main__ as lens_report
-from tests.lens.systems import close, f64
+from tests.lens.systems import close
+from tests.numbers import f64
 from tests.studies.browser import check_page
-
-D = torch.float64
 
 
 @pytest.fixture(autouse=True)

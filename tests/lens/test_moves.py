@@ -21,7 +21,8 @@ from codesign.lens.design import (
 from codesign.lens.design.hits import rim_rays
 from codesign.lens.glass import names
 from tests.lens.long_double_lens import by_frames
-from tests.lens.systems import PLANE, check_gradient, close, efl, f64, glass
+from tests.lens.systems import PLANE, check_gradient, close, efl, glass
+from tests.numbers import f64, randn64
 
 FIELDS = (0.0, 0.2)
 CROWN = Glass.named("N-BK7")
@@ -228,15 +229,15 @@ def test_moved_elements_are_rigid_bodies(name, generator):
     # both programs agree to some 1e-13 mm on the lens at rest
     close(out.position_mm[:, :2], truth[:, 0, :2].astype(float), atol=2e-12)
     close(out.direction, truth[:, 1].astype(float), atol=2e-14)
-    assert float((out.position_mm - geo.trace(starts, towards).position_mm).abs().max()) > 0.05
+    assert (out.position_mm - geo.trace(starts, towards).position_mm).abs().max() > 0.05
 
 
 @pytest.mark.parametrize("size", [0.01, 0.0])
 def test_errors_of_an_element_have_gradients(size, triplet, generator):
     """At rest too, where the kernel would leave decentres out."""
     rays = rim_rays(triplet, (0.1,), count=5)
-    weights = torch.randn(6, 3, dtype=torch.float64, generator=generator)
-    start = size * torch.randn(3, 2, dtype=torch.float64, generator=generator)
+    weights = randn64(generator, 6, 3)
+    start = size * randn64(generator, 3, 2)
 
     def loss(errors):
         return (moved_element(triplet, (2, 3), *errors).trace(*rays).position_mm * weights).sum()

@@ -2,6 +2,7 @@
 systems."""
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -227,9 +228,14 @@ def focus(system, at_m):
     at = 1e3 * L(at_m)
     pupil = analysis.pupil_grid(GRID).numpy()
     product = square = L(0)
-    for bundle in (ld.field_rays(system, "d", f, pupil, d * at) for d in (1, 2) for f in FIELDS):
-        slopes = bundle.slopes - bundle.slopes.mean(0)
-        product = product + (bundle.position * slopes).sum()
+    for d, f in itertools.product((1, 2), FIELDS):
+        colours = [ld.field_rays(system, line, f, pupil, d * at) for line in LINES]
+        position, slopes = (
+            np.concatenate([getattr(rays, name) for rays in colours])
+            for name in ("position", "slopes")
+        )
+        slopes = slopes - slopes.mean(0)
+        product = product + (position * slopes).sum()
         square = square + (slopes**2).sum()
     film = ld.crossing(system, "d", at)
     found = analysis.depth_of_field(geo.focus_at(at_m), 0.02)
@@ -242,7 +248,7 @@ def focus(system, at_m):
         )
         return 2 * abs(y[-1] + film * nu[-1] / system.index["d"][-1])
 
-    shared = focus_rays(geo, FIELDS, LIGHT_UM[:1], GRID, at_m=(at_m, 2 * at_m)).thickness_mm[-1]
+    shared = focus_rays(geo, FIELDS, LIGHT_UM, GRID, at_m=(at_m, 2 * at_m)).thickness_mm[-1]
     limits = [found.near_m] + [found.far_m] * bool(found.far_m.isfinite())
     return {
         "paraxial focus": error(geo.focus_at(at_m).thickness_mm[-1], film),

@@ -13,9 +13,8 @@ from scipy.interpolate import CubicSpline
 from codesign import lens
 from codesign.lens import GeoLens, Phase, Status, Surface, analysis, pupil_grid
 from codesign.lens.diffraction import GridPlate, ZernikePlate, noll, with_plate, zernike
-from tests.lens.systems import PLANE, check_gradient, close, f64, figure_of, paraboloid
-
-D = torch.float64
+from tests.lens.systems import PLANE, check_gradient, close, figure_of, paraboloid
+from tests.numbers import D, f64, rand64, randn64, seeded
 
 
 def landscape():
@@ -27,10 +26,8 @@ def landscape():
 
 
 def bumpy(count=9, pitch=1.5, scale=2.0, **options):
-    generator = torch.Generator().manual_seed(5)
-    return GridPlate(
-        scale * torch.randn(count, count, dtype=D, generator=generator), pitch, **options
-    )
+    generator = seeded(5)
+    return GridPlate(scale * randn64(generator, count, count), pitch, **options)
 
 
 # --- polynomials and splines
@@ -64,7 +61,7 @@ def test_terms_are_those_of_nolls_table():
 
 
 def test_slopes_are_derivatives(generator):
-    points = torch.randn(4, 2, dtype=D, generator=generator) * 0.6
+    points = randn64(generator, 4, 2) * 0.6
     for plate in (ZernikePlate({j: 0.1 * j for j in range(1, 29)}, 1.3), bumpy()):
         at = points.clone().requires_grad_()
         phase, slope, _ = plate.look(at)
@@ -75,7 +72,7 @@ def test_slopes_are_derivatives(generator):
 def test_a_grid_is_the_natural_spline_through_its_points(generator):
     plate = bumpy()
     x = ((torch.arange(9, dtype=D) - 4) * 1.5).numpy()
-    points = torch.rand(50, 2, dtype=D, generator=generator) * 12 - 6
+    points = rand64(generator, 50, 2) * 12 - 6
     phase, _, reaches = plate.look(points)
     rows = CubicSpline(x, plate.phase_rad.detach().numpy(), axis=1, bc_type="natural")
     truth = [float(CubicSpline(x, rows(px), bc_type="natural")(py)) for px, py in points.tolist()]
@@ -164,12 +161,12 @@ def test_loading_and_converting_a_replacement_leave_the_plate_alone(plate):
     twin.load_state_dict(
         state | {name: v * 0 for name, v in state.items() if "extra_state" not in name}
     )
-    assert float(next(twin.plate.parameters()).detach().abs().max()) == 0
+    assert next(twin.plate.parameters()).detach().abs().max() == 0
     for other in (plated.replace(), plated):
         assert next(other.float().plate.parameters()).dtype == torch.float32
     assert next(plate.parameters()) is first
     assert first.dtype == D
-    assert float(first.detach().min()) == 1.0
+    assert first.detach().min() == 1.0
 
 
 def test_what_a_plate_stops_is_said():
@@ -290,9 +287,9 @@ def test_light_behind_the_last_surface_is_that_between_plane_waves():
     ids=["zernike", "grid"],
 )
 def test_gradients_of_light_reach_the_plate(plate, generator):
-    picture = torch.rand(16, 16, dtype=D, generator=generator)
+    picture = rand64(generator, 16, 16)
     (parameter,) = plate.parameters()
-    values = torch.rand(parameter.shape, dtype=D, generator=generator) + 0.5
+    values = rand64(generator, parameter.shape) + 0.5
 
     def light(plated):
         found = analysis.psf_on_pixels(plated, 0.03, 0.004, 16, (0.55, 0.6), grid=192, at_m=1.5)

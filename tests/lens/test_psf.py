@@ -18,9 +18,8 @@ from codesign.lens.analysis import (
     through_focus_mtf,
     through_focus_spot_mm,
 )
-from tests.lens.systems import LINES, close, f64, paraboloid
-
-D = torch.float64
+from tests.lens.systems import LINES, close, paraboloid
+from tests.numbers import D, f64
 
 
 def test_the_airy_pattern():
@@ -45,14 +44,18 @@ def test_the_airy_pattern():
     close(float(energy[64, 64]) / pixel**2, math.pi / 4 / (w * N) ** 2, 1e-3)
 
 
-def test_the_two_transforms_agree():
-    geo = GeoLens(lens.load("la1509").surfaces, 8.0)
-    fft = diffraction_psf(geo, 0.0, grid=32, padding=2)
-    pixels = psf_on_pixels(geo, 0.0, float(fft.pitch_mm[0].detach()), 64, grid=32)
-    close(fft.pitch_mm[0], fft.pitch_mm[1], 1e-10)
-    close(pixels.energy, fft.energy, 1e-6, atol=1e-12)
+# pitches of the two axes differ by 1e-3 off the axis: by 0.02 px at 24 px from the middle
+@pytest.mark.parametrize(("field", "share", "pitch"), [(0.0, 1e-6, 1e-10), (0.03, 1e-3, 1e-3)])
+def test_the_two_transforms_agree(field, share, pitch):
+    """Picture for picture, off the axis with the coma of a singlet: turned or mirrored they differ
+    by a third of the peak."""
+    geo = GeoLens(lens.load("la1509").surfaces, 12.0).freeze()
+    fft = diffraction_psf(geo, field, grid=64, padding=2)
+    pixels = psf_on_pixels(geo, field, float(fft.pitch_mm.mean()), 48, grid=64)
+    close(fft.pitch_mm[0], fft.pitch_mm[1], pitch)
+    close(pixels.energy, fft.energy[40:88, 40:88], atol=share * float(fft.energy.max()))
     # w N / padding, N to (y / f)^2
-    close(fft.pitch_mm[0], f64(0.5875618e-3 * 99.65 / 8 / 2), 5e-3)
+    close(fft.pitch_mm[0], f64(0.5875618e-3 * 99.65 / 12 / 2), 5e-3)
 
 
 def test_the_geometric_spread_keeps_light_and_its_mean():
@@ -70,21 +73,7 @@ def test_the_geometric_spread_keeps_light_and_its_mean():
     on = ((positions[0] - lost.reference_mm) / 0.001 + 4).floor()
     inside = ((on >= 0) & (on < 7)).all(1).double().mean()
     # the share on the grid is not made up to 1
-    assert float(inside) <= float(lost.energy.sum().detach()) < 1
-
-
-def test_diffraction_keeps_the_mean_of_the_rays():
-    # the mean of |U|^2 is the mean slope of the wavefront (Ehrenfest), and the sign of y is that of
-    # the lens: coma of a singlet
-    geo = GeoLens(lens.load("la1509").surfaces, 16.0)
-    field = math.radians(2.0)
-    psf = diffraction_psf(geo, field, grid=256, padding=4)
-    at = torch.arange(1024, dtype=D) - 512
-    mean = float(((psf.energy.sum(1) * at).sum() * psf.pitch_mm[1]).detach())
-    positions, weight = analysis.polychromatic_spot(geo, field, 0.5875618, 64)
-    rays = float(((positions[0, :, 1] - psf.reference_mm[1]) * weight[0]).sum().detach())
-    assert abs(rays) > 5e-4  # mm: there is something to see
-    close(mean, rays, 0.15)  # tails that fall as 1 / r^2 are cut at the picture's rim
+    assert inside <= lost.energy.sum().detach() < 1
 
 
 def test_a_perfect_lens_reaches_the_closed_form():
@@ -100,31 +89,6 @@ def test_a_perfect_lens_reaches_the_closed_form():
     assert not found[:, frequency > 1.001 * cutoff].any()
     geometric = geometric_mtf(paraboloid(), 0.0, frequency)
     close(geometric, torch.ones(2, 45, dtype=D), atol=1e-12)
-
-
-@pytest.mark.parametrize("H", [0.0, 0.7, 1.0])
-def test_mtf_against_a_sum_over_rays_with_their_own_directions(H):
-    # Huygens: every ray is a plane wave near the image; no even grid of direction cosines, no
-    # Fourier transform
-    geo = lens.load("cooke-triplet")
-    field = math.radians(20.0) * H
-    front = analysis.wavefront(geo, field, grid=64)
-    at = (torch.arange(160, dtype=D) - 80) * 0.001
-    waves = [
-        torch.polar(torch.ones_like(a), a)
-        for a in (
-            (2 * math.pi / 0.5875618e-3 * at[:, None] * front.slope[:, k]).detach() for k in (0, 1)
-        )
-    ]
-    amplitude = torch.polar(torch.ones_like(front.waves), -2 * math.pi * front.waves).detach()
-    picture = ((waves[1] * amplitude) @ waves[0].T).abs().square()
-    frequency = f64([0.0, 20.0, 50.0, 100.0])
-    kernel = torch.polar(torch.ones(4, 160, dtype=D), -2 * math.pi * frequency[:, None] * at)
-    truth = torch.stack([(kernel * picture.sum(axis)).sum(1).abs() for axis in (1, 0)])
-    found = diffraction_mtf(geo, field, frequency, grid=128)
-    # the picture's rim at 80 um cuts off 0.4 % of the light, which raises what is left by that
-    # share
-    close(found, truth / truth[:, :1], atol=5e-3)
 
 
 def test_the_geometric_mtf_is_the_transform_of_the_spot():

@@ -12,7 +12,8 @@ import torch
 from codesign import lens
 from codesign.lens import Glass, analysis
 from codesign.lens.seidel import seidel_sums
-from tests.lens.systems import NAMES, PLANE, close, f64, half_field, reference
+from tests.lens.systems import NAMES, PLANE, close, half_field, reference
+from tests.numbers import f64
 
 OPTILAND = json.loads(Path(__file__).with_name("optiland.json").read_text())
 SHARES = (0.0, 0.7, 1.0)

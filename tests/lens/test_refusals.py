@@ -23,7 +23,8 @@ from codesign.lens import (
     spectrum,
 )
 from codesign.lens.design import constraints, hits, precision, tolerance
-from tests.lens.systems import PLANE, close, f64, glass, paraboloid
+from tests.lens.systems import PLANE, close, glass, paraboloid
+from tests.numbers import f64
 
 NAN, INF = math.nan, math.inf
 CROWN, FLINT = glass(1.5), Glass.named("F2")
@@ -140,7 +141,7 @@ def test_the_limit_that_a_sentence_names_is_the_limit(triplet):
     with pytest.raises(CodesignError) as raised:
         triplet.focus_at(0.03)
     limit = float(str(raised.value).split("more than ")[1].split(" m")[0])
-    assert float(triplet.focus_at(limit + 1e-4).thickness_mm[-1].detach()) > 1e3
+    assert triplet.focus_at(limit + 1e-4).thickness_mm[-1].detach() > 1e3
     with pytest.raises(CodesignError, match="does not converge"):
         triplet.focus_at(limit - 1e-4)
 

@@ -12,8 +12,8 @@ from codesign.mount import Body, Housing
 from codesign.mount.pose import attitude
 from codesign.mount.triangles import closest_points, first_crossings
 from scenes import bodies, robots
+from tests.numbers import D, close, f64, rand64, randn64
 
-D = torch.float64
 BOX = ((-0.2, -0.1, 0.0), (0.3, 0.15, 0.4))
 
 
@@ -25,7 +25,7 @@ def box_mesh(low, high):
 
 def box_distance(points, low, high):
     """Closed form: outside the norm of what sticks out, inside the nearest face."""
-    low, high = torch.tensor([low, high], dtype=D)
+    low, high = f64([low, high])
     over = (points - (low + high) / 2).abs() - (high - low) / 2
     return over.clamp_min(0).norm(dim=-1) + over.amax(-1).clamp_max(0)
 
@@ -38,28 +38,28 @@ def ball_mesh(radius):
 
 
 def some_poses(generator, count, spread):
-    angles = (torch.rand(count, 3, generator=generator, dtype=D) - 0.5) * 6
+    angles = (rand64(generator, count, 3) - 0.5) * 6
     poses = torch.eye(4, dtype=D).repeat(count, 1, 1)
     poses[:, :3, :3] = torch.stack([attitude(*each) for each in angles.tolist()])
-    poses[:, :3, 3] = (torch.rand(count, 3, generator=generator, dtype=D) - 0.5) * spread
+    poses[:, :3, 3] = (rand64(generator, count, 3) - 0.5) * spread
     return poses
 
 
 def test_distance_to_a_box_is_the_closed_form(generator):
-    points = 1.5 * (torch.rand(2000, 3, generator=generator, dtype=D) - 0.4)
+    points = 1.5 * (rand64(generator, 2000, 3) - 0.4)
     found = Body([box_mesh(*BOX)]).distance_m(points)
     expected = box_distance(points, *BOX)
-    assert 20 < int((expected < 0).sum()) < 1980
+    assert 20 < (expected < 0).sum() < 1980
     # the sum and root of three squares below 4 in float64
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-14)
+    close(found, expected, atol=1e-14)
 
 
 def test_nearest_points_beat_every_sampled_point(generator):
     """No point of the triangles is nearer than the one found, and the one found is a point of
     them."""
-    triangles = torch.randn(7, 3, 3, generator=generator, dtype=D)
+    triangles = randn64(generator, 7, 3, 3)
     triangles[6, 2] = 0.5 * (triangles[6, 0] + triangles[6, 1])  # one without area
-    points = 2 * torch.randn(50, 3, generator=generator, dtype=D)
+    points = 2 * randn64(generator, 50, 3)
     closest, face = closest_points(points, triangles)
     grid = torch.linspace(0, 1, 101, dtype=D)
     u, v = torch.meshgrid(grid, grid, indexing="ij")
@@ -69,18 +69,18 @@ def test_nearest_points_beat_every_sampled_point(generator):
     brute = torch.cdist(points, sampled).amin(1)
     far = (points - closest).norm(dim=1)
     spacing = 0.01 * float((triangles - triangles.roll(1, 1)).norm(dim=-1).max())
-    assert bool((far <= brute + 1e-12).all())
-    assert bool((brute - far <= spacing).all())
+    assert (far <= brute + 1e-12).all()
+    assert (brute - far <= spacing).all()
     own = torch.cdist(closest[:, None], weight @ triangles[face]).amin((1, 2))
-    assert float(own.max()) <= spacing
+    assert own.max() <= spacing
 
 
 def test_overlapping_solids_have_no_walls_inside():
     """Deep inside one of two boxes that overlap, a face of the other is near; the depth is that to
     the outside."""
     both = Body([box_mesh((0, 0, 0), (2, 1, 1)), box_mesh((0.99, 0.3, 0.3), (3, 0.7, 0.7))])
-    found = both.distance_m(torch.tensor([[1.0, 0.5, 0.5], [2.5, 0.5, 0.5]], dtype=D))
-    torch.testing.assert_close(found, torch.tensor([-0.5, -0.2], dtype=D), rtol=0, atol=1e-14)
+    found = both.distance_m(f64([[1.0, 0.5, 0.5], [2.5, 0.5, 0.5]]))
+    close(found, f64([-0.5, -0.2]), atol=1e-14)
 
 
 @pytest.mark.parametrize("turned", ["outward", "inward", "split at seams"])
@@ -92,10 +92,8 @@ def test_winding_of_the_file_and_seams_do_not_matter(turned):
         vertices, faces = vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
     body = Body([(vertices, faces)])
     assert len(body.solids) == 1
-    points = torch.tensor([[0.0, 0.0, 0.1], [0.0, 0.0, 0.5]], dtype=D)
-    torch.testing.assert_close(
-        body.distance_m(points), torch.tensor([-0.1, 0.1], dtype=D), rtol=0, atol=1e-14
-    )
+    points = f64([[0.0, 0.0, 0.1], [0.0, 0.0, 0.5]])
+    close(body.distance_m(points), f64([-0.1, 0.1]), atol=1e-14)
 
 
 SHEET = [(-5, -5, 0), (5, -5, 0), (5, 5, 0), (-5, 5, 0)], [(0, 1, 2), (0, 2, 3)]
@@ -103,8 +101,8 @@ SHEET = [(-5, -5, 0), (5, -5, 0), (5, 5, 0), (-5, 5, 0)], [(0, 1, 2), (0, 2, 3)]
 
 def test_a_sheet_has_two_sides_and_a_capsule_that_pierces_it_no_room():
     sheet = Body([SHEET])
-    points = torch.tensor([[0.3, 0.2, 2.0], [0.3, 0.2, -2.0]], dtype=D)
-    torch.testing.assert_close(sheet.distance_m(points), torch.tensor([2.0, 2.0], dtype=D))
+    points = f64([[0.3, 0.2, 2.0], [0.3, 0.2, -2.0]])
+    torch.testing.assert_close(sheet.distance_m(points), f64([2.0, 2.0]))
     pose = torch.eye(4, dtype=D)
     pose[2, 3] = 0.0713  # looks up, its back goes down through the sheet
     for behind_m, room in ((0.1, -0.02), (0.05, 0.0013)):
@@ -121,12 +119,12 @@ def test_one_file_with_two_things_makes_two_solids():
 
 def test_gradient_of_the_distance(generator):
     body = Body([box_mesh(*BOX), ball_mesh(0.2)])
-    points = (0.8 * (torch.rand(40, 3, generator=generator, dtype=D) - 0.4)).requires_grad_()
+    points = (0.8 * (rand64(generator, 40, 3) - 0.4)).requires_grad_()
     assert torch.autograd.gradcheck(body.distances_m, (points,), eps=1e-7, atol=1e-6)
     # on a face the slope is the normal: 1 outward
     on_face = torch.tensor([[0.1, 0.05, 0.4]], dtype=D, requires_grad=True)
     (slope,) = torch.autograd.grad(Body([box_mesh(*BOX)]).distance_m(on_face).sum(), on_face)
-    torch.testing.assert_close(slope[0], torch.tensor([0.0, 0.0, 1.0], dtype=D), rtol=0, atol=1e-12)
+    close(slope[0], f64([0.0, 0.0, 1.0]), atol=1e-12)
 
 
 def test_a_capsule_is_its_spheres(generator):
@@ -140,12 +138,12 @@ def test_a_capsule_is_its_spheres(generator):
     axis = poses[:, None, :3, 3] - share[:, None] * poses[:, None, :3, 2]
     sampled = (body.distances_m(axis) - 0.03).amin(1)
     outside = sampled + 0.03 > 0
-    assert bool((found <= sampled + 1e-12)[outside].all())
-    assert bool((sampled - found <= 0.12 / 400 / 2 + 1e-12)[outside].all())
-    assert bool(((found < 0) == (sampled < 0)).all())
-    assert int((~outside).sum()) > 3
+    assert (found <= sampled + 1e-12)[outside].all()
+    assert (sampled - found <= 0.12 / 400 / 2 + 1e-12)[outside].all()
+    assert ((found < 0) == (sampled < 0)).all()
+    assert (~outside).sum() > 3
     # inside, by the spacing of the points looked at
-    assert bool(((found - sampled).abs() <= 0.12 / 16 / 2 + 1e-12)[~outside].all())
+    assert ((found - sampled).abs() <= 0.12 / 16 / 2 + 1e-12)[~outside].all()
 
 
 def test_a_capsule_through_a_cube_reaches_its_middle():
@@ -169,8 +167,8 @@ def test_gradient_of_the_clearance_to_the_mount(generator):
 
 def test_rays_are_hidden_by_what_stands_before_them():
     body = Body([box_mesh(*BOX)])
-    origin = torch.tensor([[1.0, 0.0, 0.2]] * 3, dtype=D)
-    direction = torch.tensor([[-2.0, 0.0, 0.0], [1.0, 0.0, 0.0], [-1.0, 0.5, 0.0]], dtype=D)
+    origin = f64([[1.0, 0.0, 0.2]] * 3)
+    direction = f64([[-2.0, 0.0, 0.0], [1.0, 0.0, 0.0], [-1.0, 0.5, 0.0]])
     found = first_crossings(origin, direction, body.triangles)
     assert found.tolist() == [pytest.approx(0.35), math.inf, math.inf]  # 0.7 m in lengths of 2 m
 
@@ -178,9 +176,9 @@ def test_rays_are_hidden_by_what_stands_before_them():
 @pytest.mark.parametrize("first", [0, 1, 2])
 def test_a_line_through_the_edge_between_two_triangles_crosses_them(first):
     """A square at z = 2, cut from corner to corner; its middle lies on that edge."""
-    corners = torch.tensor([[0.0, 0, 2], [4, 0, 2], [4, 4, 2], [0, 4, 2]], dtype=D)
+    corners = f64([[0.0, 0, 2], [4, 0, 2], [4, 4, 2], [0, 4, 2]])
     square = torch.stack([corners[[0, 1, 2]].roll(first, 0), corners[[2, 3, 0]].roll(first, 0)])
-    origin, direction = torch.tensor([[[2.0, 2, 0]], [[0, 0, 1]]], dtype=D)
+    origin, direction = f64([[[2.0, 2, 0]], [[0, 0, 1]]])
     assert first_crossings(origin, direction, square).tolist() == [2.0]
 
 
@@ -193,4 +191,4 @@ def test_the_rover_is_a_body_without_its_camera():
     # the mast ends 50 mm below it and stands, 15 mm thick, 40 mm behind it
     alone = Body.of(robot.parts, without=["camera_link"]).distance_m(camera)
     rim = 0.04 - 0.015 * math.cos(math.pi / 48)  # of 48 faces: between its apothem and its radius
-    assert math.hypot(0.04 - 0.015, 0.05) - 1e-9 <= float(alone) <= math.hypot(rim, 0.05) + 1e-9
+    assert math.hypot(0.04 - 0.015, 0.05) - 1e-9 <= alone <= math.hypot(rim, 0.05) + 1e-9

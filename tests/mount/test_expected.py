@@ -6,34 +6,30 @@ from dataclasses import replace
 import pytest
 import torch
 
-from codesign import lens, render
 from codesign.mount import (
     PLANAR,
-    Body,
     EgoVelocity,
     FlowErrors,
-    Mount,
-    OwnBody,
     PrecisionTrend,
     Readings,
     expected_errors,
 )
+from tests.numbers import D, f64, rand64, randn64, seeded
 
-F = torch.float64
-UNIT = torch.eye(2, dtype=F)
+UNIT = torch.eye(2, dtype=D)
 
 
 def readings(count=1, points=40, axes=3, seed=0):
     """Independent points with rows, precisions and confidences drawn at random."""
-    random = torch.Generator().manual_seed(seed)
-    rows = torch.randn(count, points, 2, axes, generator=random, dtype=F)
-    root = 0.3 * torch.randn(count, points, 2, 2, generator=random, dtype=F)
+    random = seeded(seed)
+    rows = randn64(random, count, points, 2, axes)
+    root = 0.3 * randn64(random, count, points, 2, 2)
     precision = torch.linalg.inv(root @ root.mT + 0.1 * UNIT)
-    confidence = 0.5 + 0.5 * torch.rand(count, points, generator=random, dtype=F)
-    depth = 0.2 + 2 * torch.rand(count, points, generator=random, dtype=F)
-    flow = torch.zeros(count, points, 2, dtype=F)
+    confidence = 0.5 + 0.5 * rand64(random, count, points)
+    depth = 0.2 + 2 * rand64(random, count, points)
+    flow = torch.zeros(count, points, 2, dtype=D)
     return Readings(
-        flow, flow, precision, confidence, depth, rows, torch.ones(count, points, dtype=F), 1
+        flow, flow, precision, confidence, depth, rows, torch.ones(count, points, dtype=D), 1
     )
 
 
@@ -41,7 +37,7 @@ def estimator(**how):
     return EgoVelocity(PLANAR, (1.0, 0.5, 2.0), **how)
 
 
-TWIST = torch.tensor([[0.8, 0.3, 0.0, 0.0, 0.0, -0.6]], dtype=F)
+TWIST = f64([[0.8, 0.3, 0.0, 0.0, 0.0, -0.6]])
 
 
 def drawn_errors(ours, read, true_rows, errors, draws=40_000):
@@ -49,9 +45,7 @@ def drawn_errors(ours, read, true_rows, errors, draws=40_000):
     velocity = TWIST[:, list(ours.axes)]
     flow = (true_rows @ velocity[:, None, :, None])[..., 0]
     root = torch.linalg.cholesky(errors.covariance(read, flow))
-    deviate = torch.randn(
-        draws, *flow.shape[1:], generator=torch.Generator().manual_seed(1), dtype=F
-    )
+    deviate = randn64(seeded(1), draws, *flow.shape[1:])
     seen = read.confidence[..., None] * flow + (root @ deviate[..., None])[..., 0]
     many = {
         name: getattr(read, name).expand(draws, *getattr(read, name).shape[1:]) for name in READ
@@ -86,7 +80,7 @@ def test_points_that_fit_worse_than_they_claim_count_less():
     true_rows[:, :4] *= 30.0
     plain = expected_errors(estimator(outlier=None), read, TWIST, true_rows)
     robust = expected_errors(estimator(outlier=3.0), read, TWIST, true_rows)
-    assert float(robust.mean.norm()) < 0.1 * float(plain.mean.norm())
+    assert robust.mean.norm() < 0.1 * plain.mean.norm()
 
 
 def test_gradient_is_that_of_differences():
@@ -99,7 +93,7 @@ def test_gradient_is_that_of_differences():
         moved = replace(moved, confidence=read.confidence * (1 - 0.2 * x[2]))
         return expected_errors(estimator(), moved, TWIST.expand(2, 6), read.rows).squared.sum()
 
-    at = torch.tensor([0.1, -0.2, 0.3], dtype=F, requires_grad=True)
+    at = torch.tensor([0.1, -0.2, 0.3], dtype=D, requires_grad=True)
     assert torch.autograd.gradcheck(value, at, eps=1e-6, rtol=1e-6, atol=1e-12)
 
 
@@ -107,23 +101,21 @@ def test_lost_flow_has_half_its_length_squared():
     """Far beyond the reach nothing of a flow is left: its error is the flow itself, half of the
     square in either component."""
     read = readings(points=3)
-    flow = torch.tensor([[[3.0, 4.0], [0.1, 0.0], [100.0, 0.0]]], dtype=F)
+    flow = f64([[[3.0, 4.0], [0.1, 0.0], [100.0, 0.0]]])
     found = FlowErrors(claimed=0.0, share=0.0, reach_px=20.0, width_px=0.5).covariance(read, flow)
     assert found[0, 2].diagonal().tolist() == pytest.approx([5000.0, 5000.0])
-    assert float(found[0, :2].max()) < 1e-6
+    assert found[0, :2].max() < 1e-6
 
 
 def lawful(seed=0, noise=0.5):
     """Readings whose precision goes with flow to the power 0.8 and depth to the power -1, times
     what the texture says."""
-    random = torch.Generator().manual_seed(seed)
-    length = (6 * torch.rand(20, 200, generator=random, dtype=F) - 1.5).exp()
-    depth = (2 * torch.rand(20, 200, generator=random, dtype=F) - 1.5).exp()
-    texture = (noise * torch.randn(20, 200, generator=random, dtype=F)).exp()
+    random = seeded(seed)
+    length = (6 * rand64(random, 20, 200) - 1.5).exp()
+    depth = (2 * rand64(random, 20, 200) - 1.5).exp()
+    texture = (noise * randn64(random, 20, 200)).exp()
     precision = ((length + 0.5) ** 0.8 * (1 / depth + 0.3) ** 1.0 * texture)[..., None, None] * UNIT
-    confidence = torch.sigmoid(
-        0.5 * (length + 0.5).log() + 0.3 * torch.randn(20, 200, generator=random, dtype=F)
-    )
+    confidence = torch.sigmoid(0.5 * (length + 0.5).log() + 0.3 * randn64(random, 20, 200))
     flow = torch.stack([length, torch.zeros_like(length)], -1)
     zero = torch.zeros_like(flow)
     share = torch.ones_like(length)
@@ -133,7 +125,7 @@ def lawful(seed=0, noise=0.5):
 def test_the_trend_is_found_through_the_texture():
     read, flow = lawful()
     trend = PrecisionTrend().add(read, flow)
-    grown = torch.ones((), dtype=F, requires_grad=True)
+    grown = torch.ones((), dtype=D, requires_grad=True)
     moved = trend.followed(replace(read, depth_m=read.depth_m / grown), flow * grown)
     assert torch.equal(moved.precision.detach(), read.precision)
     assert torch.allclose(moved.confidence.detach(), read.confidence, rtol=1e-9)
@@ -152,9 +144,9 @@ def test_precision_is_carried_to_another_place():
     whole, flow = lawful()
     trend = PrecisionTrend().add(whole, flow)
     # bodies whose world has more texture than the law's
-    rich = (torch.arange(20) % 2 == 0).to(F)[:, None]
+    rich = (torch.arange(20) % 2 == 0).to(D)[:, None]
     told = whole.precision * (1 + 4 * rich)[..., None, None]
-    pixels = torch.cat([torch.zeros(20, 100, 2), torch.full((20, 100, 2), 50.0)], 1).to(F)
+    pixels = torch.cat([torch.zeros(20, 100, 2), torch.full((20, 100, 2), 50.0)], 1).to(D)
     here = replace(whole, precision=told, pixels=pixels, windows=2, share=whole.share.clone())
     here.share[:, 100:] = 0
     there = replace(whole, depth_m=whole.depth_m / 2, windows=2)
@@ -163,23 +155,21 @@ def test_precision_is_carried_to_another_place():
     found = trend.carried(here, trend.told(here, flow), there, trend.told(there, 2 * flow))
     assert found.depth_m is there.depth_m
     wrong = 0.5 * (torch.logdet(found.precision) - torch.logdet(truth))
-    assert float(wrong[:, :100].abs().max()) < 0.25  # the trend's third order against the law
-    assert float(wrong[:, :100].mean().abs()) < 0.02
+    assert wrong[:, :100].abs().max() < 0.25  # the trend's third order against the law
+    assert wrong[:, :100].mean().abs() < 0.02
     # of 100 points' textures
     assert wrong[:, 100:].mean(1).tolist() == pytest.approx([0.0] * 20, abs=0.25)
     odds = [(each / (1 - each)).log()[:, :100] for each in (found.confidence, whole.confidence)]
     law = 0.5 * ((2 * flow[..., 0] + 0.5) / (flow[..., 0] + 0.5)).log()[:, :100]
-    assert float((odds[0] - odds[1] - law).mean().abs()) < 0.05
+    assert (odds[0] - odds[1] - law).mean().abs() < 0.05
 
 
 def test_what_the_body_covers_is_found_through_the_texture():
     """Windows of ten points whose precision falls by e to the power of four times what is covered
     of them."""
     read, flow = lawful(noise=0.3)
-    random = torch.Generator().manual_seed(4)
-    covered = torch.rand(20, 20, generator=random, dtype=F) * (
-        torch.rand(20, 20, generator=random, dtype=F) > 0.5
-    )
+    random = seeded(4)
+    covered = rand64(random, 20, 20) * (rand64(random, 20, 20) > 0.5)
     fall = (-4 * covered).exp().repeat_interleave(10, 1)[..., None, None]
     windows = replace(read, windows=20, precision=read.precision * fall)
     trend = PrecisionTrend().add(windows, flow, covered)
@@ -201,29 +191,9 @@ def test_points_without_a_surface_are_left_out():
     )
 
 
-def test_the_share_covered_is_told_by_window():
-    """A sheet over the upper half of the view of four windows: chief rays that meet it, window by
-    window."""
-    sheet = Body([([(2, -9, 0), (2, 9, 0), (2, 9, 9), (2, -9, 9)], [(0, 1, 2), (0, 2, 3)])])
-    film = render.Film(64, 64, 16, 16, 0.1, ((0, 0), (48, 0), (0, 24), (24, 48)))
-    camera = render.Camera(lens.Pinhole(8.0), 16, 16, 0.1, 16, 0, film)
-    tilt = torch.tensor(0.05, dtype=F, requires_grad=True)
-    level = Mount((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    numbers = torch.stack([*torch.zeros(3, dtype=F), tilt, *torch.zeros(2, dtype=F)])
-    covered = OwnBody(sheet, 0.5).covered(level(numbers), camera)
-    shift_px = 8.0 / 0.1 * torch.tan(tilt.detach())
-    middle = (
-        torch.tensor([8.0, 8.0, 32.0, 56.0]) - 32 - shift_px
-    ) / 16  # of windows, below the edge, in their sides
-    exact = (0.5 - middle).clamp(0, 1)
-    assert torch.allclose(covered.detach().double(), exact.double(), atol=0.02)
-    (slope,) = torch.autograd.grad(covered[2], tilt)
-    assert float(slope) == pytest.approx(8.0 / 0.1 / 16, rel=0.03)
-
-
 def test_a_trend_without_surfaces_is_flat():
     read = readings()
-    flow = torch.rand(1, 40, 2, generator=torch.Generator().manual_seed(0), dtype=F)
+    flow = rand64(seeded(0), 1, 40, 2)
     flow = flow.requires_grad_()
     covered = replace(read, share=torch.zeros_like(read.share))
     followed = PrecisionTrend().add(covered, flow.detach()).followed(covered, flow)

@@ -17,12 +17,12 @@ from codesign.mount.head import evidence
 from codesign.types import FlowField
 from scenes.robots import pair as robot_pair
 from scenes.robots.pairs import PAIRS
+from tests.numbers import D, close, f64, rand64, randn64, seeded
 
-D = torch.float64
 INTERVAL_S = 0.01
 PITCH_MM = 0.3
 WINDOWS = ((0, 0), (40, 20), (80, 60))
-MIRROR = torch.tensor([1.0, -1, 1, -1, 1, -1], dtype=D)
+MIRROR = f64([1.0, -1, 1, -1, 1, -1])
 
 
 def camera_of(windows=WINDOWS, optics=None):
@@ -37,10 +37,10 @@ def plain_of(axes=FREE, **how):
 
 def noisy(count, windows=3, seed=3):
     """Fields of flow that is a ramp with noise, a claimed covariance and a confidence."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
 
     def draw(*shape):
-        return torch.rand(count * windows, *shape, generator=generator, dtype=D)
+        return rand64(generator, count * windows, *shape)
 
     ramp = torch.linspace(-1, 1, 32, dtype=D)
     flow = (2 * draw(2, 1, 1) - 1) * (1 + 0.3 * ramp) + 0.2 * (draw(2, 32, 32) - 0.5)
@@ -65,14 +65,14 @@ def of_windows(field, pick, flow=None):
 
 def moved(count, mount, seed=4):
     """Poses [N, 3, 4, 4] of the camera on bodies over flat ground."""
-    twists = 0.3 * torch.randn(count, 6, generator=torch.Generator().manual_seed(seed), dtype=D)
-    half = INTERVAL_S / 2 * torch.tensor([-1.0, 0.0, 1.0], dtype=D)
+    twists = 0.3 * randn64(seeded(seed), count, 6)
+    half = INTERVAL_S / 2 * f64([-1.0, 0.0, 1.0])
     return pose.se3_exp(half[:, None] * twists[:, None]) @ mount
 
 
 def stirred(head, seed=5):
     """The head in float64 with last layers that say something."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     for last in (head.say[-1], head.claim[-1]):
         for parameter in last.parameters():
             parameter.data = 0.3 * torch.randn(parameter.shape, generator=generator)
@@ -96,29 +96,27 @@ def test_fresh_it_is_least_squares_on_any_film(mount, axes, windows):
     expected = plain(field, camera, None, mount, poses)
     found = VelocityHead(plain)(field, camera, None, mount, poses)
     # the normal matrix is inverted instead of solved with: rounding times its condition
-    torch.testing.assert_close(found.velocity, expected.velocity, rtol=1e-9, atol=1e-11)
-    torch.testing.assert_close(found.covariance, expected.covariance, rtol=1e-9, atol=1e-12)
+    close(found.velocity, expected.velocity, rtol=1e-9, atol=1e-11)
+    close(found.covariance, expected.covariance, rtol=1e-9, atol=1e-12)
     torch.testing.assert_close(found.kept, expected.kept)
 
 
 def test_blur_and_focal_length_are_those_of_the_thin_lens(mount):
     camera = camera_of()
     # looks straight down
-    level = torch.tensor([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0.8], [0, 0, 0, 1]], dtype=D)
+    level = f64([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0.8], [0, 0, 0, 1]])
     plain = plain_of()
     read = plain.read(noisy(2), camera, None, level, level.expand(2, 3, 4, 4))
     found = evidence(read, plain.solve(read), camera, level, plain.prior).lens
     up = 10 * PITCH_MM / 20.5  # the middle of the second window is 10 px above that of the film
-    ahead = torch.tensor([0.0, up, -1.0], dtype=D) / math.hypot(1.0, up)
-    torch.testing.assert_close(found[:, 1, :3], ahead.expand(2, 3), rtol=0, atol=1e-9)
-    torch.testing.assert_close(
-        found[..., 3].exp() * 300, torch.full((2, 3), 20.5 / PITCH_MM, dtype=D), rtol=1e-6, atol=0
-    )
+    ahead = f64([0.0, up, -1.0]) / math.hypot(1.0, up)
+    close(found[:, 1, :3], ahead.expand(2, 3), atol=1e-9)
+    close(found[..., 3].exp() * 300, torch.full((2, 3), 20.5 / PITCH_MM, dtype=D), rtol=1e-6)
     for column, near in ((4, 1 / 0.8), (5, 0.0)):
         disc_px = 10.0 * abs(1 - 20.5 * (1 / 20.0 - 1e-3 * near)) / PITCH_MM
         # root mean square radius of a uniform disc
         expected = torch.full((2, 3), disc_px / 8**0.5, dtype=D)
-        torch.testing.assert_close(found[..., column].expm1(), expected, rtol=1e-6, atol=1e-6)
+        close(found[..., column].expm1(), expected, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("fno", [1.6, 2.2, 4.0])
@@ -161,17 +159,17 @@ def test_the_order_of_windows_does_not_matter(mount):
     turned = of_windows(field, lambda part: part.unflatten(0, (3, 3))[:, order].flatten(0, 1))
     expected = head(field, camera_of(), None, mount, poses)
     found = head(turned, camera_of(tuple(WINDOWS[k] for k in order)), None, mount, poses)
-    torch.testing.assert_close(found.velocity, expected.velocity, rtol=1e-9, atol=1e-11)
-    torch.testing.assert_close(found.covariance, expected.covariance, rtol=1e-9, atol=1e-12)
+    close(found.velocity, expected.velocity, rtol=1e-9, atol=1e-11)
+    close(found.covariance, expected.covariance, rtol=1e-9, atol=1e-12)
 
 
 def test_a_world_in_a_mirror_gives_the_velocity_in_a_mirror(mount):
     """Left and right of body and world, and of the image, are exchanged."""
     field = noisy(3)
     poses = moved(3, mount)
-    left = torch.diag(torch.tensor([1.0, -1, 1, 1], dtype=D))
-    image = torch.diag(torch.tensor([-1.0, 1, 1, 1], dtype=D))
-    sign = torch.tensor([-1.0, 1], dtype=D)[:, None, None]
+    left = torch.diag(f64([1.0, -1, 1, 1]))
+    image = torch.diag(f64([-1.0, 1, 1, 1]))
+    sign = f64([-1.0, 1])[:, None, None]
     mirrored = replace(
         field, covariance_px2=field.covariance_px2 * torch.tensor([1.0, -1, 1])[:, None, None]
     )
@@ -180,9 +178,9 @@ def test_a_world_in_a_mirror_gives_the_velocity_in_a_mirror(mount):
     head = stirred(VelocityHead(plain_of(every_px=1)))
     expected = head(field, camera_of(), None, mount, poses)
     found = head(flipped, other, None, left @ mount @ image, left @ poses @ image)
-    torch.testing.assert_close(found.velocity, expected.velocity * MIRROR, rtol=1e-7, atol=1e-9)
+    close(found.velocity, expected.velocity * MIRROR, rtol=1e-7, atol=1e-9)
     unmirrored = head(flipped, other, None, mount, poses)
-    assert float((unmirrored.velocity - expected.velocity * MIRROR).abs().max()) > 1e-3
+    assert (unmirrored.velocity - expected.velocity * MIRROR).abs().max() > 1e-3
 
 
 @pytest.fixture(scope="module")
@@ -194,11 +192,11 @@ def designs(mount):
     field, poses = noisy(2), moved(2, mount)
     body = poses @ torch.linalg.inv(mount)
     read = plain.read(field, camera, None, mount, poses)
-    generator = torch.Generator().manual_seed(8)
+    generator = seeded(8)
     ways = {}
     for name in ("flow_px", "precision", "confidence"):
         value = getattr(read, name)
-        share = torch.randn(value.shape[:2], generator=generator, dtype=D)
+        share = randn64(generator, value.shape[:2])
         ways[name] = value * share.reshape(*value.shape[:2], *[1] * (value.ndim - 2))
 
     def of_reading(shift, name):
@@ -206,9 +204,7 @@ def designs(mount):
         return head.judged(evidence(changed, plain.solve(changed), camera, mount, plain.prior))[0]
 
     def of_mount(shift):
-        turned = mount @ pose.se3_exp(
-            shift * torch.tensor([0.1, -0.2, 0.3, 0.2, 0.1, -0.3], dtype=D)
-        )
+        turned = mount @ pose.se3_exp(shift * f64([0.1, -0.2, 0.3, 0.2, 0.1, -0.3]))
         return head(field, camera, None, turned, body @ turned).velocity
 
     def of_lens(shift, share_focus):
@@ -230,7 +226,7 @@ def test_gradient_is_that_of_differences(designs, what):
     at = torch.zeros((), dtype=D, requires_grad=True)
     # truncation step^2 times third derivatives, rounding of 1e-12 over the step
     assert torch.autograd.gradcheck(designs[what], at, eps=1e-5, rtol=1e-5, atol=1e-6)
-    assert float(torch.autograd.functional.jacobian(designs[what], at).abs().max()) > 1e-4
+    assert torch.autograd.functional.jacobian(designs[what], at).abs().max() > 1e-4
 
 
 def test_weights_are_kept_and_read_again(tmp_path, mount):
@@ -250,7 +246,7 @@ def test_weights_are_kept_and_read_again(tmp_path, mount):
 
 def test_every_body_may_have_a_mount_of_its_own(mount):
     """Two mounts with two drives each are as four bodies."""
-    other = mount @ pose.se3_exp(torch.tensor([0.1, 0.0, 0.0, 0.0, 0.2, 0.0], dtype=D))
+    other = mount @ pose.se3_exp(f64([0.1, 0.0, 0.0, 0.0, 0.2, 0.0]))
     mounts = torch.stack([mount, other])[:, None]
     poses = torch.stack([moved(2, mount), moved(2, other)])
     head = stirred(VelocityHead(plain_of()))
@@ -276,4 +272,4 @@ def test_the_delivered_head_is_ahead_of_least_squares_in_an_unseen_world():
     assert sum(weight.numel() for weight in head.parameters()) <= 50_000
     # the study found 0.80 of the typical error over four designs; 12 samples of one world scatter
     # by a third of that
-    assert float(pair.errors(learnt, batch).bounded().mean()) < float(plain)
+    assert pair.errors(learnt, batch).bounded().mean() < plain

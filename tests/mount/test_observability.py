@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from codesign import lens, pose, render
-from codesign.mount import PLANAR, Mount, body_flow
+from codesign.mount import Mount, body_flow
 from codesign.render.film import some_pixels
 from codesign.render.truth import world_points
 from scenes import worlds
+from tests.numbers import D, close, f64, rand64, randn64
 
-D = torch.float64
 HEIGHT = 0.4
 # yaw, pitch, roll, position
 MOUNTS = [
@@ -22,25 +22,9 @@ MOUNTS = [
     (2.0, 0.7, -0.4, (-0.2, 0.1, 0.6)),
     (-1.2, 0.2, 2.0, (0.1, -0.2, 0.3)),  # part of the view is sky
 ]
-TWISTS = torch.tensor(
-    [
-        [0.7, -0.2, 0.0, 0.0, 0.0, 0.5],
-        [0.1, 0.2, -0.3, 0.8, -0.6, -1.3],
-        [0.0, 0.0, 0.4, 0.3, 1.1, 0.0],
-    ],
-    dtype=D,
-)
-
-
-@pytest.fixture(scope="module")
-def camera():
-    return render.Camera(lens.Pinhole(3.4), 24, 16, 0.2, 1)
-
-
-@pytest.fixture(scope="module")
-def triplet():
-    """Cooke triplet scaled to a small sensor: chief rays with distortion and a pupil of its own."""
-    return render.Camera(lens.load("cooke-triplet"), 24, 16, 1.2, 1)
+PINHOLE = render.Camera(lens.Pinhole(3.4), 24, 16, 0.2, 1)
+# chief rays with distortion and a pupil of its own
+TRIPLET = render.Camera(lens.load("cooke-triplet"), 24, 16, 1.2, 1)
 
 
 def mount_of(yaw, pitch, roll, position):
@@ -76,69 +60,42 @@ def exact_flow(camera, T_body_cam, twist, dt_s=1e-3):
     return torch.where(valid[:, None], total, 0), depth, valid
 
 
-@pytest.mark.parametrize("placed", MOUNTS)
-@pytest.mark.parametrize("twist", TWISTS)
-def test_flow_is_that_of_the_motion_carried_out(camera, placed, twist):
+# projection is good to 1e-13 px relative to 10 px, over 1e-3 s: 1e-9 px/s; differences of chief rays
+# over 2e-3 px to 1e-9 of flows of 100 px/s, and through a lens, whose trace rounds by 1e-13 mm, to
+# 1e-7
+@pytest.mark.parametrize(
+    ("optics", "placed", "rtol", "atol"),
+    [*((PINHOLE, placed, 1e-9, 1e-7) for placed in MOUNTS), (TRIPLET, MOUNTS[1], 1e-6, 1e-5)],
+)
+def test_flow_of_every_velocity_is_that_of_the_motion_carried_out(optics, placed, rtol, atol):
     T_body_cam = mount_of(*placed)
-    expected, depth, valid = exact_flow(camera, T_body_cam, twist)
-    rows, seen = body_flow(camera, depth, T_body_cam)
-    assert torch.equal(seen, valid)
-    # projection is good to 1e-13 px relative to 10 px, over 1e-3 s: 1e-9 px/s; differences of chief
-    # rays over 2e-3 px to 1e-9 of flows of 100 px/s
-    torch.testing.assert_close(rows @ twist, expected, rtol=1e-9, atol=1e-7)
+    for axis, twist in enumerate(torch.eye(6, dtype=D)):
+        expected, depth, valid = exact_flow(optics, T_body_cam, twist)
+        rows, seen = body_flow(optics, depth, T_body_cam)
+        assert torch.equal(seen, valid)
+        close(rows[..., axis], expected, rtol=rtol, atol=atol)
 
 
-def test_mounts_and_pixels_together_as_one_by_one(camera, generator):
+def test_mounts_and_pixels_together_as_one_by_one(generator):
     mounts = torch.stack([mount_of(*placed) for placed in MOUNTS])
-    pixels = 16 * torch.rand(len(MOUNTS), 5, 2, generator=generator, dtype=D)
-    depth = 1 + torch.rand(len(MOUNTS), 5, generator=generator, dtype=D)
-    together, _ = body_flow(camera, depth, mounts, pixels)
-    alone = [body_flow(camera, *each)[0] for each in zip(depth, mounts, pixels, strict=True)]
-    torch.testing.assert_close(together, torch.stack(alone), rtol=1e-12, atol=1e-12)
+    pixels = 16 * rand64(generator, len(MOUNTS), 5, 2)
+    depth = 1 + rand64(generator, len(MOUNTS), 5)
+    together, _ = body_flow(PINHOLE, depth, mounts, pixels)
+    alone = [body_flow(PINHOLE, *each)[0] for each in zip(depth, mounts, pixels, strict=True)]
+    close(together, torch.stack(alone), rtol=1e-12, atol=1e-12)
 
 
-def test_flow_through_a_real_lens(triplet):
-    T_body_cam = mount_of(*MOUNTS[1])
-    expected, depth, _ = exact_flow(triplet, T_body_cam, TWISTS[1])
-    # differences of chief rays over 2e-3 px: rounding of the trace (1e-13 mm over 1e-3 px) leaves
-    # 1e-7 of a slope
-    rows, _ = body_flow(triplet, depth, T_body_cam)
-    torch.testing.assert_close(rows @ TWISTS[1], expected, rtol=1e-6, atol=1e-5)
-
-
-def test_straight_down_is_the_textbook_case(camera):
-    """Camera axis down at height h through the body's origin: velocity = flow h / f, and turning is
-    a rotation about the image's middle."""
-    T_body_cam = mount_of(*MOUNTS[0])
-    depth = torch.full((24 * 16,), HEIGHT, dtype=D)
-    rows, seen = body_flow(camera, depth, T_body_cam)
-    rows = rows[..., PLANAR]
-    focal_px = 3.4 / 0.2
-    from_middle = camera.film.pixels() - camera.film.middle_px
-    assert bool(seen.all())
-    expected = torch.zeros(24 * 16, 2, 3, dtype=D)
-    expected[:, 1, 0] = focal_px / HEIGHT  # forward: the ground moves down in the image
-    expected[:, 0, 1] = focal_px / HEIGHT  # to the left: it moves right
-    # body left turn seen from above: the image turns right
-    expected[:, 0, 2], expected[:, 1, 2] = (
-        -from_middle[:, 1],
-        from_middle[:, 0],
-    )
-    # differences of positions of 10 px over 1e-3 px: 1e-12 relative
-    torch.testing.assert_close(rows, expected, rtol=0, atol=1e-9)
-
-
-def test_gradient_to_depth_mount_and_focal_length(camera, generator):
+def test_gradient_to_depth_mount_and_focal_length(generator):
     mount = mount_of(*MOUNTS[1])
-    _, depth, _ = ground(camera, mount)
-    weight = torch.randn(24 * 16, 2, 6, generator=generator, dtype=D)
+    _, depth, _ = ground(PINHOLE, mount)
+    weight = randn64(generator, 24 * 16, 2, 6)
 
     def along(scale, shift, focal_mm):
         optics = render.Camera(lens.Pinhole(focal_mm), 24, 16, 0.2, 1)
         rows, _ = body_flow(optics, scale * depth, mount @ pose.se3_exp(shift))
         return (rows * weight).sum()
 
-    at = (torch.ones(1, dtype=D), torch.zeros(6, dtype=D), torch.tensor(3.4, dtype=D))
+    at = (torch.ones(1, dtype=D), torch.zeros(6, dtype=D), f64(3.4))
     # rows are differences of chief rays, good to 1e-9 over steps of 1e-5
     assert torch.autograd.gradcheck(
         along, [v.requires_grad_() for v in at], eps=1e-5, atol=1e-3, rtol=1e-5
@@ -152,12 +109,12 @@ def test_some_pixels_lie_all_over_a_film(shape):
     found = some_pixels(SimpleNamespace(shape=shape), 64)
     row, column = found // columns, found % columns
     assert len(found) >= 60
-    assert abs(float(torch.corrcoef(torch.stack([row, column]).double())[0, 1])) < 0.15
+    assert abs(torch.corrcoef(torch.stack([row, column]).double())[0, 1]) < 0.15
     for place, size in ((row, rows), (column, columns)):
         # of each eighth an eighth
         counts = torch.bincount(8 * place // size, minlength=8)
-        assert int(counts.min()) >= 5
-        assert int(counts.max()) <= 11
+        assert counts.min() >= 5
+        assert counts.max() <= 11
     assert torch.equal(
         some_pixels(SimpleNamespace(shape=shape), 10**6), torch.arange(rows * columns)
     )

@@ -9,8 +9,8 @@ from codesign import lens, pose, render
 from codesign.mount import Mount
 from codesign.mount.pose import yaw_pitch_roll_rad
 from codesign.pose import check_poses
+from tests.numbers import D, close, f64, randn64
 
-D = torch.float64
 NOMINAL = (0.2, -0.1, 0.4)
 HALF = (0.1, 0.05, 0.2)
 
@@ -22,7 +22,7 @@ def test_angles_of_a_view_straight_up_or_down_have_a_gradient(up):
     upright = torch.eye(4, dtype=D)  # a camera's z axis is the body's: straight up
     upright[1:3, 1:3] *= up
     # along no axis, so that both entries of the matrix carry the slope
-    angle = torch.tensor(0.4, dtype=D)
+    angle = f64(0.4)
 
     def turned(h):
         zero = torch.zeros_like(h)
@@ -33,40 +33,36 @@ def test_angles_of_a_view_straight_up_or_down_have_a_gradient(up):
     step = 1e-5
     differences = (turned(angle + step) - turned(angle - step)) / (2 * step)
     slopes = torch.autograd.functional.jacobian(turned, angle)
-    torch.testing.assert_close(
-        differences, torch.tensor([1.0, 0.0, 0.0], dtype=D), rtol=0, atol=1e-10
-    )
-    torch.testing.assert_close(slopes, differences, rtol=0, atol=1e-10)
+    close(differences, f64([1.0, 0.0, 0.0]), atol=1e-10)
+    close(slopes, differences, atol=1e-10)
     yaw, pitch, roll = turned(0 * angle).tolist()
     again = Mount(NOMINAL, HALF, yaw_rad=yaw, pitch_rad=pitch, roll_rad=roll)().detach()
-    torch.testing.assert_close(again[:3, :3], upright[:3, :3], rtol=0, atol=1e-15)
+    close(again[:3, :3], upright[:3, :3], atol=1e-15)
 
 
 def test_positions_stay_in_the_box_and_rotations_are_free(generator):
-    numbers = 4 * torch.randn(200, 6, generator=generator, dtype=D)
+    numbers = 4 * randn64(generator, 200, 6)
     poses = Mount(NOMINAL, HALF)(numbers).detach()
     check_poses(poses)
-    offset = (poses[:, :3, 3] - torch.tensor(NOMINAL, dtype=D)).abs() / torch.tensor(HALF, dtype=D)
-    assert float(offset.max()) <= 1 + 1e-15
-    assert float(offset.max()) > 0.99  # the whole box is in reach
-    assert float(poses[:, 2, 2].min()) < -0.9  # and every direction: down and
-    assert float(poses[:, 2, 2].max()) > 0.9  # up
+    offset = (poses[:, :3, 3] - f64(NOMINAL)).abs() / f64(HALF)
+    assert offset.max() <= 1 + 1e-15
+    assert offset.max() > 0.99  # the whole box is in reach
+    assert poses[:, 2, 2].min() < -0.9  # and every direction: down and
+    assert poses[:, 2, 2].max() > 0.9  # up
 
 
 def test_start_position_is_kept_and_a_zero_range_holds_an_axis():
     mount = Mount(NOMINAL, (0.1, 0.0, 0.2), position_m=(0.25, -0.1, 0.25))
-    torch.testing.assert_close(
-        mount().detach()[:3, 3], torch.tensor([0.25, -0.1, 0.25], dtype=D), rtol=0, atol=1e-15
-    )
+    close(mount().detach()[:3, 3], f64([0.25, -0.1, 0.25]), atol=1e-15)
     moved = mount(torch.full((6,), 2.0, dtype=D))
-    assert float(moved[1, 3]) == -0.1
+    assert moved[1, 3] == -0.1
 
 
 # straight down, where yaw and roll are one, is no special case
 @pytest.mark.parametrize("pitch", [0.3, math.pi / 2])
 def test_gradient_of_the_pose(generator, pitch):
     mount = Mount(NOMINAL, HALF, yaw_rad=0.4, pitch_rad=pitch)
-    numbers = (0.5 * torch.randn(2, 6, generator=generator, dtype=D)).requires_grad_()
+    numbers = (0.5 * randn64(generator, 2, 6)).requires_grad_()
     assert torch.autograd.gradcheck(mount, (numbers,), atol=1e-8)
     jacobian = torch.autograd.functional.jacobian(mount, torch.zeros(6, dtype=D))
     assert torch.linalg.matrix_rank(jacobian.reshape(16, 6)) == 6
@@ -88,13 +84,13 @@ def test_a_unit_of_every_number_moves_the_image_by_the_natural_step(optics, dept
     optic = lens.Pinhole(11.0) if optics == "pinhole" else lens.load(optics).scaled(0.22)
     camera = render.Camera(optic, 48, 36, 0.15, 1)
     mount = Mount(NOMINAL, HALF, yaw_rad=0.4, pitch_rad=0.6, position_m=position_m)
-    mount.numbers[3:] = torch.tensor([0.2, -0.1, 0.3], dtype=D)
+    mount.numbers[3:] = f64([0.2, -0.1, 0.3])
     before = mount().clone()
     assert mount.variables(camera, depth_m, step_px=0.1)[0] is mount.numbers
-    torch.testing.assert_close(mount(), before, rtol=0, atol=1e-15)
+    close(mount(), before, atol=1e-15)
     unit = mount.unit.clone()
     mount.variables(camera, depth_m, step_px=0.1)  # asked again it says the same
-    torch.testing.assert_close(mount.unit, unit, rtol=1e-12, atol=0)
+    close(mount.unit, unit, rtol=1e-12)
     points = far_points(camera, mount, depth_m)
     base = render.project(camera, pose.apply(pose.inverse(mount()), points))
     for i in range(6):
@@ -126,6 +122,6 @@ def test_depths_of_a_picture_count_where_there_is_a_surface():
     same = Mount(NOMINAL, (0.4, 0.3, 0.2))
     same.variables(camera, 2.0)
     # a shift across the view moves every pixel alike
-    torch.testing.assert_close(found.unit[1:3], same.unit[1:3], rtol=1e-9, atol=0)
+    close(found.unit[1:3], same.unit[1:3], rtol=1e-9)
     # pixels per metre at 2 m: 11 mm / 0.5 mm / 2 m
     assert same.unit[1:3].tolist() == pytest.approx([1 / (11 * 0.3), 1 / (11 * 0.2)], rel=1e-6)

@@ -20,8 +20,8 @@ from codesign.mount import (
 )
 from scenes import bodies, robots
 from tests import refusals
+from tests.numbers import D
 
-D = torch.float64
 NAN, INF = math.nan, math.inf
 AT, HALF, STILL = (0.2, -0.1, 0.4), (0.1, 0.05, 0.2), (0.0, 0.0, 0.0)
 CAMERA = render.Camera(lens.Pinhole(3.4), 24, 16, 0.2, 1)

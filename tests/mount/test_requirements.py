@@ -8,23 +8,14 @@ import torch
 from codesign import lens, render
 from codesign.mount import Body, CableSide, Clearance, Housing, LookAhead, Mount, penalty
 from scenes import bodies
+from tests.numbers import D, close, randn64
 
-D = torch.float64
 HEIGHT = 0.4
 STILL = (0.0, 0.0, 0.0)
 
 
 def mount_at(pitch_rad, position=(0.0, 0.0, HEIGHT), **angles):
     return Mount(position, STILL, pitch_rad=pitch_rad, **angles)().detach()
-
-
-def camera_of(focal_mm=3.4, width=24, height=16, pitch_mm=0.2):
-    return render.Camera(lens.Pinhole(focal_mm), width, height, pitch_mm, 1)
-
-
-@pytest.fixture(scope="module")
-def camera():
-    return camera_of()
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +93,7 @@ def requirements(cube):
 
 def test_gradient_of_every_slack_to_the_mount(cube, camera, generator):
     mount = Mount((0.0, 0.0, HEIGHT), (0.2, 0.2, 0.1), pitch_rad=0.3, roll_rad=0.1)
-    numbers = (0.3 * torch.randn(6, generator=generator, dtype=D)).requires_grad_()
+    numbers = (0.3 * randn64(generator, 6)).requires_grad_()
     for each in requirements(cube):
         # a difference of 1e-7 seldom swaps two ranks, and a swap of equal angles changes nothing to
         # first order
@@ -117,11 +108,11 @@ def test_gradient_of_the_look_ahead_to_the_focal_length():
     focal = torch.tensor(3.4, dtype=D, requires_grad=True)
 
     def slack(value):
-        return ahead.slack(pose, camera_of(value)).sum()
+        return ahead.slack(pose, render.Camera(lens.Pinhole(value), 24, 16, 0.2, 1)).sum()
 
     assert torch.autograd.gradcheck(slack, focal, eps=1e-5, rtol=1e-6, atol=1e-12)
     (slope,) = torch.autograd.grad(slack(focal), focal)
-    assert float(slope) < -1e-3  # a longer lens sees less of the far ground
+    assert slope < -1e-3  # a longer lens sees less of the far ground
 
 
 def test_penalty_pushes_before_the_limit_and_is_smooth(cube, camera):
@@ -131,7 +122,7 @@ def test_penalty_pushes_before_the_limit_and_is_smooth(cube, camera):
     poses[:, 2, 3] = height
     found = penalty([wanted], poses, camera)
     over = (1 - (height.detach() - 0.13) / 0.05).clamp_min(0)
-    torch.testing.assert_close(found.detach(), over**2, rtol=0, atol=1e-12)
+    close(found.detach(), over**2, atol=1e-12)
     (slope,) = torch.autograd.grad(found.sum(), height)
-    torch.testing.assert_close(slope, -2 * over / 0.05, rtol=0, atol=1e-9)
+    close(slope, -2 * over / 0.05, atol=1e-9)
     assert not penalty([], poses, camera).any()

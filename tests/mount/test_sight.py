@@ -24,8 +24,8 @@ from codesign.mount import (
     sight_units,
 )
 from codesign.report.mount_sphere import mount_sphere
+from tests.numbers import D, close, f64, randn64
 
-D = torch.float64
 FOCAL_PX = 3.4 / 0.148
 HEIGHT = 0.4
 
@@ -57,7 +57,7 @@ def test_a_downward_camera_sees_what_textbooks_say(camera, over_ground):
     found = sight_table(camera, over_ground)["downward"]["sight"].alone
     expected = [2.0 / math.sqrt(48 / len(x) * value) for value in sums.values()]
     # rows are differences of chief rays, good to 1e-9
-    torch.testing.assert_close(found, torch.tensor(expected, dtype=D), rtol=1e-6, atol=0)
+    close(found, f64(expected), rtol=1e-6)
 
 
 def test_the_table_says_what_each_is_blind_to(camera, over_ground):
@@ -78,7 +78,7 @@ def test_the_table_says_what_each_is_blind_to(camera, over_ground):
     # forward and sideways are one camera turned by a right angle: forward and left, roll and pitch
     # change places
     ahead, beside = (table[name]["sight"].deviation for name in ("forward", "sideways"))
-    torch.testing.assert_close(ahead[[1, 0, 2, 4, 3, 5]], beside, rtol=1e-6, atol=0)
+    close(ahead[[1, 0, 2, 4, 3, 5]], beside, rtol=1e-6)
     assert set(table["downward"]["weakest"].split()[1::2]) <= {"forward", "left", "roll", "pitch"}
 
 
@@ -95,8 +95,8 @@ def test_far_walls_show_turns_alone(camera):
             farthest_m=1e4,
         )
         found.append(sight_table(camera, around, {"ahead": (0.0, 0.0)})["ahead"]["sight"].alone)
-    torch.testing.assert_close(found[1][:3], 1000 * found[0][:3], rtol=1e-6, atol=0)
-    torch.testing.assert_close(found[1][3:], found[0][3:], rtol=1e-9, atol=0)
+    close(found[1][:3], 1000 * found[0][:3], rtol=1e-6)
+    close(found[1][3:], found[0][3:], rtol=1e-9)
     # beyond what is farthest, nothing
     nothing = Surroundings((0.0, 0.0, 0.0), depth=around.depth, farthest_m=10.0)
     row = sight_table(camera, nothing, {"ahead": (0.0, 0.0)})["ahead"]
@@ -110,10 +110,10 @@ def test_the_map_is_even_around_a_body_that_has_no_front(camera, over_ground):
     assert error.shape == (6, 5)
     assert yaw.tolist() == pytest.approx([math.radians(a) for a in (-144, -72, 0, 72, 144)])
     assert pitch.tolist() == pytest.approx([math.radians(a) for a in (-75, -45, -15, 15, 45, 75)])
-    torch.testing.assert_close(error, error[:, :1].expand(6, 5), rtol=1e-6, atol=0)
+    close(error, error[:, :1].expand(6, 5), rtol=1e-6)
     # nothing but sky: the prior of 1 in units of 0.1
     assert error[:2].flatten().tolist() == pytest.approx([10.0] * 10)
-    assert float(error[4:].max()) < 0.2 * float(error[0, 0])
+    assert error[4:].max() < 0.2 * error[0, 0]
 
 
 def test_the_picture_shows_the_map(camera, over_ground):
@@ -129,23 +129,23 @@ def test_the_picture_shows_the_map(camera, over_ground):
 
 
 def test_precision_is_the_inverse(generator):
-    root = torch.randn(20, 2, 2, generator=generator, dtype=D)
+    root = randn64(generator, 20, 2, 2)
     full = root @ root.mT + 0.1 * torch.eye(2, dtype=D)
     packed = torch.stack([full[:, 0, 0], full[:, 0, 1], full[:, 1, 1]], -1)
-    torch.testing.assert_close(flow_precision(packed), torch.linalg.inv(full), rtol=1e-12, atol=0)
+    close(flow_precision(packed), torch.linalg.inv(full), rtol=1e-12)
     floored = torch.linalg.inv(full + 0.09 * torch.eye(2, dtype=D))
-    torch.testing.assert_close(flow_precision(packed, 0.3), floored, rtol=1e-12, atol=0)
+    close(flow_precision(packed, 0.3), floored, rtol=1e-12)
 
 
 def test_expected_error_is_what_estimates_miss_on_average(generator):
     """Velocities drawn from the prior, measured with noise, estimated by the mean of what they can
     be."""
-    rows = torch.randn(7, 3, generator=generator, dtype=D)
-    prior = torch.tensor([0.5, 1.0, 2.0], dtype=D)
-    unit = torch.tensor([0.1, 0.1, 0.3], dtype=D)
+    rows = randn64(generator, 7, 3)
+    prior = f64([0.5, 1.0, 2.0])
+    unit = f64([0.1, 0.1, 0.3])
     draws = 20000
-    velocity = prior * torch.randn(draws, 3, generator=generator, dtype=D)
-    measured = velocity @ rows.T + torch.randn(draws, 7, generator=generator, dtype=D)
+    velocity = prior * randn64(generator, draws, 3)
+    measured = velocity @ rows.T + randn64(generator, draws, 7)
     information = rows.T @ rows
     estimate = measured @ rows @ torch.linalg.inv(information + torch.diag(prior**-2))
     rms = ((estimate - velocity) / unit).square().mean().sqrt()
@@ -162,14 +162,14 @@ def test_gradient_of_the_criterion_to_mount_and_lens(generator):
         information, _ = around.information(camera, mount(numbers))
         return expected_error(information, sight_units(around), (1.0,) * 6)
 
-    numbers = (0.2 * torch.randn(6, generator=generator, dtype=D)).requires_grad_()
+    numbers = (0.2 * randn64(generator, 6)).requires_grad_()
     focal = torch.tensor(4.0, dtype=D, requires_grad=True)
     # rows are differences of chief rays, good to 1e-9 over steps of 1e-6
     assert torch.autograd.gradcheck(error, (numbers, focal), eps=1e-5, atol=1e-5, rtol=1e-4)
 
 
 def test_sight_of_independent_velocities():
-    found = sight(torch.diag(torch.tensor([400.0, 25.0, 0.0], dtype=D)), (0.1, 0.2, 0.1), PLANAR)
+    found = sight(torch.diag(f64([400.0, 25.0, 0.0])), (0.1, 0.2, 0.1), PLANAR)
     assert found.deviation.tolist() == [0.05, 0.2, math.inf]
     assert found.alone.tolist() == [0.05, 0.2, math.inf]
     assert found.weakest_deviation == math.inf
@@ -184,7 +184,7 @@ def test_sight_of_independent_velocities():
 def test_sight_of_two_that_look_alike():
     """Forward and pitch seen by their sum alone, each measured a little: the difference shows
     least."""
-    together = torch.tensor([[1.0, 1.0], [1.0, 1.0]], dtype=D) * 100 + torch.eye(2, dtype=D)
+    together = f64([[1.0, 1.0], [1.0, 1.0]]) * 100 + torch.eye(2, dtype=D)
     found = sight(together, (1.0, 1.0), (0, 4))
     inverse = torch.linalg.inv(together)
     torch.testing.assert_close(found.deviation, inverse.diagonal().sqrt())
@@ -196,11 +196,9 @@ def test_sight_of_two_that_look_alike():
 @pytest.mark.parametrize("scale", [1e-10, 1e10])
 def test_what_is_seen_does_not_hang_on_the_unit_of_information(scale):
     """NOTHING is a share of the largest eigenvalue: of 4 and 1 times any scale both are seen."""
-    found = sight(
-        scale * torch.diag(torch.tensor([4.0, 1.0, 0.0], dtype=D)), (1.0, 1.0, 1.0), PLANAR
-    )
-    expected = torch.tensor([0.5, 1.0, math.inf], dtype=D) / math.sqrt(scale)
-    torch.testing.assert_close(found.deviation, expected, rtol=1e-12, atol=0)
+    found = sight(scale * torch.diag(f64([4.0, 1.0, 0.0])), (1.0, 1.0, 1.0), PLANAR)
+    expected = f64([0.5, 1.0, math.inf]) / math.sqrt(scale)
+    close(found.deviation, expected, rtol=1e-12)
 
 
 def test_pixels_without_light_see_nothing(over_ground):
@@ -208,6 +206,6 @@ def test_pixels_without_light_see_nothing(over_ground):
     wide = render.Camera(lens.load("cooke-triplet").scaled(0.22), 24, 24, 0.77, 4)
     down = over_ground.mount(0.0, math.pi / 2)
     lit = (wide.chief_rays(wide.film.pixels()).weight > 0).double().mean()
-    assert 0.1 < float(lit) < 0.6
-    assert float(over_ground.information(wide, down)[1]) <= float(lit)
-    assert float((LookAhead(1.0, 0.5).angles(down, wide) == -1.0).double().mean()) >= 1 - lit
+    assert 0.1 < lit < 0.6
+    assert over_ground.information(wide, down)[1] <= lit
+    assert (LookAhead(1.0, 0.5).angles(down, wide) == -1.0).double().mean() >= 1 - lit

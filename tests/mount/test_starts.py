@@ -1,9 +1,7 @@
 """Starts are spread over what is allowed."""
 
-import pytest
 import torch
 
-from codesign import lens, render
 from codesign.mount import (
     CableSide,
     Clearance,
@@ -14,23 +12,18 @@ from codesign.mount import (
     judge,
     starts,
 )
+from tests.numbers import D, close, rand64, randn64
 
-D = torch.float64
 RANGES = MountRanges((0.0, -0.1, 0.3, -3.0, -1.5, -3.0), (0.3, 0.1, 0.6, 3.0, 1.5, 3.0))
-
-
-@pytest.fixture(scope="module")
-def camera():
-    return render.Camera(lens.Pinhole(3.4), 24, 16, 0.2, 1)
 
 
 def test_numbers_give_their_poses_back(generator):
     mount = Mount((0.15, 0.0, 0.45), (0.15, 0.1, 0.15), pitch_rad=0.4)
-    numbers = torch.randn(40, 6, generator=generator, dtype=D)
-    mount.unit[:] = torch.rand(6, generator=generator, dtype=D) + 0.5
+    numbers = randn64(generator, 40, 6)
+    mount.unit[:] = rand64(generator, 6) + 0.5
     # the pose of numbers up to 3 lies within tanh 4.5 of the wall: its inverse loses cosh^2 4.5 =
     # 2000 times eps
-    torch.testing.assert_close(mount.numbers_at(mount(numbers)), numbers, rtol=0, atol=1e-11)
+    close(mount.numbers_at(mount(numbers)), numbers, atol=1e-11)
 
 
 def test_starts_fill_the_inner_bounds_and_keep_what_is_required(rover, camera):
@@ -42,10 +35,8 @@ def test_starts_fill_the_inner_bounds_and_keep_what_is_required(rover, camera):
     free, allowed = starts(RANGES, 256, seed=3), starts(RANGES, 12, wanted, camera, seed=3)
     # 256 even numbers leave a hundredth at either end with a probability of 0.99^256 = 8 % each:
     # five hundredths
-    assert 0.05 <= float(free.min()) < 0.06 < 0.94 < float(free.max()) <= 0.95
-    torch.testing.assert_close(
-        free.mean(0), torch.full((6,), 0.5, dtype=D), rtol=0, atol=5 * 0.26 / 16
-    )
+    assert 0.05 <= free.min() < 0.06 < 0.94 < free.max() <= 0.95
+    close(free.mean(0), torch.full((6,), 0.5, dtype=D), atol=5 * 0.26 / 16)
     for pose in RANGES.pose(allowed):
         assert all(verdict.kept for verdict in judge(wanted, pose, camera))
     assert torch.equal(starts(RANGES, 256, seed=3), free)

@@ -18,8 +18,9 @@ from codesign.mount import (
     unknown_depth,
 )
 from codesign.types import FlowField
+from tests.mount.fields import field_of
+from tests.numbers import D, close, f64, rand64, randn64, seeded
 
-D = torch.float64
 INTERVAL_S = 0.001  # short: the flow of a pixel is that of a point, whatever the depths beside it
 NOISE_PX = 0.02
 PRIOR = (1.0, 1.0, 1.0, 0.8, 0.8, 0.8)
@@ -29,20 +30,18 @@ CHI2_90 = 10.64  # of six
 
 def points(seed, count=4, many=5, scale=1.0, bounds=(0.1, 3.0)):
     """Rows of any size, and flow of random velocities and depths."""
-    random = torch.Generator().manual_seed(seed)
+    random = seeded(seed)
 
     def normal(*shape):
-        return torch.randn(shape, generator=random, dtype=D)
+        return randn64(random, shape)
 
     far, near = scale * normal(count, many, 2, 6), scale * normal(count, many, 2, 6)
-    nearness = bounds[0] + (bounds[1] - bounds[0]) * torch.rand(
-        count, many, 1, 1, generator=random, dtype=D
-    )
+    nearness = bounds[0] + (bounds[1] - bounds[0]) * rand64(random, count, many, 1, 1)
     root = normal(count, many, 2, 2)
     precision = root @ root.mT + 0.3 * torch.eye(2, dtype=D)
     flow = (far + nearness * near) @ normal(count, 1, 6, 1) + 0.3 * normal(count, many, 2, 1)
-    weight = 0.2 + torch.rand(count, many, generator=random, dtype=D)
-    prior = torch.diag(torch.tensor(PRIOR, dtype=D) ** -2)
+    weight = 0.2 + rand64(random, count, many)
+    prior = torch.diag(f64(PRIOR) ** -2)
     return unknown_depth.Points(
         precision, (precision @ flow)[..., 0], far, near, weight, prior, bounds
     ), flow
@@ -61,7 +60,7 @@ def density(rho, top, *seen):
 @pytest.mark.parametrize("scale", [1e-4, 0.1, 1.0, 30.0])
 def test_the_likelihood_is_the_integral_over_depths(scale):
     seen, flow = points(1, scale=scale)
-    velocity = torch.randn(4, 6, generator=torch.Generator().manual_seed(2), dtype=D)
+    velocity = randn64(seeded(2), 4, 6)
     ours = unknown_depth.look(seen, velocity).value
     low, high = seen.bounds
     for body in range(4):
@@ -84,16 +83,14 @@ def test_the_likelihood_is_the_integral_over_depths(scale):
 
 def test_slope_and_curvature_are_those_of_differences():
     seen, _ = points(3)
-    velocity = torch.randn(4, 6, generator=torch.Generator().manual_seed(4), dtype=D)
+    velocity = randn64(seeded(4), 4, 6)
     found = unknown_depth.look(seen, velocity)
     step = 1e-4
     for axis in range(6):
         moved = step * torch.eye(6, dtype=D)[axis]
         up, down = (unknown_depth.look(seen, velocity + way) for way in (moved, -moved))
-        torch.testing.assert_close(
-            (up.value - down.value) / (2 * step), found.slope[:, axis], rtol=1e-5, atol=1e-5
-        )
-        torch.testing.assert_close(
+        close((up.value - down.value) / (2 * step), found.slope[:, axis], rtol=1e-5, atol=1e-5)
+        close(
             (up.slope - down.slope) / (2 * step), found.curvature[:, :, axis], rtol=1e-4, atol=1e-3
         )
 
@@ -101,13 +98,11 @@ def test_slope_and_curvature_are_those_of_differences():
 def test_a_curvature_that_is_not_positive_counts_by_its_size():
     """Away from the maximum, where an ellipsoid has no axis along which the density grows."""
     seen, _ = points(3)
-    velocity = 5 * torch.randn(4, 6, generator=torch.Generator().manual_seed(4), dtype=D)
+    velocity = 5 * randn64(seeded(4), 4, 6)
     values, vectors = torch.linalg.eigh(unknown_depth.look(seen, velocity).curvature)
-    assert bool((values < 0).any())
+    assert (values < 0).any()
     expected = vectors @ (vectors.mT / values.abs()[..., None])
-    torch.testing.assert_close(
-        unknown_depth.covariance(seen, velocity), expected, rtol=1e-6, atol=1e-9
-    )
+    close(unknown_depth.covariance(seen, velocity), expected, rtol=1e-6, atol=1e-9)
 
 
 @pytest.fixture(scope="module")
@@ -118,28 +113,25 @@ def camera():
     )
 
 
-def field_of(flow, deviation_px):
-    """The field of flow [N, points, 2] that claims this deviation everywhere."""
-    flow = flow.reshape(-1, 32, 32, 2).movedim(-1, 1)
-    ones = torch.ones_like(flow[:, 0])
-    covariance = deviation_px**2 * torch.stack([ones, 0 * ones, ones], 1)
-    return FlowField(flow, ones.bool(), INTERVAL_S, ones, covariance)
+def by_window(flow):
+    """Flow [N windows, 2, 32, 32] of [N, points, 2]."""
+    return flow.reshape(-1, 32, 32, 2).movedim(-1, 1)
 
 
 def drives(camera, bodies, nearest_m, farthest_m, seed):
     """Mount [4, 4], poses, twists [N, 6] and flow fields where every point read has a depth of its
     own."""
-    random = torch.Generator().manual_seed(seed)
-    twist = torch.tensor(PRIOR, dtype=D) * torch.randn(bodies, 6, generator=random, dtype=D)
+    random = seeded(seed)
+    twist = f64(PRIOR) * randn64(random, bodies, 6)
     turned = Mount((0.2, 0.05, 0.4), (0.1, 0.1, 0.1), pitch_rad=0.9, yaw_rad=0.4)().detach()
     pixels = camera.film.pixels()
     low, high = 1 / farthest_m, 1 / nearest_m
-    depth = 1 / (low + (high - low) * torch.rand(bodies, len(pixels), generator=random, dtype=D))
+    depth = 1 / (low + (high - low) * rand64(random, bodies, len(pixels)))
     rows, _ = body_flow(camera, depth, turned)
     flow = (rows @ twist[:, None, :, None])[..., 0] * INTERVAL_S
-    flow = flow + NOISE_PX * torch.randn(flow.shape, generator=random, dtype=D)
+    flow = flow + NOISE_PX * randn64(random, flow.shape)
     poses = torch.eye(4, dtype=D).expand(bodies, 3, 4, 4) @ turned
-    return turned, poses, twist, field_of(flow, NOISE_PX)
+    return turned, poses, twist, field_of(by_window(flow), INTERVAL_S, NOISE_PX)
 
 
 def estimator(nearest_m, farthest_m, **how):
@@ -160,7 +152,7 @@ def test_velocities_over_depths_drawn_at_random(camera, nearest_m, farthest_m):
     assert (errors < 0.5 * without).all()
     squared = (missed[:, None] @ torch.linalg.inv(found.covariance) @ missed[..., None])[:, 0, 0]
     # four points of a window count as three: claims are a little wide
-    assert 0.8 <= float((squared < CHI2_90).double().mean()) <= 0.98
+    assert 0.8 <= (squared < CHI2_90).double().mean() <= 0.98
     assert missed.abs().max() < 1.0  # no other maximum
 
 
@@ -172,24 +164,24 @@ def test_the_maximum_is_the_one_by_the_truth(camera):
         seen = ours.points(read, torch.ones_like(read.share))
         found, near = unknown_depth.follow(seen, 0 * twist), unknown_depth.descend(seen, twist, 40)
         values = [unknown_depth.look(seen, each).value for each in (found, near)]
-    assert int((values[0] > values[1] + 0.01).sum()) <= 1
+    assert (values[0] > values[1] + 0.01).sum() <= 1
 
 
 def test_depths_are_found_where_the_body_moves_across(camera):
     mount, poses, _, _ = drives(camera, 1, 0.3, 5.0, 3)
-    share = torch.rand(
-        1, len(camera.film.pixels()), generator=torch.Generator().manual_seed(1), dtype=D
-    )
+    share = rand64(seeded(1), 1, len(camera.film.pixels()))
     depth = 1 / (0.2 + (1 / 0.3 - 0.2) * share)
     rows, _ = body_flow(camera, depth, mount)
-    flow = (rows @ torch.tensor([0.8, 0.8, 0.0, 0.0, 0.0, 0.3], dtype=D))[0] * INTERVAL_S
+    flow = (rows @ f64([0.8, 0.8, 0.0, 0.0, 0.0, 0.3]))[0] * INTERVAL_S
     with torch.no_grad():
-        found = estimator(0.3, 5.0)(field_of(flow, 1e-3), camera, None, mount, poses)
+        found = estimator(0.3, 5.0)(
+            field_of(by_window(flow), INTERVAL_S, 1e-3), camera, None, mount, poses
+        )
     at = depth.reshape(len(WINDOWS), 32, 32)[:, 8::16, 8::16].reshape(1, -1)
     # all depths and the speed may be longer together: that is what the bounds leave open
     ratio = (found.depth_m / at).log()
-    assert float((ratio - ratio.mean()).abs().median()) < 0.02
-    assert float(ratio.mean().abs()) < 0.2
+    assert (ratio - ratio.mean()).abs().median() < 0.02
+    assert ratio.mean().abs() < 0.2
 
 
 def test_a_point_without_a_surface_is_nowhere(camera):
@@ -206,9 +198,9 @@ def test_a_point_without_a_surface_is_nowhere(camera):
 def test_gradient_is_that_of_differences(camera, outlier):
     mount, poses, _, field = drives(camera, 3, 0.3, 5.0, 9)
     ours = estimator(0.3, 5.0, outlier=outlier, steps=12)
-    random = torch.Generator().manual_seed(2)
-    weight = torch.randn(3, 6, generator=random, dtype=D)
-    along = 0.02 * torch.randn(field.flow_px.shape, generator=random, dtype=D)
+    random = seeded(2)
+    weight = randn64(random, 3, 6)
+    along = 0.02 * randn64(random, field.flow_px.shape)
     covariance = field.covariance_px2.detach()
 
     def value(flow, spread):

@@ -3,6 +3,8 @@ moved by."""
 
 import torch
 
+from tests.numbers import seeded
+
 
 def assert_gradients(loss, at, steps, within, seed=0):
     """Gradients of loss(*at) are its central differences within a share, each along two random
@@ -14,7 +16,7 @@ def assert_gradients(loss, at, steps, within, seed=0):
     """
     leaves = [value.detach().clone().requires_grad_() for value in at]
     found = torch.autograd.grad(loss(*leaves), leaves)
-    draw = torch.Generator().manual_seed(seed)
+    draw = seeded(seed)
     for slot, (gradient, step) in enumerate(zip(found, steps, strict=True)):
         for _ in range(2):
             way = torch.randn(gradient.shape, generator=draw, dtype=gradient.dtype)
@@ -27,7 +29,7 @@ def assert_gradients(loss, at, steps, within, seed=0):
                 )
             error = float((gradient * way).sum()) - (ahead - behind) / (2 * step)
             # relative to the gradient's own length, as a direction may lie across it
-            assert abs(error) <= within * float(gradient.norm()), (
+            assert abs(error) <= within * gradient.norm(), (
                 slot,
                 error / float(gradient.norm()),
             )
@@ -41,5 +43,5 @@ def to_twist(loss):
 
 def smooth_weights(size_px):
     """Weights [size_px, size_px] of pixels, from a picture of 5 x 5."""
-    coarse = torch.randn(1, 1, 5, 5, generator=torch.Generator().manual_seed(3))
+    coarse = torch.randn(1, 1, 5, 5, generator=seeded(3))
     return torch.nn.functional.interpolate(coarse, size=(size_px, size_px), mode="bicubic")[0, 0]

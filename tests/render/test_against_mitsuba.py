@@ -20,6 +20,7 @@ from codesign import backend, lens, render
 from codesign.pose import look_at, se3_exp
 from codesign.render import Camera
 from scenes import textures, worlds
+from tests.numbers import f64
 
 K = 16
 WIDTH = 32
@@ -141,6 +142,6 @@ def test_a_traced_lens_stopped_down_against_perspective():
 
 
 def test_the_statistic_sees_a_quarter_of_a_pixel(room):
-    turn = torch.tensor([0, 0, 0, 0, 0.25 * PITCH_MM / EFL_MM, 0], dtype=torch.float64)
+    turn = f64([0, 0, 0, 0, 0.25 * PITCH_MM / EFL_MM, 0])
     ours = own_images(room, lens.Pinhole(EFL_MM), pose=POSE @ se3_exp(turn))
     assert moments(ours, mitsuba_images(room, "perspective"))[1] > 1

@@ -5,26 +5,20 @@ import torch
 
 from codesign import lens, render
 from codesign.pose import apply, inverse, look_at
-from codesign.render import Camera, Film, MovingScene, TexturedPlane
-from scenes import silhouettes, textures, trajectories, worlds
+from codesign.render import Camera, Film, MovingScene
+from scenes import silhouettes, trajectories, worlds
+from tests.numbers import D, close, f64, rand64, randn64, seeded
+from tests.render.planes import START, plane
 
-D = torch.float64
 BATCH = (2, 3)
-START = look_at((0.2, 0.1, 2.0), (0.0, 0.0, 0.0), down=(0, 1, 0))
 T_S = torch.linspace(0, 1, 4, dtype=D)
 WINDOWS = Film(20, 16, 6, 5, 0.1, ((0, 0), (13, 8)))
 
 
 def paths(count=4, batch=BATCH, origin=START):
     """Trajectories [*batch, count, 4, 4], each with its own motion in all six components."""
-    twist = 0.05 * torch.randn(*batch, 6, generator=torch.Generator().manual_seed(7), dtype=D)
+    twist = 0.05 * randn64(seeded(7), *batch, 6)
     return trajectories.body_twist(origin, twist, torch.linspace(0, 1, count, dtype=D))
-
-
-def plane(seed=1, height_m=0.0):
-    T = torch.eye(4, dtype=D)
-    T[2, 3] = height_m
-    return TexturedPlane(*textures.waves(seed, finest_period_m=0.2), T_world_plane=T)
 
 
 def one_by_one(function, poses):
@@ -52,13 +46,13 @@ def occlusion(scene, poses, cam, stride=1):
     found = render.flow_and_occlusion(cam, scene, poses, stride)
     flow, valid = render.true_flow(cam, scene, poses, stride)
     assert torch.equal(valid, found.valid)
-    torch.testing.assert_close(flow, found.flow_px, rtol=0, atol=1e-10)
+    close(flow, found.flow_px, atol=1e-10)
     masks = torch.stack([found.valid, found.occluded], -3 - (cam.film.windows_px is not None))
     return torch.cat([flow, masks.double()], -3 - (cam.film.windows_px is not None))
 
 
 def projected(poses):
-    world = 0.2 * torch.rand(7, 3, generator=torch.Generator().manual_seed(0), dtype=D)
+    world = 0.2 * rand64(seeded(0), 7, 3)
     return render.project(
         camera(optics=lens.load("cooke-triplet").scaled(0.2)), apply(inverse(poses), world)
     )
@@ -99,7 +93,7 @@ def test_what_a_batch_gives_is_what_each_trajectory_gives(of_poses):
     # products of 4 x 4 matrices may round differently in another batch; float32 scenes have every
     # bit or a phase apart
     found = of_poses(paths())
-    torch.testing.assert_close(found, one_by_one(of_poses, paths()), rtol=1e-10, atol=1e-10)
+    close(found, one_by_one(of_poses, paths()), rtol=1e-10, atol=1e-10)
     assert not torch.equal(found[0, 0], found[0, 1])
 
 
@@ -129,19 +123,19 @@ def test_gradients_of_a_batch_are_those_of_each_trajectory(way, generator):
         gradients(cam, scene, poses, way, weights, separate) for separate in (False, True)
     )
     for found, truth in zip(whole, parts, strict=True):
-        assert float(truth.norm()) > 0
-        assert float((found - truth).norm() / truth.norm()) <= 256 * 2**-24
+        assert truth.norm() > 0
+        assert (found - truth).norm() / truth.norm() <= 256 * 2**-24
 
 
 def test_the_trajectory_that_moves_furthest_decides_the_times_of_all():
-    twist = torch.tensor([[0.2, 0.1, 0, 0, 0, 0], [0.4, 0.2, 0, 0, 0, 0.5]], dtype=D)
+    twist = f64([[0.2, 0.1, 0, 0, 0, 0], [0.4, 0.2, 0, 0, 0, 0.5]])
 
     def times(motion):
         return render.adaptive_times(
             camera(), plane(), lambda t: trajectories.body_twist(START, motion, t), 0.0, 0.1, 0.5
         )
 
-    torch.testing.assert_close(times(twist), times(twist[1]), rtol=1e-9, atol=0)
+    close(times(twist), times(twist[1]), rtol=1e-9)
 
 
 @pytest.mark.bits
@@ -153,4 +147,4 @@ def test_a_list_of_worlds_is_each_with_its_own_poses():
     for k, world in enumerate(several):
         assert torch.equal(frames[k], render.frames(camera(), world, poses[k]))
         alone = occlusion(world, poses[k], camera(), 2)
-        torch.testing.assert_close(truth[k], alone, rtol=0, atol=1e-10)
+        close(truth[k], alone, atol=1e-10)

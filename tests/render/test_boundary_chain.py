@@ -11,10 +11,10 @@ from codesign import backend, lens, pose, render
 from codesign.errors import DomainError
 from codesign.render import MitsubaScene
 from scenes import silhouettes as silhouette_scenes
+from tests.numbers import D, close, f64
 from tests.render.differences import smooth_weights, to_twist
 from tests.render.solids import area
 
-F64 = torch.float64
 SIZE_PX = 24
 STEP = 2e-3
 WEIGHT = smooth_weights(SIZE_PX)
@@ -29,7 +29,7 @@ def judged(loss, many=512, seeds=(11, 12), per_px=12.0):
         with torch.no_grad():
             ends = [
                 [loss(sign * step, many, seed, "interior", per_px) for sign in (1, -1)]
-                for step in STEP * torch.eye(6, dtype=F64)
+                for step in STEP * torch.eye(6, dtype=D)
             ]
         truths.append(torch.stack([(ahead - behind) / (2 * STEP) for ahead, behind in ends]))
     truth = torch.stack(truths).mean(0)
@@ -56,7 +56,7 @@ def aside(twist):
 def mounted(twist):
     """The robot stands in the world with the camera on it; what moves is the mount, under which the
     world moves and the robot's own body too."""
-    T_world_robot = pose.se3_exp(torch.tensor([[0.05, -1.2, 1.0, 0.0, 0.0, 0.1]], dtype=F64))
+    T_world_robot = pose.se3_exp(f64([[0.05, -1.2, 1.0, 0.0, 0.0, 0.1]]))
     T_robot_cam = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, -0.15))
     world = render.MovingScene(scene("cubes"), {"robot": (robot(), T_world_robot)})
     return world, T_world_robot @ (T_robot_cam @ pose.se3_exp(twist[None]))
@@ -64,7 +64,7 @@ def mounted(twist):
 
 def turned(twist):
     """An object that moves about its own axes, before a camera that rests."""
-    place = pose.se3_exp(torch.tensor([[-0.1, -0.1, 0.95, 0.6, 0.2, 0.5]], dtype=F64))
+    place = pose.se3_exp(f64([[-0.1, -0.1, 0.95, 0.6, 0.2, 0.5]]))
     moved = robot(), place @ pose.se3_exp(twist[None])
     return render.MovingScene(scene("wall"), {"robot": moved}), START[None]
 
@@ -110,7 +110,7 @@ def test_every_frame_is_looked_at_and_again_through_a_wider_lens():
     mi = backend.mitsuba()
     wall, ball = silhouette_scenes.build("wall"), silhouette_scenes.ball()
     camera = render.Camera(lens.Pinhole(11.0), 32, 32, 0.25, 4)
-    places = torch.eye(4, dtype=F64).repeat(3, 1, 1)
+    places = torch.eye(4, dtype=D).repeat(3, 1, 1)
     places[:, :3, 3] = torch.tensor([[0.1, 1.6, 0.7], [0.1, 2.45, 0.7], [0.1, 1.6, 0.7]])
     world = render.MovingScene(wall, {"ball": (ball, places)})
     with pytest.raises(DomainError, match="of the jumps of radiance in frame 1 lie on no edge"):
@@ -123,7 +123,7 @@ def test_every_frame_is_looked_at_and_again_through_a_wider_lens():
     narrow = camera.with_lens(lens.Pinhole(60.0))
     render.frames(narrow, scene, START[None], gradient="boundary")
     away = pose.look_at((0.05, -1.2, 1.0), (0.0, -3.0, 1.0))
-    assert float(render.frames(camera, scene, away[None], gradient="boundary").abs().max()) == 0.0
+    assert render.frames(camera, scene, away[None], gradient="boundary").abs().max() == 0.0
     with pytest.raises(DomainError, match="textures with hard texels"):
         render.frames(camera, scene, START[None], gradient="boundary")
 
@@ -133,7 +133,7 @@ def test_auto_sees_faint_edges_and_asks_the_rays_of_any_lens():
     holds its focal length under a name of its own; a scene that cannot be a key."""
 
     class Plain:
-        dtype = F64
+        dtype = D
 
         def __init__(self, focal_mm):
             self.focal_mm = focal_mm
@@ -152,7 +152,7 @@ def test_auto_sees_faint_edges_and_asks_the_rays_of_any_lens():
         return {"type": "rectangle", "to_world": place, "emitter": emitter}
 
     scene = Own({"card": sheet(101.0, 1.0, 0.3), "wall": sheet(100.0, 2.0, 5.0)})
-    focal_mm = torch.tensor(11.0, dtype=F64, requires_grad=True)
+    focal_mm = torch.tensor(11.0, dtype=D, requires_grad=True)
     camera = render.Camera(Plain(focal_mm), 16, 16, 0.5, 4)
     found, truth = (
         torch.autograd.grad(
@@ -160,5 +160,5 @@ def test_auto_sees_faint_edges_and_asks_the_rays_of_any_lens():
         )[0]
         for way in ("auto", "boundary")
     )
-    assert float(truth.abs()) > 0
-    torch.testing.assert_close(found, truth, rtol=1e-5, atol=0)
+    assert truth.abs() > 0
+    close(found, truth, rtol=1e-5)

@@ -14,6 +14,7 @@ from codesign.render import Camera, light
 from codesign.render.placed import Placement, SidedScene
 from codesign.render.silhouettes.shapes import read
 from scenes import worlds
+from tests.numbers import close
 
 CAMERA = Camera(lens.Pinhole(4.0), 24, 24, 0.1, 4)
 # axes of one length, as Mitsuba asks for
@@ -63,7 +64,7 @@ def test_what_glows_shows_the_side_that_mitsuba_shows(tmp_path, kind, seed):
     )
     # Mitsuba stores the normals of vertices to 1 %, by which a face seen nearly edge-on is lit or
     # not
-    assert float((ours - theirs).abs().mean()) < 0.02 * 100
+    assert (ours - theirs).abs().mean() < 0.02 * 100
     found = read(mi, mi.load_dict({"type": "scene", **glowing}).shapes()[0])
     if kind not in EQUAL:  # faces of the outline point to where the light goes
         corners = found.vertices[found.faces]
@@ -97,8 +98,8 @@ def test_baked_light_shows_the_side_that_mitsuba_shows(tmp_path, kind, two_sided
         seen(worlds.from_mitsuba(scene, level, up="z", samples=64, texel_m=0.2), seed)
         for level in ("baked", "path")
     )
-    assert float((ours - theirs).abs().mean()) < 0.03
-    torch.testing.assert_close(ours.mean(), theirs.mean(), rtol=0.02, atol=0)
+    assert (ours - theirs).abs().mean() < 0.03
+    close(ours.mean(), theirs.mean(), rtol=0.02)
 
 
 def test_a_back_shows_its_own_picture_however_often_the_front_repeats_its():
@@ -123,5 +124,5 @@ def test_a_back_shows_its_own_picture_however_often_the_front_repeats_its():
         )
         for front in ({"type": "rgb", "value": 50.0}, picture(2.0))
     )
-    assert float(plain.std()) > 10
-    torch.testing.assert_close(repeated, plain, rtol=1e-5, atol=0)
+    assert plain.std() > 10
+    close(repeated, plain, rtol=1e-5)

@@ -17,9 +17,8 @@ from codesign.render.charts import chart_of, emissive_mesh
 from codesign.types import Rays
 from scenes import textures, worlds
 from scenes.build import sky
+from tests.numbers import D, close
 from tests.render.solids import area
-
-D = torch.float64
 
 
 def grey(albedo, radiance=0.0) -> Any:
@@ -82,7 +81,7 @@ def test_a_white_furnace_has_emission_over_one_minus_albedo(albedo):
         # a path's light has a relative spread of about 0.5; 100,000 paths and some 60 texels of 512
         # paths: 0.0002 and 0.003 / 5 at 1 sigma
         assert float(image.mean()) == pytest.approx(truth, rel=5 * relative / 2)
-        assert float((image / truth - 1).abs().max()) < 0.25
+        assert (image / truth - 1).abs().max() < 0.25
 
 
 PARALLEL = (
@@ -197,7 +196,7 @@ def test_baked_light_is_path_traced_light_on_every_kind_of_shape(
         # face: below 1 %, and light that falls off within a texel towards the floor is smeared.
         # Over the floor there is next to no light
         least, share = (5.0, 0.01) if made else (0.5 / 0.03, 0.03)
-        assert abs(float((ours - theirs).mean())) < share * max(float(theirs.mean()), least)
+        assert abs((ours - theirs).mean()) < share * max(float(theirs.mean()), least)
 
 
 def test_faces_of_two_triangles_stay_whole_where_they_are_baked():
@@ -228,8 +227,8 @@ def test_the_sky_is_the_same_at_every_level():
         render.frames(camera, made, poses)
         for made in (MitsubaScene(scene), light.PathScene(scene, samples=1))
     )
-    torch.testing.assert_close(plain, traced, rtol=1e-4, atol=1e-3)
-    assert float(plain.std()) > 5  # and it is not plain
+    close(plain, traced, rtol=1e-4, atol=1e-3)
+    assert plain.std() > 5  # and it is not plain
 
 
 @pytest.mark.bits
@@ -257,18 +256,18 @@ POSES = look_at((0.1, -2, 0.1), (0, 0, 0)).repeat(2, 1, 1)
 def test_a_level_that_is_a_tenth_brighter_is_wrong_by_a_tenth_and_by_nothing_after_gain():
     error = light.level_error(flat_wall(55.0), flat_wall(50.0), CAMERA, POSES)
     for part in (error.mean, error.percentile_95, error.maximum, error.rms):
-        torch.testing.assert_close(part, torch.full((2,), 0.1, dtype=D), rtol=1e-5, atol=0)
-    assert float(error.rms_after_gain.max()) < 1e-6
-    assert float(error.noise.max()) == 0
+        close(part, torch.full((2,), 0.1, dtype=D), rtol=1e-5)
+    assert error.rms_after_gain.max() < 1e-6
+    assert error.noise.max() == 0
 
 
 def test_noise_of_the_reference_is_not_taken_for_error(still_life):
     truth = light.PathScene(still_life, samples=512, seed=9)
     error = light.level_error(truth, light.PathScene(still_life, samples=8), wide(2), VIEW)
-    assert float(error.noise) > 0.01
+    assert error.noise > 0.01
     # the products of independent errors average to nothing: over 1728 pixels their mean is below 5
     # / sqrt(1728) of the noise's square, plus the truth's own
-    assert float(error.rms) < float(error.noise) * (5 * 2 / 1728**0.5 + 16 / 512) ** 0.5
+    assert error.rms < error.noise * (5 * 2 / 1728**0.5 + 16 / 512) ** 0.5
 
 
 def test_the_cheapest_level_within_the_tolerance_is_chosen_and_says_why():

@@ -6,16 +6,15 @@ import torch
 
 from codesign import lens, render
 from codesign.pose import inverse, look_at, se3_exp
-from codesign.render import Camera, MitsubaScene, MovingScene, TexturedPlane
-from scenes import textures
+from codesign.render import Camera, MitsubaScene, MovingScene
+from tests.numbers import D, close, f64
+from tests.render.planes import START, at, even, plane
 from tests.render.solids import area
 
-D = torch.float64
 TRIPLET = lens.load("cooke-triplet").scaled(0.08)
-START = look_at((0.2, 0.1, 2.0), (0.0, 0.0, 0.0), down=(0, 1, 0))
 # of a camera and an object that move in all six components
 POSES, OBJECTS = (
-    se3_exp(torch.linspace(0, 1, 3, dtype=D)[:, None] * torch.tensor(twist, dtype=D))
+    se3_exp(torch.linspace(0, 1, 3, dtype=D)[:, None] * f64(twist))
     for twist in ([0.05, -0.03, 0.08, 0.02, -0.03, 0.05], [-0.1, 0.06, 0.04, 0.05, 0.03, -0.1])
 )
 POSES = START @ POSES
@@ -23,22 +22,6 @@ POSES = START @ POSES
 
 def camera(width=24, height=16, samples=1, optics=None):
     return Camera(optics or lens.Pinhole(8.0), width, height, 0.1, samples)
-
-
-def at(x_m, z_m):
-    T = torch.eye(4, dtype=D)
-    T[0, 3], T[2, 3] = x_m, z_m
-    return T
-
-
-def plane(seed, height_m=0.0):
-    return TexturedPlane(
-        *textures.waves(seed, finest_period_m=0.2), T_world_plane=at(0.0, height_m)
-    )
-
-
-def even(radiance, z_m=0.0):
-    return TexturedPlane([[1.0, 0.0]], [0.0], [0.0], mean=radiance, T_world_plane=at(0.0, z_m))
 
 
 @pytest.mark.parametrize("optics", [lens.Pinhole(8.0), TRIPLET])
@@ -49,7 +32,7 @@ def test_an_object_is_seen_as_from_its_own_axes(optics):
     found = render.frames(cam, MovingScene(plane(2, -3.0), {"card": (plane(1), OBJECTS)}), POSES)
     # the poses are multiplied in another order: rounding times the phase gradient
     truth = render.frames(cam, plane(1), inverse(OBJECTS) @ POSES)
-    torch.testing.assert_close(found, truth, rtol=1e-12, atol=0)
+    close(found, truth, rtol=1e-12)
     assert not torch.allclose(found[0], found[2], rtol=1e-2)
 
 
@@ -75,7 +58,7 @@ def test_nearest_of_several_objects_and_the_background_where_nothing_is_met():
 def test_the_nearest_of_many_is_seen_whatever_their_order(order):
     cards = {str(z): (even(100.0 * z), at(0.0, z)[None]) for z in order}
     image = render.frames(camera(5, 4), MovingScene(even(1.0, 9.0), cards), at(0.0, 0.0)[None])
-    torch.testing.assert_close(image, torch.full_like(image, 200.0), rtol=1e-12, atol=0)
+    close(image, torch.full_like(image, 200.0), rtol=1e-12)
 
 
 @pytest.mark.bits

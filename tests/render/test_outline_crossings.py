@@ -16,10 +16,10 @@ from codesign.render.silhouettes import Segments, outlines
 from codesign.render.silhouettes.crossings import Overlaps, find_crossings, overlaps
 from codesign.render.silhouettes.intersections import Intersections
 from codesign.render.silhouettes.shapes import Mesh, read
+from tests.numbers import D, close, f64, rand64
 from tests.render.solids import CORNERS, CUBE, area, squares
 
-F64 = torch.float64
-EYE = torch.tensor([0.3, -4.0, 2.0], dtype=F64)
+EYE = f64([0.3, -4.0, 2.0])
 
 
 def place():
@@ -36,11 +36,11 @@ def intersection(**shapes):
     """Points [n, 3] along the one curve on round shapes, in order of pieces, and its length."""
     (found,) = [curve for curve in curves(**shapes) if isinstance(curve, Intersections)]
     index, bounds = found.pieces(EYE, 0.05)
-    s = bounds[:, :1] + torch.linspace(0, 1, 9, dtype=F64) * (bounds[:, 1:] - bounds[:, :1])
+    s = bounds[:, :1] + torch.linspace(0, 1, 9, dtype=D) * (bounds[:, 1:] - bounds[:, :1])
     y = found.points(index[:, None].expand(s.shape).reshape(-1), s.reshape(-1), EYE).reshape(
         *s.shape, 3
     )
-    assert bool((found.aside_rad(index, EYE) > 0.9e-5).all())
+    assert (found.aside_rad(index, EYE) > 0.9e-5).all()
     return y.reshape(-1, 3), float((y[:, 1:] - y[:, :-1]).norm(dim=2).sum())
 
 
@@ -126,7 +126,7 @@ def test_faces_in_one_plane_are_refused_where_they_are_seen(shift):
 
     def seen(picture, eye):
         over = [c for c in curves(wall=tile(0.0, 1.0), picture=picture) if isinstance(c, Overlaps)]
-        index = [curve.pieces(torch.tensor(eye, dtype=F64), 0.1)[0] for curve in over]
+        index = [curve.pieces(f64(eye), 0.1)[0] for curve in over]
         return bool(index) and index[0].numel() > 0
 
     assert seen(tile(0.1, 2.0, 0.1, shift), [0.0, 0.0, 3.0])
@@ -162,7 +162,7 @@ def test_faces_in_one_plane_are_refused_where_they_are_seen(shift):
 
 def test_what_two_triangles_in_a_plane_share_has_its_middle_where_its_corners_say(generator):
     """Corners: where lines of two of the six sides meet that lie within all six."""
-    p, q = (torch.rand(60, 3, 2, generator=generator, dtype=F64).numpy() for _ in range(2))
+    p, q = (rand64(generator, 60, 3, 2).numpy() for _ in range(2))
     normal = np.tile([0.0, 0.0, 1.0], (60, 1))
     rows, middle, end = overlaps(
         *(np.pad(v, ((0, 0), (0, 0), (0, 1))) for v in (p, q)), normal, 1e-6
@@ -257,5 +257,5 @@ def test_round_shapes_meet_others_in_curves_of_closed_form(one, other, off, leng
     floor = {"type": "rectangle", "to_world": place().scale(3)}
     y, found = intersection(one=one, other=other or floor)
     away = off(*y.unbind(1))
-    torch.testing.assert_close(away, torch.zeros_like(away), rtol=0, atol=1.1e-7)
+    close(away, torch.zeros_like(away), atol=1.1e-7)
     assert found == pytest.approx(length, rel=rel)

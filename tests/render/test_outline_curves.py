@@ -10,34 +10,34 @@ from codesign import backend
 from codesign.errors import DomainError
 from codesign.render.charts import emissive_mesh
 from codesign.render.silhouettes.curves import DEEPEST, EPS, Circles, Cylinders, Segments, Spheres
+from tests.numbers import D, close, f64, rand64
 
-F64 = torch.float64
-EYE = torch.tensor([0.3, -2.0, 0.4], dtype=F64)
+EYE = f64([0.3, -2.0, 0.4])
 FIRST = torch.zeros(1, dtype=torch.long)
 
 
 def row(*values):
-    return torch.tensor([values], dtype=F64)
+    return f64([values])
 
 
 def ball(centre=(0.1, 0.2, 0.3), radius=0.5):
-    return Spheres(row(*centre), torch.tensor([radius], dtype=F64))
+    return Spheres(row(*centre), f64([radius]))
 
 
 def pole(start=(0.0, 0.0, -1.0), end=(0.2, 0.1, 1.0), radius=0.1):
-    return Cylinders.of(row(*start), row(*end), torch.tensor([radius], dtype=F64))
+    return Cylinders.of(row(*start), row(*end), f64([radius]))
 
 
 def assert_tangent(y, centre, radius, axis=(0.0, 0.0, 0.0)):
     """Points [n, 3] of a round shape, at which the way from the eye lies in its surface."""
-    axis = torch.as_tensor(axis, dtype=F64)
+    axis = torch.as_tensor(axis, dtype=D)
     out = y - centre - ((y - centre) @ axis)[:, None] * axis
-    torch.testing.assert_close(out.norm(dim=1), torch.full((len(y),), radius, dtype=F64))
-    assert float((out * (y - EYE)).sum(1).abs().max()) < 1e-12
+    torch.testing.assert_close(out.norm(dim=1), torch.full((len(y),), radius, dtype=D))
+    assert (out * (y - EYE)).sum(1).abs().max() < 1e-12
 
 
 def test_outlines_are_tangent_and_both_lines_of_a_cylinder_run_from_end_to_end():
-    s = torch.linspace(0, 1, 21, dtype=F64)
+    s = torch.linspace(0, 1, 21, dtype=D)
     assert_tangent(ball().points(FIRST.expand(21), s, EYE.expand(21, 3)), ball().centre, 0.5)
     index, bounds = pole().pieces(EYE, 0.01)
     start, end = pole().start[0], pole().end[-1]
@@ -46,10 +46,10 @@ def test_outlines_are_tangent_and_both_lines_of_a_cylinder_run_from_end_to_end()
     assert_tangent(ends.reshape(-1, 3), start, 0.1, axis)
     sides = [ends[pole().side[index] == side] for side in (1.0, -1.0)]
     for side in sides:
-        torch.testing.assert_close(side[1:, 0], side[:-1, 1], rtol=0, atol=1e-12)
+        close(side[1:, 0], side[:-1, 1], atol=1e-12)
         reach = torch.stack([(side[0, 0] - start) @ axis, (side[-1, 1] - end) @ axis])
-        assert float(reach.abs().max()) < 1e-12
-    assert float((sides[0][0, 0] - sides[1][0, 0]).norm()) > 0.1
+        assert reach.abs().max() < 1e-12
+    assert (sides[0][0, 0] - sides[1][0, 0]).norm() > 0.1
 
 
 def test_from_within_its_radius_a_round_shape_has_no_tangent():
@@ -60,7 +60,7 @@ def test_from_within_its_radius_a_round_shape_has_no_tangent():
         (upright, (0.0, 0.05, -7.0)),
         (ball((0, 0, 0)), (0.1, 0.2, 0.3)),
     ):
-        assert curve.pieces(torch.tensor(eye, dtype=F64), 0.01)[0].numel() == 0
+        assert curve.pieces(f64(eye), 0.01)[0].numel() == 0
 
 
 def units(rng, count):
@@ -144,7 +144,7 @@ def seen_across(kind, ratio, offset_m, rng, count):
 
 
 def test_what_float32_rays_cannot_find_is_refused():
-    eye = torch.tensor([2.5, 0.0, 0.0], dtype=F64)
+    eye = f64([2.5, 0.0, 0.0])
     for curve in (ball((0, 0, 0), 1e-3), pole(end=(0.0, 0.0, 1.0), radius=1e-3)):
         index, _ = curve.pieces(eye, 0.01)  # listed, since nothing says yet that it is seen
         with pytest.raises(
@@ -164,9 +164,9 @@ def test_float32_rays_find_straight_edges_within_the_reading_angle(offset_m, dis
         corners = np.float32(offset_m * units(rng, 1) + size_m * units(rng, 3)).astype(np.float64)
         mesh = emissive_mesh(mi, corners, np.array([[0, 1, 2]]), np.ones(1))
         scene = mi.load_dict({"type": "scene", "triangle": mesh})
-        none = torch.zeros(1, 2, 3, dtype=F64)
+        none = torch.zeros(1, 2, 3, dtype=D)
         ends = torch.tensor(corners[:2])
-        curve = Segments(ends[:1], ends[1:], none, FIRST == 0, torch.zeros(1, dtype=F64), none)
+        curve = Segments(ends[:1], ends[1:], none, FIRST == 0, torch.zeros(1, dtype=D), none)
         along_edge = corners[1] - corners[0]
         place = corners[0] + rng.uniform(0.1, 0.9, (64, 1)) * along_edge
         eyes = place + distance_m * units(rng, 64)
@@ -194,16 +194,16 @@ def test_no_piece_of_a_rim_turns_back(eye):
     rim = Circles(
         row(0.1, 0, 0), row(0.2, 0.1, 0), row(-0.15, 0.3, 0), row(0, 0, 0), torch.zeros(1)
     )
-    eye = torch.tensor(eye, dtype=F64)
+    eye = f64(eye)
     index, bounds = rim.pieces(eye, 0.01)
     assert float((bounds[:, 1] - bounds[:, 0]).sum()) == pytest.approx(1, abs=1e-12)
-    s = bounds[:, :1] + torch.linspace(0, 1, 41, dtype=F64) * (bounds[:, 1:] - bounds[:, :1])
+    s = bounds[:, :1] + torch.linspace(0, 1, 41, dtype=D) * (bounds[:, 1:] - bounds[:, :1])
     y = rim.points(index[:, None].expand(s.shape).reshape(-1), s.reshape(-1), eye).reshape(
         *s.shape, 3
     )
     seen = normalize(y - eye, dim=2)
     length = (seen[:, 1:] - seen[:, :-1]).norm(dim=2).sum(1)
-    assert float(((seen[:, -1] - seen[:, 0]).norm(dim=1) / length).min()) > 0.7
+    assert ((seen[:, -1] - seen[:, 0]).norm(dim=1) / length).min() > 0.7
 
 
 @pytest.mark.parametrize(
@@ -212,11 +212,11 @@ def test_no_piece_of_a_rim_turns_back(eye):
 def test_a_place_on_a_sphere_has_one_name_from_all_points_of_a_pupil(towards, generator):
     """A pupil of 2 mm before a ball of 0.3 m: the same parameters are the same places, to some
     millimetres."""
-    eye = torch.tensor([0.3, -0.2, 0.1], dtype=F64)
-    curve = ball((eye + torch.tensor(towards, dtype=F64)).tolist(), 0.3)
+    eye = f64([0.3, -0.2, 0.1])
+    curve = ball((eye + f64(towards)).tolist(), 0.3)
     index, s = curve.pieces(eye, 0.1)
     middle = s.mean(1)
     seen = curve.points(index, middle, eye)
     for _ in range(20):
-        aside = 2e-3 * (torch.rand(len(index), 3, generator=generator, dtype=F64) - 0.5)
-        assert float((curve.points(index, middle, eye + aside) - seen).norm(dim=1).max()) < 4e-3
+        aside = 2e-3 * (rand64(generator, len(index), 3) - 0.5)
+        assert (curve.points(index, middle, eye + aside) - seen).norm(dim=1).max() < 4e-3

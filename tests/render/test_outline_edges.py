@@ -13,10 +13,10 @@ from codesign.render.charts import emissive_mesh
 from codesign.render.silhouettes import Circles, Segments, mesh_edges
 from codesign.render.silhouettes.edges import edges_once, rims_once, segments
 from scenes.build import pole
+from tests.numbers import D, f64
 from tests.render import solids
 from tests.render.solids import CUBE, area
 
-F64 = torch.float64
 CORNERS = (solids.CORNERS + 1) / 2
 LIGHT = area(1.0)
 
@@ -33,16 +33,16 @@ def tube(sides=64):
 def silhouettes(edges, eye):
     """Edges of a list that are outlines from the eye and not from every side."""
     curve = Segments.of(edges)
-    index, _ = curve.pieces(torch.tensor(eye, dtype=F64), 10.0)
+    index, _ = curve.pieces(f64(eye), 10.0)
     return int((~curve.always[index]).sum())
 
 
 def test_flat_diagonals_are_no_edges_and_inner_edges_count_at_silhouettes_only():
     edges = mesh_edges(CORNERS, CUBE)
     assert len(edges) == 12
-    assert bool(edges.always.all())
+    assert edges.always.all()
     edges = mesh_edges(*tube())
-    assert int(edges.always.sum()) == 128  # the open ends
+    assert edges.always.sum() == 128  # the open ends
     # of 64 inner edges, the two where the tube turns away
     assert silhouettes(edges, (5.0, 0.1, 0.5)) == 2
 
@@ -53,23 +53,23 @@ def test_faces_wound_against_their_neighbour_part_light_from_black():
     some = np.random.default_rng(3).random(len(CUBE)) < 0.5
     edges = mesh_edges(CORNERS, np.where(some[:, None], CUBE[:, ::-1], CUBE))
     assert len(edges) == 12 + int((some[::2] != some[1::2]).sum())
-    assert bool(edges.always.all())
+    assert edges.always.all()
 
 
 def test_edges_whose_faces_both_turn_away_are_black_on_both_sides():
     edges = mesh_edges(CORNERS, CUBE)
     curve = Segments.of(edges)
-    index, _ = curve.pieces(torch.tensor([3.0, 4.0, 5.0], dtype=F64), 10.0)
+    index, _ = curve.pieces(f64([3.0, 4.0, 5.0]), 10.0)
     assert len(index) == 9  # the three that meet in the far corner are not seen
     middle = (curve.start[index] + curve.end[index]) / 2
-    assert bool((middle.sum(1) > 0.75).all())
+    assert (middle.sum(1) > 0.75).all()
     facing = ((middle - 0.5).abs() < 0.25).any(1) & (middle > 0.75).sum(1).eq(2)
-    eye = torch.tensor([[3.0, 4, 5]], dtype=F64)
+    eye = f64([[3.0, 4, 5]])
     # where two seen sides meet
     assert torch.equal(curve.face_slope(index, middle, eye).isfinite(), facing)
     # a square at x = 0, its normal along -x: black from here, and in the way
     edges = mesh_edges(CORNERS, CUBE[:2])
-    index, _ = Segments.of(edges).pieces(torch.tensor([3.0, 4, 5], dtype=F64), 10.0)
+    index, _ = Segments.of(edges).pieces(f64([3.0, 4, 5]), 10.0)
     assert len(index) == 4
 
 
@@ -81,7 +81,7 @@ def test_one_vertex_per_corner_of_every_face_is_the_same_mesh():
     )
     edges = mesh_edges(corners, np.arange(sides.size).reshape(-1, 3))
     assert len(edges) == 128 + 64
-    assert int(edges.always.sum()) == 128
+    assert edges.always.sum() == 128
     assert silhouettes(edges, (5.0, 0.1, 0.5)) == 2
 
 
@@ -99,9 +99,9 @@ def test_an_edge_of_three_faces_counts_from_every_side():
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]])
     edges = mesh_edges(vertices, np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]]))
     assert len(edges) == 7
-    assert bool(edges.always.all())
+    assert edges.always.all()
     foot = (np.abs(edges.start[:, 1:]).max(1) == 0) & (np.abs(edges.end[:, 1:]).max(1) == 0)
-    assert int(foot.sum()) == 1
+    assert foot.sum() == 1
 
 
 def test_edges_between_faces_of_unequal_radiance_count_even_where_flat():
@@ -116,7 +116,7 @@ def test_edges_between_faces_of_unequal_radiance_count_even_where_flat():
     assert len(mesh_edges(vertices, faces)) == 4 * n
     edges = mesh_edges(vertices, faces, values)
     assert len(edges) == 4 * n + (n - 1) * n
-    assert bool(edges.always.all())
+    assert edges.always.all()
     mi = backend.mitsuba()
     (curve,) = MitsubaScene({"grid": emissive_mesh(mi, vertices, faces, light)}).outline()
     assert isinstance(curve, Segments)
@@ -145,7 +145,7 @@ def test_where_edges_overlap_does_not_hang_on_rounding(shift):
         union += max(0.0, end[k] - max(begin[k], reached))
         reached = max(reached, end[k])
     assert float(edges.length_m.sum()) == pytest.approx(union, abs=1e-4)
-    assert float(edges.width_m.max()) < 4e-6
+    assert edges.width_m.max() < 4e-6
 
 
 def test_edges_that_count_as_one_are_read_from_beyond_both():
@@ -153,8 +153,8 @@ def test_edges_that_count_as_one_are_read_from_beyond_both():
     assert len(edges) == 1
     assert float(edges.width_m[0]) == pytest.approx(6e-5, rel=1e-6)
     curve = Segments.of(edges)
-    eye = torch.tensor([0.5, 0.0, 2.0], dtype=F64)
-    assert float(curve.aside_rad(torch.zeros(1).long(), eye)) > 1e-5 + 6e-5 / 2
+    eye = f64([0.5, 0.0, 2.0])
+    assert curve.aside_rad(torch.zeros(1).long(), eye) > 1e-5 + 6e-5 / 2
 
 
 def test_boxes_of_different_sizes_that_touch_share_their_edges():
@@ -207,6 +207,6 @@ def test_the_far_end_of_a_tube_is_hidden_by_its_near_wall():
     curves = MitsubaScene({"tube": tube_of}).outline()
     (rims,) = [curve for curve in curves if isinstance(curve, Circles)]
     index = torch.arange(2).repeat_interleave(50)
-    eye = torch.tensor([[0.0, -3.0, 3.0]], dtype=F64)
-    y = rims.points(index, torch.arange(100, dtype=F64) / 50, eye)
+    eye = f64([[0.0, -3.0, 3.0]])
+    y = rims.points(index, torch.arange(100, dtype=D) / 50, eye)
     assert torch.equal(rims.counts(index, y, eye), (y[:, 2] > 0.5) | (y[:, 1] < -0.1 * 0.1 / 3))

@@ -20,10 +20,10 @@ from scenes.silhouettes import smooth
 from studies.gradient_flow.silhouettes import PITCH_MM, SIZE_PX, STEPS, Task
 from tests.hostile import judge
 from tests.hostile.outline_cases import icosphere
+from tests.numbers import D, f64, rand64, randn64
 from tests.render.solids import area
 
-F64 = torch.float64
-SCALE = torch.tensor(STEPS["pose"], dtype=F64)
+SCALE = f64(STEPS["pose"])
 
 
 def picture(seed, cycles=6):
@@ -43,7 +43,7 @@ AHEAD = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
 def judged(turn_rad, pitch_mm, nearest_m, **shapes):
     """By differences with common random numbers, through a pinhole of 11 mm that looks along y."""
-    turned = AHEAD @ pose.se3_exp(torch.tensor([0, 0, 0, 0, 0, turn_rad], dtype=F64))
+    turned = AHEAD @ pose.se3_exp(f64([0, 0, 0, 0, 0, turn_rad]))
     scene = MitsubaScene(shapes)
     case = judge.Case(scene, lens.Pinhole(11.0), turned, pitch_mm, 28, nearest_m, 1)
     return judge.judge(case, effort=judge.Effort(seeds=(6,), per_px=16.0))
@@ -53,7 +53,7 @@ def loss_of_a_pole(task, start, end, radius, radiance, twist):
     """The task's loss for a bright pole that crosses the picture from top to bottom, before black:
     along every line across the picture the pole lies between two planes through the eye; the
     weights are constant within a pixel."""
-    T = (task.pose @ pose.se3_exp(torch.tensor(twist, dtype=F64)[None]))[0].numpy()
+    T = (task.pose @ pose.se3_exp(f64(twist)[None]))[0].numpy()
     eye = T[:3, 3]
     axis = (end - start) / np.linalg.norm(end - start)
     towards = eye - start
@@ -101,14 +101,14 @@ def test_poles_however_thin_and_far(ratio):
         / (2 * step)
         for t in step * np.eye(6)
     ]
-    truth = torch.tensor(truth, dtype=F64) * SCALE
+    truth = f64(truth) * SCALE
     # two lines a fraction of a pixel apart, sampled apart: a single estimate is noisy
     whole = (
         torch.stack([task.gradient("pose", 1, seed, "boundary", 32.0) for seed in range(16)])
         * SCALE
     )
     noise = float(whole.std(0).norm() / 4 / truth.norm())
-    assert float((whole.mean(0) - truth).norm() / truth.norm()) < 0.01 + 2 * noise
+    assert (whole.mean(0) - truth).norm() / truth.norm() < 0.01 + 2 * noise
     assert noise < 0.04
 
 
@@ -124,8 +124,8 @@ def test_the_outline_of_a_fine_mesh_through_a_wide_pupil():
     plain, whole = (
         task.gradient("pose", 256, 13, way, 16.0) * SCALE for way in ("interior", "boundary")
     )
-    assert float((plain - truth.mean(0)).norm() / truth.mean(0).norm()) > 0.3
-    assert float((whole - truth.mean(0)).norm() / truth.mean(0).norm()) < 0.03 + 2 * noise
+    assert (plain - truth.mean(0)).norm() / truth.mean(0).norm() > 0.3
+    assert (whole - truth.mean(0)).norm() / truth.mean(0).norm() < 0.03 + 2 * noise
     assert noise < 0.04
 
 
@@ -178,7 +178,7 @@ def test_a_view_is_looked_at_though_another_was_right(twist, nearer, monkeypatch
         "cube": {"type": "cube", "to_world": aside, "emitter": area(200)},
     }
     ball = MitsubaScene({"ball": {"type": "sphere", "radius": 0.55 / nearer, "emitter": area(20)}})
-    place = torch.eye(4, dtype=F64)[None].clone()
+    place = torch.eye(4, dtype=D)[None].clone()
     place[0, :3, 3] = torch.tensor([-6.6, 0.1, 9.3]) / nearer
     world = render.MovingScene(MitsubaScene(static), {"ball": (ball, place)})
     camera = render.Camera(lens.Pinhole(11.0), 32, 32, 0.35, 4)
@@ -188,10 +188,10 @@ def test_a_view_is_looked_at_though_another_was_right(twist, nearer, monkeypatch
         occlusion_check, "listings", lambda *given: looks.append(given) or listings(*given)
     )
     for share in (0.0, 1e-3):
-        small = pose.se3_exp(share * torch.tensor([twist], dtype=F64))
+        small = pose.se3_exp(share * f64([twist]))
         render.frames(camera, world, small, gradient="boundary")
     assert len(looks) == 1
-    other = pose.se3_exp(torch.tensor([twist], dtype=F64))
+    other = pose.se3_exp(f64([twist]))
     with pytest.raises(DomainError, match="of the jumps of radiance in frame 0"):
         render.frames(camera, world, other, gradient="boundary")
 
@@ -199,7 +199,7 @@ def test_a_view_is_looked_at_though_another_was_right(twist, nearer, monkeypatch
 @pytest.mark.parametrize("kind", ["sphere", "cylinder", "disk", "cube"])
 def test_no_surface_is_nearer_than_it_is_said(kind, generator):
     """Against points spread over the shape, from outside and within."""
-    centre = torch.tensor([0.3, -0.2, 0.5], dtype=F64)
+    centre = f64([0.3, -0.2, 0.5])
     place = (
         backend.mitsuba()
         .ScalarTransform4f()
@@ -208,7 +208,7 @@ def test_no_surface_is_nearer_than_it_is_said(kind, generator):
         .scale(0.4)
     )
     scene = MitsubaScene({"thing": {"type": kind, "to_world": place, "emitter": area(1)}})
-    at = torch.randn(40_000, 2, 3, generator=generator, dtype=F64)
+    at = randn64(generator, 40_000, 2, 3)
     direction = torch.nn.functional.normalize(centre + 0.4 * at[:, 1] - at[:, 0], dim=1)
     point, _, valid = scene.hit(at[:, 0], direction)
     for eye in torch.cat([2 * at[:20, 0], 0.1 * at[20:40, 0] + centre]):
@@ -221,43 +221,36 @@ def test_no_surface_is_nearer_than_it_is_said(kind, generator):
 def test_an_edge_that_is_seen_end_on_is_no_line_in_the_picture():
     """Of an edge along the optical axis and one across it only the second jumps, upwards at its own
     place."""
-    world = torch.tensor([[0.0, 0, 5], [0.3, 0.1, 5]], dtype=F64)
-    ahead = world + torch.tensor([[0.0, 0, 0.01], [0, 0.01, 0]], dtype=F64)
-    one, none = torch.ones(2, dtype=F64), torch.zeros(2, dtype=torch.long)
-    faces = 1e-4 * one, 1e-4 * one, torch.inf * one, torch.full((2, 2, 3), torch.nan, dtype=F64)
+    world = f64([[0.0, 0, 5], [0.3, 0.1, 5]])
+    ahead = world + f64([[0.0, 0, 0.01], [0, 0.01, 0]])
+    one, none = torch.ones(2, dtype=D), torch.zeros(2, dtype=torch.long)
+    faces = 1e-4 * one, 1e-4 * one, torch.inf * one, torch.full((2, 2, 3), torch.nan, dtype=D)
     points = CurvePoints(
-        world, ahead, one, *faces, torch.zeros(2, 2, dtype=F64), none, none, none, none
+        world, ahead, one, *faces, torch.zeros(2, 2, dtype=D), none, none, none, none
     )
     camera = render.Camera(lens.Pinhole(8.0), 33, 25, 0.05)
     scene = render.TexturedPlane([[0.7, 0.3]], [0.4], [0.2])
-    found = jumps(camera, scene, torch.eye(4, dtype=F64)[None, None], points)
+    found = jumps(camera, scene, torch.eye(4, dtype=D)[None, None], points)
     assert found is not None
     assert found.row.tolist() == [1]
     place = [16 + 0.3 / 5 * 8 / 0.05, 12 + 0.1 / 5 * 8 / 0.05]
-    torch.testing.assert_close(found.film_px, torch.tensor([place], dtype=F64))
-    torch.testing.assert_close(found.normal, torch.tensor([[-1.0, 0.0]], dtype=F64))
+    torch.testing.assert_close(found.film_px, f64([place]))
+    torch.testing.assert_close(found.normal, f64([[-1.0, 0.0]]))
 
 
 @pytest.mark.parametrize("eye_m", [0.0, 9.0])
 def test_rays_that_meet_a_chord_are_near_its_piece_wherever_the_eye_is(eye_m, generator):
     """Chords 0.2 m long 1 m before the eye, and rays from it to points all along them."""
-    eye = torch.tensor([0.0, 0.0, eye_m], dtype=F64)
-    start = (
-        torch.rand(40, 3, generator=generator, dtype=F64) * 0.4
-        + eye
-        + torch.tensor([0.0, 0.0, 1.0])
-    )
-    along = 0.2 * torch.nn.functional.normalize(
-        torch.randn(40, 3, generator=generator, dtype=F64), dim=1
-    )
+    eye = f64([0.0, 0.0, eye_m])
+    start = rand64(generator, 40, 3) * 0.4 + eye + torch.tensor([0.0, 0.0, 1.0])
+    along = 0.2 * torch.nn.functional.normalize(randn64(generator, 40, 3), dim=1)
     curve = SimpleNamespace(points=lambda index, s, eye: start[index] + s[:, None] * along[index])
     piece = torch.arange(40).repeat(9)
     to = (
-        curve.points(piece, torch.linspace(0.02, 0.98, 9, dtype=F64).repeat_interleave(40), eye)
-        - eye
+        curve.points(piece, torch.linspace(0.02, 0.98, 9, dtype=D).repeat_interleave(40), eye) - eye
     )
     distance = to.norm(dim=1)
-    bounds = torch.tensor([[0.0, 1.0]], dtype=F64).expand(40, 2)
+    bounds = f64([[0.0, 1.0]]).expand(40, 2)
     rays = eye.expand_as(to), to / distance[:, None], distance
     near = occlusion_check._near(curve, torch.arange(40), bounds, eye, *rays, 1e-6)
     assert set(enumerate(piece.tolist())) <= set(zip(*(v.tolist() for v in near), strict=True))

@@ -11,8 +11,8 @@ from codesign.pose import look_at, se3_exp
 from codesign.render import Camera, TexturedPlane
 from codesign.render.film import film_pupil_pattern
 from scenes import textures, worlds
+from tests.numbers import D, close, f64
 
-D = torch.float64
 FOCAL_MM = 6.0
 PITCH_MM = 0.05
 WIDTH = 24
@@ -20,13 +20,13 @@ HEIGHT = 16
 
 
 def tilted_plane(dtype=D, seed=3):
-    T = se3_exp(torch.tensor([0.2, -0.1, 0.4, 0.3, -0.2, 0.7], dtype=D))
+    T = se3_exp(f64([0.2, -0.1, 0.4, 0.3, -0.2, 0.7]))
     return TexturedPlane(*textures.waves(seed), mean=80.0, T_world_plane=T, dtype=dtype)
 
 
 def poses():
     base = look_at((0.4, -0.5, 2.6), (0.1, 0.1, 0.3), down=(0.2, 1.0, 0.1))
-    moved = base @ se3_exp(torch.tensor([0.05, -0.03, 0.08, 0.02, -0.03, 0.05], dtype=D))
+    moved = base @ se3_exp(f64([0.05, -0.03, 0.08, 0.02, -0.03, 0.05]))
     # from below the plane shows its front, mirrored
     return torch.stack(
         [base, moved, look_at((0.1, 0.2, -2.6), (0.1, 0.1, 0.3), down=(0.2, 1.0, 0.1))]
@@ -86,21 +86,17 @@ def test_frames_equal_the_texture_through_the_homography(samples, dtype, toleran
 
 def test_the_sample_pattern_covers_the_pixel_and_the_pupil_evenly():
     offset, pupil = film_pupil_pattern(1024, 3)
-    assert bool((offset >= -0.5).all())
-    assert bool((offset < 0.5).all())
-    assert float(pupil.square().sum(1).max()) <= 1
+    assert (offset >= -0.5).all()
+    assert (offset < 0.5).all()
+    assert pupil.square().sum(1).max() <= 1
     # moments of a unit square and a unit disc; 1024 low-discrepancy points are good to about 1/1024
     # times some logarithms
-    torch.testing.assert_close(offset.mean(0), torch.zeros(2, dtype=D), rtol=0, atol=2e-3)
-    torch.testing.assert_close(
-        offset.T @ offset / 1024, torch.eye(2, dtype=D) / 12, rtol=0, atol=2e-3
-    )
-    torch.testing.assert_close(pupil.mean(0), torch.zeros(2, dtype=D), rtol=0, atol=5e-3)
-    torch.testing.assert_close(pupil.T @ pupil / 1024, torch.eye(2, dtype=D) / 4, rtol=0, atol=5e-3)
+    close(offset.mean(0), torch.zeros(2, dtype=D), atol=2e-3)
+    close(offset.T @ offset / 1024, torch.eye(2, dtype=D) / 12, atol=2e-3)
+    close(pupil.mean(0), torch.zeros(2, dtype=D), atol=5e-3)
+    close(pupil.T @ pupil / 1024, torch.eye(2, dtype=D) / 4, atol=5e-3)
     radius = pupil.square().sum(1)  # uniform on [0, 1] for an area-preserving map
-    torch.testing.assert_close(
-        radius.sort().values, (torch.arange(1024, dtype=D) + 0.5) / 1024, rtol=0, atol=1e-2
-    )
+    close(radius.sort().values, (torch.arange(1024, dtype=D) + 0.5) / 1024, atol=1e-2)
     assert torch.equal(film_pupil_pattern(16, 3)[1], film_pupil_pattern(16, 3)[1])
 
 
@@ -109,8 +105,8 @@ def test_waves_stay_inside_their_band():
         7, count=200, finest_period_m=0.02, coarsest_period_m=0.3, log_contrast=0.5
     )
     period = 1 / frequency.norm(dim=1)
-    assert 0.02 <= float(period.min()) < 0.022
-    assert 0.27 < float(period.max()) <= 0.3
+    assert 0.02 <= period.min() < 0.022
+    assert 0.27 < period.max() <= 0.3
     # variance of the log radiance is contrast squared
     assert float(amplitude.square().sum() / 2) == pytest.approx(0.25, rel=1e-12)
     assert isinstance(worlds.smooth_plane(2, finest_period_m=0.1), TexturedPlane)

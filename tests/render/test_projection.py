@@ -9,8 +9,7 @@ from codesign import lens, render
 from codesign.render import Camera
 from codesign.render.projection import TOLERANCE_PX, ProjectionTable
 from studies.make_dataset import __main__ as study
-
-D = torch.float64
+from tests.numbers import close, f64, rand64, seeded
 
 
 def camera(name="cooke-triplet", size=24, level: Literal["traced", "thin", "pinhole"] = "traced"):
@@ -31,7 +30,7 @@ def test_the_table_projects_as_traced_rays_do(name, level):
         cam = camera(name, level=level)
         table = ProjectionTable(cam)
         assert table.series is not None
-        draw = torch.rand(400, 3, generator=torch.Generator().manual_seed(0), dtype=D)
+        draw = rand64(seeded(0), 400, 3)
         depth = 0.3 * 100 ** draw[:, 2:]
         # within and beyond the field
         points = torch.cat([(draw[:, :2] - 0.5) * 0.9 * depth, depth], 1)
@@ -39,12 +38,10 @@ def test_the_table_projects_as_traced_rays_do(name, level):
         truth = render.project(cam, points)
         assert torch.equal(pixels.isnan(), truth.isnan())
         seen = truth.isfinite().all(1)
-        assert 0.2 < float(seen.double().mean()) <= 1
-        torch.testing.assert_close(pixels[seen], truth[seen], rtol=0, atol=TOLERANCE_PX)
+        assert 0.2 < seen.double().mean() <= 1
+        close(pixels[seen], truth[seen], atol=TOLERANCE_PX)
         # the ray it names passes through the point: 1e-6 px of a 250 px focal length
-        torch.testing.assert_close(
-            base[seen] + slope[seen] * points[seen, 2:], points[seen, :2], rtol=0, atol=1e-8 * 30
-        )
+        close(base[seen] + slope[seen] * points[seen, 2:], points[seen, :2], atol=1e-8 * 30)
 
 
 def test_a_film_larger_than_the_field_is_projected_by_tracing():
@@ -52,5 +49,5 @@ def test_a_film_larger_than_the_field_is_projected_by_tracing():
         cam = Camera(lens.load("double-gauss").freeze(), 12, 12, 12.0, 1)
         table = ProjectionTable(cam)
         assert table.series is None
-        points = torch.tensor([[0.1, 0.2, 2.0], [0.0, 0.0, 1.0]], dtype=D)
-        torch.testing.assert_close(table(points)[0], render.project(cam, points), rtol=0, atol=0)
+        points = f64([[0.1, 0.2, 2.0], [0.0, 0.0, 1.0]])
+        close(table(points)[0], render.project(cam, points))

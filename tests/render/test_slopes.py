@@ -9,6 +9,7 @@ from codesign.errors import GradientError
 from codesign.render import pixel_means
 from codesign.render.wavefront import look, shade
 from codesign.types import Rays
+from tests.numbers import close, rand64, randn64
 
 FRAMES = 3
 
@@ -21,22 +22,19 @@ def plane():
 def rays(generator):
     """Eight rays of two pixels about the camera's axis, in float64, with all of their numbers
     asking."""
-    aside = 0.2 * torch.randn(8, 2, dtype=torch.float64, generator=generator)
+    aside = 0.2 * randn64(generator, 8, 2)
     direction = torch.nn.functional.normalize(
         torch.cat([aside, torch.ones(8, 1).double()], 1), dim=1
     )
-    origin = 0.01 * torch.randn(8, 3, dtype=torch.float64, generator=generator)
-    weight = 0.5 + torch.rand(8, dtype=torch.float64, generator=generator)
+    origin = 0.01 * randn64(generator, 8, 3)
+    weight = 0.5 + rand64(generator, 8)
     return [value.requires_grad_() for value in (origin, direction, weight)]
 
 
 @pytest.fixture
 def motion(generator):
     """Twists of a camera and of an object."""
-    return [
-        (0.05 * torch.randn(FRAMES, 6, dtype=torch.float64, generator=generator)).requires_grad_()
-        for _ in range(2)
-    ]
+    return [(0.05 * randn64(generator, FRAMES, 6)).requires_grad_() for _ in range(2)]
 
 
 def pictures(origin, direction, weight, camera, thing):
@@ -62,7 +60,7 @@ def test_what_memory_does_not_hold_is_worked_out_again_frame_by_frame(rays, moti
     monkeypatch.setattr(pixel_means, "KEPT", 0.0)
     again = torch.autograd.grad(pictures(*inputs), inputs, seed)
     for a, b in zip(kept, again, strict=True):  # the frames' sums are added in another order
-        torch.testing.assert_close(a, b, rtol=1e-13, atol=1e-13 * float(a.abs().max()))
+        close(a, b, rtol=1e-13, atol=1e-13 * float(a.abs().max()))
 
 
 def test_room_is_given_back_with_the_graph(rays, motion):
@@ -87,8 +85,8 @@ def test_box_around_a_scene_takes_no_ray_from_it(shape, generator):
     """Rays from before, inside and behind, at the shape and past it, some along its box's faces."""
     glow = {"type": "area", "radiance": {"type": "uniform", "value": 7.0}}
     scene = render.MitsubaScene({"thing": {"type": shape, "emitter": glow}}).two_sided()
-    origin = 3 * torch.randn(4000, 3, dtype=torch.float64, generator=generator)
-    target = 1.2 * (2 * torch.rand(4000, 3, dtype=torch.float64, generator=generator) - 1)
+    origin = 3 * randn64(generator, 4000, 3)
+    target = 1.2 * (2 * rand64(generator, 4000, 3) - 1)
     target[::4] = target[::4].round()
     direction = torch.nn.functional.normalize(target - origin, dim=1)
     still = torch.eye(4, dtype=torch.float64)[None, None], torch.zeros(4000, dtype=torch.long)
@@ -97,7 +95,7 @@ def test_box_around_a_scene_takes_no_ray_from_it(shape, generator):
     again, same = look(scene, *still, origin, direction)
     assert torch.equal(light, again)
     assert torch.equal(distance, same)
-    assert 0.05 < float((light == 7.0).double().mean()) < 0.95
+    assert 0.05 < (light == 7.0).double().mean() < 0.95
 
 
 def test_a_ray_without_a_slope_counts_none_and_leaves_the_others_theirs():

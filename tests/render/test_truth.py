@@ -10,9 +10,8 @@ from codesign.pose import apply, inverse, look_at, se3_exp
 from codesign.render import Camera, MitsubaScene, TexturedPlane, true_flow
 from codesign.render.truth import flow_and_occlusion, view
 from scenes import textures
+from tests.numbers import D, close, f64
 from tests.render.differences import assert_gradients
-
-D = torch.float64
 
 
 def start():
@@ -20,13 +19,13 @@ def start():
 
 
 def motions(*twists):
-    return start() @ se3_exp(torch.tensor(twists, dtype=D))
+    return start() @ se3_exp(f64(twists))
 
 
 def upright_plane(normal_distance_m=0.0):
     """The plane y = 0 of the world, as worlds.wall has it."""
     T = torch.eye(4, dtype=D)
-    T[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=D)
+    T[:3, :3] = f64([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     T[1, 3] = normal_distance_m
     return TexturedPlane(*textures.waves(0), T_world_plane=T)
 
@@ -47,7 +46,7 @@ def test_what_leaves_the_field_or_meets_nothing_is_invalid_zero_and_without_grad
         flow, valid = true_flow(
             Camera(changed, 12, 10, 0.5, 1), upright_plane(), poses @ se3_exp(twist)
         )
-        assert 0 < int(valid.sum()) < valid.numel()
+        assert 0 < valid.sum() < valid.numel()
         return flow.square().sum()
 
     at = [torch.zeros(2, 6, dtype=D), geo.curvature_per_mm.detach(), geo.thickness_mm.detach()]
@@ -61,7 +60,7 @@ def test_points_of_one_flat_ground_never_hide_each_other():
     precision moves the point that a ray meets along the ground by its rounding over that cosine;
     the ground lies askew, so that all its coordinates round."""
     mi = backend.mitsuba()
-    T_world_ground = se3_exp(torch.tensor([3.0, -2.0, 1.5, 0.5, 0.3, -0.4], dtype=D))
+    T_world_ground = se3_exp(f64([3.0, -2.0, 1.5, 0.5, 0.3, -0.4]))
     to_world = mi.ScalarTransform4f(T_world_ground.numpy()).scale([200, 200, 1])
     scene = MitsubaScene({"ground": {"type": "rectangle", "to_world": to_world}}, emissive=False)
     poses = torch.stack(
@@ -70,7 +69,7 @@ def test_points_of_one_flat_ground_never_hide_each_other():
     camera = Camera(lens.Pinhole(8.0), 48, 40, 0.1, 1)
     for stride in (1, 3):
         truth = flow_and_occlusion(camera, scene, T_world_ground @ poses, stride)
-        assert int(truth.valid.sum()) > 0.3 * truth.valid.numel()
+        assert truth.valid.sum() > 0.3 * truth.valid.numel()
         assert not truth.occluded.any()
 
 
@@ -90,6 +89,6 @@ def test_depth_is_measured_from_the_origin_of_the_camera_wherever_rays_start():
         for kind in (lens.Pinhole, LongHood)
     )
     truth = apply(inverse(poses[0]), hooded.points_world_m[hooded.valid])[:, 2]
-    assert int(hooded.valid.sum()) > 60
-    torch.testing.assert_close(hooded.depth_m[hooded.valid], truth, rtol=1e-12, atol=0)
-    torch.testing.assert_close(hooded.depth_m, plain.depth_m, rtol=1e-12, atol=0)
+    assert hooded.valid.sum() > 60
+    close(hooded.depth_m[hooded.valid], truth, rtol=1e-12)
+    close(hooded.depth_m, plain.depth_m, rtol=1e-12)

@@ -6,13 +6,12 @@ import math
 import pytest
 import torch
 
-from codesign.errors import DomainError
 from codesign.pose import se3_exp
 from codesign.types import EventVolume
 from scenes.robots.costs import Costs, Exposed, noise_rate_hz, threshold_to_noise
 from scenes.robots.pair import SENSOR
-
-F = torch.float64
+from tests import refusals
+from tests.numbers import D, f64, seeded
 
 
 def test_noise_follows_the_fit_of_v2e():
@@ -67,12 +66,12 @@ class Counted(torch.nn.Module):
 
 
 def test_a_bus_keeps_what_it_can_read_by_the_binomial_law():
-    counts = torch.full((4, 2, 5, 40, 40), 3.0, dtype=F)
+    counts = torch.full((4, 2, 5, 40, 40), 3.0, dtype=D)
     counts[2:] = 0.02  # the second body is quiet
     offered = float(counts[:2].sum())
     counts.requires_grad_()
     bus = Exposed(Counted(counts), 1.0, 0.3 * offered, 2)
-    read = bus.volume(counts, torch.arange(3.0), 5, torch.Generator().manual_seed(0)).counts
+    read = bus.volume(counts, torch.arange(3.0), 5, seeded(0)).counts
     assert torch.equal(read[2:], counts[2:])
     kept = read[:2].detach()
     assert float(kept.sum() / offered) == pytest.approx(0.3, abs=4 * math.sqrt(0.21 / offered))
@@ -86,10 +85,10 @@ def test_a_bus_keeps_what_it_can_read_by_the_binomial_law():
 def test_a_mast_bends_as_a_cantilever():
     """Under a load P at its tip a cantilever deflects by P L^3 / 3 E I and slopes by P L^2 / 2 E
     I."""
-    pose = torch.eye(4, dtype=F)
+    pose = torch.eye(4, dtype=D)
     pose[:3, 3] = torch.tensor([0.4, 0.1, 0.7])
-    deviates = torch.tensor([[0.3, -1.2], [1.0, 0.5]], dtype=F)
-    twist = Costs(sway_per_m_s=0.6).sway(pose, 0.3, torch.tensor([0.5, 2.0], dtype=F), deviates)
+    deviates = f64([[0.3, -1.2], [1.0, 0.5]])
+    twist = Costs(sway_per_m_s=0.6).sway(pose, 0.3, f64([0.5, 2.0]), deviates)
     # a tenth of a millisecond of it
     moved = se3_exp(1e-4 * twist) @ pose
     tip = (moved[:, :3, 3] - pose[:3, 3]) / 1e-4
@@ -98,14 +97,11 @@ def test_a_mast_bends_as_a_cantilever():
     assert torch.allclose(tip[:, 0] * slope_over_deflection, twist[:, 4], rtol=1e-4)
     assert torch.allclose(-tip[:, 1] * slope_over_deflection, twist[:, 3], rtol=1e-4)
     # 0.6 rad/s at 1 m and 1 m/s, by the square of the length; faster than 1 m/s makes no difference
-    rates = 0.6 * 0.4**2 * torch.tensor([[0.5], [1.0]], dtype=F) * deviates
+    rates = 0.6 * 0.4**2 * f64([[0.5], [1.0]]) * deviates
     assert torch.allclose(twist[:, 3:5], rates)
-    assert not Costs().sway(pose, 0.8, torch.ones(2, dtype=F), deviates).any()
+    assert not Costs().sway(pose, 0.8, torch.ones(2, dtype=D), deviates).any()
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"light": 0.0}, {"light": 1.5}, {"bus_hz": 0.0}, {"sway_per_m_s": -1.0}]
-)
-def test_costs_out_of_range_are_refused(wrong):
-    with pytest.raises(DomainError, match=next(iter(wrong))):
-        Costs(**wrong)
+@refusals.table(__file__, "costs")
+def test_costs_out_of_range_are_refused(row):
+    row.holds(globals())

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from codesign import backend, pose, render
+from codesign import backend, render
 from codesign.render import light
 from scenes import foreign, worlds
 from tests.scenes.foreign_examples import FOREIGN
@@ -74,7 +74,7 @@ def test_a_world_is_the_picture_that_mitsuba_makes_and_baked_light_is_near_it(na
     ours = torch.stack([frame(camera, paths.with_seed(k), poses) for k in range(PICTURES)])
     means = [images.mean((1, 2)) for images in (ours, theirs)]
     noise = float((means[0].var() + means[1].var()).sqrt()) / 2
-    assert abs(float(ours.mean() - theirs.mean())) <= 5 * noise < 0.1 * float(theirs.mean())
+    assert abs(ours.mean() - theirs.mean()) <= 5 * noise < 0.1 * theirs.mean()
     # 16 pairs of pictures that share four: the ratio of two RMS is good to 5 %
     among = np.mean([rms(a - b) for a, b in combinations(theirs, 2)])
     assert np.mean([rms(a - b) for a, b in product(ours, theirs)]) <= 1.1 * among
@@ -82,41 +82,4 @@ def test_a_world_is_the_picture_that_mitsuba_makes_and_baked_light_is_near_it(na
     options = {"samples": 8, "texel_m": math.sqrt(area_m2 / 20_000), "matte": name in MATTE}
     baked = worlds.from_mitsuba(scene, "baked", **options)
     error = light.level_error(baked, worlds.from_mitsuba(scene, "path", samples=16), camera, poses)
-    assert float(error.rms_after_gain.max()) <= BAKED[name]
-
-
-def test_the_gradient_of_a_baked_scene_is_that_of_differences():
-    """Of a random smooth loss to the pose, with common random numbers; without the term of
-    silhouettes it is not."""
-    scene = foreign.loaded(backend.mitsuba(), FOREIGN["terrace"](), {}, merge=False)
-    view = worlds.view_of(scene)
-    poses = view.T_world_cam[None]
-    camera = view.camera(64, WIDTH_PX)
-    area_m2 = sum(float(shape.surface_area()[0]) for shape in scene.shapes())
-    baked = worlds.from_mitsuba(scene, "baked", samples=8, texel_m=math.sqrt(area_m2 / 20_000))
-    generator = torch.Generator().manual_seed(0)
-    coarse = torch.randn(1, 1, 6, 8, generator=generator, dtype=torch.float64)
-    weight = torch.nn.functional.interpolate(
-        coarse, size=camera.film.shape[-2:], mode="bilinear", align_corners=True
-    )[0, 0]
-    step = 1e-3  # m and rad
-    seeds = []
-    for seed in range(4):
-        each = []
-        for twist in step * torch.eye(6, dtype=torch.float64):
-            ahead, behind = (
-                frame(camera.with_seed(seed), baked, poses @ pose.se3_exp(move[None]))
-                for move in (twist, -twist)
-            )
-            each.append(float(((ahead - behind) * weight).sum()) / (2 * step))
-        seeds.append(torch.tensor(each))
-    truth = torch.stack(seeds).mean(0)
-    noise = float((torch.stack(seeds).std(0) / 2).norm() / truth.norm())
-    errors = {}
-    for way in ("interior", "boundary"):
-        twist = torch.zeros(1, 6, dtype=torch.float64, requires_grad=True)
-        image = render.frames(camera.with_seed(4), baked, poses @ pose.se3_exp(twist), gradient=way)
-        (image[0].double().reshape(weight.shape) * weight).sum().backward()
-        errors[way] = float((twist.grad[0] - truth).norm() / truth.norm())
-    assert errors["boundary"] <= 0.05 + 3 * noise
-    assert errors["interior"] > 2 * errors["boundary"]
+    assert error.rms_after_gain.max() <= BAKED[name]

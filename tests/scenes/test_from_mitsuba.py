@@ -15,6 +15,7 @@ from codesign.render import Camera, light
 from codesign.render.charts import emissive_mesh
 from scenes import trial_load, worlds
 from tests import refusals
+from tests.numbers import close, f64
 
 XML = """<scene version="3.0.0">
     <default name="bright" value="2"/>
@@ -95,7 +96,7 @@ def test_a_file_a_dictionary_and_a_loaded_scene_are_one_world(path):
     ]
     # the file's turn by 90 degrees is rounded otherwise than the dictionary's
     for other in images[1:]:
-        torch.testing.assert_close(images[0], other, rtol=1e-4, atol=1e-5)
+        close(images[0], other, rtol=1e-4, atol=1e-5)
     assert not torch.equal(images[0], seen(worlds.from_mitsuba(path, "path", samples=2), view))
 
 
@@ -106,21 +107,18 @@ def test_units_and_the_up_axis_change_where_the_camera_stands_and_not_what_it_se
     view = worlds.view_of(path, unit_m=unit_m, up=up)
     plain = worlds.view_of(path, up="z")
     eye = [1.5, 2, 4] if up == "z" else [1.5, -4, 2]
-    torch.testing.assert_close(
-        view.T_world_cam[:3, 3], unit_m * torch.tensor(eye, dtype=torch.float64)
-    )
+    torch.testing.assert_close(view.T_world_cam[:3, 3], unit_m * f64(eye))
     world = worlds.from_mitsuba(path, "path", unit_m=unit_m, up=up, gain=3.0, samples=2)
-    torch.testing.assert_close(
+    close(
         seen(world, view),
         3 * seen(worlds.from_mitsuba(path, "path", up="z", samples=2), plain),
         rtol=0.02,
-        atol=0,
     )
     point, normal, valid = world.hit(
         unit_m * torch.tensor([[0.0, -1.0, 1.5] if up == "z" else [0.0, -1.5, -1.0]]).double(),
         torch.tensor([[0.0, 1.0, 0.0] if up == "z" else [0.0, 0.0, 1.0]]).double(),
     )
-    assert bool(valid)  # the floor at height 0, from below
+    assert valid  # the floor at height 0, from below
     assert float(point.norm()) == pytest.approx(1.5 * unit_m, rel=1e-5)
     assert abs(float(normal[0, 1 if up == "z" else 2])) == pytest.approx(1)
 
@@ -272,7 +270,7 @@ def test_a_mesh_of_any_fineness_shows_the_falloff_of_a_lamp(cells):
     inside = (pixel[:, None].abs() < 0.47) & (pixel[None].abs() < 0.47)
     # 16 points per texel, over which light changes by less than 6 %: 0.4 %, and bilinear between
     # texels
-    assert float((image / truth - 1)[inside].abs().max()) < 0.02
+    assert (image / truth - 1)[inside].abs().max() < 0.02
 
 
 def test_a_baked_scene_in_centimetres_stands_where_its_paths_do(path):
@@ -293,11 +291,11 @@ def test_a_baked_scene_in_centimetres_stands_where_its_paths_do(path):
     paths = worlds.from_mitsuba(scene, "path", samples=32, **options)
     error = light.level_error(baked, paths, view.camera(8), view.T_world_cam[None])
     # 64 paths per texel: 3 % of what the sky gives, and the edge of a shadow
-    assert float(error.rms) < 0.04
-    origin = torch.tensor([[0.0, -0.2, 0.5]], dtype=torch.float64)
-    down = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64)
+    assert error.rms < 0.04
+    origin = f64([[0.0, -0.2, 0.5]])
+    down = f64([[0.0, 0.0, -1.0]])
     for one, other in zip(baked.hit(origin, down), paths.hit(origin, down), strict=True):
-        torch.testing.assert_close(one.double(), other.double(), rtol=1e-5, atol=1e-6)
+        close(one.double(), other.double(), rtol=1e-5, atol=1e-6)
 
 
 def test_gloss_is_as_it_is_from_the_place_it_is_baked_towards():
@@ -333,8 +331,8 @@ def test_gloss_is_as_it_is_from_the_place_it_is_baked_towards():
         for place in (None, eye)
     )
     # 64 paths per texel; the highlight is as wide as many texels
-    assert float(there.rms) < 0.05
-    assert float(mean.rms) > 0.2
+    assert there.rms < 0.05
+    assert mean.rms > 0.2
 
 
 def test_emissive_shows_albedo_and_emission_and_auto_takes_it_where_all_is_emission():
@@ -350,7 +348,7 @@ def test_emissive_shows_albedo_and_emission_and_auto_takes_it_where_all_is_emiss
     ):
         world = worlds.from_mitsuba({"sheet": {"type": "rectangle", **surface}}, level, up="z")
         image = render.frames(camera, world, pose)
-        torch.testing.assert_close(image, torch.full_like(image, value), rtol=1e-5, atol=0)
+        close(image, torch.full_like(image, value), rtol=1e-5)
     bitmap = mi.Bitmap(np.float32([[[1.0], [2.0]], [[3.0], [4.0]]]))
     picture = {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest"}
     world = worlds.from_mitsuba(
@@ -384,7 +382,7 @@ def test_mirrors_glass_and_masks_name_the_level_to_choose_and_may_be_matte(bsdf)
     low, high = {"conductor": (1.99, 2.01), "thindielectric": (1.99, 2.01), "mask": (1.4, 1.6)}[
         bsdf
     ]
-    assert low < float(image.mean()) < high
+    assert low < image.mean() < high
 
 
 def test_instances_are_named_with_the_level_that_shows_them():

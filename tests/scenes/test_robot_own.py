@@ -19,9 +19,9 @@ from scenes.robots.own import own_pair
 from scenes.robots.page import CameraBox, OwnRobot, Start, read_own
 from scenes.robots.pairs import PAIRS
 from tests import refusals
+from tests.numbers import D, close, f64
 
-D = torch.float64
-TWIST = torch.tensor([0.4, 0.1, 0.0, 0.0, 0.0, 0.3], dtype=D)
+TWIST = f64([0.4, 0.1, 0.0, 0.0, 0.0, 0.3])
 UNSEEN = robot_pair.UNSEEN_FROM
 PAGE = """
 robot: box.obj
@@ -195,13 +195,11 @@ def test_a_robot_stands_on_the_ground_wherever_its_origin_is(page):
     assert torch.equal(twist, PAIRS["outdoors"]().drive(2, 4)[1])
     seen, _ = render.camera_velocity(poses, robot_pair.times())
     # 1e-15 m over 2.9 ms
-    torch.testing.assert_close(seen, twist[:, None].expand_as(seen), rtol=0, atol=1e-9)
+    close(seen, twist[:, None].expand_as(seen), atol=1e-9)
     middle = poses[:, 0] @ pose.se3_exp(robot_pair.MIDDLE_S * twist)
-    torch.testing.assert_close(
-        middle[:, 2, 3], torch.full((4,), 0.058, dtype=D), rtol=0, atol=1e-12
-    )
+    close(middle[:, 2, 3], torch.full((4,), 0.058, dtype=D), atol=1e-12)
     corners = torch.from_numpy(next(iter(found.bodies.values())).vertices_m)
-    assert float(pose.apply(poses.flatten(0, 1), corners)[..., 2].min()) > 0
+    assert pose.apply(poses.flatten(0, 1), corners)[..., 2].min() > 0
     assert found.ground_z_m == pytest.approx(-0.058, abs=1e-4)  # it heaves by 0.03 m/s for 1.4 ms
 
 
@@ -211,14 +209,14 @@ def test_windows_of_a_screw_have_its_twist(page):
     for number in (0, 7, UNSEEN):
         poses, twist = found.drive(number, 5)
         # clocks of 1.7e9 s have 2e-7 s
-        torch.testing.assert_close(twist, TWIST.expand(5, 6), rtol=0, atol=1e-5)
+        close(twist, TWIST.expand(5, 6), atol=1e-5)
         seen, _ = render.camera_velocity(poses, robot_pair.times())
-        torch.testing.assert_close(seen, twist[:, None].expand_as(seen), rtol=0, atol=1e-5)
+        close(seen, twist[:, None].expand_as(seen), atol=1e-5)
         angle = torch.atan2(poses[:, 0, 1, 0], poses[:, 0, 0, 0])
         begin = angle / TWIST[5]
-        torch.testing.assert_close(poses[:, 0], screw(begin), rtol=0, atol=1e-5)
+        close(poses[:, 0], screw(begin), atol=1e-5)
         last = begin + robot_pair.times()[-1]
-        assert bool((last <= 1.0 + 1e-5).all() if number < UNSEEN else (begin >= 1.0 - 1e-5).all())
+        assert (last <= 1.0 + 1e-5).all() if number < UNSEEN else (begin >= 1.0 - 1e-5).all()
     assert found.prior == pytest.approx((0.4, 0.1, 0.05, 0.05, 0.05, 0.3), abs=1e-5)
     assert found.ground_z_m == pytest.approx(-0.3, abs=1e-9)
 
@@ -232,10 +230,8 @@ def test_windows_of_uneven_motion_have_their_mean_velocity(page, tmp_path):
     (tmp_path / "gains.csv").write_text(csv(t_s, poses))
     poses, twist = own_pair(page(PAGE + "motion: gains.csv\n")).drive(3, 6)
     at = (2 * poses[:, 1:, 0, 3]).sqrt()
-    torch.testing.assert_close(twist[:, 0], (at[:, 0] + at[:, -1]) / 2, rtol=0, atol=1.3e-5)
-    torch.testing.assert_close(
-        at[:, -1] - at[:, 0], torch.full((6,), 0.02, dtype=D), rtol=0, atol=1e-4
-    )
+    close(twist[:, 0], (at[:, 0] + at[:, -1]) / 2, atol=1.3e-5)
+    close(at[:, -1] - at[:, 0], torch.full((6,), 0.02, dtype=D), atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -255,7 +251,7 @@ def test_rendered_flow_of_a_world_of_ones_own_gives_the_twist_back(write, world,
         velocity = system.begin(drives)["estimate"].velocity
     # depth is read up to 1.5 ms from the middle of the flow: 0.6 mm of 0.6 m and more, a thousandth
     # of 0.4 m/s
-    torch.testing.assert_close(velocity, drives.twist, rtol=0, atol=4e-4)
+    close(velocity, drives.twist, atol=4e-4)
 
 
 def test_settings_need_no_file():
@@ -267,7 +263,7 @@ def test_settings_need_no_file():
     assert found.ranges.held.tolist() == [False, True, False, False, True, False]
     assert found.design.pitch_rad == math.radians(20)
     poses, _ = found.drive(0, 8)
-    assert float(poses[..., 2, 3].min()) > 0.3  # it flies as it is
+    assert poses[..., 2, 3].min() > 0.3  # it flies as it is
 
 
 @refusals.table(__file__, "pages")

@@ -16,10 +16,10 @@ from codesign.mount.depth import ground_and_scene_depth, scene_depth
 from scenes import bodies, worlds
 from scenes.robots import pair as robot_pair
 from scenes.robots.pairs import PAIRS
+from tests.numbers import D, close, f64, randn64, seeded
 from tests.render.differences import assert_gradients
 from tests.scenes.solids import volume_m3
 
-D = torch.float64
 NAMES = tuple(PAIRS)
 LARGE = 200  # operations of a kernel that casts rays
 
@@ -60,14 +60,14 @@ def test_bodies_are_closed_and_stand_above_the_ground(pair, drives):
         assert volume_m3(body) > 0
         points = torch.from_numpy(body.vertices_m)
         lowest = pose.apply(drives.T_world_body.flatten(0, 1), points)[..., 2].min()
-        assert float(lowest) > 0
+        assert lowest > 0
 
 
 def test_poses_follow_the_true_velocity(drives):
     twist = torch.stack([drives.twist] * (robot_pair.FRAMES - 1), 1)
     found, _ = render.camera_velocity(drives.T_world_body[0], drives.t_s)
     # rounding of poses of 1e-15 m over 2.5 ms
-    torch.testing.assert_close(found, twist, rtol=0, atol=1e-9)
+    close(found, twist, atol=1e-9)
 
 
 def test_the_ground_is_where_the_estimator_takes_it(pair, drives):
@@ -82,7 +82,7 @@ def test_the_ground_is_where_the_estimator_takes_it(pair, drives):
     seen = scene_depth(camera, pixels, poses, drives.scene)
     near = ground < 1.5
     alike = (ground - seen).abs() < 1e-4
-    assert float(alike[near].double().mean()) > 0.7
+    assert alike[near].double().mean() > 0.7
 
 
 def test_one_cast_gives_the_depth_that_is_believed_and_the_true_one(pair, drives):
@@ -90,12 +90,8 @@ def test_one_cast_gives_the_depth_that_is_believed_and_the_true_one(pair, drives
     pixels = camera.film.pixels()[::37].expand(3, -1, 2)
     poses = drives.T_world_body[0, :, robot_pair.FRAMES // 2] @ pair.design.mount()
     believed, true = ground_and_scene_depth(camera, pixels, poses, drives.scene)
-    torch.testing.assert_close(
-        believed, ground_depth(camera, pixels, poses, drives.scene), rtol=0, atol=0
-    )
-    torch.testing.assert_close(
-        true, scene_depth(camera, pixels, poses, drives.scene), rtol=0, atol=0
-    )
+    close(believed, ground_depth(camera, pixels, poses, drives.scene))
+    close(true, scene_depth(camera, pixels, poses, drives.scene))
 
 
 def test_another_world_of_a_pair_needs_no_kernel_of_its_own(pair):
@@ -128,9 +124,9 @@ def test_a_known_body_has_no_depth(pair, drives):
     depth = scene_depth(camera, pixels, poses, drives.scene)
     rays = camera.chief_rays(camera.film.pixels())
     _, _, hit = render.truth.world_points(rays, pair.body(), above)
-    assert 0.05 < float(hit.double().mean()) < 0.9
-    assert bool(depth[:, hit].isinf().all())
-    assert bool(depth[:, ~hit].isfinite().all())
+    assert 0.05 < hit.double().mean() < 0.9
+    assert depth[:, hit].isinf().all()
+    assert depth[:, ~hit].isfinite().all()
 
 
 def test_variants_differ_and_come_again(pair):
@@ -142,7 +138,7 @@ def test_variants_differ_and_come_again(pair):
     poses = kept[0][0, :1] @ pair.design.mount()
     first, second, third = (render.frames(camera, pair.world(n), poses) for n in (5, 5, 6))
     assert torch.equal(first, second)
-    assert float((first / third).log().abs().mean()) > 0.1
+    assert (first / third).log().abs().mean() > 0.1
 
 
 def test_unseen_variants_share_nothing_with_training():
@@ -171,11 +167,9 @@ def test_speeds_and_rates_are_those_of_the_hard_regime():
     # one in every four-hundredth of the distribution
     share = (speed / 0.05).log() / math.log(60)
     even = (torch.arange(400, dtype=D) + 0.5) / 400
-    torch.testing.assert_close(share.sort().values, even, rtol=0, atol=0.5 / 400)
+    close(share.sort().values, even, atol=0.5 / 400)
     normal = 0.5 * (1 + torch.erf(deviates / math.sqrt(2)))
-    torch.testing.assert_close(
-        normal.sort(0).values, even[:, None].expand(-1, 3), rtol=0, atol=0.5 / 400
-    )
+    close(normal.sort(0).values, even[:, None].expand(-1, 3), atol=0.5 / 400)
 
 
 def test_the_design_starts_inside_its_bounds_and_others_are_refused(pair):
@@ -213,7 +207,7 @@ def test_an_estimate_of_exact_flow_is_the_true_velocity(pair, drives):
         found = system.begin(slow)["estimate"].velocity
     assert mount.shape == (4, 4)
     # things' edges and the body's own are left to the outlier rule
-    torch.testing.assert_close(found, 0.05 * drives.twist, rtol=0.05, atol=2e-3)
+    close(found, 0.05 * drives.twist, rtol=0.05, atol=2e-3)
 
 
 def slowed(drives, share):
@@ -238,13 +232,13 @@ def test_a_pair_sees_through_a_family_of_traced_lenses():
             family_pair.camera(replace(start, efl_mm=efl_mm, fno=fno)), scene, pose_at
         )
 
-    at = [torch.tensor(v, dtype=D) for v in (start.efl_mm, 1.6)]
-    weights = torch.randn(frames(*at).shape, generator=torch.Generator().manual_seed(0), dtype=D)
+    at = [f64(v) for v in (start.efl_mm, 1.6)]
+    weights = randn64(seeded(0), frames(*at).shape)
     assert_gradients(lambda *v: (frames(*v) * weights).sum(), at, (1e-5, 1e-5), 1e-5)
     whole = render.Film(*robot_pair.SENSOR_PX, *robot_pair.SENSOR_PX, robot_pair.PITCH_MM)
     for efl_mm in (family_pair.low.efl_mm, family_pair.high.efl_mm):
         family_pair.camera(replace(start, efl_mm=efl_mm)).with_film(whole).check()
     traced = family_pair.camera(start).rays().weight.reshape(9, -1).mean(1)
     thin = start.camera().rays().weight.reshape(9, -1).mean(1)
-    assert float(thin.min()) == 1.0
-    assert 0.3 < float(traced[0] / traced[4]) < 0.85
+    assert thin.min() == 1.0
+    assert 0.3 < traced[0] / traced[4] < 0.85

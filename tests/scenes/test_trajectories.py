@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from torch import pi
-from torch.testing import assert_close
 
 from codesign.mount import Mount
 from codesign.pose import check_poses, inverse, look_at, se3_exp
@@ -22,15 +21,11 @@ from scenes.trajectories import (
     mounted,
 )
 from tests import refusals
+from tests.numbers import D, close, f64, randn64, seeded
 
-D = torch.float64
 START = look_at((0.3, -2.0, 1.1), (0.0, 0.0, 1.0))
 BODY = body_at((0.1, -1.0, 1.2), (0.0, 1.0, 1.0))
 MOUNT = Mount((0.1, 0.0, 0.2), (0.2, 0.1, 0.1), yaw_rad=0.3, pitch_rad=0.2, roll_rad=0.1)
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def driving(**options):
@@ -63,36 +58,35 @@ def test_a_path_is_rigid_led_by_its_velocity_and_the_same_for_the_same_seed(fami
     step = 1e-4
     # a twist constant over the step differs from the path by the third derivative: step^3 / 24
     # times (2 pi 9 Hz)^3 * 0.008 rad and the like
-    assert_close(
+    close(
         inverse(path(t - step / 2)) @ path(t + step / 2),
         se3_exp(step * path.velocity(t)),
-        rtol=0,
         atol=1e-9,
     )
     assert torch.equal(FAMILIES[family]()(t), poses)
     order = torch.randperm(157, generator=seeded())
     # metres up to 5 and turns: sums of some ten products and waves, each within eps = 2.2e-16 of 5
-    assert_close(path(t[order]), poses[order], rtol=0, atol=1e-14)
+    close(path(t[order]), poses[order], atol=1e-14)
 
 
 def test_times_and_body_twists_are_even_steps_in_the_cameras_own_axes():
     t = trajectories.times(9, 200.0)
-    assert_close(t, 0.005 * torch.arange(9, dtype=D), rtol=0, atol=1e-17)
-    twists = torch.tensor([[0.3, 0.0, 0.1, 0.0, 0.5, 0.2], [0.0, 0.1, 0.0, 0.3, 0.0, 0.0]], dtype=D)
+    close(t, 0.005 * torch.arange(9, dtype=D), atol=1e-17)
+    twists = f64([[0.3, 0.0, 0.1, 0.0, 0.5, 0.2], [0.0, 0.1, 0.0, 0.3, 0.0, 0.0]])
     rates = torch.zeros(2, 4, 4, dtype=D)
     rates[:, :3, :3] = torch.linalg.cross(twists[:, None, 3:], torch.eye(3, dtype=D)[None]).mT
     rates[:, :3, 3] = twists[:, :3]
     expected = START @ torch.linalg.matrix_exp(t[:, None, None] * rates[:, None])
-    assert_close(trajectories.body_twist(START, twists, t), expected, rtol=0, atol=1e-14)
+    close(trajectories.body_twist(START, twists, t), expected, atol=1e-14)
     velocity = torch.tensor([0.5, -0.2, 0.1], dtype=torch.float64, requires_grad=True)
     path = trajectories.translation(START, velocity, t)
     way = path[-1, :3, 3] - START[:3, 3]
     (slope,) = torch.autograd.grad(way.square().sum() / 2, velocity)
-    assert_close(slope, velocity.detach() * t[-1] ** 2, rtol=1e-12, atol=0)
+    close(slope, velocity.detach() * t[-1] ** 2, rtol=1e-12)
     path = trajectories.translation(START, (0.5, -0.2, 0.1), t)
-    assert_close(path[:, :3, :3], START[:3, :3].expand(9, 3, 3), rtol=0, atol=1e-15)
+    close(path[:, :3, :3], START[:3, :3].expand(9, 3, 3), atol=1e-15)
     expected = 0.5 * START[:3, 0] - 0.2 * START[:3, 1] + 0.1 * START[:3, 2]
-    assert_close(path[:, :3, 3] - START[:3, 3], t[:, None] * expected, rtol=0, atol=1e-14)
+    close(path[:, :3, 3] - START[:3, 3], t[:, None] * expected, atol=1e-14)
 
 
 def test_orbits_have_their_radius_rate_and_view():
@@ -100,41 +94,37 @@ def test_orbits_have_their_radius_rate_and_view():
     orbit = Orbital(centre, 2.0, 0.7, 1.3, 0.4, 0.25, 0.5, radius_period_s=1.7, rate_period_s=2.9)
     t = torch.linspace(0, 8, 801, dtype=D)
     poses = orbit(t)
-    away = poses[:, :3, 3] - torch.tensor(centre, dtype=D)
-    assert_close(
-        away[:, :2].norm(dim=1), 2 * (1 + 0.25 * (2 * pi * t / 1.7).sin()), rtol=1e-14, atol=0
-    )
-    assert_close(away[:, 2], torch.full_like(t, 0.7), rtol=0, atol=1e-15)
-    assert_close(poses[:, :3, 0], -away / away.norm(dim=1, keepdim=True), rtol=0, atol=1e-14)
+    away = poses[:, :3, 3] - f64(centre)
+    close(away[:, :2].norm(dim=1), 2 * (1 + 0.25 * (2 * pi * t / 1.7).sin()), rtol=1e-14)
+    close(away[:, 2], torch.full_like(t, 0.7), atol=1e-15)
+    close(poses[:, :3, 0], -away / away.norm(dim=1, keepdim=True), atol=1e-14)
     # level: the left axis is horizontal, up is up
-    assert float(poses[:, 2, 1].abs().max()) == 0
-    assert float(poses[:, 2, 2].min()) > 0
+    assert poses[:, 2, 1].abs().max() == 0
+    assert poses[:, 2, 2].min() > 0
     bearing = torch.atan2(away[:, 1], away[:, 0])
     assert float(bearing[0]) == pytest.approx(0.4)
     rate = torch.remainder(bearing.diff(), 2 * pi) / 0.01
     middle = (t[1:] + t[:-1]) / 2
     # h^2 / 24 of (2 pi / 2.9)^2
-    assert_close(rate, 1.3 * (1 + 0.5 * (2 * pi * middle / 2.9).cos()), rtol=1e-4, atol=0)
+    close(rate, 1.3 * (1 + 0.5 * (2 * pi * middle / 2.9).cos()), rtol=1e-4)
     # without swings: the closed form of a circle's velocity
     circle = Orbital((0.0, 0.0, 0.0), 2.0, 0.0, 1.3).velocity(t)
-    assert_close(
-        circle, torch.tensor([0, -2.6, 0, 0, 0, 1.3], dtype=D).expand(801, 6), rtol=0, atol=1e-13
-    )
+    close(circle, f64([0, -2.6, 0, 0, 0, 1.3]).expand(801, 6), atol=1e-13)
 
 
 def test_swings_keep_their_axis_and_speed_limit():
     t = torch.linspace(0, 5, 2001, dtype=D)
     for swing, axis in (
         (Swinging.radial(BODY, 0.3, 0.8), BODY[:3, 0]),
-        (Swinging.vertical(BODY, 0.3, 0.8), torch.tensor([0, 0, 1.0], dtype=D)),
+        (Swinging.vertical(BODY, 0.3, 0.8), f64([0, 0, 1.0])),
     ):
         shift = 0.3 * (2 * pi * 0.8 * t).sin()
-        assert_close(swing(t)[:, :3, 3] - BODY[:3, 3], shift[:, None] * axis, rtol=0, atol=1e-14)
+        close(swing(t)[:, :3, 3] - BODY[:3, 3], shift[:, None] * axis, atol=1e-14)
         velocity = swing.velocity(t)
         assert float(velocity[:, :3].norm(dim=1).max()) == pytest.approx(
             2 * pi * 0.8 * 0.3, rel=1e-6
         )
-        assert float(velocity[:, 3:].abs().max()) == 0
+        assert velocity[:, 3:].abs().max() == 0
 
 
 def gauss(count):
@@ -147,15 +137,15 @@ def test_waves_integrate_and_multiply_exactly_and_stay_in_bounds():
     one = Waves.random(seeded(3), 0.7, 0.2, 0.1, 2.0)
     two = Waves.random(seeded(4), -0.3, 0.5, 0.2, 1.0, 4)
     t = torch.linspace(-3, 9, 97, dtype=D)
-    assert_close(one.times(two)(t), one(t) * two(t), rtol=0, atol=1e-15)
+    close(one.times(two)(t), one(t) * two(t), atol=1e-15)
     # differences of frequencies are 0
     square = one.times(one)
     nodes, weights = gauss(200)
     numeric = (one(t[:, None] * nodes) ** 2 * weights).sum(1) * t
-    assert_close(square.integral(t), numeric, rtol=0, atol=1e-12)
+    close(square.integral(t), numeric, atol=1e-12)
     far = (one(torch.linspace(0, 100, 20001, dtype=D)) - 0.7).abs().max()
-    assert 0.15 < float(far) <= 0.2 + 1e-15
-    assert bool(((one.rate_rad_s >= 0.2 * pi) & (one.rate_rad_s <= 4 * pi)).all())
+    assert 0.15 < far <= 0.2 + 1e-15
+    assert ((one.rate_rad_s >= 0.2 * pi) & (one.rate_rad_s <= 4 * pi)).all()
 
 
 def test_a_robot_without_slip_obeys_its_wheels():
@@ -164,20 +154,19 @@ def test_a_robot_without_slip_obeys_its_wheels():
     t = torch.linspace(0, 5, 501, dtype=D)
     left, right = (wheel(t) for wheel in robot._wheels)
     twist = robot.velocity(t)
-    assert_close(twist[:, 0], (left + right) / 2, rtol=0, atol=1e-12)
-    assert_close(twist[:, 5], (right - left) / 0.25, rtol=0, atol=1e-12)
+    close(twist[:, 0], (left + right) / 2, atol=1e-12)
+    close(twist[:, 5], (right - left) / 0.25, atol=1e-12)
     # no sideways, no vertical velocity, no roll, no pitch
-    assert float(twist[:, 1:5].abs().max()) < 1e-12
+    assert twist[:, 1:5].abs().max() < 1e-12
     # the path by integrating the wheels alone
     nodes, weights = gauss(64)
     yaw = robot._yaw(5 * nodes)
     step = 5 * weights * sum(wheel(5 * nodes) for wheel in robot._wheels) / 2
-    end = torch.tensor([0.3, -0.1], dtype=D) + torch.stack([step @ yaw.cos(), step @ yaw.sin()])
+    end = f64([0.3, -0.1]) + torch.stack([step @ yaw.cos(), step @ yaw.sin()])
     poses = robot(t)
-    assert_close(poses[-1, :2, 3], end, rtol=0, atol=1e-12)
-    assert_close(
-        poses[0], body_at((0.3, -0.1, 0.3), (0.3 + math.cos(0.4), -0.1 + math.sin(0.4), 0.3))
-    )
+    close(poses[-1, :2, 3], end, atol=1e-12)
+    ahead = (0.3 + math.cos(0.4), -0.1 + math.sin(0.4), 0.3)
+    close(poses[0], body_at((0.3, -0.1, 0.3), ahead), atol=1e-15)
 
 
 def test_slip_slows_and_slides_outwards_and_the_shake_stays_in_its_bounds():
@@ -186,43 +175,43 @@ def test_slip_slows_and_slides_outwards_and_the_shake_stays_in_its_bounds():
     t = torch.linspace(0, 5, 2001, dtype=D)
     forward, left, turn = robot._ground(t).unbind(1)
     share = forward / (sum(wheel(t) for wheel in robot._wheels) / 2)
-    assert 0.9 - 1e-15 <= float(share.min()) < 0.97
-    assert 0.93 < float(share.max()) <= 1 + 1e-15
-    assert_close(left, -0.05 * forward * turn, rtol=0, atol=1e-15)
+    assert 0.9 - 1e-15 <= share.min() < 0.97
+    assert 0.93 < share.max() <= 1 + 1e-15
+    close(left, -0.05 * forward * turn, atol=1e-15)
     # every turn is to the left: it slides to the right
-    assert float(left.max()) < 0
+    assert left.max() < 0
     poses = robot(t)
     for swing, bound in (
         (poses[:, 2, 3] - 0.3, 0.004),
         (poses[:, 2, 0], math.sin(0.01)),
         (poses[:, 2, 1], math.sin(0.02)),
     ):
-        assert 0.5 * bound < float(swing.abs().max()) <= bound + 1e-12
+        assert 0.5 * bound < swing.abs().max() <= bound + 1e-12
 
 
 def test_minimum_snap_obeys_euler_and_lagrange():
     """Degree 7 through the points, rest at both ends and six continuous derivatives: these
     conditions have one solution, and it is the one of least snap."""
-    points = torch.randn(6, 3, generator=seeded(7), dtype=D)
-    path = minimum_snap(points, torch.tensor([0.0, 0.8, 2.1, 2.9, 4.4, 5.0], dtype=D))
+    points = randn64(seeded(7), 6, 3)
+    path = minimum_snap(points, f64([0.0, 0.8, 2.1, 2.9, 4.4, 5.0]))
     t = path.knots_s
-    assert_close(path(t), points, rtol=0, atol=1e-11)
+    close(path(t), points, atol=1e-11)
     for order in (1, 2, 3):
-        assert float(path(t[[0, -1]], order).abs().max()) < 1e-8
+        assert path(t[[0, -1]], order).abs().max() < 1e-8
     for order in range(8):
         powers = [math.perm(k, order) for k in range(8)]
         each = path.coefficient / t.diff()[:, None, None] ** order
-        end = torch.einsum("mkd,k->md", each, torch.tensor(powers, dtype=D))[:-1]
+        end = torch.einsum("mkd,k->md", each, f64(powers))[:-1]
         start = math.factorial(order) * each[1:, order]
         if order < 7:
-            assert_close(end, start, rtol=1e-9, atol=1e-9 * float(start.abs().max()))
+            close(end, start, rtol=1e-9, atol=1e-9 * float(start.abs().max()))
         else:
-            assert float((end - start).abs().max()) > 1
+            assert (end - start).abs().max() > 1
     line = minimum_snap([[0.0], [2.0]], [0.0, 3.0])
     t = torch.linspace(0, 3, 31, dtype=D)
     u = t / 3
     rest_to_rest = 2 * (35 * u**4 - 84 * u**5 + 70 * u**6 - 20 * u**7)
-    assert_close(line(t)[:, 0], rest_to_rest, rtol=0, atol=1e-13)
+    close(line(t)[:, 0], rest_to_rest, atol=1e-13)
 
 
 def test_a_flight_obeys_newton_and_its_rates_are_those_of_differential_flatness():
@@ -232,28 +221,28 @@ def test_a_flight_obeys_newton_and_its_rates_are_those_of_differential_flatness(
     acceleration, jerk = (flight.path(t, order)[:, :3] for order in (2, 3))
     forward, left, up = pose[:, :3, :3].unbind(2)
     thrust = flight._thrust(t).norm(dim=1)
-    gravity = torch.tensor([0.0, 0.0, 9.81], dtype=D)
-    assert_close(thrust[:, None] * up, acceleration + gravity, rtol=0, atol=1e-12)
+    gravity = f64([0.0, 0.0, 9.81])
+    close(thrust[:, None] * up, acceleration + gravity, atol=1e-12)
     # Mellinger and Kumar, eq. 7 and below: the change of thrust direction gives roll and pitch rate
     change = (jerk - (up * jerk).sum(1, keepdim=True) * up) / thrust[:, None]
     rates = flight.velocity(t)[:, 3:]
-    assert_close(rates[:, 0], -(change * left).sum(1), rtol=0, atol=1e-12)
-    assert_close(rates[:, 1], (change * forward).sum(1), rtol=0, atol=1e-12)
+    close(rates[:, 0], -(change * left).sum(1), atol=1e-12)
+    close(rates[:, 1], (change * forward).sum(1), atol=1e-12)
     # eq. 5 there: the left axis is across the heading, and forward is ahead
     yaw = flight.path(t)[:, 3]
     heading = torch.stack([yaw.cos(), yaw.sin(), torch.zeros_like(yaw)], 1)
-    assert float((left * heading).sum(1).abs().max()) < 1e-12
-    assert float((forward * heading).sum(1).min()) > 0.9
+    assert (left * heading).sum(1).abs().max() < 1e-12
+    assert (forward * heading).sum(1).min() > 0.9
     # hovering ends: level, at rest
-    ends = flight(torch.tensor([0.0, flight.span_s[1]], dtype=D))
-    assert_close(ends[:, :3, 2], torch.tensor([[0.0, 0, 1]] * 2, dtype=D), rtol=0, atol=1e-9)
+    ends = flight(f64([0.0, flight.span_s[1]]))
+    close(ends[:, :3, 2], f64([[0.0, 0, 1]] * 2), atol=1e-9)
 
 
 def test_a_mounted_camera_passes_gradients_to_its_mount():
     path = driving()
     t = torch.linspace(0.1, 4.5, 7, dtype=D)
-    assert_close(mounted(path, MOUNT())(t), path(t) @ MOUNT(), rtol=0, atol=1e-15)
-    weight = torch.randn(7, 4, 4, generator=seeded(9), dtype=D)
+    close(mounted(path, MOUNT())(t), path(t) @ MOUNT(), atol=1e-15)
+    weight = randn64(seeded(9), 7, 4, 4)
 
     def read(numbers):
         camera = mounted(path, MOUNT(numbers))

@@ -10,14 +10,14 @@ from codesign.errors import DomainError, FileFormatError, ShapeError
 from codesign.pose import check_poses, inverse, se3_exp
 from scenes.tum import Recorded, read_tum, write_tum
 from tests import refusals
+from tests.numbers import D, close, f64, rand64, randn64, seeded
 
-D = torch.float64
 LINE = "0.5 1 2 3 0 0 0 1"
 
 
 def some_poses(count, size=1.0):
     """Random rigid motions, with half turns among them."""
-    twists = torch.randn(count, 6, generator=torch.Generator().manual_seed(0), dtype=D) * size
+    twists = randn64(seeded(0), count, 6) * size
     twists[0] = 0
     twists[1, 3:] = torch.tensor([math.pi, 0, 0])
     return se3_exp(twists)
@@ -25,25 +25,22 @@ def some_poses(count, size=1.0):
 
 def test_round_trip_keeps_every_digit(tmp_path):
     # epoch times
-    t = (
-        torch.cumsum(torch.rand(200, generator=torch.Generator().manual_seed(1), dtype=D) + 1e-3, 0)
-        + 1.7e9
-    )
+    t = torch.cumsum(rand64(seeded(1), 200) + 1e-3, 0) + 1.7e9
     poses = some_poses(200, 2.0)
     write_tum(tmp_path / "path.txt", t, poses)
     t_back, back = read_tum(tmp_path / "path.txt")
     assert torch.equal(t_back, t)
     assert torch.equal(back[:, :3, 3], poses[:, :3, 3])
-    torch.testing.assert_close(back, poses, rtol=0, atol=1e-12)
+    close(back, poses, atol=1e-12)
 
 
 def test_the_quaternion_is_the_scalar_last_one_of_the_format(tmp_path):
     # a quarter turn to the left about z: (0, 0, sin 45, cos 45); x goes to y
     (tmp_path / "a.txt").write_text(f"1.0 4 5 6 0 0 {math.sqrt(0.5)!r} {math.sqrt(0.5)!r}\n")
     t, poses = read_tum(tmp_path / "a.txt")
-    expected = torch.tensor([[[0, -1, 0, 4], [1, 0, 0, 5], [0, 0, 1, 6], [0, 0, 0, 1]]], dtype=D)
+    expected = f64([[[0, -1, 0, 4], [1, 0, 0, 5], [0, 0, 1, 6], [0, 0, 0, 1]]])
     assert t.tolist() == [1.0]
-    torch.testing.assert_close(poses, expected, rtol=0, atol=1e-15)
+    close(poses, expected, atol=1e-15)
 
 
 def test_comments_tabs_and_line_ends_do_not_matter(tmp_path):
@@ -52,9 +49,7 @@ def test_comments_tabs_and_line_ends_do_not_matter(tmp_path):
     t, poses = read_tum(tmp_path / "a.txt")
     assert t.tolist() == [0.5, 1.5]
     assert poses[:, :3, 3].tolist() == [[1, 2, 3], [-1, 2, 0.5]]
-    torch.testing.assert_close(
-        poses[:, :3, :3], torch.eye(3, dtype=D).expand(2, 3, 3), rtol=0, atol=0
-    )
+    close(poses[:, :3, :3], torch.eye(3, dtype=D).expand(2, 3, 3))
 
 
 @pytest.mark.parametrize(
@@ -81,7 +76,7 @@ def test_four_digit_quaternions_become_rotations(tmp_path):
     (tmp_path / "a.txt").write_text("0 0 0 0 0.1826 0.3651 0.5477 0.7303\n")
     check_poses(read_tum(tmp_path / "a.txt")[1])
     rotation = read_tum(tmp_path / "a.txt")[1][0, :3, :3]
-    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3, dtype=D), rtol=0, atol=1e-15)
+    close(rotation @ rotation.mT, torch.eye(3, dtype=D), atol=1e-15)
 
 
 @refusals.table(__file__, "tables of poses")
@@ -122,24 +117,22 @@ def test_writing_refuses_what_is_no_trajectory(tmp_path):
 
 
 def test_a_recorded_path_is_a_geodesic_through_its_poses():
-    twist = torch.tensor([0.4, -0.2, 0.1, 0.5, 0.3, -0.8], dtype=D)
+    twist = f64([0.4, -0.2, 0.1, 0.5, 0.3, -0.8])
     start = some_poses(3)[2]
 
     def exact(t):
         return start @ se3_exp(t[:, None] * twist)
 
-    knots = torch.tensor([0.0, 0.3, 1.0, 2.2], dtype=D)
+    knots = f64([0.0, 0.3, 1.0, 2.2])
     path = Recorded(knots, exact(knots))
     t = torch.linspace(0, 2.2, 45, dtype=D)
     # constant twist: the geodesic is the motion itself
-    torch.testing.assert_close(path(t), exact(t), rtol=0, atol=1e-13)
-    torch.testing.assert_close(path.velocity(t), twist.expand(45, 6), rtol=0, atol=1e-12)
+    close(path(t), exact(t), atol=1e-13)
+    close(path.velocity(t), twist.expand(45, 6), atol=1e-12)
     other = Recorded(torch.arange(5, dtype=D), some_poses(6, 0.8)[torch.tensor([0, 2, 3, 4, 5])])
-    torch.testing.assert_close(other(other.t_s), other.poses, rtol=0, atol=1e-13)
-    step = inverse(other(torch.tensor([1.2], dtype=D))) @ other(torch.tensor([1.7], dtype=D))
-    torch.testing.assert_close(
-        step, se3_exp(0.5 * other.velocity(torch.tensor([1.4], dtype=D))), rtol=0, atol=1e-13
-    )
+    close(other(other.t_s), other.poses, atol=1e-13)
+    step = inverse(other(f64([1.2]))) @ other(f64([1.7]))
+    close(step, se3_exp(0.5 * other.velocity(f64([1.4]))), atol=1e-13)
 
 
 def test_recorded_paths_refuse_times_outside_and_ambiguous_turns(tmp_path):
@@ -149,7 +142,7 @@ def test_recorded_paths_refuse_times_outside_and_ambiguous_turns(tmp_path):
     write_tum(tmp_path / "a.txt", [0.0, 1.0], poses[:1].expand(2, 4, 4))
     path = Recorded.read(tmp_path / "a.txt")
     # standing still
-    torch.testing.assert_close(path(torch.tensor([0.5])), poses[:1], rtol=0, atol=0)
+    close(path(torch.tensor([0.5])), poses[:1])
     with pytest.raises(DomainError, match="from 0 to 1 s"):
         path(torch.tensor([1.5]))
     with pytest.raises(ShapeError, match="at least 2"):

@@ -24,6 +24,7 @@ from scenes.windows import (
 from scenes.windows.rendered import LEAD
 from scenes.windows.sets import EVERYDAY
 from tests import refusals
+from tests.numbers import close
 
 NOISELESS = (1e-12, 1e-12)
 QUIET = Sensors(
@@ -104,9 +105,7 @@ def test_a_sample_is_the_same_in_any_batch(kind):
     assert torch.equal(together.frames[1:], alone.frames)
     # a volume is a matrix product: sums of at most 32 terms >= 0, each rounded twice by half an eps
     eps = torch.finfo(torch.float32).eps
-    torch.testing.assert_close(
-        together.volume.counts[1:], alone.volume.counts, rtol=2 * 32 * eps, atol=1e-6
-    )
+    close(together.volume.counts[1:], alone.volume.counts, rtol=2 * 32 * eps, atol=1e-6)
     assert not torch.equal(together.volume.counts[0], together.volume.counts[1])
 
 
@@ -148,7 +147,7 @@ def test_events_are_the_log_change_over_the_threshold(ratio):
     theta_on, theta_off = 0.1 * ratio**0.5, 0.1 / ratio**0.5
     assert (theta_on * on - theta_off * off - change).abs().max() <= theta_on + theta_off + 1e-4
     if ratio > 1:
-        assert float(off.sum() / on.sum()) > 2.5
+        assert off.sum() / on.sum() > 2.5
 
 
 def test_noise_is_as_frequent_as_asked():
@@ -158,7 +157,7 @@ def test_noise_is_as_frequent_as_asked():
     counts = RenderedWindows(draws, seed=1).batch(range(8)).volume.counts
     expected = 0.08 * 64 * 64 * 8
     for polarity in range(2):
-        assert abs(float(counts[:, polarity].sum()) - expected) < 5 * expected**0.5
+        assert abs(counts[:, polarity].sum() - expected) < 5 * expected**0.5
 
 
 def test_packets_hold_the_events_asked_for():
@@ -205,7 +204,7 @@ def test_noise_of_a_sensor_is_a_share_of_the_scene_at_most():
     )
     draws = Draws("fine", "similarity", (0, 0), (0.0, 0.0))
     counts = SensorWindows(draws, sensors, seed=6).batch(range(8)).volume.counts
-    assert 0.01 < float(counts.sum() / (8 * 64 * 64)) < 0.5 * 0.2 * 1.1
+    assert 0.01 < counts.sum() / (8 * 64 * 64) < 0.5 * 0.2 * 1.1
 
 
 def test_windows_of_worlds_last_until_the_flow_is_as_long_as_asked_and_count_whole_events():
@@ -215,8 +214,8 @@ def test_windows_of_worlds_last_until_the_flow_is_as_long_as_asked_and_count_who
         assert 1.5 < flow.square().sum(0)[seen].mean().sqrt() < 3.8
     whole = windows.volume.counts.sum((1, 2, 3, 4))
     # shares of an event add up to one
-    torch.testing.assert_close(whole, whole.round(), rtol=1e-5, atol=0)
-    assert abs(float(windows.volume.collected_s.sum()) - 1.0) < 1e-12
+    close(whole, whole.round(), rtol=1e-5)
+    assert abs(windows.volume.collected_s.sum() - 1.0) < 1e-12
 
 
 @pytest.mark.parametrize("name", ["planes_0.05", "layers_3", "warped", "vibration", "rotation"])

@@ -7,6 +7,7 @@ import torch
 from codesign.errors import DomainError
 from scenes.windows import RenderedWindows, motion, planes
 from scenes.windows.layers import Bent, pixels
+from tests.numbers import close
 
 TIMES = np.array([-0.3, -0.1, 0.0, 0.25, 0.5, 1.0])
 PROBE = np.array([[-32, -24, 1], [32, -24, 1], [-32, 24, 1], [32, 24, 1], [0, 0, 1.0]]).T
@@ -76,10 +77,10 @@ def test_the_origins_of_a_field_lead_back_to_the_pixels(seed):
         for share, origin in zip(field.share, origins, strict=True):
             reached = origin + share * field.displacement(origin)
             # a hundredth of what flow is judged by
-            assert float((reached - points).abs().max()) < 1e-4
+            assert (reached - points).abs().max() < 1e-4
         assert torch.equal(origins[2].float(), points)
         # the end is the same displacement the other way round
-        torch.testing.assert_close(field.end(origins[-1].float()), points, rtol=0, atol=1e-4)
+        close(field.end(origins[-1].float()), points, atol=1e-4)
 
 
 def test_the_stretch_of_a_field_is_that_of_its_differences():
@@ -92,7 +93,7 @@ def test_the_stretch_of_a_field_is_that_of_its_differences():
         for axis in torch.eye(2, dtype=torch.float64)
     ]
     truth = torch.linalg.matrix_norm(torch.stack(columns, -1), 2)
-    torch.testing.assert_close(field.stretch(points), truth, rtol=1e-6, atol=1e-9)
+    close(field.stretch(points), truth, rtol=1e-6, atol=1e-9)
 
 
 def test_three_times_the_flow_is_the_same_field_three_times():
@@ -123,12 +124,10 @@ def test_a_bent_layer_begins_flat_and_shows_at_the_end_what_it_showed_at_the_sta
     layer = Bent(homographies, field, torch.tensor([0.0, 0.5, 1.0]))
     start = pixels(40, 48)
     end = layer.end(start)
-    assert float((end - start).norm(dim=-1).mean()) > 2.0
+    assert (end - start).norm(dim=-1).mean() > 2.0
     seen = layer.texels(torch.eye(3), end)[-1].movedim(0, -1)
-    torch.testing.assert_close(seen, start, rtol=0, atol=1e-4)
-    torch.testing.assert_close(
-        layer.texels(torch.eye(3), start)[0].movedim(0, -1), start, rtol=0, atol=1e-5
-    )
+    close(seen, start, atol=1e-4)
+    close(layer.texels(torch.eye(3), start)[0].movedim(0, -1), start, atol=1e-5)
 
 
 def test_displacements_have_the_length_asked_for_unless_they_were_steep():

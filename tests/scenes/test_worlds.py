@@ -28,9 +28,9 @@ def described(name, **options):
 @pytest.mark.parametrize("name", worlds.WORLDS)
 def test_every_world_shows_something_in_range_from_its_viewpoint(name):
     image = render.frames(CAMERA, worlds.WORLDS[name](), look_at(*worlds.VIEWS[name])[None])
-    assert 0 < float(image.min()) <= float(image.max()) <= 255.001
+    assert 0 < image.min() <= image.max() <= 255.001
     if name != "blank-room":
-        assert float(image.log().std()) > 0.15  # there is contrast
+        assert image.log().std() > 0.15  # there is contrast
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_the_blank_room_shows_one_radiance_whatever_moves(level):
     image = render.frames(CAMERA, scene, start @ se3_exp(0.2 * torch.eye(6, dtype=torch.float64)))
     # emissive: rounding. Baked: 64 paths of a furnace per texel, relative spread 0.5: 6 %, of which
     # a log threshold of 0.2 sees nothing
-    assert float((image / 40 - 1).abs().max()) < (1e-5 if level is build.emissive else 0.15)
+    assert (image / 40 - 1).abs().max() < (1e-5 if level is build.emissive else 0.15)
 
 
 def inside(kind, matrix, points, margin_m):
@@ -112,30 +112,6 @@ def test_the_seed_decides_where_things_are(name):
     assert places[0] != places[2]
 
 
-def test_a_lit_room_is_brightest_at_its_ceiling_and_darker_than_its_lamp():
-    scene = worlds.room(light=lambda world, device: build.path(world, device, samples=8))
-    up, ahead = render.frames(
-        CAMERA,
-        scene,
-        torch.stack(
-            [look_at((0.3, -1.2, 1.0), (0.1, 0.0, 2.6)), look_at((0.3, -1.2, 1.3), (0, 1, 0.8))]
-        ),
-    )
-    assert 250 < float(up.max()) < 400
-    assert 2 < float(ahead.mean()) < 60
-    with pytest.raises(DomainError, match="albedo"):
-        build.lit(
-            build.World(
-                {
-                    "a": (
-                        build.rectangle(backend.mitsuba(), (0, 0, 0), (0, 0, 1), 1, 1, (0, 1, 0)),
-                        build.Paint(np.full((4, 4), 255.0), albedo=1.2),
-                    )
-                }
-            )
-        )
-
-
 # ---- bodies
 
 
@@ -168,8 +144,8 @@ def test_a_robot_stands_on_the_ground(shared):
     points, depth, valid = render.truth.world_points(
         CAMERA.chief_rays(CAMERA.film.pixels()), scene, look_at((0.0, -1.2, 0.6), (0, 0, 0.1))
     )
-    assert 0.05 < float(points[valid][:, 2].max()) < 0.5
-    assert float((points[valid][:, 2] > 0.01).double().mean()) > 0.05
+    assert 0.05 < points[valid][:, 2].max() < 0.5
+    assert (points[valid][:, 2] > 0.01).double().mean() > 0.05
 
 
 # ---- skies
@@ -182,7 +158,7 @@ def test_a_texel_of_a_large_file_is_a_pixel_of_the_file(tmp_path):
     wall = worlds.wall(tmp_path / "stripes.png", texel_m=0.001, wrap="repeat")
     camera = Camera(lens.Pinhole(8.0), 256, 4, 0.03)  # 1.92 m of the wall
     row = render.frames(camera, wall, look_at((0, -2, 0), (0, 0, 0))[None])[0, 2]
-    assert int((row > 60).int().diff().abs().sum()) == 7  # at every 0.256 m
+    assert (row > 60).int().diff().abs().sum() == 7  # at every 0.256 m
 
 
 def test_a_sky_from_a_file_has_its_mean_and_its_east_in_the_east(tmp_path):
@@ -200,14 +176,14 @@ def test_a_sky_from_a_file_has_its_mean_and_its_east_in_the_east(tmp_path):
     brightest = render.frames(
         Camera(lens.Pinhole(8.0), 16, 12, 0.3, 4), scene, torch.stack(views)
     ).amax((1, 2))
-    assert int(brightest.argmax()) == 0
-    assert float(brightest[0]) > 20 * float(brightest[1:].max())
+    assert brightest.argmax() == 0
+    assert brightest[0] > 20 * brightest[1:].max()
 
 
 def test_real_environment_maps_are_read(shared):
     values = textures.environment(shared("data/hdri/city.hdr"), mean=50.0)
     assert values.shape == (512, 1024)
-    assert float(values.max()) > 255  # lamps stay bright
+    assert values.max() > 255  # lamps stay bright
 
 
 def test_skies_that_cannot_be_are_refused(tmp_path):
@@ -222,7 +198,7 @@ def test_skies_that_cannot_be_are_refused(tmp_path):
 
 
 def test_pictures_by_name_and_array():
-    assert float(textures.picture("speckle-7").max()) <= 255
+    assert textures.picture("speckle-7").max() <= 255
     np.testing.assert_array_equal(textures.picture(np.eye(4)), np.eye(4, dtype=np.float32))
     with pytest.raises(DomainError, match="negative"):
         textures.picture(-np.eye(4))
