@@ -50,8 +50,7 @@ def estimator(name: str, train: bool, objective: str, weights: int, seed: int) -
         raise DomainError(
             f"--flow {name} is neither a network file nor one of {', '.join(ESTIMATORS)}."
         )
-    network = flow.load(name)
-    return network.requires_grad_(train)
+    return flow.load(name).requires_grad_(train)
 
 
 def weights_of(stage: Any) -> list[nn.Parameter]:
