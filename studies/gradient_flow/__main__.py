@@ -90,8 +90,7 @@ def report(run: Run[Config], cases: list[str], interrupted: bool = False) -> Non
     """The page of what is measured so far."""
     rows = {name: found for name in cases if (found := stored(run, name))}
     missed = [short for name, found in rows.items() for short in show(run, name, found)]
-    count = certificates.headline(rows["scenes"]) if "scenes" in rows else headline(rows)
-    lead = [count]
+    lead = [(certificates.headline(rows["scenes"]) if "scenes" in rows else headline(rows))]
     if interrupted:
         lead.append("**Interrupted**: the rows below are those that were done.")
     lead.append(

@@ -64,7 +64,7 @@ def lines(name: str, directions: int | None) -> list[Line]:
                 way = torch.nn.functional.normalize(way.normal_(generator=draw), dim=0)
             line = way.reshape(unit.shape) * unit
             # air has no index to change
-            if bool(line.any()):
+            if line.any():
                 found.append((group, line))
     return found
 
