@@ -78,12 +78,8 @@ def before_and_after(problem: Problem, mount: Tensor) -> Figure:
     figure = plt.figure(figsize=(13, 6.4), layout="constrained")
     drives = problem.batch(fastest(problem))
     for row, pose in enumerate((problem.ranges.pose(problem.start), mount)):
-        draw_pair(
-            figure.add_subplot(2, 4, 4 * row + 1, projection="3d"),
-            problem.pair,
-            problem.camera,
-            pose,
-        )
+        left = figure.add_subplot(2, 4, 4 * row + 1, projection="3d")
+        draw_pair(left, problem.pair, problem.camera, pose)
         axes = [figure.add_subplot(2, 4, 4 * row + column) for column in (2, 3, 4)]
         with torch.no_grad():
             run = problem.system(pose, "sensor").begin(drives)

@@ -73,7 +73,6 @@ class Outcome:
 
     @property
     def starts(self) -> int:
-        """How many."""
         return sum(name == "start" for _, name in self.judged)
 
     @cached_property
@@ -118,7 +117,6 @@ class Outcome:
 
     @property
     def answered(self) -> Tensor:
-        """Errors [N] of the answer."""
         return self.judged[self.best]
 
     @property
@@ -130,12 +128,10 @@ class Outcome:
 
     @property
     def pose(self) -> Tensor:
-        """The same as T_body_cam [4, 4]."""
         return self.race.problem.ranges.pose(self.share)
 
     @property
     def error(self) -> float:
-        """Mean error of the answer."""
         return float(self.answered.mean())
 
     @property
@@ -150,7 +146,6 @@ class Outcome:
         return over_worlds(self.answered, self.judged[0, DEFAULT], self.groups)
 
     def metrics(self) -> dict[str, float | int]:
-        """By name."""
         ratio, low, high = self.over_default
         found: dict[str, float | int] = {
             "default_error": self.default_error,
@@ -164,7 +159,7 @@ class Outcome:
         if self.groups >= LEAST_UNITS:
             found |= {"over_default_low90": low, "over_default_high90": high}
         for name, values in self.errors.items():
-            found[f"{_label(name)}_median_error"] = float(values.quantile(0.5))
+            found[f"{_label(name)}_median_error"] = values.quantile(0.5)
         for name, beside in self.rivals.items():
             over = f"over_{_label(name)}"
             found |= {f"{over}_median": beside.median, f"{over}_ahead": beside.ahead}
@@ -185,12 +180,10 @@ class Outcome:
             elif name != DEFAULT:
                 share, samples = race.answer(number, name), race.samples(number, name)
             numbers = [f"{value:.5f}" for value in problem.ranges.numbers(share).tolist()]
-            told = [
-                f"{float(errors.mean()):.5f}",
-                f"{standard_error(errors, self.groups):.5f}",
-            ]
+            told = errors.mean(), standard_error(errors, self.groups)
             seed = race.run.config.seed + number
-            writer.writerow([problem.pair.name, seed, name, *numbers, samples, *told])
+            said = (f"{figure:.5f}" for figure in told)
+            writer.writerow([problem.pair.name, seed, name, *numbers, samples, *said])
         return text.getvalue()
 
 

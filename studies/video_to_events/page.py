@@ -84,7 +84,6 @@ class View:
 
 
 def write_page(view, state, sensor, clock, written):
-    """Record the metrics, draw everything, and write the page."""
     run = view.run
     frames = len(view.t_s)
     off = state.events - state.on
@@ -131,8 +130,8 @@ def write_page(view, state, sensor, clock, written):
         pictures(view)
     run.section(
         "Input and sensor",
-        f"Clock: {clock}. Events carry that time in microseconds, from {float(view.t_s[0]):.6f} s to "
-        f"{float(view.t_s[-1]):.6f} s.",
+        f"Clock: {clock}. Events carry that time in microseconds, from {view.t_s[0]:.6f} s to "
+        f"{view.t_s[-1]:.6f} s.",
     )
     run.text(light(view))
     if view.config.upsample is not None:
@@ -265,13 +264,11 @@ def video(view, name, made, caption):
 
 
 def event_pictures(view):
-    """Pictures of the video of events, one by one."""
     for stream, start_us, end_us in view.streams():
         yield picture(to_counts(stream, [start_us / 1e6, end_us / 1e6])[0], FULL_SCALE)
 
 
 def trace_pictures(view):
-    """Pictures of the video of fading traces, one by one."""
     start = None
     for stream, _, end_us in view.streams():
         trace = decay_from_stream(stream, [end_us], view.tau_s, start=start, dtype=torch.float64)[0]
@@ -318,5 +315,4 @@ def short(value):
 
 
 def seconds(duration_s):
-    """A duration in the unit that suits it."""
     return f"{duration_s:.4g} s" if duration_s >= 1 else f"{duration_s * 1e3:.4g} ms"
