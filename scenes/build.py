@@ -155,13 +155,11 @@ def _lit_body(mi, name, body, paint, two_sided):
 
 
 def _reflectance(mi, name, paint):
-    """Albedo of a painted surface."""
     _check_albedo(name, paint.albedo * float(np.max(paint.picture)) / 255)
     return _bitmap(mi, paint, paint.albedo / 255)
 
 
 def _level(name, paint):
-    """The one radiance of a body without texture coordinates."""
     return float(textures.check_texture(paint.picture, f"of '{name}'").mean())
 
 

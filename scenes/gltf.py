@@ -129,7 +129,6 @@ def _check_nodes(nodes):
 
 
 def _surfaces(tree, folder):
-    """Surfaces by the number of their material."""
     pictures: dict[int, np.ndarray] = {}
     found = {}
     for number, material in enumerate(tree.get("materials", [])):

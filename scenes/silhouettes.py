@@ -26,7 +26,6 @@ def smooth(seed, size=64, cycles=4, darkest=20.0, brightest=220.0, rows_only=Fal
 
 
 def _light(mi, seed, **options):
-    """An emitter of a random texture."""
     radiance = {"type": "bitmap", "bitmap": mi.Bitmap(smooth(seed, **options)), "raw": True}
     return {"type": "area", "radiance": radiance}
 

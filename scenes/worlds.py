@@ -109,7 +109,6 @@ def _plane(name, texture, texel_m, half_width_m, towards, up, wrap, device):
 
 
 def _walls(mi, paints, size_m):
-    """Six inner sides of a box, each with its paint."""
     return {
         name: (side, paint)
         for (name, side), paint in zip(sides(mi, size_m).items(), paints, strict=True)

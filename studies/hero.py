@@ -154,7 +154,6 @@ def filmed(run: Run[Config], title: str, drawn: Drawn, whole: Whole, error: floa
 
 
 def drawn_at(films: Mapping[str, Film], k: int) -> Image.Image:
-    """The picture of a number."""
     figure = figure_at(films, k)
     figure.canvas.draw()
     picture = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3])
@@ -200,7 +199,6 @@ def _draw_velocity(axis, film, k, colour):
 
 
 def looped(pictures: list[Image.Image]) -> bytes:
-    """An animation as WebP, without end."""
     buffer = io.BytesIO()
     first, *rest = pictures
     how = {"duration": 120, "loop": 0, "quality": 60, "method": 6}

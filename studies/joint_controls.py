@@ -143,7 +143,6 @@ class Bland(Altered):
 
 
 def looked(drawn: Drawn, whole: Whole) -> Looked:
-    """The judge's drives."""
     return drawn.looked(whole, drawn.draw(JUDGED), "sensor")
 
 

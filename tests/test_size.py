@@ -20,30 +20,30 @@ BUDGETS = {
     "codesign/report": 7_180,  # says that there is nothing to draw; flow that is not known
     "codesign/system": 9_630,  # truth of what is read
     "codesign/train": 5_570,  # moments of weights of as many axes
-    "scenes": 14_490,  # size of a file, velocities with gradients
+    "scenes": 14_480,  # size of a file, velocities with gradients
     "scenes/robots": 9_400,
     "scenes/trajectories": 3_050,
     "scenes/windows": 8_700,
     "setup": 6_020,  # four more parts of evidence, limits beside what is timed
-    "studies": 7_720,  # joint_refiner
+    "studies": 7_710,  # joint_refiner
     "studies/chain_picture": 1_630,  # each stage alone, for the gallery
     "studies/codesign": 15_000,  # a refiner in the joint optimiser, answers that give way, tables checked whole
     "studies/flow_quality": 5_560,  # names of recordings, no truth of rotation alone
     "studies/flow_recording": 3_340,
     "studies/frame": 8_680,  # functions of scripts are named
-    "studies/gradient_flow": 6_310,  # a first line that answers
+    "studies/gradient_flow": 6_300,  # a first line that answers
     "studies/lens_motion": 4_120,  # a table read case by case
     "studies/lens_opt": 6_370,  # where windows lie
     "studies/lens_report": 2_330,
     "studies/make_dataset": 3_990,
-    "studies/placement": 7_930,
-    "studies/sensor_fit": 2_010,  # frames of uint8
+    "studies/placement": 7_900,
+    "studies/sensor_fit": 2_000,  # frames of uint8
     "studies/speed_error": 7_650,  # the same
     "studies/spike_esim": 2_940,
     "studies/stability": 8_220,
-    "studies/train_flow": 5_110,  # steps of a race
-    "studies/viewer": 3_460,  # says what a fail may be
-    "studies/video_to_events": 4_300,
+    "studies/train_flow": 5_100,  # steps of a race
+    "studies/viewer": 3_450,  # says what a fail may be
+    "studies/video_to_events": 4_290,
     "tests": 15_320,  # sdist, scripts of other processes, limits
     "tests/data": 1_000,
     "tests/events": 32_690,  # spikes on the brink in chunks

@@ -250,7 +250,6 @@ def _standing(named, bodies):
 
 
 def _designs(own):
-    """Lowest, highest and first design."""
     lens = (own.lens.focal_length_mm, own.lens.fno, 1 / own.lens.focus_m)
     designs: list[dict[str, float]] = [{}, {}, {}]
     for name, ends in own.camera.bounds().items():

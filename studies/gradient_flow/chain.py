@@ -22,7 +22,6 @@ POSE_UNIT = torch.tensor([0.01, 0.01, 0.02, 0.005, 0.005, 0.01], dtype=torch.flo
 
 
 def normal(*shape, seed):
-    """Standard normal numbers, float64."""
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 

@@ -73,7 +73,6 @@ def blank_wall():
 
 
 def write(run, course, lenses, junctions):
-    """Fill and finish the run's page."""
     config = run.config
     task = course.jobs["optimised"].task
     names = {name: label(name, config.objective) for name in lenses}

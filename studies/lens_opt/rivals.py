@@ -162,7 +162,6 @@ def residuals(
 
 
 def least(variants: list[Variant]) -> Variant:
-    """The variant of least error on the development cases."""
     return min(variants, key=lambda variant: variant.error_mrad)
 
 

@@ -54,7 +54,6 @@ def estimator(name: str, train: bool, objective: str, weights: int, seed: int) -
 
 
 def weights_of(stage: Any) -> list[nn.Parameter]:
-    """The weights of a flow stage that are trained."""
     return (
         [p for p in stage.parameters() if p.requires_grad] if isinstance(stage, nn.Module) else []
     )

@@ -249,7 +249,6 @@ def pictures(run, geo, fields, light, quick, at_m):
 
 
 def record_at(run, field, **figures):
-    """Record figures of a field."""
     place = f"{math.degrees(field):.3g}deg".replace(".", "p")
     run.record(**{f"{name}_{place}": float(value) for name, value in figures.items()})
 

@@ -126,7 +126,6 @@ def show(run, names, spent, wall_s, frames_made):
 
 
 def _pictures(folder):
-    """Images of the middle of a sequence by title."""
     with h5(folder / "frames.h5") as frames, h5(folder / "events.h5") as events:
         middle = (frames["frames"].shape[0] - 1) // 2
         image, depth, flow, valid = (

@@ -124,7 +124,6 @@ def robot_and_frame(pair: RobotPair, drives: Drives, camera: Camera, pose: Tenso
 
 
 def draw_pair(axis: Any, pair: RobotPair, camera: Camera, T_body_cam: Tensor) -> None:
-    """Robot and view, into a 3-D axis."""
     triangles = [mesh.vertices_m[mesh.faces] for mesh in pair.bodies.values()]
     shade = [np.clip(0.8 * bodies.skylight(mesh), 0, 1) for mesh in pair.bodies.values()]
     lines = robot_figures.view_lines(camera, T_body_cam, DRAWN_M)

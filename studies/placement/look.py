@@ -39,7 +39,6 @@ LEAST_HEIGHT_M = 0.05
 
 
 def look(run: Run[Any], pair: RobotPair, camera: render.Camera) -> None:
-    """The page of a robot and its default mount."""
     pose = pair.design.mount()
     drives = pair.batch((0,), 1, run.config.seed)
     meshes = pair.bodies.values()
@@ -84,7 +83,6 @@ def look(run: Run[Any], pair: RobotPair, camera: render.Camera) -> None:
 def told_requirements(
     run: Run[Any], requirements: Sequence[Requirement], pose: Tensor, camera: render.Camera
 ) -> Sequence[Verdict]:
-    """Say what a mount [4, 4] keeps."""
     verdicts = judge(requirements, pose, camera)
     run.text("Requirements: " + "; ".join(map(str, verdicts)) + ".")
     return verdicts

@@ -40,7 +40,6 @@ class Paired:
 
 
 def paired(ours: Tensor, theirs: Tensor) -> Paired:
-    """Of errors [seeds] each."""
     found = median_ratio(ours, theirs, level=INTERVAL, draws=RESAMPLED)
     return Paired(found.value, found.low, found.high, int((ours < theirs).sum()), found.count)
 
@@ -86,7 +85,6 @@ class Outcome:
 
     @cached_property
     def rivals(self) -> dict[str, Paired]:
-        """The gradient over each of the other searches."""
         ours = self.errors[GRADIENT]
         return {
             name: paired(ours, theirs)
@@ -136,7 +134,6 @@ class Outcome:
 
     @property
     def default_error(self) -> float:
-        """Mean error of the pair's own mount."""
         return float(self.judged[0, DEFAULT].mean())
 
     @property
@@ -188,5 +185,4 @@ class Outcome:
 
 
 def _label(name):
-    """A name among metrics."""
     return name.lower().replace("-", "_").replace(" ", "_")

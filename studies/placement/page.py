@@ -21,7 +21,6 @@ from studies.placement.race import DEFAULT, GRADIENT
 
 
 def report(run: Run[Any], outcome: Outcome) -> None:
-    """Metrics, raw table, hand-over and page."""
     write_atomic(run.path("race.csv"), outcome.table().encode())
     run.record(**outcome.metrics())
     run.card(
@@ -78,7 +77,6 @@ def answer(outcome: Outcome) -> str:
 
 
 def place_in_words(problem: Problem, share: Tensor) -> str:
-    """Position and attitude of a mount."""
     x, y, z, yaw, pitch, roll = problem.ranges.numbers(share).tolist()
     turned = ", ".join(
         f"{name} {round(math.degrees(angle)):+d}°".replace("-", "−")
@@ -178,7 +176,6 @@ def handed(run: Run[Any], outcome: Outcome) -> VelocityErrors:
 
 
 def velocities(run: Run[Any], outcome: Outcome, found: VelocityErrors) -> None:
-    """Errors of each velocity, in its own unit."""
     unseen = outcome.unseen
     default = unseen.judged(unseen.ranges.pose(unseen.start), unseen.draw(0), "sensor")
     rows: list[list[Any]] = []

@@ -130,7 +130,6 @@ class Problem:
 
     @cached_property
     def own_body(self) -> OwnBody:
-        """Of the robot, in its camera's view."""
         body = Body((mesh.vertices_m, mesh.faces) for mesh in self.pair.bodies.values())
         return OwnBody(body, 1.0)
 

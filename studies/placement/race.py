@@ -82,11 +82,9 @@ class Race:
         self.run.save_state(self.tensors, self.fingerprints)
 
     def trail(self, number: int, name: str) -> Trail:
-        """What a search looked at."""
         return Trail(*(self.tensors[f"{name}/{number}/{part}"] for part in ("share", "error")))
 
     def samples(self, number: int, name: str) -> int:
-        """Drives that a search rendered."""
         return int(self.tensors[f"{name}/{number}/samples"])
 
     def descent(self, number: int, start: Tensor) -> None:

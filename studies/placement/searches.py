@@ -45,7 +45,6 @@ class Trail:
 
     @property
     def best(self) -> int:
-        """Index of the smallest error."""
         return int(self.error.argmin())
 
 
@@ -143,7 +142,6 @@ class Search:
 
 
 def uniform(start: Tensor, seed: int) -> Proposals:
-    """Points spread evenly at random."""
     random = np.random.default_rng(seed)  # another stream than the starts'
     yield start
     while True:

@@ -103,7 +103,6 @@ def judge(simulated, recorded):
 
 
 def show(run, recording, sensor, simulated, figures):
-    """Write the page."""
     recorded = recording.counts()
     half = len(recorded) // 2
     rows = [(LABELS[name], *found.values()) for name, found in figures.items()]

@@ -147,7 +147,6 @@ def stage(run: Run[Config]) -> list[Asked]:
 
 
 def judged(scene: Case, rounds: int) -> dict[str, Any]:
-    """Figures of one scene."""
     world, task = scene.scene(), scene.task(0)
     truth, valid = render.true_flow(task.camera, world, task.T_world_body[:, [0, -1]])
     size_px = float(truth.square().sum(-3)[valid].mean().sqrt())
@@ -186,7 +185,6 @@ def judged(scene: Case, rounds: int) -> dict[str, Any]:
 
 
 def once(world: Any, task: Task, fidelity: Fidelity) -> Callable[[], Any]:
-    """The chain of a fidelity, to be called."""
     system, batch = system_of(world, task, fidelity), batch_of(task, fidelity)
     return torch.no_grad()(lambda: system(batch))
 

@@ -111,7 +111,6 @@ def study(run: Run[Config]) -> None:
 
 
 def sequences(run, wanted):
-    """Lists of rendered sequences."""
     wanted = [some[:2] if run.config.quick else some for some in wanted]
     made = [[] for _ in wanted]
     with run.progress(sum(map(len, wanted)), "sequences") as progress:

@@ -93,7 +93,6 @@ class ECN(Baseline):
 
 
 def _with_channels(image, count):
-    """An image with empty channels added up to a count."""
     return pad(image, (0, 0, 0, 0, 0, count - image.shape[1]))
 
 

@@ -135,7 +135,6 @@ def _command(run, network, seed):
 
 
 def _judged(run, networks):
-    """Set -> who -> Score, every network on the same windows."""
     count = run.config.final_windows
     sets = judging(SEED, 8, count, count // 3, count // 2)
     estimators = {"closed form": flow.estimate_lk, **networks}

@@ -207,7 +207,6 @@ def warnings(view, state, sensor, slow):
 
 
 def light(view):
-    """How digital values become light, in a sentence."""
     gamma = (
         "the sRGB gamma is undone, so intensities are linear in light"
         if view.config.linear
@@ -221,7 +220,6 @@ def light(view):
 
 
 def pictures(view):
-    """First pictures, rates, space-time figure, and the videos."""
     run = view.run
     config = view.config
     run.section("Events")
@@ -252,7 +250,6 @@ def pictures(view):
 
 
 def video(view, name, made, caption):
-    """Write a video, and show it where it is small enough."""
     path = view.run.path(f"{name}.mp4")
     write_video(path, made, PREVIEW_FPS)
     size_mb = path.stat().st_size / 1e6

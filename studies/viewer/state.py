@@ -89,12 +89,10 @@ class Drive:
 
     @cached_property
     def system(self) -> System:
-        """The pair's chain, at its own design."""
         return self.space.pair.system(self.space.pair.design)
 
     @property
     def names(self) -> list[str]:
-        """Of the numbers that have a slider here."""
         return [name for name in SLIDERS if name in self.space.free]
 
     @property

@@ -136,7 +136,6 @@ def _rows(junctions, losses: Losses, chosen: Sequence[Line], draws: int, way: Wa
 
 
 def _slopes(losses, chosen, draw, way):
-    """[lines, losses] derivatives by autograd."""
     leaves = {name: value.requires_grad_() for name, value in scenes.point().items()}
     found = []
     for value in losses(leaves, draw, way):
