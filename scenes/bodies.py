@@ -50,14 +50,10 @@ class Body:
     def placed(self, x=0.0, y=0.0, bottom_m=0.0, turn_deg=0.0):
         """The body turned about z, its bounding box centred over (x, y) and resting on
         ``bottom_m``."""
-        angle = np.radians(turn_deg)
-        turned = self.vertices_m @ np.array(
-            [[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
-        )
-        low = turned.min(0)
-        high = turned.max(0)
-        middle = [(low[0] + high[0]) / 2 - x, (low[1] + high[1]) / 2 - y, low[2] - bottom_m]
-        return replace(self, vertices_m=turned - middle)
+        turned = self.vertices_m @ _about_z(turn_deg).T
+        low, high = turned.min(0), turned.max(0)
+        middle = [*(low + high)[:2] / 2, low[2]]
+        return replace(self, vertices_m=turned - middle + [x, y, bottom_m])
 
 
 def read(path: str | Path, scale: float = 1.0) -> Body:
@@ -96,14 +92,14 @@ def box(size_m: Sequence[float], centre_m: Sequence[float], turn_deg: float = 0.
     >>> box((2.0, 1.0, 0.5), (0.0, 0.0, 1.0)).vertices_m.max(0).tolist()
     [1.0, 0.5, 1.25]
     """
-    angle = np.radians(turn_deg)
-    turn = np.array(
-        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
-    )
-    return Body(
-        CORNERS * np.asarray(size_m, dtype=float) @ turn.T + np.asarray(centre_m, dtype=float),
-        SIDES,
-    )
+    corners = CORNERS * np.asarray(size_m, dtype=float) @ _about_z(turn_deg).T
+    return Body(corners + np.asarray(centre_m, dtype=float), SIDES)
+
+
+def _about_z(turn_deg):
+    """Rotation [3, 3]."""
+    cosine, sine = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
 
 
 def cylinder(radius_m: float, length_m: float, centre_m: Sequence[float], along: str = "z") -> Body:

@@ -68,10 +68,7 @@ def emissive(world, device="cpu"):
         if isinstance(geometry, bodies.Body):
             shapes[name] = _glowing(mi, name, geometry, paint)
         else:
-            shapes[name] = {
-                **geometry,
-                "emitter": {"type": "area", "radiance": _bitmap(mi, paint, 1.0)},
-            }
+            shapes[name] = {**geometry, "emitter": _glow(mi, paint)}
     scene = MitsubaScene({**shapes, **world.background}, device)
     return scene.two_sided() if world.two_sided else scene
 
@@ -121,16 +118,20 @@ def _check_albedo(name, brightest):
 def _glowing(mi, name, body, paint):
     """A body as it shows its paint: by its texture coordinates, or, where it has none, shaded by a
     plain sky."""
+    triangles = mi, body.vertices_m, body.faces
     if body.uv is not None:
-        source = {"type": "area", "radiance": _bitmap(mi, paint, 1.0)}
-        return emissive_mesh(mi, body.vertices_m, body.faces, source, body.uv)
-    level = _level(name, paint) * body.tint
+        return emissive_mesh(*triangles, _glow(mi, paint), body.uv)
+    level = _level(name, paint) * body.tint * bodies.skylight(body)
     if not body.smooth:
-        return emissive_mesh(mi, body.vertices_m, body.faces, level * bodies.skylight(body))
+        return emissive_mesh(*triangles, level)
     source = {"type": "area", "radiance": {"type": "mesh_attribute", "name": "vertex_radiance"}}
-    mesh = emissive_mesh(mi, body.vertices_m, body.faces, source)
-    mesh.add_attribute("vertex_radiance", 1, np.float32(level * bodies.skylight(body)))
+    mesh = emissive_mesh(*triangles, source)
+    mesh.add_attribute("vertex_radiance", 1, np.float32(level))
     return mesh
+
+
+def _glow(mi, paint):
+    return {"type": "area", "radiance": _bitmap(mi, paint, 1.0)}
 
 
 def _lit_body(mi, name, body, paint, two_sided):
@@ -154,15 +155,12 @@ def _lit_body(mi, name, body, paint, two_sided):
 
 
 def _reflectance(mi, name, paint):
-    """Albedo of a painted surface."""
     _check_albedo(name, paint.albedo * float(np.max(paint.picture)) / 255)
     return _bitmap(mi, paint, paint.albedo / 255)
 
 
 def _level(name, paint):
-    """The one radiance of a body without texture coordinates."""
-    picture = textures.check_texture(paint.picture, f"of '{name}'")
-    return float(picture.mean())
+    return float(textures.check_texture(paint.picture, f"of '{name}'").mean())
 
 
 def _bitmap(mi, paint, scale):
@@ -209,12 +207,9 @@ def sides(mi, size_m, y=0.0):
     walls = {
         name: rectangle(mi, at, (0, y, half), wide, height) for name, (at, wide) in around.items()
     }
-    floor = rectangle(mi, (0, y, 0), (0, y, half), width, length, up)
-    return {
-        **walls,
-        "floor": floor,
-        "ceiling": rectangle(mi, (0, y, height), (0, y, half), width, length, up),
-    }
+    for name, z in (("floor", 0), ("ceiling", height)):
+        walls[name] = rectangle(mi, (0, y, z), (0, y, half), width, length, up)
+    return walls
 
 
 def block(mi, x, y, bottom_m, half_m, turn_deg=0.0):
@@ -274,11 +269,8 @@ def sun(irradiance):
     """Parallel light from where the procedural sky has its sun."""
     elevation = math.radians(textures.SUN_ELEVATION_DEG)
     azimuth = math.radians(textures.SUN_AZIMUTH_DEG)
-    towards = [
-        -math.cos(elevation) * math.sin(azimuth),
-        -math.cos(elevation) * math.cos(azimuth),
-        -math.sin(elevation),
-    ]
+    level = -math.cos(elevation)
+    towards = [level * math.sin(azimuth), level * math.cos(azimuth), -math.sin(elevation)]
     return {
         "type": "directional",
         "direction": towards,

@@ -50,11 +50,7 @@ class Stage:
 
 
 # past what is seen, with the camera to the left
-ALONG_WALL: dict[str, Any] = {
-    "yaw_rad": 0.0,
-    "turn_rad_s": 0.0,
-    "aside_rad": math.pi / 2,
-}
+ALONG_WALL: dict[str, Any] = {"turn_rad_s": 0.0, "aside_rad": math.pi / 2}
 AHEAD: dict[str, Any] = {"yaw_rad": math.pi / 2, "turn_rad_s": 0.0}
 STAGES = {
     "room": Stage(),
@@ -141,64 +137,44 @@ def _drawn(family, stage, until_s, generator):
     def between(k, low, high):
         return low + (high - low) * u[k]
 
-    level = Mount((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))().detach()
-    tilted = Mount(
-        (0.0, 0.0, 0.05), (0.0, 0.0, 0.0), yaw_rad=stage.aside_rad, pitch_rad=stage.pitch_rad
-    )().detach()
+    def camera(height_m, **attitude):
+        return Mount((0.0, 0.0, height_m), (0.0, 0.0, 0.0), **attitude)().detach()
+
     if family == "orbital":
         rate = min(between(0, 0.4, 0.8), stage.sweep_rad / until_s / 1.3)
         start = -math.pi / 2 + (
             between(1, -math.pi, math.pi) if math.isinf(stage.sweep_rad) else -rate * until_s / 2
         )
         sign = 1 if u[2] < 0.5 or not math.isinf(stage.sweep_rad) else -1
-        body = Orbital(
-            stage.centre_m or stage.target_m,
-            stage.orbit_m[0],
-            stage.orbit_m[1],
-            sign * rate,
-            start,
-            0.12,
-            0.3,
-            between(3, 1.5, 3.0),
-            between(4, 1.5, 3.0),
-        )
-        return mounted(body, level)
+        periods_s = between(3, 1.5, 3.0), between(4, 1.5, 3.0)
+        centre_m = stage.centre_m or stage.target_m
+        body = Orbital(centre_m, *stage.orbit_m, sign * rate, start, 0.12, 0.3, *periods_s)
+        return mounted(body, camera(0.0))
     if family in ("radial", "vertical"):
-        place = [
-            low + (high - low) * share
-            for low, high, share in zip(stage.low_m, stage.high_m, u[:3], strict=True)
-        ]
+        place = [between(k, stage.low_m[k], stage.high_m[k]) for k in range(3)]
         swing = Swinging.radial if family == "radial" else Swinging.vertical
-        return mounted(
-            swing(body_at(place, stage.target_m), between(3, 0.15, 0.3), between(4, 0.4, 0.7)),
-            level,
-        )
+        start = body_at(place, stage.target_m)
+        return mounted(swing(start, between(3, 0.15, 0.3), between(4, 0.4, 0.7)), camera(0.0))
     if family == "driving":
-        turn = (
-            stage.turn_rad_s
-            * between(0, 0.8, 1.2)
-            * (1 if u[1] < 0.5 or not stage.turn_rad_s else -1)
-        )
-        start = dict(zip(("x_m", "y_m"), stage.start_m, strict=True))
-        speed = between(2, 0.3, 0.6)
+        turn = stage.turn_rad_s * between(0, 0.8, 1.2) * (1 if u[1] < 0.5 else -1)
+        x_m, y_m = stage.start_m
         body = Driving(
             generator,
             until_s,
-            speed,
+            between(2, 0.3, 0.6),
             turn,
             turn_swing_rad_s=0.4 if turn else 0.15,
             height_m=stage.height_m,
-            **start,
+            x_m=x_m,
+            y_m=y_m,
             yaw_rad=stage.yaw_rad + (between(3, -math.pi, math.pi) if turn else 0.0),
         )
-        return mounted(body, tilted)
+        return mounted(body, camera(0.05, yaw_rad=stage.aside_rad, pitch_rad=stage.pitch_rad))
     try:
         body = Flying.random(generator, until_s, stage.low_m, stage.high_m, stage.target_m)
     except DomainError:  # too fast for the draw of waypoints
         return None
-    return mounted(
-        body, Mount((0.0, 0.0, 0.05), (0.0, 0.0, 0.0), pitch_rad=stage.pitch_rad)().detach()
-    )
+    return mounted(body, camera(0.05, pitch_rad=stage.pitch_rad))
 
 
 def _keeps_clear(T_world_cam, scene, camera):

@@ -227,7 +227,7 @@ def view_of(
         )
     film = sensor.film()
     width_px, height_px = (int(v) for v in film.size())
-    return FileView(T, math.radians(float(values["x_fov"][0])), width_px, height_px)
+    return FileView(T, math.radians(values["x_fov"][0]), width_px, height_px)
 
 
 def _axes(up, unit_m):

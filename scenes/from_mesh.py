@@ -94,15 +94,16 @@ def shapes_of(
         if part.uv is not None:
             picture = textures.reduced(part.colour, texture_px)
             if blur_texels:
-                picture = textures.softened(
-                    picture, blur_texels, "wrap" if part.wrap == "repeat" else "nearest"
-                )
+                beside = "wrap" if part.wrap == "repeat" else "nearest"
+                picture = textures.softened(picture, blur_texels, beside)
             body = bodies.Body(part.vertices_m, part.faces, part.uv)
             paint = Paint(_radiance(picture), wrap=part.wrap)
         else:
-            tint = 1.0 if radiance is not None else _radiance(part.colour) / 255
+            level, tint = radiance, 1.0
+            if radiance is None:
+                level, tint = 255.0, _radiance(part.colour) / 255
             body = bodies.Body(part.vertices_m, part.faces, None, tint, part.smooth)
-            paint = Paint(np.full((1, 1), 255.0 if radiance is None else radiance))
+            paint = Paint(np.full((1, 1), level))
         shapes[f"{number}-{re.sub(r'[^A-Za-z0-9_-]', '_', part.name)}"] = (body, paint)
     return shapes
 
@@ -117,5 +118,7 @@ def _background(mi, given):
             raise DomainError(f"background = {given} must be a radiance of at least 0.")
         return {"sky": {"type": "constant", "radiance": {"type": "rgb", "value": float(given)}}}
     if given is None:
-        return {"sky": sky(mi, textures.sky())}
-    return {"sky": sky(mi, textures.environment(given) if isinstance(given, str | Path) else given)}
+        given = textures.sky()
+    elif isinstance(given, str | Path):
+        given = textures.environment(given)
+    return {"sky": sky(mi, given)}

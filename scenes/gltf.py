@@ -28,16 +28,9 @@ FLOAT = 5126
 SHORTEST = 1e-3  # of a quaternion, whose length is 1
 OWN_BUFFER = "codesign:the binary chunk"
 # extensions that change neither shape nor base colour
-LIGHT_ONLY = (
-    "KHR_materials_",
-    "KHR_lights_",
-    "KHR_xmp",
-)
+LIGHT_ONLY = ("KHR_materials_", "KHR_lights_", "KHR_xmp")
 # which change what is seen even where not required
-UNREAD = (
-    "EXT_mesh_gpu_instancing",
-    "KHR_texture_transform",
-)
+UNREAD = ("EXT_mesh_gpu_instancing", "KHR_texture_transform")
 
 
 @dataclass(frozen=True)
@@ -136,14 +129,11 @@ def _check_nodes(nodes):
 
 
 def _surfaces(tree, folder):
-    """Surfaces by the number of their material."""
     pictures: dict[int, np.ndarray] = {}
     found = {}
     for number, material in enumerate(tree.get("materials", [])):
         base = material.get("pbrMetallicRoughness", {})
-        factor = float(
-            np.asarray(base.get("baseColorFactor", [1, 1, 1, 1]))[:3] @ textures.LUMINANCE
-        )
+        factor = np.asarray(base.get("baseColorFactor", [1, 1, 1, 1]))[:3] @ textures.LUMINANCE
         texture = base.get("baseColorTexture")
         if texture is None:
             found[str(number)] = Surface(factor)
@@ -169,10 +159,8 @@ def _surfaces(tree, folder):
 def _picture(tree, image, folder):
     if "bufferView" in image:
         view = tree["bufferViews"][image["bufferView"]]
-        start = view.get("byteOffset", 0)
-        data = _bytes(tree["buffers"][view["buffer"]]["uri"], folder)[
-            start : start + view["byteLength"]
-        ]
+        data = _bytes(tree["buffers"][view["buffer"]]["uri"], folder)
+        data = data[view.get("byteOffset", 0) :][: view["byteLength"]]
     else:
         data = _bytes(image["uri"], folder)
     with PIL.Image.open(io.BytesIO(data)) as picture:

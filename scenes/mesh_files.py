@@ -216,28 +216,23 @@ def _parts(path, scene, told, axes, surfaces, materials) -> Iterator[Part]:
         frame = np.asarray(frame, dtype=np.float64)
         vertices = np.asarray(mesh.vertices, dtype=np.float64)
         faces = np.asarray(mesh.faces)
+        where = f"mesh '{path}', '{name}'"
+        wrong = ""
         if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
-            raise FileFormatError(
-                f"mesh '{path}', '{name}': vertices have {vertices.shape[1]} coordinates; export it anew."
-            )
-        if not np.isfinite(vertices).all() or not np.isfinite(frame).all():
-            raise FileFormatError(
-                f"mesh '{path}', '{name}': vertices are not all finite; export it anew."
-            )
-        if faces.min() < 0 or faces.max() >= len(vertices):
-            raise FileFormatError(
-                f"mesh '{path}', '{name}': a face asks for vertex {int(faces.max())} of {len(vertices)}; export it anew."
-            )
+            wrong = f"vertices have {vertices.shape[1]} coordinates"
+        elif not np.isfinite(vertices).all() or not np.isfinite(frame).all():
+            wrong = "vertices are not all finite"
+        elif faces.min() < 0 or faces.max() >= len(vertices):
+            wrong = f"a face asks for vertex {faces.max()} of {len(vertices)}"
+        if wrong:
+            raise FileFormatError(f"{where}: {wrong}; export it anew.")
         turn = axes @ frame[:3, :3]
         vertices = vertices @ turn.T + axes @ frame[:3, 3]
         if np.linalg.det(turn) < 0:  # a mirrored instance: keep its outside outside
             faces = faces[:, ::-1]
-        corners = vertices[faces]
-        whole = (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) ** 2).sum(
-            1
-        ) > 0
+        first, second, third = vertices[faces].swapaxes(0, 1)
+        whole = (np.cross(second - first, third - first) ** 2).sum(1) > 0
         if whole.any():
-            where = f"mesh '{path}', '{name}'"
             visual = mesh.visual if materials else None
             yield _merged(_coloured(where, str(name), vertices, faces, whole, visual, surfaces))
 
@@ -248,9 +243,8 @@ def _coloured(where, name, vertices, faces, whole, visual, surfaces):
     plain = np.full(len(faces), UNCOLOURED)
     kind = None if visual is None else visual.kind
     if kind == "face":
-        return Part(
-            name, vertices, faces, _vertex_colour(np.asarray(visual.face_colors)[whole], False)
-        )
+        of_face = _vertex_colour(np.asarray(visual.face_colors)[whole], False)
+        return Part(name, vertices, faces, of_face)
     if kind == "vertex":
         of_vertex = _vertex_colour(visual.vertex_colors, surfaces is not None)
         return Part(name, vertices, faces, of_vertex, smooth=True)
@@ -297,10 +291,9 @@ def _surface(material: Any) -> gltf.Surface:
         said = None if rounded is None else np.asarray(rounded, dtype=np.float64)[:3] / 255
     elif np.size(said) != 3:
         said = np.full(3, np.ravel(said)[0])
-    whole = 1.0 if picture is not None or said is not None else UNCOLOURED
-    factor = (
-        whole if said is None else float(np.asarray(said, dtype=np.float64) @ textures.LUMINANCE)
-    )
+    factor = UNCOLOURED if picture is None else 1.0
+    if said is not None:
+        factor = float(np.asarray(said, dtype=np.float64) @ textures.LUMINANCE)
     return gltf.Surface(factor, None if picture is None else gltf.luminance(picture))
 
 
@@ -313,11 +306,8 @@ def _merged(part):
     columns += [part.uv] if part.uv is not None else []
     columns += [part.colour[:, None]] if part.smooth else []
     rows = np.ascontiguousarray(np.concatenate(columns, 1)) + 0.0  # no negative zeros
-    _, first, index = np.unique(
-        rows.view([("", rows.dtype)] * rows.shape[1]).reshape(-1),
-        return_index=True,
-        return_inverse=True,
-    )
+    records = rows.view([("", rows.dtype)] * rows.shape[1]).reshape(-1)
+    _, first, index = np.unique(records, return_index=True, return_inverse=True)
     return replace(
         part,
         vertices_m=part.vertices_m[first],

@@ -26,7 +26,6 @@ def smooth(seed, size=64, cycles=4, darkest=20.0, brightest=220.0, rows_only=Fal
 
 
 def _light(mi, seed, **options):
-    """An emitter of a random texture."""
     radiance = {"type": "bitmap", "bitmap": mi.Bitmap(smooth(seed, **options)), "raw": True}
     return {"type": "area", "radiance": radiance}
 
@@ -119,21 +118,9 @@ def robot(device="cpu"):
     """A robot's deck and mast in the axes of the camera's mount (x right, y ahead, z up), so near
     that they cross the border of its view."""
     mi = backend.mitsuba(device)
-    deck = (
-        mi.ScalarTransform4f()
-        .translate([0.0, 0.15, -0.12])
-        .rotate([1, 0.3, 0.2], 9)
-        .scale([0.11, 0.22, 0.03])
-    )
+    turned = mi.ScalarTransform4f().translate([0.0, 0.15, -0.12]).rotate([1, 0.3, 0.2], 9)
+    deck = {"type": "cube", "to_world": turned.scale([0.11, 0.22, 0.03])}
     mast = {"type": "cylinder", "p0": [0.08, 0.5, -0.06], "p1": [0.1, 0.47, 0.25], "radius": 0.015}
-    return MitsubaScene(
-        {
-            "deck": {
-                "type": "cube",
-                "to_world": deck,
-                "emitter": _light(mi, 7, cycles=2, darkest=120),
-            },
-            "mast": {**mast, "emitter": _light(mi, 8, cycles=2, brightest=90)},
-        },
-        device,
-    )
+    deck["emitter"] = _light(mi, 7, cycles=2, darkest=120)
+    mast["emitter"] = _light(mi, 8, cycles=2, brightest=90)
+    return MitsubaScene({"deck": deck, "mast": mast}, device)

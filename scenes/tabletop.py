@@ -33,28 +33,23 @@ def tabletop(seed: int = 0, device: str = "cpu", light: Light = emissive) -> Any
         textures.speckle(seed + 5, finest_px=12.0, coarsest_px=48.0, contrast=0.2), 3.0
     )
     shapes = {**_surroundings(mi), **_table(mi, wood)}
-    patterns = [
-        textures.softened(textures.speckle(seed + 20 + k, 128, finest_px=20.0, contrast=0.25), 2.0)
-        * scale
-        for k, scale in enumerate((0.5, 1.0, 1.6, 2.2))
-    ]
-    patterns = [np.clip(p, 1, 255) for p in patterns]
+    patterns = []
+    for k, scale in enumerate((0.5, 1.0, 1.6, 2.2)):
+        speckle = textures.speckle(seed + 20 + k, 128, finest_px=20.0, contrast=0.25)
+        patterns.append(np.clip(scale * textures.softened(speckle, 2.0), 1, 255))
     places = []
     for k in range(CUBES + SPHERES + POLES):
         slim = k >= CUBES + SPHERES
-        half = float(random.uniform(0.0025, 0.004) if slim else random.uniform(0.018, 0.05))
+        half = random.uniform(0.0025, 0.004) if slim else random.uniform(0.018, 0.05)
         x, y = _free(random, places, half * math.sqrt(2) if k < CUBES else half)
         pattern = patterns[k % len(patterns)]
         if k < CUBES:
-            turn_deg = float(random.uniform(0, 90))
-            shapes[f"cube-{k}"] = (
-                block(mi, x, y, TOP_M, (half, half, half), turn_deg),
-                Paint(pattern),
-            )
+            cube = block(mi, x, y, TOP_M, (half, half, half), random.uniform(0, 90))
+            shapes[f"cube-{k}"] = (cube, Paint(pattern))
         elif not slim:
             shapes[f"sphere-{k}"] = (ball(mi, x, y, TOP_M, half), Paint(pattern))
         else:
-            top = (x, y, TOP_M + float(random.uniform(0.12, 0.3)))
+            top = (x, y, TOP_M + random.uniform(0.12, 0.3))
             tube, cap = pole(mi, (x, y, TOP_M + GAP_M), top, half)
             shapes[f"pole-{k}"] = (tube, Paint(pattern, (0.2, 2)))
             shapes[f"pole-cap-{k}"] = (cap, Paint(np.full((4, 4), 80.0)))
@@ -64,12 +59,8 @@ def tabletop(seed: int = 0, device: str = "cpu", light: Light = emissive) -> Any
 def _surroundings(mi):
     """A room of 5 m about the table, its pictures fading to one colour."""
     back = textures.faded_to(textures.picture("brick"), 60.0)
-    plain = textures.faded_to(
-        textures.softened(
-            textures.speckle(3, finest_px=40.0, coarsest_px=160.0, contrast=0.3), 3.0
-        ),
-        60.0,
-    )
+    speckle = textures.speckle(3, finest_px=40.0, coarsest_px=160.0, contrast=0.3)
+    plain = textures.faded_to(textures.softened(speckle, 3.0), 60.0)
     paints = {"north": Paint(back), "ceiling": Paint(plain, glow=250.0)}
     walls = sides(mi, (5.0, 5.0, 2.6))
     order = ("floor", "ceiling", "north", "south", "east", "west")
@@ -77,20 +68,12 @@ def _surroundings(mi):
 
 
 def _table(mi, wood):
-    shapes = {
-        "top": (
-            block(mi, 0, 0, TOP_M - THICK_M - GAP_M, (HALF_X_M, HALF_Y_M, THICK_M / 2)),
-            Paint(wood),
-        )
-    }
-    height = TOP_M - THICK_M - 3 * GAP_M
+    top = block(mi, 0, 0, TOP_M - THICK_M - GAP_M, (HALF_X_M, HALF_Y_M, THICK_M / 2))
+    shapes = {"top": (top, Paint(wood))}
+    half = (0.025, 0.025, (TOP_M - THICK_M - 3 * GAP_M) / 2)
     for k, (x, y) in enumerate(((-1, -1), (1, -1), (-1, 1), (1, 1))):
-        shapes[f"leg-{k}"] = (
-            block(
-                mi, x * (HALF_X_M - 0.05), y * (HALF_Y_M - 0.05), 0.0, (0.025, 0.025, height / 2)
-            ),
-            Paint(wood, (0.1, 1)),
-        )
+        leg = block(mi, x * (HALF_X_M - 0.05), y * (HALF_Y_M - 0.05), 0.0, half)
+        shapes[f"leg-{k}"] = (leg, Paint(wood, (0.1, 1)))
     return shapes
 
 
@@ -101,10 +84,8 @@ def _fence(mi, picture):
     width = 2 * (HALF_X_M - 0.08)
     for k in range(POSTS):
         x = -width / 2 + width * k / (POSTS - 1)
-        shapes[f"post-{k}"] = (
-            block(mi, x, y, TOP_M, (0.004, 0.004, 0.07)),
-            Paint(picture, (0.1, 1)),
-        )
+        post = block(mi, x, y, TOP_M, (0.004, 0.004, 0.07))
+        shapes[f"post-{k}"] = (post, Paint(picture, (0.1, 1)))
     for k, z in enumerate((0.04, 0.11)):
         rail = block(mi, 0.0, y + 0.008 + GAP_M, TOP_M + z, (width / 2 + 0.01, 0.004, 0.006))
         shapes[f"rail-{k}"] = (rail, Paint(picture, (3, 0.1)))
@@ -115,8 +96,8 @@ def _free(random, places, radius):
     """A place on the table, clear of the edge, the fence and all earlier things; it is added to
     ``places``."""
     while True:
-        x = float(random.uniform(-HALF_X_M + 0.08, HALF_X_M - 0.08))
-        y = float(random.uniform(-HALF_Y_M + 0.08, HALF_Y_M - 0.14))
+        x = random.uniform(-HALF_X_M + 0.08, HALF_X_M - 0.08)
+        y = random.uniform(-HALF_Y_M + 0.08, HALF_Y_M - 0.14)
         if all(math.hypot(x - px, y - py) > radius + other + SPACING_M for px, py, other in places):
             places.append((x, y, radius))
             return x, y

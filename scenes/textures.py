@@ -341,8 +341,7 @@ def _unscaled(path, what):
         )
     if Path(path).suffix.lower() not in HDR:
         return linear(_stored(path))
-    values = rgbe.read(path)
-    return check_texture(luminance(values), str(path)).astype(np.float64)
+    return check_texture(luminance(rgbe.read(path)), str(path)).astype(np.float64)
 
 
 def _scaled(values, weight, mean, name):

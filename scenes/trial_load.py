@@ -57,13 +57,9 @@ def check(
                 "a bitmap of the scene names no file; give its filename, or take it out."
             )
         name = values.get("filename", None)
-        if not isinstance(name, str):
-            continue
-        beside = [Path(str(each)).parent / name for each in state.files] or [Path(name)]
-        path = next((each for each in beside if each.is_file()), None)
-        if path is None:
-            continue
-        named.append((kind, str(path)))
+        if isinstance(name, str):
+            beside = [Path(str(each)).parent / name for each in state.files] or [Path(name)]
+            named += [(kind, str(path)) for path in beside if path.is_file()][:1]
     texts = {name: str(value) for name, value in dict(parameters).items()}
     asked = json.dumps([mi.variant(), file and str(file), texts, [] if file else named])
     files = [Path(name) for _, name in named] + [Path(str(each)) for each in state.files]
@@ -78,10 +74,9 @@ def check(
     for kind, name in named:
         with open_regular(name) as opened:
             begin = opened.read(2)
-        # Mitsuba goes by the first bytes, not by the ending
+        # Mitsuba goes by the first bytes, not by the ending; a reader that writes past its end may
+        # go on for a while, so a trial would not always tell
         if begin == b"#?" and kind in ("bitmap", "envmap"):
-            # a reader that writes past its end may go on for a while, so a trial would not always
-            # tell
             rgbe.radiance(name)
     try:
         done = subprocess.run(

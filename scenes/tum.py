@@ -141,11 +141,11 @@ class Recorded(Trajectory):
             .copy()
         )
         twist = Se3(So3.from_wxyz(turn), step[:, :3, 3]).log().detach()
-        if float(twist[:, 3:].norm(dim=1).max()) > 3:
+        if twist[:, 3:].norm(dim=1).max() > 3:
             at = int(twist[:, 3:].norm(dim=1).argmax())
             raise DomainError(
-                f"the body turns by {float(twist[at, 3:].norm()):.3g} rad between {float(self.t_s[at]):g} "
-                f"and {float(self.t_s[at + 1]):g} s; give poses closer together (at most 3 rad apart)."
+                f"the body turns by {twist[at, 3:].norm():.3g} rad between {self.t_s[at]:g} "
+                f"and {self.t_s[at + 1]:g} s; give poses closer together (at most 3 rad apart)."
             )
         self.twist_per_s = twist / self.t_s.diff()[:, None]
 
@@ -174,7 +174,7 @@ def _checked(t_s, poses):
             f"{tuple(t_s.shape)} times were given for {poses.shape[0]} poses; give one per pose."
         )
     check_finite(t_s, "times of poses")
-    if bool((t_s.diff() <= 0).any()):
+    if (t_s.diff() <= 0).any():
         raise DomainError("the times of poses must increase strictly; sort them and drop doubles.")
     return t_s, poses
 

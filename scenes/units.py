@@ -24,16 +24,14 @@ def hint(
     size_m = max(float(high) - float(low) for low, high in zip(low_m, high_m, strict=True))
     if SMALL_M <= size_m <= LARGE_M or not size_m > 0:
         return None
-    units = size_m / unit_m
+    remedy = "a larger unit_m"
     if size_m > LARGE_M:
-        other = " or ".join(
-            f"unit_m={metres:g} ({name}: {units * metres:.3g} m)"
+        smaller = (
+            f"unit_m={metres:g} ({name}: {size_m / unit_m * metres:.3g} m)"
             for name, metres in UNITS
             if metres < unit_m
         )
-        remedy = f"if its file is not in units of {unit_m:g} m, give {other or 'a smaller unit_m'}"
-    else:
-        remedy = f"if its file is not in units of {unit_m:g} m, give a larger unit_m"
-    sentence = f"{what} is {size_m:.3g} m wide; {remedy}."
+        remedy = " or ".join(smaller) or "a smaller unit_m"
+    sentence = f"{what} is {size_m:.3g} m wide; if its file is not in units of {unit_m:g} m, give {remedy}."
     warnings.warn(sentence, UserWarning, stacklevel=3)
     return sentence

@@ -11,6 +11,7 @@ rough as the grain.
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -108,7 +109,6 @@ def _plane(name, texture, texel_m, half_width_m, towards, up, wrap, device):
 
 
 def _walls(mi, paints, size_m):
-    """Six inner sides of a box, each with its paint."""
     return {
         name: (side, paint)
         for (name, side), paint in zip(sides(mi, size_m).items(), paints, strict=True)
@@ -135,10 +135,8 @@ def room(
     shapes = _walls(mi, paints, size_m)
     if objects:
         shapes["crate"] = (block(mi, -0.9, 0.9, 0.0, (0.3, 0.3, 0.3), 25), Paint(pictures[0]))
-        shapes["box"] = (
-            block(mi, 0.8, 1.2, 0.0, (0.35, 0.2, 0.2), -15),
-            Paint(pictures[1 % len(pictures)]),
-        )
+        box = block(mi, 0.8, 1.2, 0.0, (0.35, 0.2, 0.2), -15)
+        shapes["box"] = (box, Paint(pictures[1 % len(pictures)]))
         shapes["ball"] = (ball(mi, 0.1, 0.5, 0.0, 0.25), Paint(pictures[2 % len(pictures)]))
     return light(World(shapes), device)
 
@@ -184,7 +182,7 @@ def corridor(device: str = "cpu", light: Light = emissive) -> Any:
         for x in (-1, 1):
             half = (0.08, 0.12, height_m / 2 - GAP_M)
             shapes[f"pillar-{k}{'w' if x < 0 else 'e'}"] = (
-                block(mi, x * (width_m / 2 - half[0] - GAP_M), float(y), 0.0, half),
+                block(mi, x * (width_m / 2 - half[0] - GAP_M), y, 0.0, half),
                 Paint(column, (0.3, 3)),
             )
     return light(World(shapes), device)
@@ -226,7 +224,7 @@ def outdoor(
         )
     while len(places) < clutter + len(meshes):
         x, y = random.uniform(-0.5, 0.5, 2) * GROUND_M
-        size = float(random.uniform(0.15, 0.5))
+        size = random.uniform(0.15, 0.5)
         if abs(x) < 0.7 + 1.5 * size or any(
             math.hypot(x - px, y - py) < 1.8 * (size + other) for px, py, other in places
         ):
@@ -235,26 +233,15 @@ def outdoor(
         places.append((x, y, size))
         paint = Paint(pictures[k % 4])
         if k % 3 == 0:
-            shapes[f"crate-{k}"] = (
-                block(
-                    mi,
-                    x,
-                    y,
-                    0.0,
-                    (size, size, size * random.uniform(0.6, 1.6)),
-                    random.uniform(0, 90),
-                ),
-                paint,
-            )
+            half = (size, size, size * random.uniform(0.6, 1.6))
+            shapes[f"crate-{k}"] = (block(mi, x, y, 0.0, half, random.uniform(0, 90)), paint)
         elif k % 3 == 1:
             shapes[f"ball-{k}"] = (ball(mi, x, y, 0.0, size), paint)
         else:
-            height = random.uniform(1.2, 3.0)
-            tube, cap = pole(mi, (x, y, GAP_M), (x, y, height), 0.03 + 0.1 * size)
-            shapes[f"post-{k}"], shapes[f"cap-{k}"] = (
-                (tube, Paint(pictures[k % 4], (1, 4))),
-                (cap, Paint(np.full((4, 4), 90.0))),
-            )
+            top = (x, y, random.uniform(1.2, 3.0))
+            tube, cap = pole(mi, (x, y, GAP_M), top, 0.03 + 0.1 * size)
+            shapes[f"post-{k}"] = (tube, replace(paint, repeat=(1, 4)))
+            shapes[f"cap-{k}"] = (cap, Paint(np.full((4, 4), 90.0)))
     above = textures.sky(seed) if environment is None else textures.environment(environment)
     lamps = {"sun": sun(800.0)} if environment is None else {}
     return light(World(shapes, {"sky": sky(mi, above)}, lamps, texel_m=0.08), device)
@@ -265,16 +252,12 @@ def dark_room(seed: int = 0, device: str = "cpu", light: Light = emissive) -> An
     random without touching."""
     mi = backend.mitsuba(device)
     random = np.random.default_rng(seed)
-    dim = [
-        textures.faded_to(
-            textures.softened(textures.speckle(seed + k, finest_px=16.0, contrast=0.35), 2.0), PAINT
-        )
-        * (DARK / PAINT)
-        for k in range(6)
-    ]
-    shapes = _walls(
-        mi, [Paint(picture, albedo=0.25 * 255 / float(picture.max())) for picture in dim], ROOM_M
-    )
+    paints = []
+    for k in range(6):
+        speckle = textures.speckle(seed + k, finest_px=16.0, contrast=0.35)
+        dim = textures.faded_to(textures.softened(speckle, 2.0), PAINT) * (DARK / PAINT)
+        paints.append(Paint(dim, albedo=0.25 * 255 / float(dim.max())))
+    shapes = _walls(mi, paints, ROOM_M)
     low, high = np.array([-1.6, -1.6, 0.4]), np.array([1.6, 1.6, ROOM_M[2] - 0.4])
     places = []
     while len(places) < SPOTS:
@@ -284,7 +267,7 @@ def dark_room(seed: int = 0, device: str = "cpu", light: Light = emissive) -> An
             and np.linalg.norm(place - [0, -1.2, 1.3]) > 0.7
         ):
             places.append(place)
-            radius = float(random.uniform(0.015, 0.04))
+            radius = random.uniform(0.015, 0.04)
             shapes[f"spot-{len(places)}"] = (
                 ball(mi, *map(float, place), radius),
                 Paint(np.full((4, 4), BRIGHT, dtype=np.float32), albedo=0.0, glow=BRIGHT),

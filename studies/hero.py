@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 from typing import Any, ClassVar
 
 import matplotlib.pyplot as plt
@@ -81,8 +82,7 @@ class Film:
 def study(run: Run[Config]) -> None:
     config = run.config
     setting, rows = answers(config.answers)
-    space = space_of(setting)
-    drawn = Drawn(driving(space, config), (config.world,), 1, config.pictures)
+    drawn = Drawn(driving(space_of(setting), config), (config.world,), 1, config.pictures)
     titles = ("as it came", "designed together")
     films = {}
     with run.progress(len(titles), "designs") as bar:
@@ -108,8 +108,7 @@ def driving(space: Space, config: Config) -> Space:
     twist = torch.tensor([config.speed, 0.0, 0.0, 0.0, 0.0, config.turn], dtype=torch.float64)
 
     def drive(number: int, motions: int) -> tuple[Tensor, Tensor]:
-        begun = pair.drive(number, 1)[0][0, 0]
-        level = begun.clone()
+        level = pair.drive(number, 1)[0][0, 0].clone()
         level[:3, :3] = torch.eye(3, dtype=torch.float64)
         since_s = STEP_S * torch.arange(config.pictures, dtype=torch.float64)
         twists = twist.expand(config.pictures, 6)
@@ -120,9 +119,7 @@ def driving(space: Space, config: Config) -> Space:
 
 def median(rows: list[dict[str, Any]], arm: str, space: Space) -> tuple[Whole, float]:
     """The answer of an arm in the middle by its error in unseen worlds, and that error."""
-    found = sorted(
-        (float(np.mean(row["errors"])), row["share"]) for row in rows if row["arm"] == arm
-    )
+    found = sorted((fmean(row["errors"]), row["share"]) for row in rows if row["arm"] == arm)
     if not found:
         raise DomainError(f"--arm {arm}: no answer of it is there.")
     error, share = found[len(found) // 2]
@@ -157,7 +154,6 @@ def filmed(run: Run[Config], title: str, drawn: Drawn, whole: Whole, error: floa
 
 
 def drawn_at(films: Mapping[str, Film], k: int) -> Image.Image:
-    """The picture of a number."""
     figure = figure_at(films, k)
     figure.canvas.draw()
     picture = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3])
@@ -170,17 +166,18 @@ def figure_at(films: Mapping[str, Film], k: int) -> Any:
     figure = plt.figure(figsize=(13.2, 2.5 * len(films)), layout="constrained", dpi=80)
     grid = figure.add_gridspec(len(films), 6, width_ratios=(1.1, 1.1, 1.3, 1.3, 1.3, 1.2))
     for row, ((title, film), colour) in enumerate(zip(films.items(), COLOURS, strict=True)):
+        whole = film.whole
         axes = [
             figure.add_subplot(grid[row, column], projection="3d" if column == 1 else None)
             for column in range(6)
         ]
-        if isinstance(film.whole.camera.lens, lens.GeoLens):
-            draw_layout(axes[0], film.whole.camera.lens, FIELDS_RAD, rays=3)
+        if isinstance(whole.camera.lens, lens.GeoLens):
+            draw_layout(axes[0], whole.camera.lens, FIELDS_RAD, rays=3)
             axes[0].get_legend().remove()
-        axes[0].set_axis_off()
         axes[0].set_title(f"{title}:\nvelocity error {film.error:.2f}", fontsize=11, color=colour)
-        draw_pair(axes[1], film.whole.space.pair, film.whole.camera, film.whole.T_body_cam)
-        axes[1].set_axis_off()
+        draw_pair(axes[1], whole.space.pair, whole.camera, whole.T_body_cam)
+        for axis in axes[:2]:
+            axis.set_axis_off()
         draw_image(axes[2], film.frames[k], film.frames)
         axes[3].imshow(events.picture(film.counts[k], 2.0).squeeze().numpy())
         axes[4].imshow(flow_colours(film.flow_px[k].double().numpy(), LONGEST_PX))
@@ -202,19 +199,10 @@ def _draw_velocity(axis, film, k, colour):
 
 
 def looped(pictures: list[Image.Image]) -> bytes:
-    """An animation as WebP, without end."""
     buffer = io.BytesIO()
     first, *rest = pictures
-    first.save(
-        buffer,
-        "WEBP",
-        save_all=True,
-        append_images=rest,
-        duration=120,
-        loop=0,
-        quality=60,
-        method=6,
-    )
+    how = {"duration": 120, "loop": 0, "quality": 60, "method": 6}
+    first.save(buffer, "WEBP", save_all=True, append_images=rest, **how)
     return buffer.getvalue()
 
 

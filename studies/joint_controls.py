@@ -115,30 +115,27 @@ class Changed(Whole):
         return self.stage(super().events(kind, bins))
 
 
-class Shuffled(nn.Module):
-    """Events whose order in the interval is lost: bins in an order drawn for every pixel."""
+class Altered(nn.Module):
+    """An event stage of which something is taken away."""
 
     def __init__(self, stage: nn.Module) -> None:
         super().__init__()
         self.stage = stage
 
+
+class Shuffled(Altered):
+    """Events whose order in the interval is lost: bins in an order drawn for every pixel."""
+
     def volume(self, frames: Any, t_s: Any, bins: int, generator: Any = None) -> EventVolume:
         made = self.stage.volume(frames, t_s, bins, generator)
-        drawn = torch.rand(
-            made.counts[:, :1].shape,
-            generator=torch.Generator().manual_seed(0),
-            dtype=torch.float64,
-        )
+        generator = torch.Generator().manual_seed(0)
+        drawn = torch.rand(made.counts[:, :1].shape, generator=generator, dtype=torch.float64)
         order = drawn.argsort(2).expand_as(made.counts)
         return replace(made, counts=made.counts.gather(2, order))
 
 
-class Bland(nn.Module):
+class Bland(Altered):
     """Frames at their mean, in which nothing moves."""
-
-    def __init__(self, stage: nn.Module) -> None:
-        super().__init__()
-        self.stage = stage
 
     def volume(self, frames: Any, t_s: Any, bins: int, generator: Any = None) -> EventVolume:
         level = frames.mean((-3, -2, -1), keepdim=True).expand_as(frames).contiguous()
@@ -146,7 +143,6 @@ class Bland(nn.Module):
 
 
 def looked(drawn: Drawn, whole: Whole) -> Looked:
-    """The judge's drives."""
     return drawn.looked(whole, drawn.draw(JUDGED), "sensor")
 
 

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+from statistics import fmean
 from typing import Any, ClassVar
 
 import matplotlib.pyplot as plt
@@ -25,7 +26,7 @@ from studies.codesign.race import compared, start
 from studies.frame.compare import Interval, bootstrap
 from studies.frame.run import Run, main
 from studies.frame.show import tabulate
-from studies.frame.sweep import Row, select
+from studies.frame.sweep import Row, column, select, typical
 
 ORDERS = ("lens > mount > read-out", "mount > lens > read-out")
 ENOUGH = 6  # cells, below which nothing is said of the prediction
@@ -70,14 +71,13 @@ def study(run: Run[Config]) -> None:
         order = max(ORDERS, key=lambda arm: found[arm][0].value)
         over = found[order][0].ratio()
         ratios[cell] = over
-        errors = {arm: _median(mine, arm) for arm in ("joint", order)}
         line = {
             "cell": cell,
             "best order": order,
-            "joint": errors["joint"],
-            "order": errors[order],
+            "joint": typical(mine, arm="joint"),
+            "order": typical(mine, arm=order),
             **{name: getattr(over, name) for name in ("value", "low", "high")},
-            "rank": ranked([row["expected"] for row in mine], [_error(row) for row in mine]),
+            "rank": ranked(column(mine, "expected"), [fmean(row["errors"]) for row in mine]),
         }
         if pulls:
             line |= _foretold(config, given, select(pulls, regime=cell), order)
@@ -126,15 +126,6 @@ def _foretold(config: Config, given: Mapping[str, Any], pulls: Sequence[Row], or
     return {name: 1 / value for name, value in told.items()}
 
 
-def _error(row):
-    return sum(row["errors"]) / len(row["errors"])
-
-
-def _median(rows, arm):
-    errors = [_error(row) for row in select(rows, arm=arm)]
-    return float(torch.tensor(errors, dtype=torch.float64).quantile(0.5))
-
-
 def _answer(run: Run[Config], ratios: Mapping[str, Interval], foretold: Mapping[str, float]) -> str:
     """The map in one sentence, and the rank of what was foretold."""
     won = sum(over.high < 1 for over in ratios.values())
@@ -176,8 +167,8 @@ def drawn(ratios: Mapping[str, Interval], foretold: Mapping[str, float]) -> Figu
     axis.axvline(1, color="0.5", linewidth=1)
     axis.set_yticks(range(len(ratios)), list(ratios), fontsize=8)
     axis.set(xlabel="joint / better order", xscale="log")
-    axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axis.xaxis.set_minor_formatter(lambda value, _: f"{value:g}")
+    axis.xaxis.set_major_formatter("{x:g}")
+    axis.xaxis.set_minor_formatter("{x:g}")
     axis.set_ylim(len(ratios) - 0.4, -0.6)
     return figure
 

@@ -10,15 +10,13 @@ import sys
 from dataclasses import dataclass
 from typing import ClassVar
 
-import torch
-
 from studies.codesign.cells import CellsConfig, setting, space_of
 from studies.codesign.race import compared
 from studies.codesign.refined import AFTERWARDS, JOINT, raced
 from studies.frame.config import check_least
 from studies.frame.run import Run, main
 from studies.frame.show import tabulate
-from studies.frame.sweep import plain, select, sweep
+from studies.frame.sweep import plain, select, sweep, typical
 
 OWN = ("judged_worlds", "judged_drives", "rate", "updates")
 ENOUGH = 6  # starts, below which nothing is decided
@@ -52,8 +50,8 @@ def study(run: Run[Config]) -> None:
     lines = []
     for arm in dict.fromkeys(row["arm"] for row in rows):
         mine = select(rows, arm=arm)
-        of = {name: _median(mine, name) for name in ("errors", "closed_form_errors")}
-        line = {"arm": arm, "refiner": of["errors"], "closed_form": of["closed_form_errors"]}
+        line = {"arm": arm, "refiner": typical(mine)}
+        line["closed_form"] = typical(mine, "closed_form_errors")
         if arm in over:
             ratio, p = over[arm][0].ratio(), over[arm][1]
             run.record(**ratio.metrics(plain("joint over", arm)))
@@ -74,11 +72,6 @@ def study(run: Run[Config]) -> None:
         f"Designed together with its refiner, the camera of '{config.pair}' {found.outcome} against the same design followed by "
         f"training: errors {found.ratio():.2f} of it. Training leaves {trained:.2f} of the error.{few}",
     )
-
-
-def _median(rows, name):
-    errors = [sum(row[name]) / len(row[name]) for row in rows]
-    return float(torch.tensor(errors, dtype=torch.float64).quantile(0.5))
 
 
 if __name__ == "__main__":

@@ -85,8 +85,8 @@ def study(run: Run[Config]):
         )
     geo = lens.load(config.lens).freeze()
     half_field = half_field_of(geo, config)
-    names = [field.name for field in dataclasses.fields(Tolerances) if hasattr(config, field.name)]
-    tolerances = Tolerances(**{name: getattr(config, name) for name in names})
+    known = {field.name for field in dataclasses.fields(Tolerances)}
+    tolerances = Tolerances(**{name: x for name, x in vars(config).items() if name in known})
     angles = tuple(share * half_field for share in FIELDS)
     linear = linear_figures(half_field)
     refocus = partial(focus_rays, fields_rad=angles, wavelengths_um=LINES, grid=8)
@@ -113,11 +113,10 @@ def study(run: Run[Config]):
     )
     report_linear(run, slopes, first)
     grown = []
-    for k, (name, forecast) in enumerate(forecasts.items()):
-        squares = trials.figures[:, count + k * len(FIELDS) :][:, : len(FIELDS)]
-        grown.append(
-            f"{report_spot(run, name, forecast, trials.amounts, squares)} (image plane {name})"
-        )
+    spots = trials.figures[:, count:].split(len(FIELDS), 1)
+    for (name, forecast), squares in zip(forecasts.items(), spots, strict=True):
+        change = report_spot(run, name, forecast, trials.amounts, squares)
+        grown.append(f"{change} (image plane {name})")
     report_offenders(run, geo, tolerances, slopes, forecasts)
     report_needed(run, geo, fixed, refocus)
     run.record(trials=config.trials, failed_trials=trials.failed, errors=errors)
@@ -147,7 +146,7 @@ def simulate(run, geo, tolerances, figures):
     total = run.config.trials
     generator = torch.Generator().manual_seed(run.config.seed)
     parts = []
-    if run.resumed and (stored := run.load_state()):
+    if stored := run.load_state():
         generator.set_state(stored.tensors.pop("generator"))
         parts.append(Trials(**stored.tensors, failed=int(stored.numbers["failed"])))
 
@@ -175,7 +174,6 @@ def simulate(run, geo, tolerances, figures):
 
 
 def report_linear(run, slopes, trials):
-    """Table, figure and metrics of the linear figures."""
     found = compare(slopes, trials)
     quantiles = trials.quantiles(QUANTILES)
     rows = []
@@ -185,20 +183,13 @@ def report_linear(run, slopes, trials):
             "deviation_simulated": found.simulated[k],
             "correlation": found.correlation[k],
         }
-        key = plain(name.split(" (")[0].lower())
+        key = plain(name.split(" (")[0])
         run.record(**{f"{key}_{figure}": value for figure, value in known.items()})
         figures = {"nominal": trials.nominal[k], **known, "mean shift / deviation": found.bias[k]}
         figures |= {f"{q:.0%}": value for q, value in zip(QUANTILES, quantiles[:, k], strict=True)}
-        rows.append(
-            # what is 0 by symmetry is shown as 0, not as its rounding
-            {
-                "figure": name,
-                **{
-                    title: f"{round(float(value), 12) + 0.0:.6g}"
-                    for title, value in figures.items()
-                },
-            }
-        )
+        # what is 0 by symmetry is shown as 0, not as its rounding
+        said = {title: f"{round(float(x), 12) + 0.0:.6g}" for title, x in figures.items()}
+        rows.append({"figure": name, **said})
     run.card(
         "Linear figures",
         f"{min(found.correlation.tolist()):.6f}",
@@ -255,37 +246,28 @@ def report_spot(run, name, forecast, amounts, squares):
     quantiles = [v.quantile(v.new_tensor(QUANTILES), 0) for v in (drawn_um, truth_um)]
     rows = []
     for f, share in enumerate(FIELDS):
-        figures = {figure: float(values[f]) for figure, values in known.items()}
+        figures = {figure: values[f] for figure, values in known.items()}
         key = f"spot_{name}_field{share:g}".replace(".", "_")
-        figures_of = {"mean_square_ratio": float(expected[f] / mean[f]), **figures}
+        figures_of = {"mean_square_ratio": expected[f] / mean[f], **figures}
         run.record(**{f"{key}_{figure}": value for figure, value in figures_of.items()})
         sizes = nominal_um[f], 1e3 * expected[f].sqrt(), 1e3 * mean[f].sqrt()
-        rows.append(
-            [
-                f"{share:g}",
-                *(f"{float(size):.2f}" for size in sizes),
-                *(f"{v:.5f}" for v in figures.values()),
-            ]
-            + [
-                f"{a:.2f} / {b:.2f}"
-                for a, b in zip(*(q[:, f].tolist() for q in quantiles), strict=True)
-            ]
-        )
-    worst = float((known["mean_square_same_draws_ratio"] - 1).abs().max())
+        cells = [f"{share:g}", *(f"{size:.2f}" for size in sizes)]
+        cells += [f"{v:.5f}" for v in figures.values()]
+        both = zip(*(q[:, f].tolist() for q in quantiles), strict=True)
+        rows.append([*cells, *(f"{a:.2f} / {b:.2f}" for a, b in both)])
+    worst = (known["mean_square_same_draws_ratio"] - 1).abs().max()
     run.card(
         f"Spot, {name}", f"{worst:.2%}", "largest error of the mean square spot over the same draws"
     )
     run.section(f"Spot with the image plane {name}")
     run.table(
         "Forecast and trials",
-        ["field", "nominal (µm)", "root mean square forecast (µm)", "simulated"]
-        + ["mean square of the same draws: forecast / simulated", "its deviation"]
-        + [
-            "deviation of the square: quadratic / simulated",
-            "linear / simulated",
-            "correlation of squares",
-        ]
-        + [f"{q:.0%} forecast / simulated (µm)" for q in QUANTILES],
+        [
+            *("field", "nominal (µm)", "root mean square forecast (µm)", "simulated"),
+            *("mean square of the same draws: forecast / simulated", "its deviation"),
+            *("deviation of the square: quadratic / simulated", "linear / simulated"),
+            *("correlation of squares", *(f"{q:.0%} forecast / simulated (µm)" for q in QUANTILES)),
+        ],
         rows,
         "RMS spots over F, d and C. Over the same draws only the forecast errs; over all draws the trials' "
         "own scatter comes in (heavy tails: some 5 % of a deviation at a thousand trials). The linear column "
@@ -307,11 +289,10 @@ def report_spot(run, name, forecast, amounts, squares):
         "Distribution of the RMS spot: trials, and draws of the quadratic forecast.",
     )
     most = int((mean / forecast.nominal).argmax())
-    return f"from {float(nominal_um[most]):.2f} to {1e3 * float(mean[most].sqrt()):.2f} µm"
+    return f"from {nominal_um[most]:.2f} to {1e3 * mean[most].sqrt():.2f} µm"
 
 
 def report_offenders(run, geo, tolerances, slopes, forecasts):
-    """The errors that matter most."""
     run.section("Worst offenders")
     errors = errors_of(geo, tolerances)
     for name, forecast in forecasts.items():
@@ -320,11 +301,7 @@ def report_offenders(run, geo, tolerances, slopes, forecasts):
             f"Spot, {name}",
             ["error", "mean square added (µm²)", "share"],
             [
-                [
-                    errors[k].name,
-                    f"{1e6 * float(added[k]):.3f}",
-                    f"{float(added[k] / added.sum()):.1%}",
-                ]
+                [errors[k].name, f"{1e6 * added[k]:.3f}", f"{added[k] / added.sum():.1%}"]
                 for k in added.argsort(descending=True)[:10].tolist()
             ],
             "Mean over the fields, per one standard deviation of the error.",
@@ -361,7 +338,7 @@ def report_needed(run, geo, figure, refocus):
 
     generator = torch.Generator().manual_seed(config.seed + 3)
     trials = monte_carlo(geo, needed.errors, square, JUDGED, generator, compensate=refocus)
-    kept = float((trials.figures - trials.nominal <= budget).double().mean())
+    kept = (trials.figures - trials.nominal <= budget).double().mean()
     run.record(needed_share_within_budget=kept, needed_cost=needed.cost)
     shares = dict.fromkeys((error.drawn for error in needed.errors), 0.0)
     deviations = {error.drawn: said(geo, error) for error in reversed(needed.errors)}

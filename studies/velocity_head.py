@@ -108,9 +108,8 @@ def designs(pair: RobotPair, count: int, seed: int) -> list[Design]:
         for name, share in zip(names, shares, strict=True):
             low, high = getattr(pair.low, name), getattr(pair.high, name)
             at = MARGIN + (1 - 2 * MARGIN) * share
-            numbers[name] = (
-                low * (high / low) ** at if name == "efl_mm" else low + (high - low) * at
-            )
+            even = low + (high - low) * at
+            numbers[name] = low * (high / low) ** at if name == "efl_mm" else even
         found.append(pair.check(replace(pair.design, **numbers)))
     return found
 
@@ -125,14 +124,11 @@ def samples(run: Run[Config], pair: RobotPair) -> tuple[Samples, Samples]:
             path = run.folder / "samples" / f"{pair.name}_{index:03d}.safetensors"
             if not path.exists():
                 path.parent.mkdir(exist_ok=True)
-                checkpoint.write_tensors(
-                    path, rendered(pair, design, index, config), {"kind": "evidence"}
-                )
-            tensors = {
-                name: value.double() for name, value in checkpoint.read_tensors(path)[0].items()
-            }
-            seen = Evidence(*(tensors[f.name] for f in fields(Evidence)))
-            parts.append(Samples(seen, tensors["twist"], pair.axes))
+                found = rendered(pair, design, index, config)
+                checkpoint.write_tensors(path, found, {"kind": "evidence"})
+            stored, _ = checkpoint.read_tensors(path)
+            seen = Evidence(*(stored[f.name].double() for f in fields(Evidence)))
+            parts.append(Samples(seen, stored["twist"].double(), pair.axes))
             bar.advance()
     seen = Evidence.joined([part.seen for part in parts])
     first = config.worlds - max(1, config.worlds // 4)  # of those to choose by

@@ -52,7 +52,7 @@ def check_pair(
         )
     for number in numbers:
         poses, twist = pair.drive(number, DRIVES)
-        if not float(twist.abs().max()) > STILL:
+        if not twist.abs().max() > STILL:
             raise DomainError(
                 f"pair '{pair.name}': drives {number} never move, so there are no events; give a "
                 "motion that does."
@@ -72,14 +72,14 @@ def check_pair(
         ends = poses[:, [1, -1]] @ pair.design.mount()
         flow_px, valid = render.true_flow(camera, world, ends)
         length_px = flow_px.norm(dim=2)[valid]
-        moved_px = float(length_px.median())
+        moved_px = length_px.median()
         if moved_px < LEAST_MOVED_PX:
             raise DomainError(
                 f"pair '{pair.name}': in drives {number} the picture moves by {moved_px:.2g} "
                 f"pixels in {1e3 * robot_pair.DURATION_S:g} ms, {LEAST_MOVED_PX:g} are the least; "
                 "drive faster, or see whether the motion is in metres and seconds."
             )
-        followed = float((length_px <= robot_pair.WINDOW_PX).double().mean())
+        followed = (length_px <= robot_pair.WINDOW_PX).double().mean()
         if not followed >= LEAST_FOLLOWED:  # no surface, no number
             raise DomainError(
                 f"pair '{pair.name}': in drives {number} {followed:.0%} of the surfaces seen move "
@@ -97,7 +97,7 @@ def _check_width(pair, camera):
         if hasattr(lens, "semi_aperture_mm")
         else lens.entrance_pupil_diameter_mm
     )
-    width_mm = float(torch.as_tensor(widths).max())
+    width_mm = torch.as_tensor(widths).max()
     if width_mm > housing_mm:
         raise DomainError(
             f"pair '{pair.name}': its lens is {width_mm:.3g} mm wide, wider than the camera's "

@@ -61,20 +61,16 @@ def world(number: int) -> MitsubaScene:
     random, _, covered = robot_pair.variant(number)
     half = half_width_m(number)
     walls = sides(mi, (2 * half, LENGTH_M, HEIGHT_M), LENGTH_M / 2)
-    shapes: dict = {
-        "west": (walls["west"], covered(LENGTH_M, HEIGHT_M)),
-        "east": (walls["east"], covered(LENGTH_M, HEIGHT_M)),
-        "floor": (walls["floor"], covered(2 * half, LENGTH_M)),
-        "ceiling": (walls["ceiling"], covered(2 * half, LENGTH_M)),
-        "start": (walls["south"], covered(2 * half, HEIGHT_M)),
-        "end": (walls["north"], covered(2 * half, HEIGHT_M)),
-    }
+    along, across, level = (LENGTH_M, HEIGHT_M), (2 * half, HEIGHT_M), (2 * half, LENGTH_M)
+    sizes = {"west": along, "east": along, "floor": level, "ceiling": level}
+    sizes |= {"south": across, "north": across}
+    shapes = {name: (walls[name], covered(*size)) for name, size in sizes.items()}
     column = covered(2 * PILLAR_M[1], HEIGHT_M)
     stations = np.arange(EVERY_M, LENGTH_M - 0.5, EVERY_M)
     for k, y in enumerate(stations):
         for sign in (-1, 1):
             size = (*PILLAR_M, HEIGHT_M / 2 - GAP_M)
-            shape = block(mi, sign * (half - PILLAR_M[0] - GAP_M), float(y), 0.0, size)
+            shape = block(mi, sign * (half - PILLAR_M[0] - GAP_M), y, 0.0, size)
             shapes[f"pillar-{k}{'we'[sign > 0]}"] = (shape, column)
     taken = random.permutation([(sign, y) for sign in (-1, 1) for y in stations[:-1]])[:CRATES]
     for k, (sign, y) in enumerate(taken):
@@ -86,7 +82,7 @@ def world(number: int) -> MitsubaScene:
 
 def half_width_m(number: int) -> float:
     """From the middle of the corridor to its walls."""
-    return float(np.random.default_rng([number, 3]).uniform(*HALF_WIDTH_M))
+    return np.random.default_rng([number, 3]).uniform(*HALF_WIDTH_M)
 
 
 def drive(number: int, motions: int) -> tuple[torch.Tensor, torch.Tensor]:

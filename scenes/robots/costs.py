@@ -136,26 +136,22 @@ class Exposed(nn.Module):
             made = stage.volume(frames, t_s, bins, generator)
         else:
             made = stage(frames, t_s, generator)
-        return (
-            made
-            if self.most is None
-            else replace(made, counts=self._read_out(made.counts, generator))
-        )
+        if self.most is None:
+            return made
+        return replace(made, counts=self._read_out(made.counts, generator))
 
     def _read_out(self, counts, generator):
         per_body = counts.detach().unflatten(0, (-1, self.windows)).flatten(1).sum(1)
         kept = (self.most / per_body.clamp_min(1e-9)).clamp_max(1).repeat_interleave(self.windows)
         kept = kept[:, None, None, None, None].to(counts)
-        if bool((kept == 1).all()):
+        if (kept == 1).all():
             return counts
         whole = counts.detach().floor()
-        one = (
-            generator
-            if isinstance(generator, torch.Generator)
-            else torch.Generator().manual_seed(0)
-        )
-        read = torch.binomial(whole, kept.expand_as(whole).contiguous(), generator=one)
+        if not isinstance(generator, torch.Generator):
+            generator = torch.Generator().manual_seed(0)
+        share = kept.expand_as(whole).contiguous()
+        read = torch.binomial(whole, share, generator=generator)
         rest = counts.detach() - whole
-        read = read + rest * torch.bernoulli(kept.expand_as(whole), generator=one)
+        read = read + rest * torch.bernoulli(share, generator=generator)
         mean = kept * counts
         return torch.where(kept == 1, counts, mean + (read - mean).detach())

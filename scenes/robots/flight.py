@@ -2,6 +2,7 @@
 every direction of flight, with a map of the room."""
 
 import math
+from itertools import product
 
 import numpy as np
 import torch
@@ -32,11 +33,11 @@ BODIES = {
     "skid left": box((0.24, 0.012, 0.012), (0.0, 0.09, -0.13)),
     "skid right": box((0.24, 0.012, 0.012), (0.0, -0.09, -0.13)),
 }
-for _x in (-1, 1):
-    for _y in (-1, 1):
-        BODIES[f"leg {_x:+d} {_y:+d}"] = box((0.01, 0.01, 0.1), (0.05 * _x, 0.09 * _y, -0.074))
-        BODIES[f"motor {_x:+d} {_y:+d}"] = cylinder(0.016, 0.03, (ARM_M * _x, ARM_M * _y, 0.028))
-        BODIES[f"rotor {_x:+d} {_y:+d}"] = cylinder(0.12, 0.004, (ARM_M * _x, ARM_M * _y, 0.046))
+for _x, _y in product((-1, 1), (-1, 1)):
+    _at, _tip = f"{_x:+d} {_y:+d}", (ARM_M * _x, ARM_M * _y)
+    BODIES[f"leg {_at}"] = box((0.01, 0.01, 0.1), (0.05 * _x, 0.09 * _y, -0.074))
+    BODIES[f"motor {_at}"] = cylinder(0.016, 0.03, (*_tip, 0.028))
+    BODIES[f"rotor {_at}"] = cylinder(0.12, 0.004, (*_tip, 0.046))
 LOW = Design(2.5, 1.2, 0.0, 0.12, -0.06, -0.16, -0.8, -0.4, -0.6)
 HIGH = Design(12.0, 1.2, 8.0, 0.25, 0.06, 0.02, 0.8, 1.5, 0.6)
 START = Design(6.5, 1.2, 0.55, 0.16, 0.0, -0.08, 0.0, 0.6, 0.0)
@@ -49,20 +50,9 @@ def flight() -> RobotPair:
     (0, 1, 2, 3, 4, 5)
     """
     prior = (0.8, 0.8, 0.4, 0.8, 0.8, 0.8)
-    return RobotPair(
-        "flight",
-        BODIES,
-        LOW,
-        HIGH,
-        START,
-        FREE,
-        prior,
-        "scene",
-        None,
-        world,
-        drive,
-        frame="base_link",
-    )
+    bounds = LOW, HIGH, START
+    how = FREE, prior, "scene", None
+    return RobotPair("flight", BODIES, *bounds, *how, world, drive, frame="base_link")
 
 
 def world(number: int) -> MitsubaScene:
@@ -80,10 +70,8 @@ def world(number: int) -> MitsubaScene:
             shapes[f"ball-{k}"] = (ball(mi, x, y, 0.0, size), covered(1.0, 1.0))
         else:
             half = (size, size, random.uniform(0.2, 0.6))
-            shapes[f"crate-{k}"] = (
-                block(mi, x, y, 0.0, half, random.uniform(0, 90)),
-                covered(0.6, 0.6),
-            )
+            crate = block(mi, x, y, 0.0, half, random.uniform(0, 90))
+            shapes[f"crate-{k}"] = (crate, covered(0.6, 0.6))
     return emissive(World(shapes))
 
 
@@ -99,10 +87,8 @@ def drive(number: int, motions: int) -> tuple[torch.Tensor, torch.Tensor]:
         (-ABOUT_M, -ABOUT_M, -math.pi), (ABOUT_M, ABOUT_M, math.pi), (motions, 3)
     )
     lowest, highest = np.log(FLOWN_M)
-    height = np.exp(
-        lowest
-        + (highest - lowest) * (random.permutation(motions) + random.random(motions)) / motions
-    )
+    share = (random.permutation(motions) + random.random(motions)) / motions
+    height = np.exp(lowest + (highest - lowest) * share)
     tilt = torch.zeros(motions, 6, dtype=torch.float64)
     tilt[:, 3:5] = TILT_RAD * torch.from_numpy(random.standard_normal((motions, 2)))
     pose = robot_pair.standing(torch.from_numpy(starts))

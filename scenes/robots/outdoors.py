@@ -83,9 +83,9 @@ def places(number: int) -> list[tuple[float, float, float]]:
     found: list[tuple[float, float, float]] = []
     while len(found) < THINGS:
         x, y = random.uniform(-REACH_M, REACH_M, 2)
-        size = float(random.uniform(0.08, 0.3))
+        size = random.uniform(0.08, 0.3)
         if all(math.hypot(x - u, y - v) > 1.5 * (size + other) for u, v, other in found):
-            found.append((float(x), float(y), size))
+            found.append((x, y, size))
     return found
 
 
@@ -97,16 +97,15 @@ def drive(number: int, motions: int) -> tuple[torch.Tensor, torch.Tensor]:
     things = np.array(places(number))
     starts = []
     for _ in range(200 * motions):
-        if len(starts) == motions:
-            break
         x, y = random.uniform(-REACH_M / 2, REACH_M / 2, 2)
         heading = random.uniform(-math.pi, math.pi)
         if (np.hypot(things[:, 0] - x, things[:, 1] - y) > CLEAR_M + 1.5 * things[:, 2]).all():
             starts.append((x, y, heading))
-    if len(starts) < motions:
+        if len(starts) == motions:
+            break
+    else:
         raise DomainError(
             f"world {number} has room for {len(starts)} of {motions} drives; ask for fewer."
         )
-    return robot_pair.moved(
-        robot_pair.standing(torch.tensor(starts, dtype=torch.float64)), twist
-    ), twist
+    at = robot_pair.standing(torch.tensor(starts, dtype=torch.float64))
+    return robot_pair.moved(at, twist), twist

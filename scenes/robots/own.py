@@ -61,7 +61,7 @@ def own_pair(settings: OwnRobot | str | Path) -> RobotPair:
     if own.velocities is not None:
         axes = PLANAR if own.velocities == "planar" else FREE
     middle = drive(0, 12)[0][:, robot_pair.FRAMES // 2]
-    if axes == PLANAR and float(middle[:, 2, 2].min()) < math.cos(MOST_TILT_RAD):
+    if axes == PLANAR and middle[:, 2, 2].min() < math.cos(MOST_TILT_RAD):
         raise DomainError(
             f"motion: '{own.motion}' tips the robot by more than {math.degrees(MOST_TILT_RAD):.0f} degrees, and its velocities "
             "are planar; see whether its quaternions are qx qy qz qw, or set velocities: free."
@@ -105,9 +105,9 @@ def recorded_drives(path: Path) -> tuple[Drive, tuple[float, ...]]:
     """
     t_s, poses = read_tum(path)
     window_s = float(robot_pair.times()[-1])
-    if not float(t_s[-1] - t_s[0]) >= 3 * window_s:
+    if not (t_s[-1] - t_s[0]) >= 3 * window_s:
         raise DomainError(
-            f"motion: '{path}' lasts {float(t_s[-1] - t_s[0]):g} s; {3 * window_s:.3g} s are the least: windows of "
+            f"motion: '{path}' lasts {(t_s[-1] - t_s[0]):g} s; {3 * window_s:.3g} s are the least: windows of "
             f"{window_s:.3g} s are taken from its first two thirds for training and from the rest for judging."
         )
     trajectory = Recorded(t_s - t_s[0], poses)
@@ -116,7 +116,7 @@ def recorded_drives(path: Path) -> tuple[Drive, tuple[float, ...]]:
     for first, last in parts.values():
         inside = trajectory.t_s[(trajectory.t_s > first) & (trajectory.t_s < last)]
         passed = trajectory(torch.cat([torch.tensor([first, last], dtype=torch.float64), inside]))
-        if float((passed - passed[0]).abs().max()) < STILL:
+        if (passed - passed[0]).abs().max() < STILL:
             raise DomainError(
                 f"motion: '{path}' stands still from {first:g} to {last:g} s after its begin, so nothing there makes "
                 "an event; cut it to where the robot moves."
@@ -224,7 +224,7 @@ def _world(own):
 def _standing(named, bodies):
     """Drives of a pair for other bodies; those that drive stand on the ground."""
     vertices = np.concatenate([mesh.vertices_m for mesh in bodies.values()])
-    reach = float(np.linalg.norm(vertices[:, :2], axis=1).max())
+    reach = np.linalg.norm(vertices[:, :2], axis=1).max()
     if reach > ROOM_M:
         raise DomainError(
             f"robot: it reaches {reach:.3g} m from its origin, the drives of '{named.name}' have room for {ROOM_M:g} m; "
@@ -234,7 +234,7 @@ def _standing(named, bodies):
         lowest = float(vertices[:, 2].min()) + float(named.drive(0, 12)[0][..., 2, 3].min())
         if lowest < 0:
             raise DomainError(
-                f"robot: it reaches {-float(vertices[:, 2].min()):.3g} m below its origin, and the drives of '{named.name}' would "
+                f"robot: it reaches {-vertices[:, 2].min():.3g} m below its origin, and the drives of '{named.name}' would "
                 f"bring that {-lowest:.2g} m under the floor; put its origin lower, or give a world and a trajectory of your own."
             )
         return named.drive
@@ -250,24 +250,15 @@ def _standing(named, bodies):
 
 
 def _designs(own):
-    """Lowest, highest and first design."""
-    bounds = own.camera.bounds()
-    first = {name: getattr(own.start, name) for name in bounds}
-    first = {
-        name: sum(bounds[name]) / 2 if value is None else value for name, value in first.items()
-    }
     lens = (own.lens.focal_length_mm, own.lens.fno, 1 / own.lens.focus_m)
-    low, high = ({name: ends[k] for name, ends in bounds.items()} for k in (0, 1))
-    return [Design(*lens, **_in_radians(each)) for each in (low, high, first)]
-
-
-def _in_radians(numbers):
-    turns = {
-        name.replace("_deg", "_rad"): math.radians(v)
-        for name, v in numbers.items()
-        if "_deg" in name
-    }
-    return turns | {name: value for name, value in numbers.items() if name.endswith("_m")}
+    designs: list[dict[str, float]] = [{}, {}, {}]
+    for name, ends in own.camera.bounds().items():
+        given = getattr(own.start, name)
+        first = sum(ends) / 2 if given is None else given
+        for design, value in zip(designs, (*ends, first), strict=True):
+            turns = name.endswith("_deg")
+            design[name.replace("_deg", "_rad")] = math.radians(value) if turns else value
+    return [Design(*lens, **each) for each in designs]
 
 
 explain(globals())

@@ -43,6 +43,7 @@ from codesign.mount import (
     yaw_pitch_roll_rad,
 )
 from codesign.mount import Body as SolidBody
+from codesign.mount.pose import NAMES
 from codesign.pose import se3_exp
 from codesign.system import Batch, System
 from scenes import textures
@@ -191,8 +192,7 @@ class RobotPair:
     @property
     def ranges(self) -> MountRanges:
         """Bounds of the mount."""
-        names = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "roll_rad")
-        low, high = ([getattr(each, name) for name in names] for each in (self.low, self.high))
+        low, high = ([getattr(each, name) for name in NAMES] for each in (self.low, self.high))
         return MountRanges(low, high)
 
     def requirements(self) -> list[Requirement]:

@@ -109,8 +109,7 @@ def from_urdf(
     """
     path = Path(path)
     model = _model(path)
-    angles = _checked_angles(path, model, dict(joint_angles or {}))
-    model.update_cfg(angles)
+    model.update_cfg(_checked_angles(path, model, dict(joint_angles or {})))
     root = model.base_link if base is None else base
     names = [link.name for link in model.robot.links]
     if root not in names:

@@ -3,7 +3,7 @@ them smooth random functions of time whose integrals and products are known in c
 (Waves)."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -72,15 +72,10 @@ class Waves:
         def pairs(name, sign):
             return (getattr(self, name)[:, None] + sign * getattr(other, name)).reshape(-1)
 
-        mixed = (
-            Waves(0.0, amplitude, pairs("rate_rad_s", sign), pairs("phase_rad", sign))
-            for sign in (-1, 1)
-        )
-        total = self.scaled(other.mean).plus(
-            Waves(0.0, other.amplitude * self.mean, other.rate_rad_s, other.phase_rad)
-        )
-        for part in mixed:
-            total = total.plus(part)
+        total = self.scaled(other.mean).plus(replace(other.scaled(self.mean), mean=0.0))
+        for sign in (-1, 1):
+            mixed = pairs("rate_rad_s", sign), pairs("phase_rad", sign)
+            total = total.plus(Waves(0.0, amplitude, *mixed))
         return total
 
 
@@ -124,11 +119,7 @@ class Driving(Trajectory):
         yaw_rad=0.0,
     ):
         self.span_s = (0.0, positive("duration_s", duration_s, most=1e4))
-        if not (
-            math.isfinite(speed_m_s)
-            and math.isfinite(turn_rad_s)
-            and math.isfinite(x_m + y_m + yaw_rad + height_m)
-        ):
+        if not math.isfinite(speed_m_s + turn_rad_s + x_m + y_m + yaw_rad + height_m):
             raise DomainError("driving: speed, turn rate and start must be finite numbers.")
         positive("speed_share", speed_share, 0, 1, inclusive=True)
         self.track_m = positive("track_m", track_m)

@@ -75,11 +75,11 @@ def minimum_snap(points, t_s):
     check_finite(points, "waypoints")
     check_finite(t_s, "waypoint times")
     length = t_s.diff()
-    if bool((length <= 0).any()):
+    if (length <= 0).any():
         raise DomainError(f"waypoint times must increase strictly, got {t_s.tolist()}.")
-    if float(length.max() / length.min()) > LARGEST_RATIO:
+    if (length.max() / length.min()) > LARGEST_RATIO:
         raise DomainError(
-            f"the segments last from {float(length.min()):g} to {float(length.max()):g} s; let the longest "
+            f"the segments last from {length.min():g} to {length.max():g} s; let the longest "
             f"be at most {LARGEST_RATIO:g} times the shortest."
         )
     at_rest = [(order, np.zeros(points.shape[1])) for order in (1, 2, 3)]
@@ -120,16 +120,13 @@ class Flying(Trajectory):
         thrust = self._thrust(t)
         heading = self._heading(t)
         size = thrust.norm(dim=1)
-        if float(size.min()) < LEAST_THRUST * GRAVITY_M_S2:
+        if size.min() < LEAST_THRUST * GRAVITY_M_S2:
             at = float(t[size.argmin()])
             raise DomainError(
                 f"the flight comes within {LEAST_THRUST:g} g of free fall at {at:.3g} s, where its attitude "
                 "is undefined; allow more time between waypoints."
             )
-        if (
-            float(torch.linalg.cross(thrust / size[:, None], heading).norm(dim=1).min())
-            < LEVEL_ENOUGH
-        ):
+        if torch.linalg.cross(thrust / size[:, None], heading).norm(dim=1).min() < LEVEL_ENOUGH:
             raise DomainError(
                 "the flight tilts until its thrust points along its heading, where its attitude is "
                 "undefined; allow more time between waypoints."
@@ -149,13 +146,12 @@ class Flying(Trajectory):
         points = low + (high - low) * torch.rand(
             legs + 1, 3, generator=generator, dtype=torch.float64
         )
-        towards = (
-            points.diff(dim=0)[:, :2]
-            if target_m is None
-            else torch.tensor(target_m, dtype=torch.float64)[:2] - points[:, :2]
-        )
+        if target_m is None:
+            ways = points.diff(dim=0)
+            towards = torch.cat([ways, ways[-1:]])
+        else:
+            towards = torch.tensor(target_m, dtype=torch.float64) - points
         yaw = torch.atan2(towards[:, 1], towards[:, 0])
-        yaw = torch.cat([yaw, yaw[-1:]]) if target_m is None else yaw
         turns = torch.remainder(yaw.diff() + math.pi, 2 * math.pi) - math.pi  # the short way round
         yaw = yaw[0] + torch.cat([torch.zeros(1, dtype=torch.float64), turns.cumsum(0)])
         return Flying(points, yaw, torch.arange(legs + 1, dtype=torch.float64) * seconds_per_leg)

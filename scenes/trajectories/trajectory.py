@@ -64,11 +64,11 @@ class Trajectory(ABC):
             )
         check_finite(t, "trajectory times", "give finite seconds")
         if self.span_s is not None and not (
-            self.span_s[0] <= float(t.min()) and float(t.max()) <= self.span_s[1]
+            self.span_s[0] <= t.min() and t.max() <= self.span_s[1]
         ):
             raise DomainError(
                 f"the trajectory runs from {self.span_s[0]:g} to {self.span_s[1]:g} s, but times from "
-                f"{float(t.min()):g} to {float(t.max()):g} s were asked for; stay inside."
+                f"{t.min():g} to {t.max():g} s were asked for; stay inside."
             )
         return t
 

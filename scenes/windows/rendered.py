@@ -216,7 +216,7 @@ class RenderedWindows(Windows):
                 else ONE_PLANE[d.motion](draw, t, *size, d.flow_px)
             )
             motion = [Plane(layer) for layer in torch.from_numpy(matrices).float()]
-        blur_px = np.hypot(BLUR_LEAST_PX, draw.uniform(d.blur_px[0], d.blur_px[1]))
+        blur_px = np.hypot(BLUR_LEAST_PX, draw.uniform(*d.blur_px))
         layers = []
         for number, moved in enumerate(motion):
             crop, place = self._texture(draw, number > 0, blur_px)
@@ -226,8 +226,8 @@ class RenderedWindows(Windows):
         rate = log_uniform(draw, *d.noise) * 8 if d.noise[1] > 0 else 0.0
         events = draw.poisson(rate * 2 * shape[0] * shape[1])
         noise = np.stack([draw.integers(0, high, events) for high in (self.intervals, 2, *shape)])
-        distortion = draw.uniform(d.distortion[0], d.distortion[1])
-        contrast = float(draw.uniform(d.contrast[0], d.contrast[1]))
+        distortion = draw.uniform(*d.distortion)
+        contrast = draw.uniform(*d.contrast)
         ratio = log_uniform(draw, *d.on_over_off) ** 0.5
         thetas *= np.array([ratio, 1 / ratio])[:, None, None]
         return Sample(
@@ -280,13 +280,10 @@ class RenderedWindows(Windows):
         at = pixels(self.height_px, self.width_px)
 
         def look(layer):
-            return (self._distorted(layer.motion.end(points), sample.distortion) - at).movedim(
-                -1, 0
-            ), points
+            end = self._distorted(layer.motion.end(points), sample.distortion)
+            return (end - at).movedim(-1, 0), points
 
-        return topmost(sample.layers, look), torch.ones(
-            self.height_px, self.width_px, dtype=torch.bool
-        )
+        return topmost(sample.layers, look), torch.ones(at.shape[:2], dtype=torch.bool)
 
 
 class PacketWindows(RenderedWindows):
@@ -376,10 +373,9 @@ class DiscWindows(RenderedWindows):
 
 def _shift(draw, t, length_px):
     angle = draw.uniform(0, 2 * np.pi)
+    way = draw.uniform(*length_px) * np.array([np.cos(angle), np.sin(angle)])
     matrices = np.tile(np.eye(3), (len(t), 1, 1))
-    matrices[:, :2, 2] = np.outer(
-        t, draw.uniform(*length_px) * np.array([np.cos(angle), np.sin(angle)])
-    )
+    matrices[:, :2, 2] = np.outer(t, way)
     return Plane(torch.from_numpy(matrices).float())
 
 

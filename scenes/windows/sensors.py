@@ -106,7 +106,7 @@ class SensorWindows(RenderedWindows):
                 log_uniform(draw, *s.shot_rate_hz), NOISE_SHARE * density / duration_s
             ),
             refractory_s=log_uniform(draw, *s.refractory_s),
-            hot_pixel_share=float(draw.uniform(0, s.hot_share)),
+            hot_pixel_share=draw.uniform(0, s.hot_share),
             hot_pixel_rate_hz=log_uniform(draw, *s.hot_rate_hz),
         )
         level = frames.clamp_min(DARKEST).log()

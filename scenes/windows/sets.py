@@ -20,6 +20,7 @@ from scenes.windows.rendered import (
     planes,
 )
 from scenes.windows.sensors import Sensors, SensorWindows
+from scenes.windows.worlds import WorldWindows
 
 UNSEEN = 1_000_000  # added to the seed of what networks are judged on
 SIDE_PX = 96
@@ -121,6 +122,17 @@ HARSH: dict[str, Make] = {
 """Families that estimators of flow fail on: approach, roll, bodies before still ground, stripes,
 motion that turns back, packets of few events, and noise alone. Name -> function (seed, bins) ->
 source."""
+
+
+def judging(
+    seed: int, bins: int, windows: int, world_windows: int, real_windows: int, more=SETS
+) -> dict[str, tuple[Windows, int]]:
+    """Name -> source and number of windows of what estimators are judged on: VALIDATION at 64 x 64
+    pixels, the 3-D worlds, and further sets."""
+    shape = Shape(64, 64, bins)
+    found = {name: (make(shape, seed), windows) for name, make in VALIDATION.items()}
+    found["worlds"] = (WorldWindows(seed=UNSEEN + seed, bins=bins), world_windows)
+    return found | {name: (make(UNSEEN + seed, bins), real_windows) for name, make in more.items()}
 
 
 @dataclass(frozen=True)

@@ -85,8 +85,7 @@ def turning(duration_s=0.3, size_px=(180, 240), seed=0) -> Recording:
         angles = TURN_RAD * (np.sin(swing) - np.sin(TURN_PHASE))
         return k @ Rotation.from_rotvec(angles).as_matrix() @ np.linalg.inv(k)
 
-    draw = np.random.default_rng((31, seed))
-    layers = [_layer(draw, move, "coffee", size_px, False)]
+    layers = [_layer(np.random.default_rng((31, seed)), move, "coffee", size_px, False)]
     return _recorded("turning", layers, duration_s, size_px, seed)
 
 

@@ -43,33 +43,25 @@ def study(run: Run[Config]):
     config = run.config
     published = lens.load(config.lens)
     geo = published.scaled(11.0 / float(published.first_order().efl_mm.detach())).freeze()
+    size = config.width_px, config.height_px, PITCH_MM
     system = System(
-        camera=render.Camera(
-            geo, config.width_px, config.height_px, PITCH_MM, config.samples, config.seed
-        ),
+        camera=render.Camera(geo, *size, config.samples, config.seed),
         events=events.HardSensor(events.SensorModel(theta_on=0.15, theta_off=0.15), 8),
         flow=flow.load("refiner"),
-        objectives={
-            "endpoint error": lambda field, truth: flow.metrics.aee(
-                field.flow_px, truth.flow_px, truth.valid
-            )
-        },
+        objectives={"endpoint error": endpoint_error},
         scene=worlds.room(),
     )
     t_s = torch.linspace(0, DURATION_S, 33, dtype=torch.float64)
     # m/s and rad/s in camera axes
     twist = torch.tensor([0.5, -0.1, 1.0, 0.0, 0.1, 0.25], dtype=torch.float64)
-    batch = Batch(
-        trajectories.body_twist(pose.look_at((0.1, -1.5, 0.7), (0.0, 1.0, 0.35)), twist, t_s), t_s
-    )
+    start = pose.look_at((0.1, -1.5, 0.7), (0.0, 1.0, 0.35))
+    batch = Batch(trajectories.body_twist(start, twist, t_s), t_s)
     with run.progress(1, "one pass") as bar, torch.no_grad():
         seen = system.begin(batch)
-        error = float(
-            flow.metrics.aee(seen["field"].flow_px, seen["truth"].flow_px, seen["truth"].valid)
-        )
+        true = seen["truth"]
+        error = endpoint_error(seen["field"], true)
         bar.advance(error_px=error)
-    true = seen["truth"]
-    moved = float(true.flow_px.square().sum(1).sqrt()[true.valid].mean())
+    moved = true.flow_px.square().sum(1).sqrt()[true.valid].mean()
     run.record(
         endpoint_error_px=error, true_motion_px=moved, events=float(seen["volume"].counts.sum())
     )
@@ -90,6 +82,10 @@ def study(run: Run[Config]):
         f"The estimated flow is off by {error:.2f} px where the picture moves by {moved:.2f} px: one pass from glass to "
         "flow, with the hard sensor.",
     )
+
+
+def endpoint_error(field, truth):
+    return flow.metrics.aee(field.flow_px, truth.flow_px, truth.valid)
 
 
 def _each_stage(run, seen, t_s):

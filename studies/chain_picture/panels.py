@@ -78,13 +78,11 @@ def overlay(frame: Tensor, fields: dict[str, FlowField], every_px: int) -> Figur
     y, x = torch.meshgrid(
         *(torch.arange(every_px // 2, n, every_px) for n in frame.shape), indexing="ij"
     )
+    how = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.004, "color": "#d95f02"}
     for axis, (title, field) in zip(np.atleast_1d(axes), fields.items(), strict=True):
         draw_image(axis, frame, [frame])
         seen = field.valid[0, y, x]
-        u, v = field.flow_px[0, :, y, x].detach()[:, seen]
-        axis.quiver(
-            x[seen], y[seen], u, v, color="#d95f02", angles="xy", scale_units="xy", scale=1, width=0.004
-        )  # fmt: skip
+        axis.quiver(x[seen], y[seen], *field.flow_px[0, :, y, x].detach()[:, seen], **how)
         axis.set_title(title, fontsize=10)
     return figure
 
@@ -151,12 +149,9 @@ def smoothing(cutoffs_hz: Iterable[float]) -> list[Panel]:
 
 def thresholds(frames: Tensor, t_s: Tensor, thetas: Sequence[float]) -> Panel:
     """Events of the drive per polarity over the contrast threshold, and a line of their inverse."""
-    found = torch.stack(
-        [
-            events.dense_counts(frames, t_s, events.SensorModel(theta, theta)).sum((0, 2, 3))
-            for theta in thetas
-        ]
-    )
+    sensors = [events.SensorModel(theta, theta) for theta in thetas]
+    counts = [events.dense_counts(frames, t_s, sensor).sum((0, 2, 3)) for sensor in sensors]
+    found = torch.stack(counts)
     series = {name: (thetas, found[:, k].numpy()) for k, name in enumerate(POLARITIES)}
     inverse = float(found[0].mean()) * thetas[0] / np.array(thetas)
     return Panel(

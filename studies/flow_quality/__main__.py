@@ -5,8 +5,10 @@ no choice, with hard events.
 ``--sets cells`` judges on single planes, one threshold and one level of noise at a time.
 """
 
+import math
 import sys
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -18,8 +20,8 @@ from codesign.report.flow_colours import flow_colours
 from codesign.report.prose import counted
 from codesign.train.validation import batches
 from scenes.windows.rendered import planes
-from scenes.windows.sets import HARSH, SETS, UNSEEN, VALIDATION, Shape
-from scenes.windows.worlds import ALL, WorldWindows
+from scenes.windows.sets import HARSH, SETS, Shape, judging
+from scenes.windows.worlds import ALL
 from studies.flow_quality import recordings
 from studies.flow_quality.estimators import estimators
 from studies.flow_quality.measures import figures, join, mean_of_known, measure
@@ -186,23 +188,14 @@ def judged(config, bins):
 
     Raises: DomainError for an unknown name.
     """
-    shape = Shape(64, 64, bins)
-    seed = SEED + config.seed
-    found = {name: (make(shape, seed), config.windows) for name, make in VALIDATION.items()}
-    found["worlds"] = (WorldWindows(ALL, seed=UNSEEN + seed, bins=bins), config.world_windows)
-    for name, make in (SETS | HARSH).items():
-        found[name] = (make(UNSEEN + seed, bins), config.real_windows)
+    counts = config.windows, config.world_windows, config.real_windows
+    found = judging(SEED + config.seed, bins, *counts, SETS | HARSH)
     if not config.sets:
         return found
-    cells = {
-        f"{kind}_theta_{theta:g}_noise_{noise:g}": (
-            shape(planes(kind, theta, (noise, noise)), config.seed + 1),
-            config.windows,
-        )
-        for kind in ("fine", "mixed")
-        for theta in (0.1, 0.2)
-        for noise in NOISE
-    }
+    cells = {}
+    for kind, theta, noise in product(("fine", "mixed"), (0.1, 0.2), NOISE):
+        source = Shape(64, 64, bins)(planes(kind, theta, (noise, noise)), config.seed + 1)
+        cells[f"{kind}_theta_{theta:g}_noise_{noise:g}"] = (source, config.windows)
     chosen = [each for name in config.sets for each in (cells if name == "cells" else (name,))]
     unknown = [name for name in chosen if name not in found | cells]
     if unknown:
@@ -222,29 +215,22 @@ def _measured(source, number, who, progress):
         for name, field in fields.items():
             parts[name].append(measure(field, windows))
         density.append(windows.volume.counts.sum((1, 2)).mean((1, 2)))
-        shown += [(windows, fields, k) for k in range(len(windows.truth.valid))]
-        for _ in windows.truth.valid:
+        for k in range(len(windows.truth.valid)):
+            shown.append((windows, fields, k))
             progress.advance()
     return {name: join(mine) for name, mine in parts.items()}, torch.cat(density), shown[:SHOWN]
 
 
 def _record(run, name, found, density, rows):
     zero = rows[START]["zero_px"]
-    run.record(
-        **{
-            f"{name}_windows": len(zero),
-            f"{name}_zero_flow_px": zero.mean(),
-            f"{name}_events_per_px_median": density.median(),
-            f"{name}_refiner_over_closed_form": found[BEST]["aee_px"] / found[START]["aee_px"],
-        }
-    )
-    run.record(
-        **{
-            f"{name}_{who}_{key}": value
-            for who, mine in found.items()
-            for key, value in mine.items()
-        }
-    )
+    told = {
+        "windows": len(zero),
+        "zero_flow_px": zero.mean(),
+        "events_per_px_median": density.median(),
+        "refiner_over_closed_form": found[BEST]["aee_px"] / found[START]["aee_px"],
+    }
+    told |= {f"{who}_{key}": value for who, mine in found.items() for key, value in mine.items()}
+    run.record(**{f"{name}_{key}": value for key, value in told.items()})
     run.card(
         name.replace("_", " "),
         f"{found[BEST]['ratio']:.3f} x zero flow",
@@ -255,31 +241,31 @@ def _record(run, name, found, density, rows):
 def _tables(run, found, about, who):
     rows = []
     for name, (density, measured) in about.items():
-        shares = [round(float(density.quantile(share)), 3) for share in (0.5, 0.05, 0.95)]
-        zero = round(float(measured[START]["zero_px"].mean()), 2)
-        rows.append([name.replace("_", " "), len(density), *shares, zero])
+        shares = density.quantile(density.new_tensor([0.5, 0.05, 0.95])).tolist()
+        zero = round(measured[START]["zero_px"].mean(), 2)
+        rows.append([name.replace("_", " "), len(density), *(round(x, 3) for x in shares), zero])
     run.table(
         "Sets", ["set", "windows", "events per px, median", "5 %", "95 %", "mean flow, px"], rows
     )
+    for name, mine in found.items():
+        truth = mean_of_known(about[name][1][START]["truth_fwl"])
+        mine["true flow"] = {} if math.isnan(truth) else {"sharpness": truth}
     for key, (title, note, digits) in FIGURES.items():
-        rows = []
-        for name, mine in found.items():
-            cells = [_cell(each, key, digits) for each in mine.values()]
-            if key == "sharpness":
-                truth = mean_of_known(about[name][1][START]["truth_fwl"])
-                cells.append(f"{truth:.{digits}f}" if truth == truth else None)
-            rows.append([name.replace("_", " "), *cells])
-        extra = ["true flow"] if key == "sharpness" else []
-        run.table(title, ["set", *(name.replace("_", " ") for name in who), *extra], rows, note)
+        shown = [*who, "true flow"] if key == "sharpness" else [*who]
+        rows = [
+            [name.replace("_", " "), *(_cell(mine[each], key, digits) for each in shown)]
+            for name, mine in found.items()
+        ]
+        run.table(title, ["set", *(name.replace("_", " ") for name in shown)], rows, note)
 
 
 def _cell(figures, key, digits):
     if key not in figures:
         return None
-    interval = (
-        f" ({figures['ratio_low']:.3f} to {figures['ratio_high']:.3f})" if key == "ratio" else ""
-    )
-    return f"{figures[key]:.{digits}f}{interval}"
+    said = f"{figures[key]:.{digits}f}"
+    if key != "ratio":
+        return said
+    return f"{said} ({figures['ratio_low']:.3f} to {figures['ratio_high']:.3f})"
 
 
 def _worlds(run, measured):

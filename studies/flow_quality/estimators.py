@@ -11,6 +11,7 @@ from skimage.registration import optical_flow_ilk, optical_flow_tvl1
 from torch.nn.functional import grid_sample
 
 from codesign import flow
+from codesign.flow.warp import pixel_grid
 from codesign.types import EventVolume, FlowField
 
 FRAME_METHODS = {"ilk_frames": optical_flow_ilk, "tvl1_frames": optical_flow_tvl1}
@@ -62,13 +63,10 @@ def plain_lk(volume: EventVolume) -> FlowField:
     share = (volume.collected_s / span).to(counts)[:, None, None]
     time = (volume.centroid_s / span).to(counts)[:, None, None] - 0.5
     rate = (counts[:, 0] - counts[:, 1]) / share
-    y, x = torch.meshgrid(
-        torch.arange(height).to(counts), torch.arange(width).to(counts), indexing="ij"
-    )
+    x, y = pixel_grid(height, width, counts)
     half = max(height, width) / 2
-    basis = torch.stack(
-        [torch.ones_like(x), (x - (width - 1) / 2) / half, (y - (height - 1) / 2) / half]
-    )
+    across, down = (x - (width - 1) / 2) / half, (y - (height - 1) / 2) / half
+    basis = torch.stack([torch.ones_like(x), across, down])
     parameters = torch.zeros(batch, 2, 3).to(counts)
     for sigma in LEVELS_PX:
         size = 2 * int(3 * sigma + 0.5) + 1

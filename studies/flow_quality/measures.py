@@ -86,7 +86,6 @@ def of_claim(miss, covariance, doubt, random) -> dict[str, float]:
 
 
 def join(parts: Sequence[Rows]) -> Rows:
-    """Rows of several batches as one."""
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
@@ -112,7 +111,7 @@ def figures(rows: Rows) -> dict[str, float]:
         "ause": np.trapezoid(ours - best, SHARES),
         "sharpness": mean_of_known(rows["fwl"]),
     }
-    return {name: float(value) for name, value in found.items() if not np.isnan(value)}
+    return {name: value for name, value in found.items() if not np.isnan(value)}
 
 
 def curves(rows: Rows) -> tuple[np.ndarray, np.ndarray]:

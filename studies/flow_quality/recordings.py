@@ -3,6 +3,7 @@ flow, and those the user names."""
 
 import itertools
 import statistics
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -61,37 +62,25 @@ def cases(config, say):
     """Cases of all recordings, the made ones first; a recording with too few events for a packet
     says so."""
     found, left_out = [], []
-    for make, turns in ((turning, True), (sliding, False)):
+    for make, assumed in ((turning, "rotation"), (sliding, "affine")):
         recording = make(seed=config.seed)
         for count in config.packet_events:
-            packets = cut(recording, count, config.packets)
-            assumed = "rotation" if turns else "affine"
-            found += [
-                Case(
-                    _kind(recording.name, count),
-                    p,
-                    partial(in_context, recording, p, turns),
-                    assumed,
-                )
-                for p in packets
-            ]
-    names = named(config.recording)
-    for path, name in zip(config.recording, names, strict=True):
+            kind = _kind(recording.name, count)
+            for p in cut(recording, count, config.packets):
+                seek = partial(in_context, recording, p, assumed == "rotation")
+                found.append(Case(kind, p, seek, assumed))
+    seek, assumed = sharpest.affine, "affine"
+    if config.focal_px:
+        seek, assumed = partial(sharpest.rotation, focal_px=config.focal_px), "rotation"
+    for path, name in zip(config.recording, named(config.recording), strict=True):
         for count in config.packet_events:
+            options = PacketOptions(events=count, count=config.packets)
             try:
-                packets = read_packets(
-                    path, None, PacketOptions(events=count, count=config.packets)
-                )
+                packets = read_packets(path, None, options)
             except DomainError as error:
                 say(f"{path}, packets of {count} events: left out: {error}")
                 left_out.append(f"{name}, packets of {count} events: {error}")
                 continue
-            seek = (
-                partial(sharpest.rotation, focal_px=config.focal_px)
-                if config.focal_px
-                else sharpest.affine
-            )
-            assumed = "rotation" if config.focal_px else "affine"
             kind = _kind(name, count)
             found += [Case(kind, p, partial(seek, p), assumed) for p in packets]
     return found, left_out
@@ -118,7 +107,6 @@ def _kind(name, count):
 
 
 def cut(recording, count, packets):
-    """Packets spread over a made recording."""
     stream = recording.stream
     total = len(stream)
     firsts = np.linspace(EDGE * total, (1 - EDGE) * total - count, packets).astype(int)
@@ -159,7 +147,7 @@ def judged(packet, mask, flow_px, sharpest_px=None):
     if sharpest_px is not None:
         found["distance_px"] = float(metrics.aee(flow_px, sharpest_px.to(flow_px), mask))
     truth = true_flow(packet)
-    if truth is not None and bool((both := truth.valid & mask).any()):
+    if truth is not None and (both := truth.valid & mask).any():
         found["aee_px"] = float(metrics.aee(flow_px, truth.flow_px, both))
     return found
 
@@ -185,12 +173,11 @@ def measured(case, who, bins):
 
 def show(run, who, bins, todo, left_out):
     """Measure the cases, record, and show on the page, with what was left out."""
-    found = {}
-    cases_of = {}
+    found, cases_of = defaultdict(list), defaultdict(list)
     with run.progress(len(todo), "packets") as progress:
         for case in todo:
-            found.setdefault(case.kind, []).append(measured(case, who, bins))
-            cases_of.setdefault(case.kind, []).append(case)
+            found[case.kind].append(measured(case, who, bins))
+            cases_of[case.kind].append(case)
             progress.advance()
     for kind, packets in found.items():
         record(run, kind, packets)
@@ -207,11 +194,10 @@ def show(run, who, bins, todo, left_out):
         )
     rows = []
     for kind, mine in cases_of.items():
-        stream = mine[0].packet.stream
-        length_ms = statistics.fmean(
-            1e-3 * (each.packet.t1_us - each.packet.t0_us) for each in mine
-        )
-        density = statistics.fmean(len(each.packet.stream) for each in mine)
+        packets = [each.packet for each in mine]
+        stream = packets[0].stream
+        length_ms = statistics.fmean(1e-3 * (each.t1_us - each.t0_us) for each in packets)
+        density = statistics.fmean(len(each.stream) for each in packets)
         density /= stream.height_px * stream.width_px
         rows.append([kind, len(mine), round(length_ms, 2), round(density, 3), mine[0].assumed])
     run.table(
@@ -234,7 +220,6 @@ def show(run, who, bins, todo, left_out):
 
 
 def record(run, kind, packets):
-    """Means and extremes over the packets of a kind."""
     for name in sorted({name for rows in packets for name in rows}):
         for measure, (_, _, extreme, worst) in MEASURES.items():
             values = _values(packets, name, measure)

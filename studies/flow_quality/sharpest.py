@@ -5,6 +5,7 @@ Source: Gallego, Rebecq, Scaramuzza, A unifying contrast maximization framework 
 CVPR 2018, with an image for each polarity.
 """
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,7 +122,7 @@ class _Events:
             )
         self.height = stream.height_px
         self.width = stream.width_px
-        self.corner_px = float(np.hypot(self.height, self.width) / 2)
+        self.corner_px = np.hypot(self.height, self.width) / 2
         self.x = stream.x.numpy() - (self.width - 1) / 2
         self.y = stream.y.numpy() - (self.height - 1) / 2
         self.on = (stream.p.numpy() > 0).astype(int)
@@ -129,11 +130,10 @@ class _Events:
 
     def some(self, count):
         """Every so many-th event."""
-        other = object.__new__(_Events)
-        every = slice(None, None, max(1, len(self.x) // count))
-        vars(other).update(
-            vars(self), **{name: getattr(self, name)[every] for name in ("x", "y", "t", "on")}
-        )
+        other = copy.copy(self)
+        every = max(1, len(self.x) // count)
+        for name in ("x", "y", "t", "on"):
+            setattr(other, name, getattr(self, name)[::every])
         return other
 
     def pixels(self):

@@ -26,6 +26,11 @@ from studies.frame.run import Run, StudyConfig, main
 from studies.train_flow import peers  # noqa: F401  which network files know
 
 SHOWN = 4  # packets with pictures
+# options of the packets, by the same name
+PASSED = (
+    *("start_s", "events", "columns", "time_unit", "truth_unit", "gyro_axes"),
+    *("calibration", "truth_pixels", "skip"),
+)
 MADE_PX = (180, 240)  # of the synthetic recording
 MADE_QUICK_PX = (90, 120)
 
@@ -130,10 +135,10 @@ def filmed(run, recording, estimators, read):
 def load(name):
     """{name: (estimator, bins it needs, None: any)}."""
     closed_form = {"lk": (partial(flow.estimate_lk, clock="events"), None)}
-    if name == "lk":
+    if name == "auto" and DELIVERED["refiner"].is_file():
+        return closed_form | load("refiner")
+    if name in ("lk", "auto"):
         return closed_form
-    if name == "auto":
-        return closed_form | load("refiner") if DELIVERED["refiner"].is_file() else closed_form
     network = load_network(name).requires_grad_(False)
     return {
         name if name == "refiner" else Path(name).stem: (network, network.config.get("bins", 8))
@@ -141,7 +146,6 @@ def load(name):
 
 
 def options(config):
-    """PacketOptions of the command line."""
     height, width = config.height_px, config.width_px
     if (width is None) != (height is None):
         raise DomainError("give both --width-px and --height-px, or neither.")
@@ -151,22 +155,10 @@ def options(config):
         size = MADE_QUICK_PX if config.quick else MADE_PX
         if config.events is None:
             window_ms = window_ms or 20.0
-    seconds = [None if ms is None else ms * 1e-3 for ms in (window_ms, config.truth_interval_ms)]
-    return PacketOptions(
-        window_s=seconds[0],
-        start_s=config.start_s,
-        count=config.packets,
-        events=config.events,
-        size_px=size,
-        columns=config.columns,
-        time_unit=config.time_unit,
-        truth_unit=config.truth_unit,
-        truth_interval_s=seconds[1],
-        gyro_axes=config.gyro_axes,
-        calibration=config.calibration,
-        truth_pixels=config.truth_pixels,
-        skip=config.skip,
-    )
+    times_ms = {"window_s": window_ms, "truth_interval_s": config.truth_interval_ms}
+    times_s = {name: None if ms is None else ms * 1e-3 for name, ms in times_ms.items()}
+    same = {name: getattr(config, name) for name in PASSED}
+    return PacketOptions(count=config.packets, size_px=size, **times_s, **same)
 
 
 @torch.no_grad()
@@ -185,18 +177,24 @@ def measured(packet, estimate, bins):
             )
         both = packet.truth.valid & metrics.event_mask(volume)
         # what rotation alone says is no truth where the camera translates
-        if not packet.translates:
-            found |= errors(field.flow_px, truth, packet.truth.valid, both)
-        elif bool(both.any()):
-            found["rotation_difference_px"] = float(metrics.aee(field.flow_px, truth, both))
+        pair = field.flow_px, truth
+        if both.any() and packet.translates:
+            found["rotation_difference_px"] = metrics.aee(*pair, both)
+        elif both.any():
+            found["aee_px"] = metrics.aee(*pair, both)
+            found["zero_aee_px"] = metrics.aee(torch.zeros_like(truth), truth, both)
+            found["outlier_percent"] = metrics.outlier_percent(*pair, both)
+            found["angular_error_deg"] = metrics.angular_error_deg(*pair, both)
+        if packet.truth.valid.any() and not packet.translates:
+            found["aee_dense_px"] = metrics.aee(*pair, packet.truth.valid)
         known = _where(packet.stream, packet.truth.valid[0])
         if len(known):
-            found["truth_fwl"] = float(metrics.fwl(known, truth, *span))
-            found["fwl_where_known"] = float(metrics.fwl(known, field.flow_px, *span))
+            found["truth_fwl"] = metrics.fwl(known, truth, *span)
+            found["fwl_where_known"] = metrics.fwl(known, field.flow_px, *span)
     if len(packet.stream):
-        found["fwl"] = float(metrics.fwl(packet.stream, field.flow_px, *span))
-        found["rsat"] = float(metrics.rsat(packet.stream, field.flow_px, *span))
-    return field, found
+        found["fwl"] = metrics.fwl(packet.stream, field.flow_px, *span)
+        found["rsat"] = metrics.rsat(packet.stream, field.flow_px, *span)
+    return field, {name: float(value) for name, value in found.items()}
 
 
 def _where(stream, valid):
@@ -205,20 +203,6 @@ def _where(stream, valid):
     return replace(
         stream, **{name: getattr(stream, name)[kept] for name in ("t_us", "x", "y", "p")}
     )
-
-
-def errors(flow_px, truth, valid, both):
-    """{figure: value} of the errors where the truth is valid, and where events are too
-    (``both``)."""
-    found = {}
-    if bool(both.any()):
-        found["aee_px"] = float(metrics.aee(flow_px, truth, both))
-        found["zero_aee_px"] = float(metrics.aee(torch.zeros_like(truth), truth, both))
-        found["outlier_percent"] = float(metrics.outlier_percent(flow_px, truth, both))
-        found["angular_error_deg"] = float(metrics.angular_error_deg(flow_px, truth, both))
-    if bool(valid.any()):
-        found["aee_dense_px"] = float(metrics.aee(flow_px, truth, valid))
-    return found
 
 
 if __name__ == "__main__":

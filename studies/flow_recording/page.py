@@ -1,6 +1,7 @@
 """The page of a recording: figures and their means, pictures, and what they do not say: windows and
 events left out, and why a true flow may be none."""
 
+import operator
 import statistics
 
 import torch
@@ -51,13 +52,7 @@ def show(run, packets, rows, names, film):
     notes = " ".join(f"{note}." for note in packets[0].notes)
     run.section("Packets", f"{made_up if synthetic else ''}{notes}")
     table = [
-        (
-            packet.name,
-            _ms(packet),
-            len(packet.stream),
-            name,
-            *(found.get(figure) for figure in UNITS),
-        )
+        (packet.name, _ms(packet), len(packet.stream), name, *map(found.get, UNITS))
         for packet, name, found in rows
     ]
     run.table(
@@ -67,7 +62,7 @@ def show(run, packets, rows, names, film):
         "AEE, outliers (above 3 px and 5 % of the true length) and angles where events are and the truth "
         "is valid, unless said otherwise. FWL above 1: sharper than without flow; RSAT below 1 likewise.",
     )
-    table = [(name, *(mine.get(figure) for figure in UNITS)) for name, mine in means.items()]
+    table = [(name, *map(mine.get, UNITS)) for name, mine in means.items()]
     run.table("Means over packets", ("estimator", *UNITS.values()), table)
     for sentence in doubts(packets, rows, best):
         run.text(sentence)
@@ -110,21 +105,16 @@ def _means(found):
     values = {figure: [each[figure] for each in found if figure in each] for figure in UNITS}
     means = {figure: statistics.fmean(each) for figure, each in values.items() if each}
     if sharp := values["fwl"]:
-        means |= {
-            "fwl_least": min(sharp),
-            "fwl_above_1_share": statistics.fmean(value > 1 for value in sharp),
-        }
+        means["fwl_least"] = min(sharp)
+        means["fwl_above_1_share"] = statistics.fmean(value > 1 for value in sharp)
     if "aee_px" in means:
-        worse = [
-            ours > zero for ours, zero in zip(values["aee_px"], values["zero_aee_px"], strict=True)
-        ]
+        worse = map(operator.gt, values["aee_px"], values["zero_aee_px"])
         means["worse_than_zero_share"] = statistics.fmean(worse)
     return means
 
 
 def counts(packets, rows, name):
-    """{metric: number} of the faults of a recording and of its packets. name: the estimator that is
-    compared with the truth."""
+    """{metric: number} of the faults of a recording. name: the estimator held against the truth."""
     return {
         "packets_without_events": sum(not len(packet.stream) for packet in packets),
         "packets_without_truth": sum(packet.truth is None for packet in packets),
@@ -140,22 +130,19 @@ def counts(packets, rows, name):
 def doubts(packets, rows, name):
     """Paragraphs for the page, those alone that concern this recording."""
     found = counts(packets, rows, name)
-    empty = found["packets_without_events"]
-    blind = found["packets_without_truth"]
+    empty, blind, gaps = (
+        found[f"packets_{what}"] for what in ("without_events", "without_truth", "across_gaps")
+    )
     left_out = [
         f"{number} {fault.replace('_', ' ')}"
         for fault, number in packets[0].left_out.items()
         if number
     ]
-    gaps = found["packets_across_gaps"]
     moving = [packet.name for packet in packets if packet.translates]
     distorted_px = found["truth_undistorted_doubt_px"]
     sharper = _sharper(rows, name)
-    blurred = [
-        packet.name
-        for packet, one, figures in rows
-        if one == name and figures.get("truth_fwl", 1) < 1
-    ]
+    mine = [(packet.name, figures) for packet, one, figures in rows if one == name]
+    blurred = [packet for packet, figures in mine if figures.get("truth_fwl", 1) < 1]
     sentences = (
         (
             empty or blind,
@@ -222,16 +209,14 @@ def pictures(packet, fields):
     still = _warped(packet, torch.zeros(1, 2, packet.stream.height_px, packet.stream.width_px))
     truth = packet.truth
     longest = None
-    if truth is not None and bool(truth.valid.any()):
+    if truth is not None and truth.valid.any():
         longest = float(truth.flow_px.abs().amax(1)[truth.valid].max())
     rows = {}
     for name, field in fields.items():
         full = longest or max(float(field.flow_px.abs().max()), 1e-6)
-        known = (
-            field.valid[0]
-            if field.confidence is None
-            else field.valid[0] & (field.confidence[0] > 0)
-        )
+        known = field.valid[0]
+        if field.confidence is not None:
+            known = known & (field.confidence[0] > 0)
         row = rows[f"{name}, full colour {full:.1f} px"] = {
             "events as they came": still,
             "warped by the flow": _warped(packet, field.flow_px),
@@ -250,6 +235,5 @@ def _colours(flow_px, known, full):
 def _warped(packet, flow_px):
     if not len(packet.stream):
         return torch.zeros(flow_px.shape[2:])
-    return count_image(stream_tracks(packet.stream, flow_px, packet.t0_us, packet.t1_us), 1.0)[
-        0
-    ].sum(0)
+    tracks = stream_tracks(packet.stream, flow_px, packet.t0_us, packet.t1_us)
+    return count_image(tracks, 1.0)[0].sum(0)

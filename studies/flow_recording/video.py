@@ -60,13 +60,10 @@ def write(run, held, tracker, name, start_s):
             spent_ms.append(1e3 * window.processor_s)
             progress.advance()
     speeds = np.concatenate([np.hypot(one.u, one.v)[one.sure > SURE] for one in found])
-    full = max(float(np.quantile(speeds, FULL)), 1e-6) if len(speeds) else 1.0
+    full = max(np.quantile(speeds, FULL), 1e-6) if len(speeds) else 1.0
     path = run.path("flow.mp4")
-    write_video(
-        path,
-        pictures(held, found, cell, full, tracker.real_time_factor, name),
-        run.config.video_fps,
-    )
+    made = pictures(held, found, cell, full, tracker.real_time_factor, name)
+    write_video(path, made, run.config.video_fps)
     metrics = {
         "video_windows": len(found),
         "video_events": tracker.events,
@@ -105,16 +102,8 @@ def arrows(held, window, cell):
     u, v = flow[0, :, y, x].numpy() / seconds
     confidence = (weighed / share.clamp_min(1e-9))[0, 0, y, x].numpy()
     middle = (cell - 1) / 2
-    return Arrows(
-        window.t0_us,
-        window.t1_us,
-        window.events,
-        x * cell + middle,
-        y * cell + middle,
-        u,
-        v,
-        confidence,
-    )
+    places = x * cell + middle, y * cell + middle
+    return Arrows(window.t0_us, window.t1_us, window.events, *places, u, v, confidence)
 
 
 def pictures(held, found, cell, full, factor, name):
@@ -139,16 +128,8 @@ def pictures(held, found, cell, full, factor, name):
         colours = np.zeros((int(clear.sum()), 4))
         colours[:, 3] = FAINT + (1 - FAINT) * (one.sure[clear] - SURE) / (1 - SURE)
         length = np.stack([one.u, one.v])[:, clear] * (cell / full)
-        axis.quiver(
-            one.x_px[clear],
-            one.y_px[clear],
-            *length,
-            angles="xy",
-            scale_units="xy",
-            scale=1,
-            color=colours,
-            width=0.0025,
-        )
+        how = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.0025}
+        axis.quiver(one.x_px[clear], one.y_px[clear], *length, color=colours, **how)
         axis.set_xlim(-0.5, held.width_px - 0.5)
         axis.set_ylim(held.height_px - 0.5, -0.5)
         title = (

@@ -90,7 +90,6 @@ def turns(
     rounds: int,
     repeats: int = 1,
     warm: int = 1,
-    after_each: Callable[[], object] | None = None,
 ) -> dict[Key, Timing]:
     """Times of several functions, each ``repeats`` times in every round, so that what else the
     machine does meets all.
@@ -100,15 +99,12 @@ def turns(
       rounds: turns of each.
       repeats: timed calls of a turn.
       warm: untimed calls before each turn; one more before the first, which compiles.
-      after_each: called after every turn of every function.
     """
     found: dict[Key, Timing] = {}
     for number in range(rounds):
         for name, work in works.items():
             timing = measure(work, repeats, warm if number else warm + 1)
             found[name] = found[name] + timing if name in found else timing
-            if after_each:
-                after_each()
     return found
 
 
@@ -203,11 +199,9 @@ def peak_mb(function: Callable[[], object]) -> float:
     before = resident_mb()
     result = function()
     try:
-        line = next(
-            x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith("VmHWM")
-        )
-        largest = int(line.split()[1]) * 1024 / 1e6
-    except (OSError, StopIteration):
+        told = Path("/proc/self/status").read_text().partition("VmHWM:")[2]
+        largest = int(told.split()[0]) * 1024 / 1e6
+    except (OSError, IndexError):
         largest = _largest_mb()
     del result
     return largest - before

@@ -12,7 +12,7 @@ Every interval prints as "value (low to high)", with a format of its own: f"{int
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -23,6 +23,7 @@ from codesign.errors import DomainError, ShapeError
 
 LEVEL = 0.95
 DRAWS = 2000
+SIGNS = 20_000
 
 
 @dataclass(frozen=True)
@@ -58,9 +59,8 @@ class Interval:
 
     def ratio(self) -> "Interval":
         """A log ratio as the ratio it is."""
-        return replace(
-            self, **{end: math.exp(getattr(self, end)) for end in ("value", "low", "high")}
-        )
+        ends = (math.exp(x) for x in (self.value, self.low, self.high))
+        return Interval(*ends, self.count)
 
     def percent(self) -> str:
         """A log ratio as the change it is: "-3.1 % (-5.0 to -1.2 %)"."""
@@ -112,9 +112,7 @@ def bootstrap(
         )
     picked = torch.randint(count, (draws, count), generator=torch.Generator().manual_seed(seed))
     drawn = statistic(*(sample[..., picked] for sample in units))
-    ends = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
-    low, high = torch.quantile(drawn.double(), ends).tolist()
-    return Interval(float(statistic(*units)), low, high, count)
+    return _percentiles(statistic(*units), drawn, count, level)
 
 
 def ratio_of_means(ours: Any, theirs: Any, **how: Any) -> Interval:
@@ -137,15 +135,12 @@ def log_ratios(ours: Sequence[float], theirs: Sequence[float]) -> Tensor:
         raise ShapeError(f"{len(ours)} and {len(theirs)} errors; pairs need one of each per case.")
     if not all(0 < e < math.inf for e in (*ours, *theirs)):
         raise DomainError("errors must be finite and above 0, since their log ratio is taken.")
-    return (
-        torch.tensor(ours, dtype=torch.float64).log()
-        - torch.tensor(theirs, dtype=torch.float64).log()
-    )
+    return _units(ours).log() - _units(theirs).log()
 
 
-def log_ratio(ours: Sequence[float], theirs: Sequence[float], level: float = LEVEL) -> Interval:
+def log_ratio(ours: Sequence[float], theirs: Sequence[float]) -> Interval:
     """Mean log ratio of errors on the same cases, by Student's t; below 0 ours are smaller."""
-    return student(log_ratios(ours, theirs), level)
+    return student(log_ratios(ours, theirs))
 
 
 def _units(values) -> Tensor:
@@ -155,53 +150,50 @@ def _units(values) -> Tensor:
     return tensor
 
 
-def crossed(logs: Any, level: float = LEVEL, draws: int = DRAWS, seed: int = 0) -> Interval:
+def _percentiles(value, drawn, count, level=LEVEL) -> Interval:
+    """A value, and the ends of ``level`` of what was drawn."""
+    ends = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
+    return Interval(float(value), *torch.quantile(drawn.double(), ends).tolist(), count)
+
+
+def crossed(logs: Any) -> Interval:
     """Median over seeds of the mean over worlds of paired log ratios [seeds, worlds], and its
     interval when seeds and worlds are redrawn, each by itself."""
-    logs = torch.as_tensor(logs, dtype=torch.float64)
-    generator = torch.Generator().manual_seed(seed)
-    seeds, worlds = logs.shape
-    rows = torch.randint(seeds, (draws, seeds), generator=generator)
-    columns = torch.randint(worlds, (draws, worlds), generator=generator)
+    logs = _units(logs)
+    generator = torch.Generator().manual_seed(0)
+    rows, columns = (torch.randint(n, (DRAWS, n), generator=generator) for n in logs.shape)
     drawn = logs[rows[:, :, None], columns[:, None, :]].mean(2).quantile(0.5, dim=1)
-    ends = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
-    low, high = torch.quantile(drawn, ends).tolist()
-    return Interval(float(logs.mean(1).quantile(0.5)), low, high, seeds)
+    return _percentiles(logs.mean(1).quantile(0.5), drawn, len(logs))
 
 
-def grouped(
-    values: Any, groups: Sequence[Any], level: float = LEVEL, draws: int = DRAWS, seed: int = 0
-) -> Interval:
+def grouped(values: Any, groups: Sequence[Any]) -> Interval:
     """Mean of values [N] that share groups, such as cases their textures, and its percentile
     interval when groups are redrawn, and the values of each."""
     values = _units(values)
-    generator = torch.Generator().manual_seed(seed)
-    names = list(dict.fromkeys(groups))
-    of = [values[[k for k, name in enumerate(groups) if name == own]] for own in names]
-    picked = torch.randint(len(of), (len(of), draws), generator=generator)
-    total, count = torch.zeros(2, draws, dtype=torch.float64)
-    for row in picked:
+    generator = torch.Generator().manual_seed(0)
+    of = [values[[name == own for name in groups]] for own in dict.fromkeys(groups)]
+    total, count = torch.zeros(2, DRAWS, dtype=torch.float64)
+    for row in torch.randint(len(of), (len(of), DRAWS), generator=generator):
         for number, mine in enumerate(of):
             at = row == number
             again = torch.randint(len(mine), (int(at.sum()), len(mine)), generator=generator)
             total[at] += mine[again].sum(1)
             count[at] += len(mine)
-    ends = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
-    low, high = torch.quantile(total / count, ends).tolist()
-    return Interval(float(values.mean()), low, high, len(of))
+    return _percentiles(values.mean(), total / count, len(of))
 
 
-def sign_flip(differences: Any, draws: int = 20_000, seed: int = 0) -> float:
+def sign_flip(differences: Any) -> float:
     """Two-sided p of paired differences [N] under random signs of their mean; every sign there is
-    up to N = 14, the signs that were found among those drawn beyond."""
+    up to N = 14, the signs that were found among 20,000 that are drawn beyond."""
     found = _units(differences)
     count = len(found)
     if count <= 14:
         signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * count)
         signs = signs.reshape(-1, count)
     else:
-        generator = torch.Generator().manual_seed(seed)
-        signs = 1 - 2.0 * torch.randint(2, (draws, count), generator=generator, dtype=torch.float64)
+        generator = torch.Generator().manual_seed(0)
+        shape = (SIGNS, count)
+        signs = 1 - 2.0 * torch.randint(2, shape, generator=generator, dtype=torch.float64)
         signs[0] = 1
     flipped = (signs * found).mean(1).abs()
     return float((flipped >= found.mean().abs() * (1 - 1e-12)).double().mean())

@@ -28,16 +28,9 @@ def fresh(study: str, out: Path | None):
     Raises: CodesignError when it cannot be made or written, or holds something already.
     """
     folder = out or _timed(Path("runs") / study)
-    try:
-        holds = (
-            sorted(entry.name for entry in folder.iterdir() if entry.name != LOCK)
-            if folder.exists()
-            else []
-        )
-    except OSError as error:
-        raise CodesignError(
-            f"the output folder '{folder}' cannot be read ({error.strerror}); {REMEDY}."
-        ) from error
+    with _told(f"the output folder '{folder}' cannot be read"):
+        found = folder.iterdir() if folder.exists() else ()
+        holds = sorted(entry.name for entry in found if entry.name != LOCK)
     # a run that stopped at bad input leaves config.json alone, and nothing is lost by starting over
     # it
     if holds and (holds != ["config.json"] or owner(folder) != study):
@@ -50,12 +43,8 @@ def fresh(study: str, out: Path | None):
             f"the output folder '{folder}' holds other things "
             f"({', '.join(holds[:3])}{', …' if len(holds) > 3 else ''}); {REMEDY}, new or empty."
         )
-    try:
+    with _told(f"the output folder '{folder}' cannot be made"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise CodesignError(
-            f"the output folder '{folder}' cannot be made ({error.strerror}); {REMEDY}."
-        ) from error
     write_atomic(folder / ".writable", b"")
     (folder / ".writable").unlink()
     return folder
@@ -81,12 +70,8 @@ def held(folder: Path) -> Iterator[None]:
         yield
         return
     while True:
-        try:
+        with _told(f"'{folder}' cannot be written"):
             handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-        except OSError as error:
-            raise CodesignError(
-                f"'{folder}' cannot be written ({error.strerror}); {REMEDY}."
-            ) from error
         try:
             # a record lock: workers that outlive a killed run do not inherit it
             fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -105,6 +90,15 @@ def held(folder: Path) -> Iterator[None]:
     finally:
         path.unlink(missing_ok=True)
         os.close(handle)
+
+
+@contextmanager
+def _told(what):
+    """An error of the system, said with its remedy."""
+    try:
+        yield
+    except OSError as error:
+        raise CodesignError(f"{what} ({error.strerror}); {REMEDY}.") from error
 
 
 def _timed(parent: Path):

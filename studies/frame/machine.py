@@ -41,26 +41,18 @@ def hardware():
 
 
 def _commit(root):
+    def git(*words):
+        ran = subprocess.run(
+            ["git", "-C", root, *words], capture_output=True, text=True, timeout=10, check=True
+        )
+        return ran.stdout.strip()
+
     if not (root / ".git").exists():
         return "unknown"
     try:
-        commit = subprocess.run(
-            ["git", "-C", root, "rev-parse", "HEAD"],
-            capture_output=True,
-            text=True,
-            timeout=10,
-            check=True,
-        ).stdout.strip()
-        changed = subprocess.run(
-            ["git", "-C", root, "status", "--porcelain"],
-            capture_output=True,
-            text=True,
-            timeout=10,
-            check=True,
-        ).stdout.strip()
+        return git("rev-parse", "HEAD") + ("+changes" if git("status", "--porcelain") else "")
     except (OSError, subprocess.SubprocessError):
         return "unknown"
-    return commit + ("+changes" if changed else "")
 
 
 def _cpu():

@@ -2,7 +2,7 @@
 and last step and every few seconds."""
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -20,9 +20,14 @@ class Pace:
     first_seconds: float = 0.0
     first_steps: int = 0
 
-    def to_json(self):
-        """Plain values that ``Pace(**values)`` takes back."""
-        return asdict(self)
+    def add(self, seconds: float, first: bool):
+        """Take in a step."""
+        if first:
+            self.first_seconds += seconds
+            self.first_steps += 1
+        else:
+            self.seconds += seconds
+            self.steps += 1
 
     @property
     def seconds_per_step(self):
@@ -62,7 +67,6 @@ class StepProgress:
         self._interruption = interruption
         self._pace = pace
         self._fresh = True  # no step of this session yet
-        self._last_line = self._last_step = time.monotonic()
         self._bar = None
         if console.is_terminal:
             columns = (
@@ -95,35 +99,18 @@ class StepProgress:
         """One more whole step was made; ``numbers`` (loss=…) are shown. A pressed Ctrl-C takes
         effect here, after saving."""
         self.done += 1
-        first = self._fresh
-        self._time_step(first)
+        first, self._fresh = self._fresh, False
+        now = time.monotonic()
+        self._pace.add(now - self._last_step, first)
+        self._last_step = now
         shown = "  ".join(f"{name} {float(value):.4g}" for name, value in numbers.items())
         if self._bar:
             self._bar.update(self._task, completed=self.done, numbers=shown)
-        elif (
-            first
-            or self.done == self.total
-            or self._last_step - self._last_line >= SECONDS_BETWEEN_LINES
-        ):
-            self._last_line = self._last_step
-            self._console.print(
-                f"{self.description}  {self.done}/{self.total}  {shown}  {self._time_left()}".rstrip(),
-                highlight=False,
-                markup=False,
-                soft_wrap=True,
-            )
+        elif first or self.done == self.total or now - self._last_line >= SECONDS_BETWEEN_LINES:
+            self._last_line = now
+            line = f"{self.description}  {self.done}/{self.total}  {shown}  {self._time_left()}"
+            self._console.print(line.rstrip(), highlight=False, markup=False, soft_wrap=True)
         self._interruption.safe_point()
-
-    def _time_step(self, first):
-        now = time.monotonic()
-        if first:
-            self._pace.first_seconds += now - self._last_step
-            self._pace.first_steps += 1
-        else:
-            self._pace.seconds += now - self._last_step
-            self._pace.steps += 1
-        self._last_step = now
-        self._fresh = False
 
     @property
     def seconds_per_step(self):

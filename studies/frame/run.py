@@ -106,11 +106,10 @@ class Run(Generic[Config]):
         # read by none of the study's code: of an earlier version, which kept its progress there
         self.state_unread = stored is not None
         if stored is not None:
-            self._earlier_s = stored.numbers[TIMES]["seconds"]
-            self._paces = {
-                name: Pace(**pace) for name, pace in stored.numbers[TIMES]["loops"].items()
-            }
-            self._continue_from(stored.numbers[TIMES].get("commit", "unknown"))
+            times = stored.numbers[TIMES]
+            self._earlier_s = times["seconds"]
+            self._paces = {name: Pace(**pace) for name, pace in times["loops"].items()}
+            self._continue_from(times.get("commit", "unknown"))
         if resumed and (folder / "metrics.json").exists():
             self.metrics = _read_metrics(folder / "metrics.json")
 
@@ -158,7 +157,7 @@ class Run(Generic[Config]):
         codesign.state.write_state), with the times of the loops and of the run."""
         times = {
             "seconds": self.seconds,
-            "loops": {name: pace.to_json() for name, pace in self._paces.items()},
+            "loops": {name: vars(pace) for name, pace in self._paces.items()},
             "commit": self._machine["versions"]["commit"],
         }
         state.write_state(
@@ -181,8 +180,7 @@ class Run(Generic[Config]):
         Raises: NonFiniteError on NaN or infinity, DomainError on anything that is not a number;
           nothing is written then.
         """
-        accepted = {name: _metric(name, value) for name, value in numbers.items()}
-        self.metrics.update(accepted)
+        self.metrics.update({name: _metric(name, value) for name, value in numbers.items()})
         text = json.dumps({**self.metrics, **self._machine}, indent=2, allow_nan=False)
         write_atomic(self.folder / "metrics.json", text.encode())
 
@@ -241,13 +239,9 @@ class Run(Generic[Config]):
         if self.config.quick:
             lead = f"{QUICK} {lead}"
         self.record()
-        configuration = json.loads(to_json(self.study, self.config))
-        facts = {
-            "Configuration": configuration,
-            "Versions": self._machine["versions"],
-            "Hardware": self._machine["hardware"],
-            "Metrics": self.metrics,
-        }
+        facts = {"Configuration": json.loads(to_json(self.study, self.config))}
+        facts |= {name.capitalize(): found for name, found in self._machine.items()}
+        facts["Metrics"] = self.metrics
         html = page.render_page(title, lead, self._cards, self._sections, facts)
         path = self.folder / "report.html"
         write_atomic(path, html.encode())
@@ -409,13 +403,8 @@ def _metric(name, value):
 
 def _read_metrics(path):
     stored = read_json(path)
-    numbers = (
-        {name: value for name, value in stored.items() if name not in RESERVED}
-        if isinstance(stored, dict)
-        else {}
-    )
-    if not isinstance(stored, dict) or not all(
-        type(value) in (int, float) for value in numbers.values()
-    ):
-        raise FileFormatError(f"'{path}' is damaged; remove it to go on with this run.")
-    return numbers
+    if isinstance(stored, dict):
+        numbers = {name: value for name, value in stored.items() if name not in RESERVED}
+        if all(type(value) in (int, float) for value in numbers.values()):
+            return numbers
+    raise FileFormatError(f"'{path}' is damaged; remove it to go on with this run.")

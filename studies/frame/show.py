@@ -70,15 +70,11 @@ class Asked:
 
     @property
     def wanted(self) -> str:
-        ends = []
-        if self.least > -math.inf:
-            ends.append(f"≥ {self.least:.3g}")
-        if self.most < math.inf:
-            ends.append(f"≤ {self.most:.3g}")
-        return ", ".join(ends) or "–"
+        ends = (("≥", self.least), ("≤", self.most))
+        return ", ".join(f"{sign} {end:.3g}" for sign, end in ends if math.isfinite(end)) or "–"
 
 
-def asked(run: Run, figures: Iterable[Asked], title: str = "Against what was asked") -> str:
+def asked(run: Run, figures: Iterable[Asked]) -> str:
     """Show figures beside what was asked of them, as a table, and record them by their names.
 
     Returns: "All figures are met." or the sentence about those that are not, for the head of the
@@ -87,7 +83,7 @@ def asked(run: Run, figures: Iterable[Asked], title: str = "Against what was ask
     figures = list(figures)
     run.record(**{plain(figure.what): figure.value for figure in figures})
     rows = [(f.what, f.value, f.wanted, "yes" if f.met else "NO") for f in figures]
-    run.table(title, ("what", "found", "asked", "met"), rows)
+    run.table("Against what was asked", ("what", "found", "asked", "met"), rows)
     missed = [f"{f.what} {f.value:.3g} ({f.wanted})" for f in figures if not f.met]
     return f"**Missed in this run:** {'; '.join(missed)}." if missed else "All figures are met."
 
@@ -123,14 +119,8 @@ def panels(*charts: Panel, width: float = 4.5) -> Figure:
             for axis in axes[0]
             for line, label in zip(*axis.get_legend_handles_labels(), strict=True)
         }
-        figure.legend(
-            list(handles.values()),
-            list(handles),
-            loc="outside lower center",
-            ncols=4,
-            frameon=False,
-            fontsize=8,
-        )
+        how = {"loc": "outside lower center", "ncols": 4, "frameon": False, "fontsize": 8}
+        figure.legend(handles.values(), handles.keys(), **how)
     return figure
 
 
@@ -146,12 +136,9 @@ def pictures(
     place empty.
     """
     titles = list(dict.fromkeys(title for row in rows.values() for title in row))
+    size = (side * len(titles), side * len(rows))
     figure, axes = plt.subplots(
-        len(rows),
-        len(titles),
-        figsize=(side * len(titles), side * len(rows)),
-        squeeze=False,
-        layout="constrained",
+        len(rows), len(titles), figsize=size, squeeze=False, layout="constrained"
     )
     signed = set(signed)
     for line, (label, row) in zip(axes, rows.items(), strict=True):
@@ -188,7 +175,7 @@ def bars(
     axis.set(xlabel=xlabel, xscale="log" if log else "linear")
     if log:  # 0.5, not 5 x 10^-1
         low, high = axis.get_xlim()
-        axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        axis.xaxis.set_major_formatter("{x:g}")
         axis.xaxis.set_minor_formatter(lambda value, _: f"{value:g}" if high < 10 * low else "")
     axis.invert_yaxis()
     return figure

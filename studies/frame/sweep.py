@@ -113,6 +113,11 @@ def column(rows: Iterable[Row], name: str, **where: Any) -> list[Any]:
     return [row[name] for row in select(rows, **where)]
 
 
+def typical(rows: Iterable[Row], name: str = "errors", **where: Any) -> float:
+    """Median over the rows that have these values of the mean of a figure that is a list."""
+    return statistics.median(map(statistics.fmean, column(rows, name, **where)))
+
+
 def metrics(rows: Iterable[Mapping[str, Any]], *axes: str, prefix: str = "") -> dict[str, float]:
     """What ``Run.record`` takes of a table: every number by the values of the axes and its own
     name, in plain letters.

@@ -87,11 +87,9 @@ def study(run: Run[Config]) -> None:
 
 
 def report(run: Run[Config], cases: list[str], interrupted: bool = False) -> None:
-    """The page of what is measured so far."""
     rows = {name: found for name in cases if (found := stored(run, name))}
     missed = [short for name, found in rows.items() for short in show(run, name, found)]
-    count = certificates.headline(rows["scenes"]) if "scenes" in rows else headline(rows)
-    lead = [count]
+    lead = [(certificates.headline(rows["scenes"]) if "scenes" in rows else headline(rows))]
     if interrupted:
         lead.append("**Interrupted**: the rows below are those that were done.")
     lead.append(
@@ -117,7 +115,6 @@ def headline(rows: dict[str, list[Row]]) -> str:
 
 
 def measured(run: Run[Config], name: str) -> None:
-    """Measure the rows of a case, job by job."""
     topic = CASES[name]
 
     def cell(job):
@@ -130,7 +127,6 @@ def measured(run: Run[Config], name: str) -> None:
 
 
 def stored(run: Run[Config], name: str) -> list[Row]:
-    """The rows of a case that are in the run's folder."""
     path = run.path(f"{name}.jsonl")
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     found = [row for line in lines for row in json.loads(line)[1]]

@@ -22,7 +22,6 @@ POSE_UNIT = torch.tensor([0.01, 0.01, 0.02, 0.005, 0.005, 0.01], dtype=torch.flo
 
 
 def normal(*shape, seed):
-    """Standard normal numbers, float64."""
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
@@ -46,7 +45,7 @@ def rays_rows():
     return certify(fn, params, scales=scales, ladder=FINE, tolerance=1e-6)
 
 
-def _final(task, case_list, layer, samples, sensor=SENSOR):
+def _final(task, case_list, layer, samples):
     """Mean log angular flow error over cases, as a function of three curvatures and the camera
     pose."""
     base = task.design.reference
@@ -57,7 +56,7 @@ def _final(task, case_list, layer, samples, sensor=SENSOR):
         )
         optics = base.replace(curvature_per_mm=base.curvature_per_mm + change)
         system = task.system(
-            task.camera(optics, samples), events.layer(layer, sensor, learn=()), flow.estimate_lk
+            task.camera(optics, samples), events.layer(layer, SENSOR, learn=()), flow.estimate_lk
         )
         moved = [
             replace(case, T_world_body=case.T_world_body @ pose.se3_exp(p["pose"]))
@@ -106,7 +105,7 @@ def hard_rows(seed, count, moved=("curvature", "pose")):
         {name: torch.stack(values) for name, values in side.items()}
         for side in (slopes, differences)
     ]
-    both = [torch.cat(list(side.values()), 1) for side in columns]
+    both = [torch.cat(tuple(side.values()), 1) for side in columns]
     rows = [_averaged(name, *(side[name] for side in columns), step[name]) for name in params]
     return [*rows, _averaged("all", *both, 1.0)]
 
@@ -172,10 +171,10 @@ def endpoint_error(field, truth):
     return (miss[truth.valid] + 1e-4).sqrt().mean()
 
 
-def draw_batch(drives: int, seed: int, frames: int = 9) -> Batch:
+def draw_batch(drives: int, seed: int) -> Batch:
     """Drives that start near the middle of the room, forward with some slip and turn."""
     generator = torch.Generator().manual_seed(seed)
-    t_s = torch.linspace(0, DURATION_S, frames, dtype=torch.float64)
+    t_s = torch.linspace(0, DURATION_S, 9, dtype=torch.float64)
     poses = []
     for _ in range(drives):
         at = 0.5 * (2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1)
@@ -206,12 +205,7 @@ def joint_rows(system: System, batch: Batch, directions: int) -> list[Certificat
     whole, params = by_group(system, lambda call: call(batch).loss, GROUPS)
     behind, _ = by_group(system, behind_frames, GROUPS)
     loss = {"lens": whole, "mount": whole, "thresholds": behind, "network": behind}
-    scales = {
-        "lens": 1.0,
-        "mount": 1.0,
-        "thresholds": 1.0,
-        "network": float(params["network"].norm()) / 4,
-    }
+    scales = dict.fromkeys(GROUPS, 1.0) | {"network": float(params["network"].norm()) / 4}
     return [
         row
         for name in params
@@ -259,9 +253,7 @@ CHAIN = Topic(
     ("junction", "parameters"),
     lambda quick: [(label,) for label in ASKED],
     measure_junction,
-    lambda row: (
-        Asked({"cosine": 0.9}, {}) if row.names[0] == HARD else Asked({}, {"relative_error": 1e-6})
-    ),
+    lambda row: ASKED[row.names[0]],
 )
 JOINT = Topic(
     "Lens, mount, thresholds and network in one graph",

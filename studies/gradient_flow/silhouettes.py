@@ -14,7 +14,6 @@ SIZE_PX = 32
 PITCH_MM = 0.25
 SAMPLES = 16  # per pixel of one estimate as an optimiser takes it
 PER_PX = 64.0  # of the precise ones
-LENSES = ("pinhole", "thin", "traced")
 # metres and radians; curvatures per mm, thicknesses mm
 STEPS = {
     "pose": (2e-3,) * 6,
@@ -41,18 +40,16 @@ class Task:
         )[0, 0]
 
     def loss(self, numbers, group, samples, seed, way: Way = "interior", per_px=2.5):
-        optics = self.lens
-        turn = torch.zeros(6, dtype=torch.float64)
-        if group == "pose":
-            turn = numbers
-        else:
-            base = torch.zeros(2, 6, dtype=torch.float64)
-            change = base.index_put(
-                (torch.tensor([0, 0, 0, 1, 1, 1]), torch.tensor([*ROWS[0], *ROWS[1]])), numbers
+        optics, turn = self.lens, numbers
+        if group == "lens":
+            turn = torch.zeros(6, dtype=torch.float64)
+            curved, thick = (
+                turn.index_put((torch.tensor(rows),), mine)
+                for rows, mine in zip(ROWS, numbers.split(3), strict=True)
             )
             optics = self.lens.replace(
-                curvature_per_mm=self.lens.curvature_per_mm + change[0],
-                thickness_mm=self.lens.thickness_mm + change[1],
+                curvature_per_mm=self.lens.curvature_per_mm + curved,
+                thickness_mm=self.lens.thickness_mm + thick,
             )
         camera = render.Camera(optics, SIZE_PX, SIZE_PX, PITCH_MM, samples, seed)
         frames = render.frames(
@@ -64,14 +61,12 @@ class Task:
         start = torch.zeros(6, dtype=torch.float64, requires_grad=True)
         return torch.autograd.grad(self.loss(start, group, samples, seed, way, per_px), start)[0]
 
+    @torch.no_grad()
     def differences(self, group, samples, seed):
         found = []
         for step in torch.diag(torch.tensor(STEPS[group], dtype=torch.float64)):
-            with torch.no_grad():
-                found.append(
-                    (self.loss(step, group, samples, seed) - self.loss(-step, group, samples, seed))
-                    / (2 * step.sum())
-                )
+            ahead, behind = (self.loss(way, group, samples, seed) for way in (step, -step))
+            found.append((ahead - behind) / (2 * step.sum()))
         return torch.stack(found)
 
 
@@ -99,10 +94,12 @@ def measure(config, scene, kind, group):
     task = Task(silhouette_scenes.build(scene), kind)
 
     def estimates(seed):
-        ways = [task.differences(group, config.samples, 100 + seed)]
-        for way in ("interior", "boundary"):
-            ways.append(task.gradient(group, config.samples, 200 + seed, way, PER_PX))
-        ways.append(task.gradient(group, SAMPLES, 300 + seed, "boundary"))
+        ways = [
+            task.differences(group, config.samples, 100 + seed),
+            task.gradient(group, config.samples, 200 + seed, "interior", PER_PX),
+            task.gradient(group, config.samples, 200 + seed, "boundary", PER_PX),
+            task.gradient(group, SAMPLES, 300 + seed, "boundary"),
+        ]
         return torch.stack(ways) * torch.tensor(STEPS[group], dtype=torch.float64)
 
     values = torch.stack([estimates(config.seed + number) for number in range(config.seeds)])
@@ -113,14 +110,16 @@ def jobs(quick):
     if quick:
         return [
             ("cubes", "pinhole", "pose"),
-            *((scene, "traced", "lens") for scene in ("cubes", "poles")),
+            ("cubes", "traced", "lens"),
+            ("poles", "traced", "lens"),
         ]
-    kinds = {"cubes": LENSES}
     return [
         (scene, kind, group)
         for scene in silhouette_scenes.NAMES
-        for kind in kinds.get(scene, ("pinhole", "traced"))
-        for group in (("pose", "lens") if kind == "traced" else ("pose",))
+        for kind in ("pinhole", "thin", "traced")
+        if kind != "thin" or scene == "cubes"
+        for group in ("pose", "lens")
+        if group == "pose" or kind == "traced"
     ]
 
 

@@ -80,5 +80,4 @@ class Topic:
 
 
 def label(job: Job) -> str:
-    """The name of a job in the stored state."""
     return " ".join(map(str, job))

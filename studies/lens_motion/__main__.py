@@ -11,6 +11,7 @@ where the motion has a direction, with the motion turned by 90 degrees.
 
 import csv
 import math
+import statistics
 import sys
 from dataclasses import dataclass, replace
 from itertools import product
@@ -28,6 +29,7 @@ from codesign.report.prose import counted
 from codesign.system import System
 from codesign.system.objectives import angular_error_mrad, edge_energy
 from studies.frame.compare import Interval, grouped, log_ratio, log_ratios
+from studies.frame.config import check_least
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.show import bars, table
 from studies.frame.sweep import Row, column, plain, select, sweep
@@ -72,11 +74,8 @@ def study(run: Run[Config]):
     config = run.config
     if config.raw is not None:
         return _redraw(run)
-    for name, least in (("steps", 1), ("developed", 1), ("judged", 2), ("judged_turned", 2)):
-        if getattr(config, name) < least:
-            raise DomainError(
-                f"--{name.replace('_', '-')} is {getattr(config, name)}; at least {least} is needed."
-            )
+    check_least(config, 1, "steps", "developed")
+    check_least(config, 2, "judged", "judged_turned")
     form = make_form(config.lens, config.fno)
     motion = Motion(config.motion, form.efl_mm)
     motion.directions_rad()  # a file that cannot be read is refused here
@@ -85,8 +84,7 @@ def study(run: Run[Config]):
     lenses = {name: form.optics(torch.tensor(point)).freeze() for name, point in answers.items()}
     for name, optics in lenses.items():
         lens.save(optics, run.path(f"lens_{name}.json"))
-    rows = _judged(run, lenses, motion)
-    _finish(run, lenses, motion, rows)
+    _finish(run, lenses, motion, _judged(run, lenses, motion))
 
 
 def _designs(run, form, motion):
@@ -148,40 +146,40 @@ def _chosen(run, form: Form, motion, answers):
         return sweep(run, cell, name, case=range(run.config.developed))
 
     answers = {name: answers[name] for name in ("spots", "mtf", "mtf_along")}
+
+    def mrad(label):
+        return _geometric(column(rows, "error_mrad", lens=label))
+
     points = answers | rivals.between(answers)
     rows = tried("development", points)
-    best = min(points, key=lambda label: _geometric(column(rows, "error_mrad", lens=label)))
+    best = min(points, key=mrad)
     around = {
         f"{best}, film {step:+g}": [points[best][0] + step, *points[best][1:]]
         for step in (-2.0, -1.0, 1.0, 2.0)
     }
     rows += tried("refined", around)
     points |= around
-    by_flow = min(points, key=lambda label: _geometric(column(rows, "error_mrad", lens=label)))
+    by_flow = min(points, key=mrad)
     by_edge = max(points, key=lambda label: sum(column(rows, "edge_energy", lens=label)))
     run.say(f"flow chooses: {by_flow}; edge energy chooses: {by_edge}")
-    shown = {
-        label: {"mrad": _geometric(column(rows, "error_mrad", lens=label)), "lens": label}
-        for label in points
-    }
     run.section(
         "What flow and edge energy chose from",
         f"{run.config.developed} development cases, hard events. Flow: {by_flow}. Edge: {by_edge}.",
     )
-    run.table("Development cases", *table(shown.values(), lens="lens", mrad="flow error (mrad)"))
+    shown = [(label, mrad(label)) for label in points]
+    run.table("Development cases", ("lens", "flow error (mrad)"), shown)
     return {"edge": points[by_edge], "flow": points[by_flow]}
 
 
 def _judged(run, lenses, motion):
     """Errors of every lens on the held-out cases, the motion as it is and turned."""
     pool = make_worlds(HELD_OUT)
-    motions = {0: motion}
+    wanted = [("judged", motion, lenses)]
     if motion.directed:
-        motions[1] = Motion(motion.name, motion.efl_mm, turned=True)
-    counts = (run.config.judged, run.config.judged_turned)
+        shown = {name: lenses[name] for name in TURNED}
+        wanted.append(("turned", replace(motion, turned=True), shown))
     rows = []
-    for turned, drives in motions.items():
-        shown = {name: lenses[name] for name in (TURNED if turned else lenses)}
+    for turned, (name, drives, shown) in enumerate(wanted):
 
         def cell(case, drives=drives, shown=shown):
             drawn = drives.case(pool, JUDGED + case)
@@ -189,10 +187,8 @@ def _judged(run, lenses, motion):
                 {"lens": name, **judge(optics, drives, drawn)} for name, optics in shown.items()
             ]
 
-        name = "turned" if turned else "judged"
-        rows += [
-            {"turned": turned, **row} for row in sweep(run, cell, name, case=range(counts[turned]))
-        ]
+        count = run.config.judged_turned if turned else run.config.judged
+        rows += [{"turned": turned, **row} for row in sweep(run, cell, name, case=range(count))]
     return rows
 
 
@@ -220,7 +216,7 @@ def detectable(pair: Interval) -> float:
 
 
 def _geometric(values):
-    return math.exp(sum(map(math.log, values)) / len(values))
+    return statistics.geometric_mean(values)
 
 
 def _finish(run, lenses, motion, rows):
@@ -279,7 +275,7 @@ def _finish(run, lenses, motion, rows):
     run.figure(page.point_images(lenses, motion), "point_images", page.IMAGES)
     run.finish(
         "A lens for the motion",
-        f"**{said}**\n\n{config.lens} at f/{float(lenses['flow'].first_order().fno):.3g}, motion {config.motion}.",
+        f"**{said}**\n\n{config.lens} at f/{lenses['flow'].first_order().fno:.3g}, motion {config.motion}.",
     )
     run.say(said)
 

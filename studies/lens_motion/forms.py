@@ -15,6 +15,7 @@ from codesign import lens
 from codesign.errors import DomainError
 from codesign.lens.design import edge_thickness_mm
 from codesign.lens.solves import hold_efl
+from studies.lens_opt.spots import film_moved
 from studies.lens_opt.task import DISTANCE_M
 
 CROWN, FLINT = "N-BK7", "N-SF5"
@@ -62,11 +63,8 @@ class Form:
             curvature_per_mm=self.start.curvature_per_mm + STEPS[1] * bending,
             thickness_mm=torch.stack(thickness),
         )
-        held = hold_efl(bent, self.efl_mm)
-        focused = held.focus_at(DISTANCE_M).thickness_mm
-        return held.replace(
-            thickness_mm=torch.cat([focused[:-1], (focused[-1] + STEPS[0] * film)[None]])
-        )
+        focused = hold_efl(bent, self.efl_mm).focus_at(DISTANCE_M)
+        return film_moved(focused, STEPS[0] * film)
 
     def penalty(self, optics: lens.GeoLens) -> Tensor:
         """Of glass edges that are too thin, scalar."""
@@ -89,16 +87,11 @@ def make_form(name: str, fno: float | None = None) -> Form:
         optics = _opened(lens.load("cooke-triplet"), efl_mm, half_mm)
         return Form(hold_efl(optics, efl_mm).freeze(), (1, 3), efl_mm)
     rows, free = ROWS[name]
-    surfaces = [
-        lens.Surface(
-            r * efl_mm / 11,
-            t,
-            lens.Glass.named(g) if g else None,
-            half_mm + MARGIN_MM,
-            is_stop=i == 0,
-        )
-        for i, (r, t, g) in enumerate(rows)
-    ]
+    surfaces = []
+    for i, (r, t, g) in enumerate(rows):
+        glass = lens.Glass.named(g) if g else None
+        wide = half_mm + MARGIN_MM
+        surfaces.append(lens.Surface(r * efl_mm / 11, t, glass, wide, is_stop=i == 0))
     optics = lens.GeoLens(surfaces, 2 * half_mm, name=name)
     return Form(hold_efl(optics, efl_mm).freeze(), free, efl_mm)
 

@@ -18,7 +18,14 @@ from codesign.errors import DomainError
 from codesign.system import Batch
 from scenes import trajectories
 from scenes.tum import Recorded
-from studies.lens_opt.task import DISTANCE_M, DURATION_S, MOTION, PITCH_MM, SENSOR_PX
+from studies.lens_opt.task import (
+    DISTANCE_M,
+    DURATION_S,
+    MOTION,
+    PITCH_MM,
+    SENSOR_PX,
+    drawn_place,
+)
 
 SPEED_PX = 2.0  # over the interval
 SPREAD = 0.4  # standard deviation of the logarithm of the speed
@@ -116,8 +123,7 @@ class Motion:
         """A world out of ``pool``, a place before it and a drive, all from one seed."""
         generator = torch.Generator().manual_seed(seed)
         world = pool[drawn_world(len(pool), generator)]
-        x_m, z_m = (2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1).tolist()
-        start = pose.look_at((x_m, -DISTANCE_M, z_m), (x_m, 0.0, z_m))
+        start = drawn_place(generator)
         t_s = torch.linspace(0, DURATION_S, FRAMES, dtype=torch.float64)
         drive = trajectories.body_twist(start, self.twist(generator) / DURATION_S, t_s)
         return Batch(drive, t_s, world, seed)

@@ -3,6 +3,7 @@ for MTF over all directions, or for MTF along the motion."""
 
 import math
 from collections.abc import Callable
+from itertools import combinations, product
 
 import numpy as np
 import torch
@@ -26,18 +27,16 @@ TRIED = 2  # of the starts, the best, from which is descended
 NAMES = ("refocused", "spots", "mtf", "mtf_along")
 
 
-def mtf(rays: SpotRays, directions_rad: Tensor, per_px: float = FREQUENCY_PER_PX) -> Tensor:
-    """Contrast of a grating by the rays alone, without the pixel's own.
+def mtf(rays: SpotRays, directions_rad: Tensor) -> Tensor:
+    """Contrast of a grating of FREQUENCY_PER_PX by the rays alone, without the pixel's own.
 
     Args:
       directions_rad: [F, D] of the grating's wave vector, from the radius (y of the rays), per
         point.
-      per_px: its cycles per pixel.
     Returns: [F, D] in [0, 1]. Gradient: to the rays.
     """
-    wave = torch.stack([directions_rad.sin(), directions_rad.cos()], -1) * (
-        2 * math.pi * per_px / PITCH_MM
-    )
+    per_mm = FREQUENCY_PER_PX / PITCH_MM
+    wave = torch.stack([directions_rad.sin(), directions_rad.cos()], -1) * (2 * math.pi * per_mm)
     phase = torch.einsum("fdk,fnk->fdn", wave, rays.spread()[0])
     share = rays.share[:, None]
     return torch.hypot((share * phase.cos()).sum(-1), (share * phase.sin()).sum(-1))
@@ -57,14 +56,11 @@ def rms_px(rays: SpotRays) -> float:
 
 def objective(name: str, motion: Motion) -> Callable[[SpotRays], Tensor]:
     """What a designer minimises, of rays at the windows' centres."""
+    if name in ("refocused", "spots"):
+        return lambda rays: rays.rms_mm().square().mean().log()
     along = motion.directions_rad()
-    around = ALL_ROUND.expand(len(along), -1)
-    return {
-        "refocused": lambda rays: rays.rms_mm().square().mean().log(),
-        "spots": lambda rays: rays.rms_mm().square().mean().log(),
-        "mtf": lambda rays: -mtf(rays, around).mean(),
-        "mtf_along": lambda rays: -mtf(rays, along).mean(),
-    }[name]
+    directions = along if name == "mtf_along" else ALL_ROUND.expand(len(along), -1)
+    return lambda rays: -mtf(rays, directions).mean()
 
 
 def design(name: str, form: Form, motion: Motion, seed: int, steps: int) -> list[float]:
@@ -93,29 +89,15 @@ def design(name: str, form: Form, motion: Motion, seed: int, steps: int) -> list
     drawn = np.random.default_rng(seed).uniform(bounds[:, 0], bounds[:, 1], (DRAWN, len(bounds)))
     line = [[film, *np.zeros(len(bounds) - 1)] for film in np.linspace(-30, 3, 12)]
     starts = sorted(([*line, *drawn]), key=lambda point: value(np.asarray(point))[0])
-    found = [
-        minimize(
-            value,
-            start,
-            jac=True,
-            method="L-BFGS-B",
-            bounds=list(map(tuple, bounds)),
-            options={"maxfun": steps},
-        )
-        for start in starts[:TRIED]
-    ]
+    how = {"jac": True, "method": "L-BFGS-B", "bounds": bounds, "options": {"maxfun": steps}}
+    found = [minimize(value, start, **how) for start in starts[:TRIED]]
     return min(found, key=lambda result: result.fun).x.tolist()
 
 
-def between(
-    answers: dict[str, list[float]], shares: tuple[float, ...] = (1 / 3, 2 / 3)
-) -> dict[str, list[float]]:
-    """Lenses on the way from one answer to another, by name."""
+def between(answers: dict[str, list[float]]) -> dict[str, list[float]]:
+    """Lenses at a third and two thirds of the way from one answer to another, by name."""
     found = {}
-    names = list(answers)
-    for i, one in enumerate(names):
-        for other in names[i + 1 :]:
-            for share in shares:
-                a, b = np.array(answers[one]), np.array(answers[other])
-                found[f"{share:.2f} from {one} to {other}"] = ((1 - share) * a + share * b).tolist()
+    for (one, other), share in product(combinations(answers, 2), (1 / 3, 2 / 3)):
+        a, b = np.array(answers[one]), np.array(answers[other])
+        found[f"{share:.2f} from {one} to {other}"] = ((1 - share) * a + share * b).tolist()
     return found

@@ -16,6 +16,7 @@ together with the lens.
 
 import sys
 from dataclasses import dataclass, replace
+from statistics import fmean
 from typing import Any, ClassVar, Literal
 
 from codesign import flow, lens
@@ -26,6 +27,7 @@ from codesign.system import check
 from studies.frame.compare import log_ratio
 from studies.frame.config import check_least
 from studies.frame.run import Run, StudyConfig, main
+from studies.frame.sweep import column
 from studies.lens_motion import __main__ as lens_motion
 from studies.lens_opt import page as lens_opt_page
 from studies.lens_opt import rivals
@@ -98,17 +100,14 @@ class Course:
 
     def __init__(self, run: Run[Config]):
         stored = run.load_state()
+        numbers = stored.numbers if stored else {"choices": {}, "found": {}, "jobs": {}}
         self.run = run
         self.fresh = stored is None
         self.jobs: dict[str, Job] = {}
-        self.choices: dict[str, list[dict[str, Any]]] = (
-            {} if stored is None else stored.numbers["choices"]
-        )
-        self.found: dict[str, list[dict[str, float]]] = (
-            {} if stored is None else stored.numbers["found"]
-        )
-        self._left = {} if stored is None else stored.numbers["jobs"]
-        self._tensors = {} if stored is None else stored.tensors
+        self.choices: dict[str, list[dict[str, Any]]] = numbers["choices"]
+        self.found: dict[str, list[dict[str, float]]] = numbers["found"]
+        self._left = numbers["jobs"]
+        self._tensors = stored.tensors if stored else {}
 
     def add(self, name: str, job: Job):
         """A design by gradients, which goes on from where the stored run left it."""
@@ -253,14 +252,14 @@ def _finish(run, course, lenses, seconds):
         run.record(
             **{
                 f"rms_spot_um_{name}": task.rms_spot_um(optics).mean(),
-                **{f"{key}_hard_{name}": _mean(found[name], key) for key in MEANS},
+                **{f"{key}_hard_{name}": fmean(column(found[name], key)) for key in MEANS},
                 f"efl_mm_{name}": first_order.efl_mm.detach(),
                 f"fno_{name}": first_order.fno.detach(),
                 f"edge_below_floor_mm_{name}": thin.detach(),
             }
         )
     for name, design, rival in pairs_of(lenses):
-        pair = log_ratio(*([row["flow_error_mrad"] for row in found[n]] for n in (design, rival)))
+        pair = log_ratio(*(column(found[n], "flow_error_mrad") for n in (design, rival)))
         run.record(**pair.metrics(f"log_ratio_{name}"))
     blank = draw_case([lens_opt_page.blank_wall()], JUDGED, frames=17)
     for name in ("detuned", "optimised"):
@@ -270,12 +269,8 @@ def _finish(run, course, lenses, seconds):
     result.backward()
     rows = result.table()
     for row in rows:
-        run.record(
-            **{
-                f"gradient_norm_{row['junction']}": row["gradient_norm"],
-                f"zero_share_{row['junction']}": row["zero_share"],
-            }
-        )
+        figures = ("gradient_norm", "zero_share")
+        run.record(**{f"{figure}_{row['junction']}": row[figure] for figure in figures})
     record = job.loop.record
     run.record(
         loss_first=record.score[0],
@@ -292,15 +287,9 @@ def pairs_of(lenses):
     """(name, design, rival) of the pairs that are compared: the design with every other lens, and
     the spot designer's lens after flow steps with itself before."""
     found = [(rival, "optimised", rival) for rival in lenses if rival != "optimised"]
-    return (
-        [*found, ("after_spots_over_spots", "after_spots", "spots")]
-        if "after_spots" in lenses
-        else found
-    )
-
-
-def _mean(rows, key):
-    return sum(row[key] for row in rows) / len(rows)
+    if "after_spots" in lenses:
+        found.append(("after_spots_over_spots", "after_spots", "spots"))
+    return found
 
 
 def judge_all(course, lenses):

@@ -4,6 +4,7 @@ junction table."""
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from statistics import fmean
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from codesign.report import lens_figures
 from scenes import worlds
 from studies.frame.compare import Interval, log_ratio
 from studies.frame.show import Panel, bars, panels, pictures, table
+from studies.frame.sweep import column
 from studies.lens_opt.task import DISTANCE_M, FIELDS, PITCH_MM, SENSOR, window_shares
 
 DESIGNS = {"flow": "the flow design", "edge": "the edge design"}
@@ -71,11 +73,10 @@ def blank_wall():
 
 
 def write(run, course, lenses, junctions):
-    """Fill and finish the run's page."""
     config = run.config
     task = course.jobs["optimised"].task
     names = {name: label(name, config.objective) for name in lenses}
-    errors = {name: [row["flow_error_mrad"] for row in rows] for name, rows in course.found.items()}
+    errors = {name: column(rows, "flow_error_mrad") for name, rows in course.found.items()}
     pairs = {
         name: log_ratio(errors["optimised"], errors[name]) for name in lenses if name != "optimised"
     }
@@ -124,11 +125,9 @@ def _who_wins(run, names, pairs, rivals):
     design = names["optimised"]
     m = run.metrics
     for name in ("optimised", *rivals):
-        change = (
-            f"the design against it: {pairs[name].percent()}"
-            if name in pairs
-            else "mean of held-out cases"
-        )
+        change = "mean of held-out cases"
+        if name in pairs:
+            change = f"the design against it: {pairs[name].percent()}"
         error, spot = m[f"flow_error_mrad_hard_{name}"], m[f"rms_spot_um_{name}"]
         run.card(
             f"Flow error, {names[name]}", f"{error:.3f} mrad", f"RMS spot {spot:.1f} µm; {change}"
@@ -141,24 +140,18 @@ def _who_wins(run, names, pairs, rivals):
         "variables, focal length, f-number and floors of thickness; the published lens is a "
         "yardstick that no design here knows.",
     )
+    columns = {
+        "flow_error_mrad_hard": "flow error (mrad)",
+        "rms_spot_um": "RMS spot (µm)",
+        "edge_below_floor_mm": "edge below its floor (mm)",
+    }
     rows = []
     for name, title in names.items():
-        figures = (
-            m[f"{key}_{name}"]
-            for key in ("flow_error_mrad_hard", "rms_spot_um", "edge_below_floor_mm")
-        )
         change = (pairs[name].percent(), pairs[name].outcome) if name in pairs else ("", "")
-        rows.append([title, *figures, *change])
+        rows.append([title, *(m[f"{key}_{name}"] for key in columns), *change])
     run.table(
         "Lenses on held-out cases",
-        [
-            "lens",
-            "flow error (mrad)",
-            "RMS spot (µm)",
-            "edge below its floor (mm)",
-            f"change by the {design}",
-            "it",
-        ],
+        ["lens", *columns.values(), f"change by the {design}", "it"],
         rows,
         f"RMS spot: mean over three fields of a wall at {DISTANCE_M:g} m, four wavelengths; a pixel is "
         f"{PITCH_MM * 1e3:g} µm.",
@@ -181,14 +174,9 @@ def _by_window(run, found, names, rivals):
     rows = []
     for h, share in zip(FIELDS, window_shares(), strict=True):
         key = f"flow_error_mrad_field_{h:g}"
-        own, *others = ([row[key] for row in found[name]] for name in ("optimised", *rivals))
-        rows.append(
-            [
-                f"{share:.2f}",
-                sum(own) / len(own),
-                *(log_ratio(own, other).percent() for other in others),
-            ]
-        )
+        own, *others = (column(found[name], key) for name in ("optimised", *rivals))
+        changes = (log_ratio(own, other).percent() for other in others)
+        rows.append([f"{share:.2f}", fmean(own), *changes])
     run.table(
         "Where: by window",
         [
@@ -213,12 +201,10 @@ def _settings(run, course):
         "for as many steps, with a clip and a step size of its own, the best of a few on "
         "development cases.",
     )
+    error = "flow error on development cases (mrad), the least is chosen"
     for name, rows in course.choices.items():
-        columns = {
-            "setting": "setting",
-            "error_mrad": "flow error on development cases (mrad), the least is chosen",
-        }
-        run.table(f"Settings: {label(name, config.objective)}", *table(rows, **columns))
+        title = f"Settings: {label(name, config.objective)}"
+        run.table(title, *table(rows, setting="setting", error_mrad=error))
 
 
 def _lenses(run, task, shown):
@@ -316,10 +302,8 @@ def _way(run, course):
 def _cases(run, errors, names):
     m = run.metrics
     run.section("Case by case", "The control is a wall without texture, where no lens can help.")
-    rows = [
-        [i + 1, *(round(errors[name][i], 3) for name in names)]
-        for i in range(len(errors["optimised"]))
-    ]
+    cases = zip(*(errors[name] for name in names), strict=True)
+    rows = [[i, *(round(error, 3) for error in case)] for i, case in enumerate(cases, 1)]
     run.table("Angular flow error per held-out case (mrad)", ["case", *names.values()], rows)
     keys = ("edge_energy_hard", "events_per_pixel_hard", "efl_mm", "fno")
     run.table(

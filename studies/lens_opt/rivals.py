@@ -102,12 +102,10 @@ def shrink_spots(
     weights = field_weights(task)
     size = sizes_of(task.design.reference)
     first = torch.zeros_like(size)
-    others = [
-        SPREAD * torch.randn(len(size), generator=generator, dtype=size.dtype)
-        for _ in range(starts - 1)
-    ]
     tried = []
-    for start in (first, *others):
+    for number in range(starts):
+        drawn = torch.randn(len(size), generator=generator, dtype=size.dtype) if number else first
+        start = SPREAD * drawn
         try:
             tried.append(_solved(task, size, weights[FIRST], start, steps))
         except CodesignError:  # a start through which no light comes, or no focal length
@@ -127,9 +125,13 @@ def shrink_spots(
     found = []
     for name in weights:
         optics = _lens(task, size, solved[name].variables).freeze()
-        found.append(
-            Variant(f"fields {name}", optics, judge(optics), _complaint(solved[name], steps))
-        )
+        complaint, why = "", solved[name].stopped
+        if why in ("steps", "damping"):
+            complaint = (
+                f"the spot designer has not converged in {steps} steps (it stopped for: {why}); with more "
+                "--spot-steps it may do better than shown."
+            )
+        found.append(Variant(f"fields {name}", optics, judge(optics), complaint))
     return found
 
 
@@ -160,7 +162,6 @@ def residuals(
 
 
 def least(variants: list[Variant]) -> Variant:
-    """The variant of least error on the development cases."""
     return min(variants, key=lambda variant: variant.error_mrad)
 
 
@@ -177,12 +178,3 @@ def _solved(task, size, weights, start, steps):
     )
     solver.run()
     return solver
-
-
-def _complaint(solver, steps):
-    if solver.stopped in ("steps", "damping"):
-        return (
-            f"the spot designer has not converged in {steps} steps (it stopped for: {solver.stopped}); with more "
-            "--spot-steps it may do better than shown."
-        )
-    return ""

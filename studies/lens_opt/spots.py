@@ -90,7 +90,7 @@ def spot_rays(
         )
     position, slope, share = (torch.cat(columns, 1) for columns in zip(*parts, strict=True))
     total = share.sum(1, keepdim=True)
-    if bool((total == 0).any()):
+    if (total == 0).any():
         raise DomainError(
             f"{optics.name}: no light of some point of the wall arrives at the film; use a smaller field."
         )
@@ -109,6 +109,10 @@ def refocused(
     """The lens with its film at ``SpotRays.best_focus_mm`` of points of the wall; see
     ``spot_rays``."""
     shift = spot_rays(optics, fields_rad, distance_m, light).best_focus_mm(weights)
-    return optics.replace(
-        thickness_mm=torch.cat([optics.thickness_mm[:-1], (optics.thickness_mm[-1] + shift)[None]])
-    )
+    return film_moved(optics, shift)
+
+
+def film_moved(optics: lens.GeoLens, distance_mm: Tensor) -> lens.GeoLens:
+    """The lens with its film ``distance_mm`` further behind. Gradient: both."""
+    *glass, film = optics.thickness_mm.unbind()
+    return optics.replace(thickness_mm=torch.stack([*glass, film + distance_mm]))

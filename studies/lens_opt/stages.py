@@ -50,12 +50,10 @@ def estimator(name: str, train: bool, objective: str, weights: int, seed: int) -
         raise DomainError(
             f"--flow {name} is neither a network file nor one of {', '.join(ESTIMATORS)}."
         )
-    network = flow.load(name)
-    return network.requires_grad_(train)
+    return flow.load(name).requires_grad_(train)
 
 
 def weights_of(stage: Any) -> list[nn.Parameter]:
-    """The weights of a flow stage that are trained."""
     return (
         [p for p in stage.parameters() if p.requires_grad] if isinstance(stage, nn.Module) else []
     )

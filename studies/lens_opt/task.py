@@ -175,7 +175,7 @@ def make_task(source, seed, detuned_px=1.5):
         math.atan(h * HALF_DIAGONAL_MM / float(nominal.first_order().efl_mm)) for h in FIELDS
     )
     nominal = in_focus(nominal, fields).freeze()
-    published_px = float(mean_spot_mm(nominal, fields)) / PITCH_MM
+    published_px = float(spot_rays(nominal, fields, DISTANCE_M, LIGHT).rms_mm().mean()) / PITCH_MM
     if published_px > 0.5 * detuned_px:
         raise DomainError(
             f"lens {source}: its mean RMS spot is {published_px:.3g} pixels before any detuning, so there "
@@ -209,16 +209,11 @@ def _detuned(around, fields, target_mm, generator):
             if not last:
                 raise
             continue
-        if bool((edge_thickness_mm(made) > around.edge_floor_mm.clamp_max(0)).all()):
+        if (edge_thickness_mm(made) > around.edge_floor_mm.clamp_max(0)).all():
             return made
     raise DomainError(
         f"{DIRECTIONS} detunings leave no edge to some element; choose another seed, or a smaller --detuned-px."
     )
-
-
-def mean_spot_mm(optics, fields_rad):
-    """Mean RMS spot of the wall over the fields, scalar mm."""
-    return spot_rays(optics, fields_rad, DISTANCE_M, LIGHT).rms_mm().mean()
 
 
 def in_focus(optics, fields_rad):
@@ -249,12 +244,14 @@ def draw_case(pool, seed, frames=9):
     """A world out of ``pool``, a place before it and a motion, all from one seed."""
     generator = torch.Generator().manual_seed(seed)
     world = pool[int(torch.randint(len(pool), (1,), generator=generator))]
-    place = 2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1
+    start = drawn_place(generator)
     motion = torch.randn(6, generator=generator, dtype=torch.float64)
-    start = pose.look_at(
-        (float(place[0]), -DISTANCE_M, float(place[1])), (float(place[0]), 0.0, float(place[1]))
-    )
     t_s = torch.linspace(0, DURATION_S, frames, dtype=torch.float64)
-    return Batch(
-        trajectories.body_twist(start, MOTION * motion / DURATION_S, t_s), t_s, world, seed
-    )
+    drive = trajectories.body_twist(start, MOTION * motion / DURATION_S, t_s)
+    return Batch(drive, t_s, world, seed)
+
+
+def drawn_place(generator):
+    """Pose [4, 4] of a camera that stands before the wall somewhere, and looks across it."""
+    x_m, z_m = (2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1).tolist()
+    return pose.look_at((x_m, -DISTANCE_M, z_m), (x_m, 0.0, z_m))

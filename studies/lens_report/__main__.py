@@ -6,6 +6,7 @@ apertures clip. Where a lens names no half field, the largest field up to 10 deg
 and at least half of whose rays arrive is taken, and the page says so.
 """
 
+import contextlib
 import math
 import sys
 import time
@@ -81,10 +82,10 @@ def study(run: Run[Config]) -> None:
     sharpness(run, geo, fields, light, quick, at_m)
     depth(run, geo, fields, light[0], distances)
     run.record(half_field_deg=half_deg, seconds=time.perf_counter() - start)
-    spots = [
+    spots = ", ".join(
         f"{radius:.1f} µm at {degrees(field)}" for field, radius in zip(fields, radii, strict=True)
-    ]
-    said = f"At f/{run.metrics['fno']:.3g} the lens makes RMS spots of {', '.join(spots)}."
+    )
+    said = f"At f/{run.metrics['fno']:.3g} the lens makes RMS spots of {spots}."
     run.finish(f"Lens report: {geo.name}", " ".join([said, *notes]))
 
 
@@ -112,11 +113,9 @@ def arrival(geo, field_rad, wavelength_um, at_m=math.inf):
     """Share of the pupil's light that arrives at a field, 0 when its chief ray does not."""
     try:
         analysis.chief_ray(geo, field_rad, wavelength_um, at_m=at_m)
-        return float(
-            analysis.trace_field(
-                geo, field_rad, analysis.pupil_grid(32, geo.dtype), wavelength_um, True, at_m=at_m
-            ).weight.mean()
-        )
+        return analysis.trace_field(
+            geo, field_rad, analysis.pupil_grid(32, geo.dtype), wavelength_um, True, at_m=at_m
+        ).weight.mean()
     except DomainError:
         return 0.0
 
@@ -133,13 +132,12 @@ def arriving(fields, geo, wavelength_um, at_m=math.inf):
 
 
 def first_order(run, geo, light, half_deg, at_m):
-    """Focal length, pupils and cardinal points."""
     f = geo.first_order(light[0])
     points = cardinal_points(geo, light[0])
     run.card(
         "Focal length",
-        f"{float(f.efl_mm):.4g} mm",
-        f"f/{float(f.fno):.3g} at {light[0] * 1e3:.0f} nm",
+        f"{f.efl_mm:.4g} mm",
+        f"f/{f.fno:.3g} at {light[0] * 1e3:.0f} nm",
     )
     run.record(efl_mm=f.efl_mm, bfl_mm=f.bfl_mm, fno=f.fno)
     run.section("First order")
@@ -164,19 +162,15 @@ def first_order(run, geo, light, half_deg, at_m):
     run.table(
         f"Paraxial figures at {light[0] * 1e3:.1f} nm, mm",
         ("figure", "mm"),
-        [(name, f"{float(value):.6g}") for name, value in figures.items()],
+        [(name, f"{value:.6g}") for name, value in figures.items()],
     )
     if len(light) > 1:
         colour = 1e3 * analysis.chromatic_focus_shift_mm(geo, light, light[0], at_m)
-        rows = [
-            (f"{w * 1e3:.1f}", f"{float(shift):.4g}")
-            for w, shift in zip(light, colour, strict=True)
-        ]
+        rows = [(f"{w * 1e3:.1f}", f"{shift:.4g}") for w, shift in zip(light, colour, strict=True)]
         run.table("Paraxial focus by wavelength", ("nm", "shift (µm)"), rows)
 
 
 def seidel(run, geo, half_rad, wavelength_um, at_m):
-    """Seidel sums, where the lens has paraxial rays."""
     sums = seidel_sums(geo, half_rad, wavelength_um, at_m=at_m)
     run.section(
         "Seidel sums",
@@ -188,15 +182,11 @@ def seidel(run, geo, half_rad, wavelength_um, at_m):
     colours = torch.stack([sums.axial_colour, sums.lateral_colour], 1)
     columns = torch.cat([sums.per_surface, colours], 1) / (wavelength_um * 1e-3)
     total = columns.sum(0)
-    labels = [*range(1, len(columns) + 1), "total"]
-    run.table(
-        "Seidel sums, waves",
-        ("surface", "S I", "S II", "S III", "S IV", "S V", "C I", "C II"),
-        [
-            (str(label), *(f"{float(v):.4f}" for v in row))
-            for label, row in zip(labels, [*columns, total], strict=True)
-        ],
-    )
+    cells = [(f"{v:.4f}" for v in row) for row in (*columns, total)]
+    rows = [(str(k), *row) for k, row in enumerate(cells, 1)]
+    rows[-1] = ("total", *rows[-1][1:])
+    heads = ("surface", "S I", "S II", "S III", "S IV", "S V", "C I", "C II")
+    run.table("Seidel sums, waves", heads, rows)
     run.record(
         **{f"seidel_{name}_waves": value for name, value in zip(NAMES, total[:5], strict=True)}
     )
@@ -247,7 +237,7 @@ def pictures(run, geo, fields, light, quick, at_m):
             run, field, rms_spot_um=radius, distortion_percent=distortion, passed_share=passed
         )
         radii.append(radius)
-        foci = (f"{float(s):.4f}" for s in shift)
+        foci = (f"{s:.4f}" for s in shift)
         rows.append((degrees(field), f"{radius:.2f}", f"{distortion:.3f}", *foci, f"{passed:.3f}"))
     run.table(
         "By field",
@@ -259,13 +249,11 @@ def pictures(run, geo, fields, light, quick, at_m):
 
 
 def record_at(run, field, **figures):
-    """Record figures of a field."""
     place = f"{math.degrees(field):.3g}deg".replace(".", "p")
     run.record(**{f"{name}_{place}": float(value) for name, value in figures.items()})
 
 
 def sharpness(run, geo, fields, light, quick, at_m):
-    """Wavefront, point spread, MTF."""
     run.section(
         "Wavefront",
         f"At {light[0] * 1e3:.0f} nm, against the sphere about the chief ray's image point.",
@@ -279,14 +267,10 @@ def sharpness(run, geo, fields, light, quick, at_m):
     for field in fields:
         front = analysis.wavefront(geo, field, light[0], 64, True, at_m=at_m)
         flat = analysis.remove_fit(front)
-        figures = (
-            analysis.rms_waves(front),
-            analysis.rms_waves(flat),
-            analysis.peak_to_valley_waves(front),
-            analysis.strehl_direct(flat),
-        )
-        record_at(run, field, rms_waves=figures[0])
-        rows.append((degrees(field), *(f"{float(v):.4f}" for v in figures)))
+        rms, extent = analysis.rms_waves(front), analysis.peak_to_valley_waves(front)
+        figures = rms, analysis.rms_waves(flat), extent, analysis.strehl_direct(flat)
+        record_at(run, field, rms_waves=rms)
+        rows.append((degrees(field), *(f"{v:.4f}" for v in figures)))
     run.table(
         "Wavefront by field",
         ("field", "RMS (waves)", "RMS without tilt", "peak to valley", "Strehl ratio without tilt"),
@@ -294,12 +278,9 @@ def sharpness(run, geo, fields, light, quick, at_m):
     )
     fno = float(geo.first_order(light[0]).fno.abs())
     airy = light[0] * 1e-3 * fno
+    how = {"about_chief": True, "at_m": at_m}
     widest = max(
-        float(
-            analysis.encircled_radius_mm(
-                geo, field, 0.99, light, 48, True, about_chief=True, at_m=at_m
-            )
-        )
+        float(analysis.encircled_radius_mm(geo, field, 0.99, light, 48, True, **how))
         for field in fields
     )
     pixels = 64 if quick else 96
@@ -310,22 +291,18 @@ def sharpness(run, geo, fields, light, quick, at_m):
     curves = {}
     for field in fields:
         steep = not sampled(geo, field, light, at_m)
+        picture, cells, how = analysis.psf_on_pixels, MOST_CELLS, "diffraction"
         # the picture repeats with the number of cells
         if steep or 1.2 * pixels * pixel > MOST_CELLS * min(light) * 1e-3 * fno:
-            psf = analysis.geometric_psf(geo, field, pixel, pixels, light, 256, True, at_m=at_m)
-            psfs[f"{degrees(field)}, rays"] = psf
-        else:
-            psf = analysis.psf_on_pixels(
-                geo, field, pixel, pixels, light, MOST_CELLS, True, at_m=at_m
-            )
-            psfs[f"{degrees(field)}, diffraction"] = psf
+            picture, cells, how = analysis.geometric_psf, 256, "rays"
+        psf = picture(geo, field, pixel, pixels, light, cells, True, at_m=at_m)
+        psfs[f"{degrees(field)}, {how}"] = psf
+        given = geo, field, frequency, light
         if steep:
-            curve = ideal * analysis.geometric_mtf(
-                geo, field, frequency, light, 96, True, at_m=at_m
-            )
+            curve = ideal * analysis.geometric_mtf(*given, 96, True, at_m=at_m)
         else:
             cells = 256 if quick else MOST_CELLS
-            curve = analysis.diffraction_mtf(geo, field, frequency, light, cells, True, at_m=at_m)
+            curve = analysis.diffraction_mtf(*given, cells, True, at_m=at_m)
         curves[f"{degrees(field)}{', rays' if steep else ''}"] = curve
         record_at(run, field, mtf_tangential=curve[0, 20], mtf_sagittal=curve[1, 20])
     run.record(mtf_at_per_mm=float(frequency[20]))
@@ -358,20 +335,18 @@ def sharpness(run, geo, fields, light, quick, at_m):
 
 
 def names_of(distances):
-    """Distances in words."""
     return ", ".join("infinity" if math.isinf(d) else f"{d:g} m" for d in distances)
 
 
 def sampled(geo, field, light, at_m):
     """Whether the wavefront of a field is gentle enough for ``MOST_CELLS`` pupil cells at every
     wavelength."""
-    try:
+    with contextlib.suppress(DomainError):
         for wavelength_um in light:
             # half the cells: a lens that just passes has room
             analysis.pupil_function(geo, field, wavelength_um, MOST_CELLS // 2, True, at_m=at_m)
-    except DomainError:
-        return False
-    return True
+        return True
+    return False
 
 
 def round_frequency(value):

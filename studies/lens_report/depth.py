@@ -29,11 +29,11 @@ def depth(run, geo, fields, wavelength_um, distances):
         except DomainError as error:
             refused.append(f"{title}: {error}")
             continue
-        near, far, focus = (float(v) for v in (found.near_m, found.far_m, found.focus_m))
-        limits.append((title, *(f"{v:.4g}" for v in (near, far, focus))))
-        run.record(**{f"depth_of_field_near_m_{title}": near})
-        if math.isfinite(far):
-            run.record(**{f"depth_of_field_far_m_{title}": far})
+        ends = {"near": found.near_m, "far": found.far_m}
+        limits.append((title, *(f"{v:.4g}" for v in (*ends.values(), found.focus_m))))
+        for name, end in ends.items():
+            if math.isfinite(end):
+                run.record(**{f"depth_of_field_{name}_m_{title}": end})
     nearest = min(distances)
     try:
         hyperfocal = float(analysis.hyperfocal_m(geo, blur_mm, wavelength_um))

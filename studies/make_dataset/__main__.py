@@ -125,8 +125,7 @@ def study(run: Run[Config]) -> None:
                 continue
             sequence = Sequence(maker, index, folder)
             for chunk in range(ready[index], maker.chunks):
-                events = sequence.make(chunk)
-                progress.advance(sequence=index, events=events)
+                progress.advance(sequence=index, events=sequence.make(chunk))
             sequence.finish()
             resident_mb.append(resident_mb_now())
     wall_s = time.perf_counter() - start
@@ -224,14 +223,12 @@ class Maker:
         self.clock = Clock()
 
     def path(self, index):
-        """Trajectory of a sequence."""
         family = FAMILIES[index % len(FAMILIES)]
         duration_s = float(times(self.config.frames, self.config.rate_hz)[-1])
         draw = self.drawn(2 * index)
         return motion(family, self.stage, self.scene, self.camera, duration_s, draw)
 
     def drawn(self, number):
-        """A generator of the run's seed."""
         return torch.Generator().manual_seed(1_000_003 * self.config.seed + number)
 
     def frames(self, poses, first, last):
@@ -274,8 +271,7 @@ class Maker:
             [[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]], dtype=torch.float64
         )
         beside = self.camera.chief_rays(film.middle_px + aside).direction.double()
-        x = beside[:, 0] / beside[:, 2]
-        y = beside[:, 1] / beside[:, 2]
+        x, y = (beside[:, :2] / beside[:, 2:]).T
         cx, cy = film.middle_px.tolist()
         content = io.BytesIO()
         with store.h5(content, "w") as file:
@@ -319,11 +315,10 @@ class Sequence:
         clock = maker.clock
         first = chunk * maker.chunk_frames
         last = min(first + maker.chunk_frames, maker.config.frames)
-        # at the start of a session
-        if self.state is None and chunk:
-            self.state = store.read_state(store.part_path(self.folder, chunk - 1))
-        elif self.state is None:
+        if chunk == 0:
             self.state = SensorState(generator=self.noise)
+        elif self.state is None:  # at the start of a session
+            self.state = store.read_state(store.part_path(self.folder, chunk - 1))
         with clock.on("frames"):
             frames = maker.frames(self.poses, first, last)
         with clock.on("truth"):

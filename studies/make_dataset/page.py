@@ -58,14 +58,14 @@ def statistics(folder):
         "events": events,
         "events_per_pixel_s": events / duration_s / (pixels / count),
         "on_share": on,
-        "mean_flow_px": float(np.mean(mean_px)),
-        "largest_flow_px": float(max(largest_px)),
-        "valid_share": float(np.mean(valid)),
+        "mean_flow_px": np.mean(mean_px),
+        "largest_flow_px": max(largest_px),
+        "valid_share": np.mean(valid),
         "occluded_share": occluded / (pixels - pixels // count),  # of frames with flow
         "nearest_m": min(nearest, default=0.0),
         "farthest_m": max(farthest),
         "mean_radiance": light / pixels,
-        "path_m": float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()),
+        "path_m": np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum(),
     }
 
 
@@ -79,7 +79,6 @@ def _lengths(flow, valid):
 
 
 def show(run, names, spent, wall_s, frames_made):
-    """Metrics and the page of a finished data set."""
     folders = {name: run.folder / name for name in names}
     rows = [
         {"sequence": name, **json.loads((folder / "sequence.json").read_text(encoding="utf-8"))}
@@ -127,7 +126,6 @@ def show(run, names, spent, wall_s, frames_made):
 
 
 def _pictures(folder):
-    """Images of the middle of a sequence by title."""
     with h5(folder / "frames.h5") as frames, h5(folder / "events.h5") as events:
         middle = (frames["frames"].shape[0] - 1) // 2
         image, depth, flow, valid = (

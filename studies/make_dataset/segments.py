@@ -33,7 +33,7 @@ class Segments:
             zip(self._parts, cameras, strict=True)
         ):
             met = owner == number
-            if not shapes or not bool(met.any()):
+            if not shapes or not met.any():
                 found = torch.where(met, first, found)
                 continue
             origin = turned(pose, rays.origin_m.double()) + pose[..., :3, 3]

@@ -8,6 +8,7 @@ so they are the same to the last bit however often the run was killed.
 
 import hashlib
 import io
+import itertools
 import json
 import shutil
 from contextlib import contextmanager
@@ -45,7 +46,6 @@ def h5(file, mode="r") -> Any:
 
 
 def part_path(folder: Path, index: int):
-    """Where part ``index`` of a sequence lies."""
     return folder / PARTS / f"{index:06d}.h5"
 
 
@@ -97,10 +97,7 @@ def read_state(path: Path):
 
 def parts_done(folder: Path):
     """Number of parts there are without a gap."""
-    count = 0
-    while part_path(folder, count).exists():
-        count += 1
-    return count
+    return next(k for k in itertools.count() if not part_path(folder, k).exists())
 
 
 def join(folder: Path, count: int, t_s, extra: dict[str, np.ndarray]):

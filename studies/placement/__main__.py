@@ -121,7 +121,6 @@ def cheapest(run: Run[Config], problem: Problem, starts: Sequence[Tensor]) -> Ca
 
 
 def checked(size: Config) -> None:
-    """Raise DomainError for sizes that cannot be."""
     if size.robot is None and size.pair not in PAIRS:
         raise DomainError(
             f"--pair {size.pair}: choose from {', '.join(PAIRS)}, or give --robot and a .yaml file."

@@ -51,9 +51,8 @@ def shuffled(volume: EventVolume) -> EventVolume:
     moves."""
     height, width = volume.counts.shape[-2:]
     order = torch.randperm(height * width, generator=torch.Generator().manual_seed(0))
-    return replace(
-        volume, counts=volume.counts.flatten(-2)[..., order].unflatten(-1, (height, width))
-    )
+    counts = volume.counts.flatten(-2)[..., order].unflatten(-1, (height, width))
+    return replace(volume, counts=counts)
 
 
 def looking_back(problem: Problem) -> Tensor:
@@ -65,9 +64,9 @@ def looking_back(problem: Problem) -> Tensor:
     # beneath them there may be no room over the ground
     downward = across[:, 2] < -DOWN * across.norm(dim=1)
     largest = int(across.norm(dim=1).masked_fill(downward, 0).argmax())
-    view = -across[largest] / across[largest].norm()
-    right = (faces[largest, 1] - faces[largest, 0]) / (faces[largest, 1] - faces[largest, 0]).norm()
+    face = faces[largest]
+    view, right = (way / way.norm() for way in (-across[largest], face[1] - face[0]))
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = torch.stack([right, torch.linalg.cross(view, right), view], 1)
-    pose[:3, 3] = faces[largest].mean(0) - NEAR_M * view
+    pose[:3, 3] = face.mean(0) - NEAR_M * view
     return pose

@@ -78,12 +78,8 @@ def before_and_after(problem: Problem, mount: Tensor) -> Figure:
     figure = plt.figure(figsize=(13, 6.4), layout="constrained")
     drives = problem.batch(fastest(problem))
     for row, pose in enumerate((problem.ranges.pose(problem.start), mount)):
-        draw_pair(
-            figure.add_subplot(2, 4, 4 * row + 1, projection="3d"),
-            problem.pair,
-            problem.camera,
-            pose,
-        )
+        left = figure.add_subplot(2, 4, 4 * row + 1, projection="3d")
+        draw_pair(left, problem.pair, problem.camera, pose)
         axes = [figure.add_subplot(2, 4, 4 * row + column) for column in (2, 3, 4)]
         with torch.no_grad():
             run = problem.system(pose, "sensor").begin(drives)
@@ -128,7 +124,6 @@ def robot_and_frame(pair: RobotPair, drives: Drives, camera: Camera, pose: Tenso
 
 
 def draw_pair(axis: Any, pair: RobotPair, camera: Camera, T_body_cam: Tensor) -> None:
-    """Robot and view, into a 3-D axis."""
     triangles = [mesh.vertices_m[mesh.faces] for mesh in pair.bodies.values()]
     shade = [np.clip(0.8 * bodies.skylight(mesh), 0, 1) for mesh in pair.bodies.values()]
     lines = robot_figures.view_lines(camera, T_body_cam, DRAWN_M)

@@ -2,6 +2,7 @@
 that is the robot itself, whether the mount keeps what is required, and what motions it is blind
 to."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -16,6 +17,7 @@ from codesign.mount import (
     VELOCITIES,
     Body,
     OwnBody,
+    Requirement,
     Sight,
     Surroundings,
     judge,
@@ -37,13 +39,12 @@ LEAST_HEIGHT_M = 0.05
 
 
 def look(run: Run[Any], pair: RobotPair, camera: render.Camera) -> None:
-    """The page of a robot and its default mount."""
     pose = pair.design.mount()
     drives = pair.batch((0,), 1, run.config.seed)
-    body = Body((mesh.vertices_m, mesh.faces) for mesh in pair.bodies.values())
+    meshes = pair.bodies.values()
+    body = Body((mesh.vertices_m, mesh.faces) for mesh in meshes)
     own_share = 1 - float(OwnBody(body, 1.0).exact(pose, camera))
-    faces = sum(len(mesh.faces) for mesh in pair.bodies.values())
-    run.record(faces=faces, own_body_share=own_share)
+    run.record(faces=sum(len(mesh.faces) for mesh in meshes), own_body_share=own_share)
     run.card("Own body in view", f"{own_share:.1%}", "of the pixels' chief rays")
     run.section("The robot and its view", size_in_words(pair))
     run.figure(
@@ -52,21 +53,15 @@ def look(run: Run[Any], pair: RobotPair, camera: render.Camera) -> None:
         "Left: the robot in its own axes (m) and its camera's view; right: the frame (gamma 2.2, 255 is white), the windows "
         "that are read outlined.",
     )
-    verdicts = judge(pair.requirements(), pose, camera)
-    run.text("Requirements: " + "; ".join(map(str, verdicts)) + ".")
+    verdicts = told_requirements(run, pair.requirements(), pose, camera)
     around = surroundings(pair, pose)
     told = what_it_tells(run, pair, camera, pose, "default")
     if told:
         names = [VELOCITIES[axis] for axis in around.axes]
         table = sight_table(camera, around)
-        for attitude in ATTITUDES:
-            label = attitude.replace(" ", "_")
-            finite = {
-                name: table[attitude][name]
-                for name in names
-                if math.isfinite(table[attitude][name])
-            }
-            run.record(**{f"{label}_{name}": value for name, value in finite.items()})
+        for attitude, name in itertools.product(ATTITUDES, names):
+            if math.isfinite(value := table[attitude][name]):
+                run.record(**{f"{attitude.replace(' ', '_')}_{name}": value})
         run.table(
             "Standard deviations from that place, by where the camera looks",
             ["looks", "sees", *names, "blind to", "weakest motion"],
@@ -83,6 +78,14 @@ def look(run: Run[Any], pair: RobotPair, camera: render.Camera) -> None:
             "Blind to: worse than 0.1 m/s or 0.1 rad/s. Weakest motion: shares of the units in which it is hardest to see.",
         )
     run.finish("A robot and its camera", answer(pair, own_share, verdicts, told))
+
+
+def told_requirements(
+    run: Run[Any], requirements: Sequence[Requirement], pose: Tensor, camera: render.Camera
+) -> Sequence[Verdict]:
+    verdicts = judge(requirements, pose, camera)
+    run.text("Requirements: " + "; ".join(map(str, verdicts)) + ".")
+    return verdicts
 
 
 def answer(
@@ -128,7 +131,7 @@ def what_it_tells(
     """Show what a mount [4, 4] is blind to over flat ground, and all other directions there; None
     where it is too low."""
     around = surroundings(pair, pose)
-    height = float(pose[2, 3] + around.T_world_body[2, 3])
+    height = pose[2, 3] + around.T_world_body[2, 3]
     if height <= LEAST_HEIGHT_M:
         return None
     told = sight(around.information(camera, pose)[0], sight_units(around), around.axes)

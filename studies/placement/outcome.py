@@ -40,7 +40,6 @@ class Paired:
 
 
 def paired(ours: Tensor, theirs: Tensor) -> Paired:
-    """Of errors [seeds] each."""
     found = median_ratio(ours, theirs, level=INTERVAL, draws=RESAMPLED)
     return Paired(found.value, found.low, found.high, int((ours < theirs).sum()), found.count)
 
@@ -73,7 +72,6 @@ class Outcome:
 
     @property
     def starts(self) -> int:
-        """How many."""
         return sum(name == "start" for _, name in self.judged)
 
     @cached_property
@@ -87,7 +85,6 @@ class Outcome:
 
     @cached_property
     def rivals(self) -> dict[str, Paired]:
-        """The gradient over each of the other searches."""
         ours = self.errors[GRADIENT]
         return {
             name: paired(ours, theirs)
@@ -118,7 +115,6 @@ class Outcome:
 
     @property
     def answered(self) -> Tensor:
-        """Errors [N] of the answer."""
         return self.judged[self.best]
 
     @property
@@ -130,17 +126,14 @@ class Outcome:
 
     @property
     def pose(self) -> Tensor:
-        """The same as T_body_cam [4, 4]."""
         return self.race.problem.ranges.pose(self.share)
 
     @property
     def error(self) -> float:
-        """Mean error of the answer."""
         return float(self.answered.mean())
 
     @property
     def default_error(self) -> float:
-        """Mean error of the pair's own mount."""
         return float(self.judged[0, DEFAULT].mean())
 
     @property
@@ -150,7 +143,6 @@ class Outcome:
         return over_worlds(self.answered, self.judged[0, DEFAULT], self.groups)
 
     def metrics(self) -> dict[str, float | int]:
-        """By name."""
         ratio, low, high = self.over_default
         found: dict[str, float | int] = {
             "default_error": self.default_error,
@@ -164,7 +156,7 @@ class Outcome:
         if self.groups >= LEAST_UNITS:
             found |= {"over_default_low90": low, "over_default_high90": high}
         for name, values in self.errors.items():
-            found[f"{_label(name)}_median_error"] = float(values.quantile(0.5))
+            found[f"{_label(name)}_median_error"] = values.quantile(0.5)
         for name, beside in self.rivals.items():
             over = f"over_{_label(name)}"
             found |= {f"{over}_median": beside.median, f"{over}_ahead": beside.ahead}
@@ -185,15 +177,12 @@ class Outcome:
             elif name != DEFAULT:
                 share, samples = race.answer(number, name), race.samples(number, name)
             numbers = [f"{value:.5f}" for value in problem.ranges.numbers(share).tolist()]
-            told = [
-                f"{float(errors.mean()):.5f}",
-                f"{standard_error(errors, self.groups):.5f}",
-            ]
+            told = errors.mean(), standard_error(errors, self.groups)
             seed = race.run.config.seed + number
-            writer.writerow([problem.pair.name, seed, name, *numbers, samples, *told])
+            said = (f"{figure:.5f}" for figure in told)
+            writer.writerow([problem.pair.name, seed, name, *numbers, samples, *said])
         return text.getvalue()
 
 
 def _label(name):
-    """A name among metrics."""
     return name.lower().replace("-", "_").replace(" ", "_")

@@ -7,21 +7,20 @@ from typing import Any
 from torch import Tensor
 
 from codesign.atomic import write_atomic
-from codesign.mount import VelocityErrors, judge
+from codesign.mount import VelocityErrors
 from codesign.report.prose import counted
 from codesign.system import HandOver, load_hand_over, save_hand_over
 from scenes.robots import pair as robot_pair
 from studies.frame.run import Run
 from studies.placement import figures
 from studies.placement.controls import controls
-from studies.placement.look import what_it_tells
+from studies.placement.look import told_requirements, what_it_tells
 from studies.placement.outcome import INTERVAL, LEAST_UNITS, Outcome
 from studies.placement.problem import Problem
 from studies.placement.race import DEFAULT, GRADIENT
 
 
 def report(run: Run[Any], outcome: Outcome) -> None:
-    """Metrics, raw table, hand-over and page."""
     write_atomic(run.path("race.csv"), outcome.table().encode())
     run.record(**outcome.metrics())
     run.card(
@@ -78,7 +77,6 @@ def answer(outcome: Outcome) -> str:
 
 
 def place_in_words(problem: Problem, share: Tensor) -> str:
-    """Position and attitude of a mount."""
     x, y, z, yaw, pitch, roll = problem.ranges.numbers(share).tolist()
     turned = ", ".join(
         f"{name} {round(math.degrees(angle)):+d}°".replace("-", "−")
@@ -88,7 +86,6 @@ def place_in_words(problem: Problem, share: Tensor) -> str:
 
 
 def searches(run: Run[Any], outcome: Outcome) -> None:
-    """The searches beside one another."""
     race = outcome.race
     samples = race.samples(0, GRADIENT)
     begun = f"{outcome.starts} mounts" if outcome.starts > 1 else "mount"
@@ -135,26 +132,20 @@ def seen(run: Run[Any], outcome: Outcome) -> None:
         "The robot with its default mount (above) and that of the answer (below): frame of an "
         "unseen drive with the windows read, events of the hard sensor in them, flow.",
     )
-    verdicts = judge(unseen.requirements, mount, unseen.camera)
-    run.text("Requirements: " + "; ".join(map(str, verdicts)) + ".")
+    told_requirements(run, unseen.requirements, mount, unseen.camera)
     what_it_tells(run, unseen.pair, unseen.camera, mount, "answer")
 
 
 def left(run: Run[Any], outcome: Outcome) -> None:
-    """What is left where there is nothing to be found."""
     unseen, mount = outcome.unseen, outcome.pose
-    samples = unseen.draw(0)
-    found = controls(unseen, mount, samples)
+    found = controls(unseen, mount, unseen.draw(0))
     run.section(
         "Controls",
         "Single events on unseen samples. Errors of an answer that is always zero, of a camera "
         "that sees nothing move, and of one that looks at its own robot should be alike.",
     )
-    run.table(
-        "What is left",
-        ("control", "mean bounded error"),
-        [[k.replace("_", " "), v] for k, v in found.items()],
-    )
+    rows = [(name.replace("_", " "), value) for name, value in found.items()]
+    run.table("What is left", ("control", "mean bounded error"), rows)
     run.record(**{f"control_{name}_error": value for name, value in found.items()})
 
 
@@ -173,8 +164,7 @@ def handed(run: Run[Any], outcome: Outcome) -> VelocityErrors:
         mount, unseen.camera, robot_pair.SENSOR, unseen.pair.frame, "camera_optical_frame", notes
     )
     save_hand_over(path, handed_over)
-    back = load_hand_over(path)
-    found = unseen.judged(back.mount().detach(), unseen.draw(0), "sensor")
+    found = unseen.judged(load_hand_over(path).mount().detach(), unseen.draw(0), "sensor")
     again = found.bounded().mean()
     run.record(hand_over_score_again=again, hand_over_score=outcome.error)
     run.section(
@@ -186,7 +176,6 @@ def handed(run: Run[Any], outcome: Outcome) -> VelocityErrors:
 
 
 def velocities(run: Run[Any], outcome: Outcome, found: VelocityErrors) -> None:
-    """Errors of each velocity, in its own unit."""
     unseen = outcome.unseen
     default = unseen.judged(unseen.ranges.pose(unseen.start), unseen.draw(0), "sensor")
     rows: list[list[Any]] = []

@@ -86,7 +86,6 @@ class Problem:
 
     @property
     def samples(self) -> int:
-        """Drives in a draw."""
         return self.spread * self.per_world
 
     @property
@@ -100,13 +99,14 @@ class Problem:
 
     def draw(self, number: int) -> Samples:
         """Samples of that number: other worlds and drives for each, until all have been seen."""
+
+        def shuffled(count, seed):
+            return torch.randperm(count, generator=torch.Generator().manual_seed(seed)).tolist()
+
         turns, part = divmod(number, max(1, len(self.numbers) // self.spread))
-        order = torch.randperm(len(self.numbers), generator=torch.Generator().manual_seed(turns))
-        drives = torch.randperm(DRIVES, generator=torch.Generator().manual_seed(number))[
-            : self.per_world
-        ]
-        chosen = order[part * self.spread : (part + 1) * self.spread].tolist()
-        return Samples(tuple(self.numbers[k] for k in chosen), tuple(drives.tolist()), number)
+        chosen = shuffled(len(self.numbers), turns)[part * self.spread : (part + 1) * self.spread]
+        which = tuple(shuffled(DRIVES, number)[: self.per_world])
+        return Samples(tuple(self.numbers[k] for k in chosen), which, number)
 
     def batch(self, samples: Samples) -> Drives:
         """Worlds and drives of samples, the robot in them, which count as rendered."""
@@ -115,24 +115,21 @@ class Problem:
 
     def scenes(self, samples: Samples) -> Drives:
         """Worlds and drives of samples; worlds are built once."""
-        scenes = []
-        poses = []
-        twists = []
+        scenes, poses, twists = [], [], []
+        which = list(samples.which)
         for number in samples.numbers:
             if number not in self._worlds:
                 self._worlds[number] = (self.pair.world(number), *self.pair.drive(number, DRIVES))
-            world, driven, twist = self._worlds[number]
-            which = list(samples.which)
-            scenes.append(render.MovingScene(world, {"body": (self._body, driven[which])}))
-            poses.append(driven[which])
-            twists.append(twist[which])
-        return Drives(
-            torch.stack(poses), times(), tuple(scenes), samples.seed, twist=torch.cat(twists)
-        )
+            world, *drives = self._worlds[number]
+            driven, twist = (part[which] for part in drives)
+            scenes.append(render.MovingScene(world, {"body": (self._body, driven)}))
+            poses.append(driven)
+            twists.append(twist)
+        twist = torch.cat(twists)
+        return Drives(torch.stack(poses), times(), tuple(scenes), samples.seed, twist=twist)
 
     @cached_property
     def own_body(self) -> OwnBody:
-        """Of the robot, in its camera's view."""
         body = Body((mesh.vertices_m, mesh.faces) for mesh in self.pair.bodies.values())
         return OwnBody(body, 1.0)
 
@@ -167,7 +164,6 @@ class Problem:
 
     @torch.no_grad()
     def penalty_of(self, share: Tensor) -> float:
-        """Of a mount [6]."""
         return float(self.penalty(self.ranges.pose(share)))
 
     def penalty(self, T_body_cam: Tensor) -> Tensor:
@@ -206,23 +202,17 @@ class Problem:
         them carried over."""
         worlds, each = len(samples.numbers), len(samples.which)
         batch = self.scenes(replace(samples, which=samples.which * len(poses)))
-        which = (
-            torch.arange(worlds * each)
-            .reshape(worlds, 1, each)
-            .expand(-1, len(poses), -1)
-            .flatten()
+        drives = torch.arange(worlds * each).reshape(worlds, 1, each)
+        which = drives.expand(-1, len(poses), -1).flatten()
+        fields = of_bodies(field, which, worlds * each)
+        there = self._seen(fields, batch, poses.repeat_interleave(each, 0))
+        told, told_there = (
+            self.trend.told(seen.surfaces, seen.flow_px, seen.covered) for seen in (here, there)
         )
-        there = self._seen(
-            of_bodies(field, which, worlds * each), batch, poses.repeat_interleave(each, 0)
-        )
-        told = self.trend.told(here.surfaces, here.flow_px, here.covered)
-        told_there = self.trend.told(there.surfaces, there.flow_px, there.covered)
-        read = self.trend.carried(
-            of_bodies(here.read, which, worlds * each), told[which], there.read, told_there
-        )
-        return (
-            self._bounded(read, there, batch.twist).reshape(worlds, len(poses), each).mean((0, 2))
-        )
+        read = of_bodies(here.read, which, worlds * each)
+        read = self.trend.carried(read, told[which], there.read, told_there)
+        errors = self._bounded(read, there, batch.twist)
+        return errors.reshape(worlds, len(poses), each).mean((0, 2))
 
     def _seen(self, field, batch, T_body_cam):
         """What flow in the windows of a batch is of, from a mount [4, 4], or from one for each

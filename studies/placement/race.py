@@ -29,20 +29,14 @@ WORST = 1.0
 
 def feasible(problem: Problem, count: int, seed: int, first: Sequence[Tensor] = ()) -> list[Tensor]:
     """Mounts [6] to start from: those given, and others spread at random over what is allowed."""
-    if bool(problem.ranges.held.all()):
+    if problem.ranges.held.all():
         raise DomainError(
             "equal bounds hold all six numbers of the mount; widen what is to be searched."
         )
     found = list(first)[:count]
-    more = count - len(found)
-    return [
-        *found,
-        *(
-            starts(problem.ranges, more, problem.requirements, problem.real, seed=seed)
-            if more
-            else ()
-        ),
-    ]
+    if more := count - len(found):
+        found += starts(problem.ranges, more, problem.requirements, problem.real, seed=seed)
+    return found
 
 
 def kept(problem: Problem, share: Tensor) -> bool:
@@ -85,15 +79,12 @@ class Race:
             check_same(stored.numbers, self.fingerprints)
 
     def save(self) -> None:
-        """Keep what has been found."""
         self.run.save_state(self.tensors, self.fingerprints)
 
     def trail(self, number: int, name: str) -> Trail:
-        """What a search looked at."""
         return Trail(*(self.tensors[f"{name}/{number}/{part}"] for part in ("share", "error")))
 
     def samples(self, number: int, name: str) -> int:
-        """Drives that a search rendered."""
         return int(self.tensors[f"{name}/{number}/samples"])
 
     def descent(self, number: int, start: Tensor) -> None:
@@ -133,15 +124,11 @@ class Race:
             share = whole(part)
             return None if kept(problem, share) else WORST + problem.penalty_of(share)
 
+        def judge(part):
+            return problem.error(whole(part), samples)
+
         def make(advance):
-            trail = SEARCHES[name](
-                lambda part: problem.error(whole(part), samples),
-                start[free],
-                count,
-                seed,
-                advance,
-                refused,
-            )
+            trail = SEARCHES[name](judge, start[free], count, seed, advance, refused)
             return Trail(whole(trail.share), trail.error)
 
         self._made(number, name, count, make)
@@ -164,12 +151,8 @@ class Race:
         """The mount [6] that a search ends with: the descent's mean of its end, or the last before
         it that keeps what is required; of the others the best that does."""
         trail = self.trail(number, name)
-        order = trail.error.argsort().tolist()
-        if name == GRADIENT:
-            order = range(len(trail.error) - 1, -1, -1)
-        return next(
-            (trail.share[k] for k in order if kept(self.problem, trail.share[k])), trail.share[0]
-        )
+        shares = trail.share.flip(0) if name == GRADIENT else trail.share[trail.error.argsort()]
+        return next((share for share in shares if kept(self.problem, share)), trail.share[0])
 
     def judge(self, unseen: Problem, starts: list[Tensor]) -> dict[tuple[int, str], Tensor]:
         """Bounded errors [N] of starts and answers, on the same unseen samples with single events.
@@ -191,7 +174,7 @@ class Race:
                     self.tensors[key] = unseen.judged(pose, samples, "sensor").bounded()
                     self.save()
                 found[number, name] = self.tensors[key]
-                bar.advance(error=float(self.tensors[key].mean()))
+                bar.advance(error=self.tensors[key].mean())
         return found
 
     def chosen(self, count: int) -> tuple[int, str]:

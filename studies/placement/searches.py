@@ -45,7 +45,6 @@ class Trail:
 
     @property
     def best(self) -> int:
-        """Index of the smallest error."""
         return int(self.error.argmin())
 
 
@@ -66,11 +65,10 @@ def descend(
     """
     here = start.detach().clone()
     pace = torch.zeros_like(here)
-    shares = []
-    errors = []
+    shares, errors = [], []
     for step in range(steps):
         value, gradient = slope(here, step)
-        if not bool(torch.isfinite(gradient).all()):
+        if not torch.isfinite(gradient).all():
             raise NonFiniteError(f"the gradient of the placement is not finite at step {step + 1}.")
         shares.append(here)
         errors.append(value)
@@ -144,7 +142,6 @@ class Search:
 
 
 def uniform(start: Tensor, seed: int) -> Proposals:
-    """Points spread evenly at random."""
     random = np.random.default_rng(seed)  # another stream than the starts'
     yield start
     while True:
@@ -216,6 +213,6 @@ def available(names: Iterable[str]) -> dict[str, Search]:
         if name not in SEARCHES:
             raise DomainError(f"search '{name}' is unknown; choose from {', '.join(SEARCHES)}.")
         found[name] = SEARCHES[name]
-        if found[name].library:
-            require(found[name].library, "search", f"the search {name}")
+        if library := SEARCHES[name].library:
+            require(library, "search", f"the search {name}")
     return found

@@ -84,7 +84,7 @@ def judge(simulated, recorded):
     Raises: DomainError when nothing was recorded in one polarity.
     """
     totals = recorded.double().sum((0, 2, 3))
-    if bool((totals == 0).any()):
+    if (totals == 0).any():
         raise DomainError(
             "no event of one polarity was recorded in the second half; record for longer."
         )
@@ -103,7 +103,6 @@ def judge(simulated, recorded):
 
 
 def show(run, recording, sensor, simulated, figures):
-    """Write the page."""
     recorded = recording.counts()
     half = len(recorded) // 2
     rows = [(LABELS[name], *found.values()) for name, found in figures.items()]
@@ -128,10 +127,7 @@ def show(run, recording, sensor, simulated, figures):
     run.table(
         "Fitted sensor (sensor.json)",
         ("parameter", "start", "fitted"),
-        [
-            (name, START[name], f"{float(value.detach()):.3g}")
-            for name, value in sensor.values().items()
-        ],
+        [(name, START[name], f"{value.detach():.3g}") for name, value in sensor.values().items()],
     )
     run.figure(
         maps(recorded, simulated, half),

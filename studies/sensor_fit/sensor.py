@@ -88,7 +88,6 @@ class FittedSensor(torch.nn.Module):
         )
 
     def save(self, path):
-        """Write the values as JSON."""
         values = {name: float(value.detach()) for name, value in self.values().items()}
         write_atomic(Path(path), json.dumps(values, indent=2).encode())
 
@@ -149,7 +148,6 @@ class Fit:
         return self.losses[-1]
 
     def state(self):
-        """Tensors and numbers to go on from."""
         moments = self.optimiser.state_dict()["state"]
         tensors = {
             f"{index}/{name}": value for index, of in moments.items() for name, value in of.items()
@@ -157,7 +155,6 @@ class Fit:
         return {**tensors, **self.sensor.state_dict()}, {"losses": self.losses}
 
     def restore(self, tensors, numbers):
-        """Take up what ``state`` gave."""
         self.losses = list(numbers["losses"])
         self.sensor.load_state_dict({name: tensors[name] for name in self.sensor.state_dict()})
         moments = {}

@@ -132,7 +132,6 @@ def _front(rows, seconds, change_px):
 def of_stage(
     world: Any, task: Task, levels: Levels, stage: str, rounds: int
 ) -> list[dict[str, Any]]:
-    """Rows of the levels of one stage, timed in turns."""
     measure = MEASURES[stage]
     finest = Fidelity.finest(levels)
     run = system_of(world, task, finest).begin(batch_of(task, finest))

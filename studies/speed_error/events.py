@@ -18,6 +18,7 @@ from studies.speed_error import Config
 SIZES = {"346x260": (260, 346, 96), "1280x720": (720, 1280, 32)}
 SPEED_PX = {"calm": 0.05, "busy": 0.6}
 FPS = 1000
+CHUNK = 500  # frames of the stream at a time
 THETA = 0.2
 # every kind of noise that v2e has by default
 NOISE = events.SensorModel(
@@ -121,24 +122,23 @@ def timed(size: str, pace: float, repeats: int, seed: int) -> list[dict[str, obj
     return rows
 
 
-def stream(run: Run[Config], count: int, chunk: int = 500) -> None:
+def stream(run: Run[Config], count: int) -> None:
     """Memory in use while frames of 32 x 32 pixels go through a sensor with all noise; events are
     dropped."""
-    frames = texture(32, 32, chunk, 0.05, run.config.seed)
+    frames = texture(32, 32, CHUNK, 0.05, run.config.seed)
     state = events.SensorState()
     memory = []
-    with run.progress(count // chunk, "stream") as progress:
-        for first in range(0, count, chunk):
-            t_s = torch.arange(first, first + chunk, dtype=torch.float64) / FPS
+    with run.progress(count // CHUNK, "stream") as progress:
+        for first in range(0, count, CHUNK):
+            t_s = torch.arange(first, first + CHUNK, dtype=torch.float64) / FPS
             events.simulate(frames, t_s, NOISE, state=state)
             memory.append(resident_mb())
             progress.advance(memory_mb=memory[-1])
     run.record(stream_growth_mb=max(memory) - memory[len(memory) // 10])
     at = np.linspace(0, count, len(memory))
     chart = Panel({"memory": (at, memory)}, "frames", "memory in use, MB")
-    run.figure(
-        panels(chart, width=6), "memory", f"{count:,} frames, {chunk} at a time, through a sensor."
-    )
+    caption = f"{count:,} frames, {CHUNK} at a time, through a sensor."
+    run.figure(panels(chart, width=6), "memory", caption)
 
 
 def spiking_stage(run: Run[Config]) -> list[Asked]:
@@ -157,16 +157,13 @@ def spiking_stage(run: Run[Config]) -> list[Asked]:
     figures = []
     for count in steps:
         ours = {row["kind"]: row for row in select(rows, layer="codesign", steps=count)}
-        figures += [
-            Asked(f"{kind}, T = {count}: copies", ours[kind]["copies"], most=most)
-            for kind, most in ASKED_COPIES.items()
-        ]
-        figures += [
-            Asked(f"{row['layer']} over ours, T = {count}: wall", row["wall_s"] / both, least)
-            for layer, least in ASKED_SPEED.items()
-            for row in select(rows, layer=layer, steps=count, kind="forward_backward")
-            for both in [ours["forward_backward"]["wall_s"]]
-        ]
+        for kind, most in ASKED_COPIES.items():
+            figures.append(Asked(f"{kind}, T = {count}: copies", ours[kind]["copies"], most=most))
+        both = ours["forward_backward"]["wall_s"]
+        for row in select(rows, steps=count, kind="forward_backward"):
+            if least := ASKED_SPEED.get(row["layer"]):
+                what = f"{row['layer']} over ours, T = {count}: wall"
+                figures.append(Asked(what, row["wall_s"] / both, least))
     return figures
 
 
@@ -196,13 +193,12 @@ def ours(drive):
     return srm(drive, theta=THETA_SPIKE, tau_s=TAU_S, tau_r=TAU_R, response="alpha")[0]
 
 
-def taps(tau: float, amplitude: float, cut: float = 0.01) -> torch.Tensor:
-    """SLAYER's finite alpha kernel: 77 taps for tau = 10."""
+def taps(tau: float, amplitude: float) -> torch.Tensor:
+    """SLAYER's finite alpha kernel, down to 0.01: 77 taps for tau = 10."""
     found = []
-    k = 0
-    while k <= tau or abs(found[-1]) >= cut:
+    while len(found) <= tau or abs(found[-1]) >= 0.01:
+        k = len(found)
         found.append(amplitude * k / tau * math.exp(1 - k / tau))
-        k += 1
     return torch.tensor(found[:-1])
 
 
@@ -247,7 +243,10 @@ def snntorch_cell(drive):
 
     decay = math.exp(-1 / TAU_S)
     cell = snntorch.Synaptic(decay, decay, threshold=THETA_SPIKE, reset_mechanism="subtract")
-    states = cell.reset_mem()
+    return _stepped(cell, cell.reset_mem(), drive)
+
+
+def _stepped(cell, states, drive):
     spikes = []
     for x in drive:
         spike, *states = cell(x, *states)
@@ -259,13 +258,7 @@ def norse_cell(drive):
     """norse's two-state leaky integrate-and-fire cell, step by step."""
     from norse.torch import LIFCell  # pyright: ignore[reportMissingImports]
 
-    cell = LIFCell()
-    state = None
-    spikes = []
-    for x in drive:
-        spike, state = cell(x, state)
-        spikes.append(spike)
-    return torch.stack(spikes)
+    return _stepped(LIFCell(), [None], drive)
 
 
 SPIKING: dict[str, Callable] = {

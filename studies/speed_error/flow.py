@@ -80,7 +80,6 @@ def _label(name, kind, size, windows):
 
 
 def like_the_refiner(network, seed):
-    """A network of as many weights as the refiner."""
     return network.with_weights(count_weights(Refiner()), seed=seed)
 
 

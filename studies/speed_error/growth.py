@@ -57,7 +57,7 @@ def stage(run: Run[Config]) -> list[Asked]:
 
 def fitted(counts: np.ndarray, cpu_s: np.ndarray) -> float:
     """The exponent p of cpu_s ~ counts^p, by least squares of the logarithms."""
-    return float(np.polyfit(np.log(counts), np.log(cpu_s), 1)[0])
+    return np.polyfit(np.log(counts), np.log(cpu_s), 1)[0]
 
 
 def seconds(make: Callable[[int], render.MitsubaScene], count: int) -> dict[str, float]:
@@ -80,8 +80,7 @@ def seconds(make: Callable[[int], render.MitsubaScene], count: int) -> dict[str,
     for work in (renders, scene.outline, step, step):
         work()
         clock.append(time.process_time())
-    seconds_of = np.diff(clock) / (RENDERS, 1, 1, 1)
-    return dict(zip(PARTS, seconds_of.tolist(), strict=True))
+    return dict(zip(PARTS, (np.diff(clock) / (RENDERS, 1, 1, 1)).tolist(), strict=True))
 
 
 def cubes(count: int) -> render.MitsubaScene:

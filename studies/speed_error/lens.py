@@ -99,7 +99,6 @@ def tracing(
     repeats: int,
     seed: int,
 ) -> dict[str, Any]:
-    """Cost and largest error of one tracer."""
     warnings.simplefilter("ignore")
     make = trace_by_optiland if tracer == "optiland" else trace_by_us
     # imports, and compiles what does not depend on the number of rays

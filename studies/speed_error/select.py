@@ -17,8 +17,8 @@ from scenes import trajectories, worlds
 from studies.frame.bench import turns
 from studies.frame.compare import median_ratio
 from studies.frame.run import Run
-from studies.frame.show import Asked, tabulate
-from studies.frame.sweep import sweep
+from studies.frame.show import Asked, table, tabulate
+from studies.frame.sweep import column, sweep
 from studies.speed_error import Config
 
 SIZE_PX = 48
@@ -129,41 +129,24 @@ def stage(run: Run[Config]) -> list[Asked]:
     cases = dict(list(CASES.items())[:2]) if run.config.quick else CASES
     rows = sweep(run, partial(judged, rounds=run.config.repeats), "select", scene=cases)
     shown = ("flow_px", "tolerance_px", "here_px", "fresh_px", "faster", "over_best")
-    tabulate(
-        run,
-        "Picks",
-        [{k: row[k] for k in ("scene", *shown, "holds")} for row in rows],
-        "scene",
-        prefix="select",
-    )
-    run.table(
-        "What was picked",
-        ("scene", "pick", "best of all"),
-        [(row["scene"], row["pick"], row["best"]) for row in rows],
-    )
+    picks = [{k: row[k] for k in ("scene", *shown, "holds")} for row in rows]
+    tabulate(run, "Picks", picks, "scene", prefix="select")
+    titles = {"scene": "scene", "pick": "pick", "best": "best of all"}
+    run.table("What was picked", *table(rows, **titles))
     for row in rows:
         run.text(
             f"**{row['scene']}**: faster {row['faster_interval']}, over the best {row['over_interval']}."
         )
+    held, faster, over = (column(rows, name) for name in ("holds", "faster", "over_best"))
+    quick = sum(x >= ASKED_FASTER for x in faster)
     return [
-        Asked(
-            "picks that hold", sum(row["holds"] for row in rows), least=min(ASKED_HOLD, len(rows))
-        ),
-        Asked(
-            "scenes at least 3 x faster",
-            sum(row["faster"] >= ASKED_FASTER for row in rows),
-            least=min(ASKED_QUICK, len(rows)),
-        ),
-        Asked(
-            "worst time over the best of all",
-            max(row["over_best"] for row in rows),
-            most=ASKED_OVER_BEST,
-        ),
+        Asked("picks that hold", sum(held), least=min(ASKED_HOLD, len(rows))),
+        Asked("scenes at least 3 x faster", quick, least=min(ASKED_QUICK, len(rows))),
+        Asked("worst time over the best of all", max(over), most=ASKED_OVER_BEST),
     ]
 
 
 def judged(scene: Case, rounds: int) -> dict[str, Any]:
-    """Figures of one scene."""
     world, task = scene.scene(), scene.task(0)
     truth, valid = render.true_flow(task.camera, world, task.T_world_body[:, [0, -1]])
     size_px = float(truth.square().sum(-3)[valid].mean().sqrt())
@@ -181,11 +164,8 @@ def judged(scene: Case, rounds: int) -> dict[str, Any]:
         return change(*(outcome(world, other, each, seed).judged for each in (pick, finest)))
 
     fresh_px = max(map(off, FRESH))
-    works = {
-        name: once(world, task, each)
-        for name, each in {"pick": pick, "best": best, "finest": finest}.items()
-    }
-    timed = turns(works, rounds)
+    named = {"pick": pick, "best": best, "finest": finest}
+    timed = turns({name: once(world, task, each) for name, each in named.items()}, rounds)
     faster = median_ratio(timed["finest"].cpu_s, timed["pick"].cpu_s)
     over = median_ratio(timed["pick"].cpu_s, timed["best"].cpu_s)
     return {
@@ -205,7 +185,6 @@ def judged(scene: Case, rounds: int) -> dict[str, Any]:
 
 
 def once(world: Any, task: Task, fidelity: Fidelity) -> Callable[[], Any]:
-    """The chain of a fidelity, to be called."""
     system, batch = system_of(world, task, fidelity), batch_of(task, fidelity)
     return torch.no_grad()(lambda: system(batch))
 

@@ -52,10 +52,7 @@ CAPTION = (
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
-    QUICK: ClassVar = {
-        "frames": 60,
-        "steps": 8,
-    }
+    QUICK: ClassVar = {"frames": 60, "steps": 8}
     frames: int = 200
     """Frames of every rendered sequence, at 500 per second."""
     steps: int = 160
@@ -74,7 +71,7 @@ def study(run: Run[Config]) -> None:
         esim_theta=theta,
         ours_theta_on=on,
         ours_theta_off=off,
-        ours_refractory_s=float(ours.refractory_s()),
+        ours_refractory_s=ours.refractory_s(),
     )
     ours.save(run.path("spike_esim.npz"))
     draws = 100 if run.config.quick else 1000
@@ -92,10 +89,8 @@ def study(run: Run[Config]) -> None:
                 run.record(**interval.metrics(f"unseen_{name}_{key}_{figure}"))
             rows.append({"generator": title, **found})
         run.table(f"Unseen {name}", *table(rows), CAPTION)
-        shown = {
-            "physical sensor": some[0].counts,
-            **{TITLES[key]: counts[key][0] for key in TITLES},
-        }
+        shown = {"physical sensor": some[0].counts}
+        shown |= {title: counts[key][0] for key, title in TITLES.items()}
         show(run, f"unseen_{name}", shown, some[0].dt_s)
         of = {row["generator"]: row["loss"].value for row in rows}
         nearer += of[TITLES["ours"]] < of[TITLES["esim"]]
@@ -116,14 +111,12 @@ def study(run: Run[Config]) -> None:
 
 
 def sequences(run, wanted):
-    """Lists of rendered sequences."""
     wanted = [some[:2] if run.config.quick else some for some in wanted]
+    made = [[] for _ in wanted]
     with run.progress(sum(map(len, wanted)), "sequences") as progress:
-        made = []
-        for some in wanted:
-            made.append([])
+        for some, mine in zip(wanted, made, strict=True):
             for one in some:
-                made[-1].append(rendered(*one, run.config.frames))
+                mine.append(rendered(*one, run.config.frames))
                 progress.advance()
     return made
 
@@ -161,11 +154,10 @@ def show(run, name, shown, dt_s):
     run.figure(pictures(rows), f"{name}_pictures", "Events of 30 ms. Red ON, blue OFF.")
 
     def chart(rates, label):
-        times = {
-            title: 1e3 * judge.BIN_S * (torch.arange(len(rate)) + 0.5)
+        series = {
+            title: (1e3 * judge.BIN_S * (torch.arange(len(rate)) + 0.5), rate)
             for title, rate in rates.items()
         }
-        series = {title: (times[title], rate) for title, rate in rates.items()}
         return Panel(series, "time, ms", f"{label} events of 10 ms")
 
     totals = {title: judge.binned(counts, dt_s)[..., 0, 0].T for title, counts in shown.items()}

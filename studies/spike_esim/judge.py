@@ -19,19 +19,20 @@ HIGH_HZ = 50.0
 def judge(pairs, resamples, seed):
     """Figures by name, numbers or Intervals, of pairs (counts [T-1, 2, H, W], Sequence with the
     target's); ON and OFF: the smaller one."""
-    found, target = [made for made, _ in pairs], [sequence.counts for _, sequence in pairs]
+    found, target = sides = [[x for x, _ in pairs], [sequence.counts for _, sequence in pairs]]
     dt_s = pairs[0][1].dt_s
     loss, rate = intervals(pairs, resamples, seed)
-    cells = [[binned(counts, dt_s, CELL_PX) for counts in side] for side in (found, target)]
-    power = [sum(flicker(counts, dt_s) for counts in side) for side in (found, target)]
+    ours, theirs = (sum(flicker(counts, dt_s) for counts in side) for side in sides)
+
+    def correlated(side_px):
+        return correlation(*([binned(x, dt_s, side_px) for x in side] for side in sides))
+
     return {
         "loss": loss,
         "rate_ratio": rate,
-        "rate_correlation": correlation(
-            *([binned(x, dt_s) for x in side] for side in (found, target))
-        ),
-        "cell_correlation": correlation(*cells),
-        "flicker_ratio": power[0] / power[1],
+        "rate_correlation": correlated(None),
+        "cell_correlation": correlated(CELL_PX),
+        "flicker_ratio": ours / theirs,
         "delay_s": dt_s * delay(found, target, round(LAGS_S / dt_s)),
     }
 
@@ -45,11 +46,8 @@ def distance(pairs):
 def intervals(pairs, resamples, seed):
     """``distance``, and events over the target's: Interval each, 95 %, blocks of pixels drawn
     again."""
-    found, silence, made, wanted = block_sums(pairs)
-    return [
-        ratio_of_means(*pair, draws=resamples, seed=seed)
-        for pair in ((found, silence), (made, wanted))
-    ]
+    halves = block_sums(pairs).split(2)
+    return [ratio_of_means(*half, draws=resamples, seed=seed) for half in halves]
 
 
 def block_sums(pairs):
@@ -58,35 +56,34 @@ def block_sums(pairs):
     sums = []
     for found, sequence in pairs:
         target = sequence.counts
-        errors = (found - target, target)
-        responses = [
-            events.alpha_response(error, tau_s=TAU_S, dt=sequence.dt_s)[0] for error in errors
+        squares = [
+            events.alpha_response(error, tau_s=TAU_S, dt=sequence.dt_s)[0].square()
+            for error in (found - target, target)
         ]
-        pictures = [
-            x.sum((0, 1)) for x in (*(response.square() for response in responses), found, target)
-        ]
-        sums.append(F.avg_pool2d(torch.stack(pictures), BLOCK_PX).flatten(1) * BLOCK_PX**2)
+        pictures = torch.stack([x.sum((0, 1)) for x in (*squares, found, target)])
+        sums.append(F.avg_pool2d(pictures, BLOCK_PX).flatten(1) * BLOCK_PX**2)
     return torch.cat(sums, 1).double()
 
 
 def binned(counts, dt_s, side_px=None):
     """Events per bin, polarity and cell, [bins, 2, h, w]; one cell is the whole picture when
     side_px is None. What fills no bin or cell is left out."""
+    sums = _pictures(counts, dt_s)
+    if side_px is None:
+        return sums.sum((-2, -1), keepdim=True)
+    return F.avg_pool2d(sums, side_px) * side_px**2
+
+
+def _pictures(counts, dt_s):
+    """Events per bin, [bins, 2, H, W]."""
     steps = max(1, round(BIN_S / dt_s))
-    sums = counts[: len(counts) // steps * steps].unflatten(0, (-1, steps)).sum(1)
-    return (
-        sums.sum((-2, -1), keepdim=True)
-        if side_px is None
-        else F.avg_pool2d(sums, side_px) * side_px**2
-    )
+    return counts[: len(counts) // steps * steps].unflatten(0, (-1, steps)).sum(1)
 
 
 def filtered(counts, dt_s):
     """Pictures of one bin each behind a median of 5 x 5 px, [bins, 2, H, W]: lone events vanish,
     edges stay."""
-    steps = max(1, round(BIN_S / dt_s))
-    pictures = counts[: len(counts) // steps * steps].unflatten(0, (-1, steps)).sum(1)
-    wide = F.pad(pictures, (MEDIAN_PX // 2,) * 4, mode="replicate")
+    wide = F.pad(_pictures(counts, dt_s), (MEDIAN_PX // 2,) * 4, mode="replicate")
     return wide.unfold(2, MEDIAN_PX, 1).unfold(3, MEDIAN_PX, 1).flatten(-2).median(-1).values
 
 
@@ -123,7 +120,6 @@ def delay(found, target, most):
 
 def _pearson(first, second):
     """Pearson's correlation; 0 when one side is constant."""
-    first = first.double() - first.double().mean()
-    second = second.double() - second.double().mean()
+    first, second = (side.double() - side.double().mean() for side in (first, second))
     norm = float(first.norm() * second.norm())
     return float(first @ second) / norm if norm > 0 else 0.0

@@ -4,6 +4,7 @@ spiking network of the thesis, ESIM with its best threshold, and Spike-ESIM."""
 import math
 from dataclasses import dataclass
 from functools import partial
+from operator import attrgetter
 
 import torch
 from torch import Tensor
@@ -67,7 +68,7 @@ class Store:
     one."""
 
     def __init__(self, run):
-        stored = run.load_state() if run.resumed else None
+        stored = run.load_state()
         self.run = run
         self.tensors = dict(stored.tensors) if stored else {}
 
@@ -110,11 +111,7 @@ def generators(run, sequences):
     def draw(sequence):
         return ours.draw(sequence.frames, sequence.t_s, torch.Generator().manual_seed(0))[0]
 
-    made |= {
-        "esim": partial(esim, theta=theta),
-        "ours": draw,
-        "sensor": lambda sequence: sequence.again,
-    }
+    made |= {"esim": partial(esim, theta=theta), "ours": draw, "sensor": attrgetter("again")}
     return made, ours, theta
 
 
@@ -124,7 +121,6 @@ def best_theta(sequences):
 
 
 def esim(sequence, theta):
-    """Counts of the ideal sensor."""
     return events.dense_counts(sequence.frames, sequence.t_s, SensorModel(theta, theta))
 
 
@@ -167,18 +163,17 @@ def descend(optimiser, loss, steps, advance, paces=None, clip=math.inf):
         torch.nn.utils.clip_grad_norm_(parameters, clip)
         optimiser.step()
         schedule.step()
-        advance(loss=float(value.detach()))
+        advance(loss=value.detach())
 
 
-def objective(found, target, dt_s, count_weight=0.1, block_steps=8):
+def objective(found, target, dt_s):
     """Van Rossum distance and a share of that of pooled counts, each over that of silence."""
 
     def over_silence(distance):
         return distance(found, target) / distance(torch.zeros_like(target), target)
 
-    pooled = partial(events.count_loss, side_px=8, steps=block_steps)
-    loss = over_silence(partial(events.van_rossum, tau_s=TAU_S, dt=dt_s))
-    return loss + count_weight * over_silence(pooled) if count_weight else loss
+    pooled = over_silence(partial(events.count_loss, side_px=8, steps=8))
+    return over_silence(partial(events.van_rossum, tau_s=TAU_S, dt=dt_s)) + 0.1 * pooled
 
 
 def train_ours(model, sequences, steps, generator, advance):
@@ -225,12 +220,8 @@ def calibrate(model, sequences, rounds=3):
     for _ in range(rounds):
         found = torch.zeros(2, dtype=torch.float64)
         for sequence in sequences:
-            counts = model(sequence.frames, sequence.t_s)[0]
-            found += (
-                (counts + model.expected_noise(sequence.frames, sequence.t_s))
-                .sum((0, 2, 3))
-                .double()
-            )
+            seen = sequence.frames, sequence.t_s
+            found += (model(*seen)[0] + model.expected_noise(*seen)).sum((0, 2, 3)).double()
         # events go as 1/theta for a steady change and as 1/theta^2 for a random walk
         model.log_gain.add_(0.7 * (found / target).log())
 

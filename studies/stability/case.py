@@ -134,6 +134,17 @@ def nothing(**_: Tensor) -> float:
     return 0.0
 
 
+SPOILT = {"place": Span(0, 1), "kind": Span(0, 1)}
+
+
+def spoilt(values: Tensor, place: Tensor, kind: float = 0.0) -> Tensor:
+    """Values of which the one at a place, 0 to 1 of the way through them, is NaN, or infinite from
+    a ``kind`` of 1/2 on."""
+    at = (place * (values.numel() - 0.1)).long()
+    flat = values.flatten().index_fill(0, at, math.nan if kind < 0.5 else math.inf)
+    return flat.reshape(values.shape)
+
+
 def off(expected: Tensor, seen: Tensor, unit: float = 1.0) -> float:
     """Largest difference over the largest expected, or over the unit where that is larger."""
     size = max(float(expected.abs().max()), unit)

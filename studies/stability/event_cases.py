@@ -12,7 +12,7 @@ import torch
 
 from codesign import events
 from codesign.types import EventStream
-from studies.stability.case import Case, Span
+from studies.stability.case import SPOILT, Case, Span, spoilt
 
 MANY = 100_000
 SECOND_US = 1_000_000
@@ -158,11 +158,9 @@ def nearness(times_s):
     return torch.cat([shares, 0 * shares])
 
 
-def spoilt(layer, place, kind):
+def refused(layer, place, kind):
     """NaN or infinity anywhere in the frames is refused."""
-    value = math.nan if kind < 0.5 else math.inf
-    frames = place.new_full((6,), 50.0).index_fill(0, (place * 5.9).long(), value)
-    return layer(frames, place.new_tensor(0.2))
+    return layer(spoilt(place.new_full((6,), 50.0), place, kind), place.new_tensor(0.2))
 
 
 THETA, THRESHOLDS, NUDGE = Span(0.05, 0.4), Span(1, 20), Span(0, 0, (2,))
@@ -177,7 +175,6 @@ RESTING = [{"theta": THETA, "gray": gray, "nudge": Span(0, 0)} for gray in GRAYS
 LAYERS = {"memory": memory, "smooth counts": smooth, "sensor": sensor}
 DEAD = {"theta": Span(0.01, 0.05), "every": Span(1, 60)}
 ONE, AT_ONCE = {"theta": THETA, "share": Span(0.55, 0.95)}, {"times_s": Span(0, 1, (1,))}
-PLACE = {"place": Span(0, 1), "kind": Span(0, 1)}
 # single levels near 4 are exact to 2.4e-7: of the smallest threshold; of a quarter of 0.05; over
 # the slowest speed, 0.052 a second. Near 70 they are to 4e-6 of 0.05
 FINE, TURNED, MICROSECOND = (1e-10, 1e-9, 3e-3), (1e-12, 1e-9, 1e-4), (1e-6, 0, 6e-6)
@@ -193,7 +190,7 @@ CASES = [
     Case("one event", "sensor", ONE, only_event, crossing, MICROSECOND, ()),
     Case("one event", "volume", AT_ONCE, volume_of, nearness, MICROSECOND, ()),
     *[
-        Case("NaN or infinity", stage, PLACE, partial(spoilt, layer), "frames must be finite")
+        Case("NaN or infinity", stage, SPOILT, partial(refused, layer), "frames must be finite")
         for stage, layer in LAYERS.items()
     ],
 ]

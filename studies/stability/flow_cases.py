@@ -9,7 +9,7 @@ import torch
 
 from codesign import events, flow
 from codesign.types import EventVolume
-from studies.stability.case import Case, Span, nothing
+from studies.stability.case import SPOILT, Case, Span, nothing, spoilt
 
 SIDE_PX = 48
 TIMES_S = torch.linspace(0, 0.1, 31, dtype=torch.float64)
@@ -101,41 +101,36 @@ def one_event(amount):
 
 def no_events(counts):
     """No flow, not valid, no confidence, no slope."""
-    field = estimate(counts.reshape(2, 5, 6, 8))
+    field = estimate(counts)
     valid = field.valid[0].to(counts).expand(2, 6, 8)
     return torch.cat([field.flow_px[0], valid, field.confidence.to(counts)])
 
 
 def mirrored(counts):
-    return estimate(counts.reshape(2, 5, 6, 8).flip(-1)).flow_px[0]
+    return estimate(counts.flip(-1)).flow_px[0]
 
 
 def mirrored_flow(counts):
     """Mirrored events flow mirrored."""
-    across, down = estimate(counts.reshape(2, 5, 6, 8)).flow_px[0].flip(-1)
+    across, down = estimate(counts).flow_px[0].flip(-1)
     return torch.stack([-across, down])
 
 
 def too_few(counts):
     """Counts of 1e-320 to 1e-39 say nothing: no flow."""
-    return estimate(counts.reshape(2, 5, 6, 8)).flow_px
+    return estimate(counts).flow_px
 
 
-def spoilt(place, kind):
+def refused(place, kind):
     """NaN or infinity anywhere in the counts is refused."""
-    value = math.nan if kind < 0.5 else math.inf
-    counts = place.new_ones(480).index_fill(0, (place * 479.9).long(), value)
-    return estimate(counts.reshape(2, 5, 6, 8)).flow_px
+    return estimate(spoilt(place.new_ones(2, 5, 6, 8), place, kind)).flow_px
 
 
-COUNTS, ZEROS = {"counts": Span(0, 4, (480,))}, {"counts": Span(0, 0, (480,))}
-TINY = {"counts": Span(1e-320, 1e-39, (480,), log=True)}
-SMALL, SHIFT, ZOOM = (
-    {"shift_px": Span(-5e-4, 5e-4)},
-    {"shift_px": Span(1, 4)},
-    {"zoom": Span(0.1, 0.3)},
-)
-PLACE = {"place": Span(0, 1), "kind": Span(0, 1)}
+SHAPE = (2, 5, 6, 8)
+COUNTS, ZEROS = {"counts": Span(0, 4, SHAPE)}, {"counts": Span(0, 0, SHAPE)}
+TINY = {"counts": Span(1e-320, 1e-39, SHAPE, log=True)}
+SMALL, SHIFT = ({"shift_px": Span(*ends)} for ends in ((-5e-4, 5e-4), (1, 4)))
+ZOOM = {"zoom": Span(0.1, 0.3)}
 EXACT, SYMMETRIC, LINEAR = (0.0, 0.0, 0.0), (1e-10, 1e-9, 1e-3), (0.01, 0.01, 0.05)
 ASKED = (0.17, 0.17, 1e-3)  # error over that of zero flow, of fine textures
 HALF = {"learn": (), "unit": 0.5, "slow": True}
@@ -156,5 +151,5 @@ CASES = [
     Case("out and half back", "flow", SHIFT, by_events, half_of_it, ASKED, known=UNTURNED, **HALF),
     Case("out and half back", "chosen flow", SHIFT, by_choice, half_of_it, ASKED, **HALF),
     Case("mirrored shapes", "flow", COUNTS, mirrored, mirrored_flow, SYMMETRIC, slow=True),
-    Case("NaN or infinity", "flow", PLACE, spoilt, "event volume must be finite"),
+    Case("NaN or infinity", "flow", SPOILT, refused, "event volume must be finite"),
 ]

@@ -5,7 +5,7 @@ import math
 import torch
 
 from codesign import lens
-from studies.stability.case import Case, Span
+from studies.stability.case import Case, Span, spoilt
 
 INDEX = 1.5
 GLASS = lens.Glass.from_indices(INDEX, INDEX, INDEX)
@@ -22,8 +22,7 @@ def traced(height, front, back):
     """They pass 5 mm of glass and 10 mm of air; status, light and deficit of each, and landing."""
     surfaces = [lens.Surface(math.inf, 5.0, GLASS, 9.9), lens.Surface(math.inf, 10.0, None, 9.9)]
     geo = lens.GeoLens(surfaces, 4.0, height.dtype)
-    bent = geo.replace(curvature_per_mm=torch.stack([front, back]))
-    out = bent.trace(*along_axis(height))
+    out = geo.replace(curvature_per_mm=torch.stack([front, back])).trace(*along_axis(height))
     return torch.stack([out.status.to(height), out.weight, out.deficit]), out.position_mm[:, 0]
 
 
@@ -83,14 +82,13 @@ def slightly_bent(height, curvature):
 def spoilt_ray(place):
     """NaN anywhere in the origins is refused."""
     origin, ahead = along_axis(place.new_ones(4))
-    origin = origin.flatten().index_fill(0, (place * 11.9).long(), math.nan).reshape(4, 3)
-    return lens.load("cooke-triplet", place.dtype).trace(origin, ahead).weight
+    return lens.load("cooke-triplet", place.dtype).trace(spoilt(origin, place), ahead).weight
 
 
 BENT = {"height": Span(7.5, 9.0, (1,)), "curvature": Span(-0.11, -0.095)}
 WIDE = {"height": Span(11, 40, (3,)), "curvature": Span(0.095, 0.2)}
 FLAT = {"height": Span(-3, 3, (2,)), "curvature": Span(1e-320, 1e-39, log=True)}
-BALL = {"height": Span(0.05, 0.9, (3,))}
+LOST, BALL = ({"height": span} for span in (Span(7.5, 9, (2,)), Span(0.05, 0.9, (3,))))
 # from where the light comes, and the ball's size
 FAR = BALL | {"distance": Span(1, 2e6, log=True), "scale": Span(1, 1)}
 SCALED = BALL | {"distance": Span(1, 2), "scale": Span(1e-3, 1e3, log=True)}
@@ -100,13 +98,7 @@ OF_NEAR = (1e-12, 1e-9, 1e-5)
 CASES = [
     Case("total reflection", "lens", BENT, reflected, reflection, DEFICIT),
     Case("all rays lost", "lens", WIDE, missed, miss, DEFICIT),
-    Case(
-        "all rays lost",
-        "render",
-        {"height": Span(7.5, 9, (2,))},
-        through_nothing,
-        "every ray fails",
-    ),
+    Case("all rays lost", "render", LOST, through_nothing, "every ray fails"),
     Case("object 10 km away", "lens", FAR, through_ball, ball_landing, OF_FAR, ("height",)),
     Case(
         "huge, tiny coordinates", "lens", SCALED, through_ball, ball_landing, OF_NEAR, ("height",)

@@ -6,7 +6,7 @@ import torch
 
 from codesign import lens, mount, pose, render
 from scenes import trajectories
-from studies.stability.case import Case, Span, nothing
+from studies.stability.case import Case, Span, nothing, spoilt
 from studies.stability.motion import hat, rigid, rodrigues, small
 
 MANY = 100_000
@@ -50,8 +50,7 @@ def one_motion(twist):
 
 def spoilt_pose(place):
     """NaN anywhere in a pose is refused."""
-    start = torch.eye(4).to(place).flatten()
-    return pose.check_pose(start.index_fill(0, (place * 15.9).long(), math.nan).reshape(4, 4))
+    return pose.check_pose(spoilt(torch.eye(4).to(place), place))
 
 
 def mirrored_pose(place):
@@ -86,7 +85,7 @@ def pinhole_flow(depth):
 
 def spoilt_mount(place):
     """NaN anywhere in the numbers of a mount is refused."""
-    return pose_of(place.new_zeros(6).index_fill(0, (place * 5.9).long(), math.nan))
+    return pose_of(spoilt(place.new_zeros(6), place))
 
 
 ZERO, TINY = Span(0, 0, (6,)), Span(1e-320, 1e-9, (6,), log=True)

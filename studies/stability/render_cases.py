@@ -6,7 +6,7 @@ from functools import cache, partial
 import torch
 
 from codesign import backend, lens, pose, render
-from studies.stability.case import Case, Span
+from studies.stability.case import Case, Span, spoilt
 from studies.stability.motion import FREQUENCY, MEAN, PHASE, plane_light, rigid, rodrigues, small
 
 FOCAL_MM, PITCH_MM = 20.0, 0.5
@@ -30,8 +30,12 @@ def plane(distance, amplitude, mean=MEAN):
 
 def picture(twist, distance, amplitude=0.3, mean=MEAN):
     """The wall from a pose that is ``twist`` away, lengths in units of its distance."""
-    shift = torch.cat([twist[:3] * distance, twist[3:]])
-    return render.frames(camera(), plane(distance, amplitude, mean), pose.se3_exp(shift)[None])
+    there = pose.se3_exp(_stretched(twist, distance))[None]
+    return render.frames(camera(), plane(distance, amplitude, mean), there)
+
+
+def _stretched(twist, distance):
+    return torch.cat([twist[:3] * distance, twist[3:]])
 
 
 def one_light(twist, distance, light=MEAN):
@@ -39,10 +43,10 @@ def one_light(twist, distance, light=MEAN):
     return light
 
 
-def expected_picture(twist, distance, amplitude=0.3, motion=rodrigues):
+def expected_picture(twist, distance, motion=rodrigues):
     """The texture under every ray, with lengths from 0.1 mm to 10 km."""
-    scaled = torch.cat([twist[:3] * distance, twist[3:]])
-    light = plane_light(motion(scaled), camera().rays().direction, distance, amplitude)
+    there = motion(_stretched(twist, distance))
+    light = plane_light(there, camera().rays().direction, distance, 0.3)
     return light.reshape(1, 4, 4, -1).mean(-1)
 
 
@@ -53,16 +57,14 @@ def near_picture(twist, distance):
 
 def spoilt_poses(place):
     """NaN anywhere in the poses is refused."""
-    poses = torch.eye(4).to(place).expand(3, 4, 4).flatten()
-    poses = poses.index_fill(0, (place * 47.9).long(), math.nan).reshape(3, 4, 4)
+    poses = spoilt(torch.eye(4).to(place).repeat(3, 1, 1), place)
     return render.frames(camera(), plane(place.new_ones(()), 0.3), poses)
 
 
 def flow_of(path, distance):
     """Flow from the first of some poses to the last, [2, H, W] px."""
     poses = torch.stack([pose.se3_exp(twist) for twist in path])
-    wall = plane(distance, 0.3)
-    return render.true_flow(camera(), wall, poses, stride=len(path) - 1)[0][0]
+    return render.true_flow(camera(), plane(distance, 0.3), poses, stride=len(path) - 1)[0][0]
 
 
 def ahead(zoom, distance):

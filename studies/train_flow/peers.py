@@ -93,7 +93,6 @@ class ECN(Baseline):
 
 
 def _with_channels(image, count):
-    """An image with empty channels added up to a count."""
     return pad(image, (0, 0, 0, 0, 0, count - image.shape[1]))
 
 
@@ -152,8 +151,9 @@ class IDNet(Baseline):
         padded = counts.unflatten(1, (2, -1))
         bins = padded.shape[2]
         time = (volume.centroid_s / volume.collected_s.sum()).to(padded)
-        cells = [side // self.STRIDE for side in padded.shape[3:]]
-        flow = padded.new_zeros(batch, 2, *cells)  # px on cells
+        flow = padded.new_zeros(
+            batch, 2, *[side // self.STRIDE for side in padded.shape[3:]]
+        )  # px on cells
         full = padded.new_zeros(batch, 2, *padded.shape[3:])
         found = []
         for _ in range(self.config["iterations"]):
@@ -162,8 +162,7 @@ class IDNet(Baseline):
                 at = pixel_grid(*full.shape[2:], full) + time[:, None, None, None] * full[:, None]
                 each = read_at(each, at.flatten(0, 1), "zeros")
             each = each.contiguous(memory_format=torch.channels_last)
-            read = self.encoder(each).unflatten(0, (batch, bins))
-            state = self._read(read)
+            state = self._read(self.encoder(each).unflatten(0, (batch, bins)))
             flow = flow + self.STRIDE * self.head(state)
             full = mixed(flow, self.blend(state))
             found.append(full)

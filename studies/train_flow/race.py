@@ -5,6 +5,8 @@ Every training is a run of this study in a folder below; those that are done are
 goes on with --resume. Then all networks are judged on the same windows.
 """
 
+import itertools
+import operator
 import re
 import subprocess
 import sys
@@ -13,11 +15,11 @@ from dataclasses import fields
 
 from codesign import flow
 from codesign.errors import CodesignError, DomainError
+from codesign.flow.baselines.parts import count_weights
 from codesign.flow.refiner import Refiner
 from codesign.report.prose import counted
 from codesign.train.validation import batches, score
-from scenes.windows.sets import SETS, UNSEEN, VALIDATION, Shape
-from scenes.windows.worlds import ALL, WorldWindows
+from scenes.windows.sets import judging
 from studies.train_flow.setup import named_class
 
 NAMES = {
@@ -76,7 +78,6 @@ def _folder(run, network, seed):
 
 
 def _train(run, wanted):
-    """Run every training that is not done, some at a time."""
     waiting = [job for job in wanted if not (_folder(run, *job) / "report.html").exists()]
     done = len(wanted) - len(waiting)
     children: list[subprocess.Popen] = []
@@ -90,8 +91,7 @@ def _train(run, wanted):
                 each.result()
                 progress.advance()
         finally:
-            for each in active:
-                each.cancel()
+            pool.shutdown(wait=False, cancel_futures=True)
             for child in children:
                 child.terminate()
 
@@ -127,26 +127,16 @@ def _command(run, network, seed):
         "validate-every": 10**9,
         "validate-on": "layers",
     }
-    options |= {
-        name: value
-        for name, value in (("steps", config.steps), ("cpu-minutes", config.cpu_minutes))
-        if value is not None
-    }
+    options |= {"steps": config.steps, "cpu-minutes": config.cpu_minutes}
     if network in NAMES and network != "refiner":
-        options["weights"] = sum(p.numel() for p in Refiner().parameters())
-    return [
-        *start,
-        *(word for name, value in options.items() for word in (f"--{name}", str(value))),
-    ]
+        options["weights"] = count_weights(Refiner())
+    given = [(f"--{name}", str(value)) for name, value in options.items() if value is not None]
+    return [*start, *itertools.chain(*given)]
 
 
 def _judged(run, networks):
-    """Set -> who -> Score, every network on the same windows."""
-    shape = Shape(64, 64, 8)
     count = run.config.final_windows
-    sets = {name: (make(shape, SEED), count) for name, make in VALIDATION.items()}
-    sets["worlds"] = (WorldWindows(ALL, seed=UNSEEN + SEED, bins=8), count // 3)
-    sets |= {name: (make(UNSEEN + SEED, 8), count // 2) for name, make in SETS.items()}
+    sets = judging(SEED, 8, count, count // 3, count // 2)
     estimators = {"closed form": flow.estimate_lk, **networks}
     found = {}
     with run.progress(len(sets), "judging") as progress:
@@ -166,30 +156,22 @@ def _show(run, names, networks, found):
         ratios = {
             network: [scores[network, seed].ratio for seed in config.seeds] for network in names
         }
-        shares = [
-            max(
-                ours / theirs for ours, theirs in zip(ratios["refiner"], ratios[rival], strict=True)
-            )
-            for rival in rivals
-        ]
-        met += sum(share <= ASKED for share in shares)
+        shares = {
+            rival: max(map(operator.truediv, ratios["refiner"], ratios[rival])) for rival in rivals
+        }
+        met += sum(share <= ASKED for share in shares.values())
+        closed = scores["closed form"]
+        figures = {"closed_form_ratio": closed.ratio, "windows": closed.windows}
         for network, values in ratios.items():
             for seed, value in zip(config.seeds, values, strict=True):
-                run.record(**{f"{name}_{_key(network)}_ratio_seed{seed}": value})
-        closed = scores["closed form"]
-        run.record(
-            **{f"{name}_closed_form_ratio": closed.ratio, f"{name}_windows": closed.windows},
-            **{
-                f"{name}_refiner_over_{_key(r)}_worst": s
-                for r, s in zip(rivals, shares, strict=True)
-            },
-        )
+                figures[f"{_key(network)}_ratio_seed{seed}"] = value
+        figures |= {f"refiner_over_{_key(rival)}_worst": x for rival, x in shares.items()}
+        run.record(**{f"{name}_{figure}": value for figure, value in figures.items()})
         spread = [f"{min(values):.3f} to {max(values):.3f}" for values in ratios.values()]
-        rows.append([name.replace("_", " "), closed.windows, closed.ratio, *spread, *shares])
+        cells = (closed.windows, closed.ratio, *spread, *shares.values())
+        rows.append([name.replace("_", " "), *cells])
     asked = len(rivals) * len(rows)
-    weights = {
-        name: sum(p.numel() for p in networks[name, config.seeds[0]].parameters()) for name in names
-    }
+    weights = {name: count_weights(networks[name, config.seeds[0]]) for name in names}
     run.record(**{f"{_key(name)}_weights": number for name, number in weights.items()})
     run.record(shares_met=met, shares_asked=asked)
     run.card(

@@ -189,10 +189,7 @@ def build_network(config):
 
 
 def named_class(name):
-    """The class of a network by its name, or by module:Class.
-
-    Raises: DomainError where there is none.
-    """
+    """The class of a network by its name, or by module:Class. Raises: DomainError where there is none."""
     module, colon, own = name.partition(":")
     if not colon:
         return checkpoint.network_class(name)
@@ -216,12 +213,8 @@ def parse(option):
 
 
 def start(network, config):
-    """Begin with the weights of an earlier network.
-
-    Raises: FileFormatError when they are of another network.
-    """
-    path = checkpoint.DELIVERED.get(str(config.start), Path(config.start))
-    stored = checkpoint.read(path)
+    """Begin with the weights of an earlier network. Raises: FileFormatError when they are of another one."""
+    stored = checkpoint.read(checkpoint.DELIVERED.get(str(config.start), Path(config.start)))
     if stored.network != config.network:
         raise FileFormatError(
             f"'{config.start}' holds a '{stored.network}', --network is '{config.network}'; give the same "
@@ -261,9 +254,8 @@ def sources(config, shape):
 
 
 def _warn_of_empty(config, whole):
-    """Warn where most of the windows that are looked at hold no event."""
     looked = range(0, len(whole), max(1, len(whole) // LOOKED_AT))
-    empty = sum(not bool(whole.batch([k]).volume.counts.any()) for k in looked)
+    empty = sum(not whole.batch([k]).volume.counts.any() for k in looked)
     if 2 * empty > len(looked):
         warnings.warn(
             f"{empty} of {len(looked)} windows of '{config.data}' that were looked at hold no event where they are cut; is "
@@ -273,7 +265,6 @@ def _warn_of_empty(config, whole):
 
 
 def check_names(option, names, table):
-    """Raise DomainError for a name that is not in the table."""
     for name in names:
         if name not in table:
             raise DomainError(f"--{option} {name} is unknown; choose from {', '.join(table)}.")

@@ -73,7 +73,6 @@ class Watch:
             self._bar.advance(loss=statistics.fmean(progress.loss[-RECENT:]), step=step)
 
     def save(self):
-        """Write the checkpoint."""
         training.save(
             self.run.path("checkpoint"), self.job.learner, self.job.progress, self.job.facts
         )
@@ -104,7 +103,6 @@ class Watch:
         self.run.say(f"step {progress.step}: error over that of zero flow (closed form): {shown}")
 
     def finish(self):
-        """Save, judge on all windows, keep the network, write metrics and page."""
         run = self.run
         progress = self.job.progress
         learner = self.job.learner
@@ -160,7 +158,6 @@ def _figures(found):
 
 
 def show(run, job, scores):
-    """Cards, table, figures and text of a finished run."""
     config = run.config
     progress = job.progress
     rows = []
@@ -216,7 +213,6 @@ def answer(scores):
 
 
 def curves(progress):
-    """Figure of loss, gradient norm and validation."""
     width = max(1, min(RECENT, progress.step // 5))
     at = np.arange(width, progress.step + 1)
     charts = [
@@ -240,7 +236,6 @@ def curves(progress):
 
 @torch.no_grad()
 def pictures(job, scores):
-    """Figure: one window of each set, in rows."""
     network = job.learner.delivered.eval()
     device = next(network.parameters()).device
     rows = {}

@@ -94,7 +94,6 @@ def check_outputs(run, config, height, width):
 
 
 def write_outputs(run, config, log):
-    """Write the event files; returns their paths."""
     paths = [run.path(name) for name in config.events]
     if paths:
         stream = log.read(0, log.count)

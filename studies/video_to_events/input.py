@@ -48,9 +48,9 @@ def frame_times(config, source, most=None):
     if config.slow_motion != 1:
         t_s = t_s[0] + (t_s - t_s[0]) / config.slow_motion
         clock = f"{clock}; plays {config.slow_motion:g} times slower than life"
-    if not bool(t_s.isfinite().all() & ((t_s * 1e6).round().diff() >= 1).all()):
+    if not (t_s.isfinite().all() & ((t_s * 1e6).round().diff() >= 1).all()):
         raise DomainError(
-            f"two frames lie {float(t_s.diff().min()) * 1e6:.3g} us apart; times must be finite and increase "
+            f"two frames lie {t_s.diff().min() * 1e6:.3g} us apart; times must be finite and increase "
             "strictly, by a microsecond or more, in which events are counted."
         )
     used = torch.ones(source.count, dtype=torch.bool)
@@ -62,7 +62,7 @@ def frame_times(config, source, most=None):
     if len(kept) < 2:
         raise DomainError(
             f"{len(kept)} frame(s) lie between --start-s and --stop-s; the input has {source.count}, from "
-            f"{float(t_s[0]):g} to {float(t_s[-1]):g} s, and two are needed."
+            f"{t_s[0]:g} to {t_s[-1]:g} s, and two are needed."
         )
     return t_s, int(kept[0]), int(kept[-1]) + 1, clock
 

@@ -84,7 +84,6 @@ class View:
 
 
 def write_page(view, state, sensor, clock, written):
-    """Record the metrics, draw everything, and write the page."""
     run = view.run
     frames = len(view.t_s)
     off = state.events - state.on
@@ -131,8 +130,8 @@ def write_page(view, state, sensor, clock, written):
         pictures(view)
     run.section(
         "Input and sensor",
-        f"Clock: {clock}. Events carry that time in microseconds, from {float(view.t_s[0]):.6f} s to "
-        f"{float(view.t_s[-1]):.6f} s.",
+        f"Clock: {clock}. Events carry that time in microseconds, from {view.t_s[0]:.6f} s to "
+        f"{view.t_s[-1]:.6f} s.",
     )
     run.text(light(view))
     if view.config.upsample is not None:
@@ -208,7 +207,6 @@ def warnings(view, state, sensor, slow):
 
 
 def light(view):
-    """How digital values become light, in a sentence."""
     gamma = (
         "the sRGB gamma is undone, so intensities are linear in light"
         if view.config.linear
@@ -222,7 +220,6 @@ def light(view):
 
 
 def pictures(view):
-    """First pictures, rates, space-time figure, and the videos."""
     run = view.run
     config = view.config
     run.section("Events")
@@ -253,7 +250,6 @@ def pictures(view):
 
 
 def video(view, name, made, caption):
-    """Write a video, and show it where it is small enough."""
     path = view.run.path(f"{name}.mp4")
     write_video(path, made, PREVIEW_FPS)
     size_mb = path.stat().st_size / 1e6
@@ -265,13 +261,11 @@ def video(view, name, made, caption):
 
 
 def event_pictures(view):
-    """Pictures of the video of events, one by one."""
     for stream, start_us, end_us in view.streams():
         yield picture(to_counts(stream, [start_us / 1e6, end_us / 1e6])[0], FULL_SCALE)
 
 
 def trace_pictures(view):
-    """Pictures of the video of fading traces, one by one."""
     start = None
     for stream, _, end_us in view.streams():
         trace = decay_from_stream(stream, [end_us], view.tau_s, start=start, dtype=torch.float64)[0]
@@ -318,5 +312,4 @@ def short(value):
 
 
 def seconds(duration_s):
-    """A duration in the unit that suits it."""
     return f"{duration_s:.4g} s" if duration_s >= 1 else f"{duration_s * 1e3:.4g} ms"

@@ -44,7 +44,6 @@ class EventLog:
             file.truncate(count * RECORD.itemsize)
 
     def append(self, stream):
-        """Add the events of the next chunk."""
         records = np.empty(len(stream), RECORD)
         for name, values in (("t", stream.t_us), ("x", stream.x), ("y", stream.y), ("p", stream.p)):
             records[name] = values.cpu().numpy()
@@ -143,7 +142,6 @@ class Progress:
         return max(1.0, step / LARGE)
 
     def save(self, run):
-        """Write the state into the run's folder."""
         tensors = {"histogram": self.histogram}
         if self.before is not None:
             tensors["before"] = self.before

@@ -6,6 +6,7 @@ from typing import Any
 
 from codesign.errors import FileFormatError
 from codesign.mount import yaw_pitch_roll_rad
+from codesign.mount.pose import NAMES
 from codesign.reading import building, read_json
 from codesign.system import load_hand_over
 from studies.codesign.design import BLOCKS, Space, Whole
@@ -41,14 +42,11 @@ def _mounted(path, space, traced):
     traced."""
     back = load_hand_over(path)
     T_body_cam = back.mount().detach()
-    place = zip(("x_m", "y_m", "z_m"), T_body_cam[:3, 3].tolist(), strict=True)
-    attitude = zip(
-        ("yaw_rad", "pitch_rad", "roll_rad"), yaw_pitch_roll_rad(T_body_cam).tolist(), strict=True
-    )
+    numbers = [*T_body_cam[:3, 3].tolist(), *yaw_pitch_roll_rad(T_body_cam).tolist()]
     if traced:
         free = tuple(name for name in space.free if name not in BLOCKS["lens"])
         space = replace(space, free=free)
-    found = Whole(space, {**space.default, **dict(place), **dict(attitude)})
+    found = Whole(space, {**space.default, **dict(zip(NAMES, numbers, strict=True))})
     vars(found)["T_body_cam"] = T_body_cam
     if traced:
         vars(found)["camera"] = back.camera

@@ -85,22 +85,18 @@ class Drive:
         return Drive(space, batch, film, rays_per_px)
 
     def camera(self, whole: Whole) -> render.Camera:
-        """The film behind a design's lens."""
         return whole.camera.with_film(self.film).with_samples(self.rays_per_px)
 
     @cached_property
     def system(self) -> System:
-        """The pair's chain, at its own design."""
         return self.space.pair.system(self.space.pair.design)
 
     @property
     def names(self) -> list[str]:
-        """Of the numbers that have a slider here."""
         return [name for name in SLIDERS if name in self.space.free]
 
     @property
     def middle(self) -> int:
-        """Number of the frame that is shown."""
         return len(self.batch.t_s) // 2
 
     @property
@@ -173,8 +169,7 @@ class Setting:
     @torch.no_grad()
     def frame(self) -> np.ndarray:
         """[H, W] uint8, the middle one, with the gamma of a screen."""
-        windows = self.run["frames"][0, 0, self.drive.middle]
-        return _grey(tiled(windows.numpy()))
+        return _grey(tiled(self.run["frames"][0, 0, self.drive.middle].numpy()))
 
     @torch.no_grad()
     def events(self) -> np.ndarray:
@@ -224,8 +219,8 @@ class Setting:
         found, true = self.run["estimate"], self.drive.batch.twist
         error = float(self.drive.space.pair.errors(found, self.drive.batch).bounded())
         return (
-            f"{float(self.run['volume'].counts.sum()):,.0f} events; forward {float(found.velocity[0, 0]):.2f} m/s, "
-            f"in truth {float(true[0, 0]):.2f}; error of the velocity {error:.3f} (0 none, 1 all)"
+            f"{self.run['volume'].counts.sum():,.0f} events; forward {found.velocity[0, 0]:.2f} m/s, "
+            f"in truth {true[0, 0]:.2f}; error of the velocity {error:.3f} (0 none, 1 all)"
         )
 
 

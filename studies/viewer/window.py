@@ -91,16 +91,10 @@ class Window:
         self.pictures = {
             name: gui.add_image(blank, label=name) for name in ("frame", "events", "flow")
         }
-        button = gui.add_button("certify here")
-        button.on_click(lambda _: self._ask())
+        gui.add_button("certify here").on_click(lambda _: (self._asked.set(), self._changed.set()))
         self.verdict = gui.add_markdown("")
 
-    def _ask(self):
-        self._asked.set()
-        self._changed.set()
-
     def serve(self) -> None:
-        """Follow the sliders and the button until interrupted."""
         while True:
             self._changed.wait()
             self._changed.clear()
@@ -131,7 +125,7 @@ class Window:
             "frames": self._camera_and_frame,
             "volume": lambda: self._picture("events", self.setting.events()),
             "field": lambda: self._picture("flow", self.setting.flow()),
-            "estimate": self._words,
+            "estimate": lambda: setattr(self.words, "content", self.setting.words()),
         }
         spent = dict.fromkeys((*steps, "drawing"), 0.0)
         for stage, draw in steps.items():
@@ -165,9 +159,6 @@ class Window:
 
     def _picture(self, name, colours):
         self.pictures[name].image = colours.repeat(ENLARGED, 0).repeat(ENLARGED, 1)
-
-    def _words(self):
-        self.words.content = self.setting.words()
 
     def certify(self) -> None:
         """Certify the gradient at the setting that is shown, and show the verdicts."""

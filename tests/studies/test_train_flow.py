@@ -203,10 +203,12 @@ def test_two_processes_learn_what_one_does(tmp_path):
 def test_a_race_trains_every_network_with_every_seed_and_judges_them_alike(tmp_path, monkeypatch):
     """Ours errs by half of the flow, the rival by a quarter; the commands of trainings are looked
     at, not run."""
+
+    def judging(seed, bins, windows, world_windows, real_windows):
+        return {"unseen": (Made(seed), windows), "worlds": (Made(3), world_windows)}
+
     monkeypatch.setattr(races, "NAMES", {"refiner": "refiner"})
-    monkeypatch.setattr(races, "SETS", {})
-    monkeypatch.setattr(races, "VALIDATION", {"unseen": lambda shape, seed: Made(seed)})
-    monkeypatch.setattr(races, "WorldWindows", lambda *_, **__: Made(3))
+    monkeypatch.setattr(races, "judging", judging)
     commands = {}
 
     def trained(job, command, children):

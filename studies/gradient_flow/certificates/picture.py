@@ -64,7 +64,7 @@ def lines(name: str, directions: int | None) -> list[Line]:
                 way = torch.nn.functional.normalize(way.normal_(generator=draw), dim=0)
             line = way.reshape(unit.shape) * unit
             # air has no index to change
-            if bool(line.any()):
+            if line.any():
                 found.append((group, line))
     return found
 
@@ -136,7 +136,6 @@ def _rows(junctions, losses: Losses, chosen: Sequence[Line], draws: int, way: Wa
 
 
 def _slopes(losses, chosen, draw, way):
-    """[lines, losses] derivatives by autograd."""
     leaves = {name: value.requires_grad_() for name, value in scenes.point().items()}
     found = []
     for value in losses(leaves, draw, way):

@@ -99,7 +99,6 @@ def steps(name: str) -> dict[str, Tensor]:
 
 
 def camera(numbers: Numbers, samples: int, seed: int) -> render.Camera:
-    """The camera whose lens has these tensors."""
     geo = optics().replace(**{name: numbers[name] for name in LENS_UNITS})
     return render.Camera(geo, SIZE_PX, SIZE_PX, WIDTH_MM / SIZE_PX, samples, seed)
 
