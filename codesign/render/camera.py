@@ -15,17 +15,15 @@ from codesign.errors import DomainError, ShapeError
 from codesign.render.film import Film, check_memory, coarse_pixels, film_pupil_pattern
 from codesign.types import Rays
 
-_NEWTON_STEPS = 8
+_NEWTON_STEPS = 12
 _STEP_MM = 1e-4
-_SHRINK = 0.85  # by which a first guess beyond the lens's field is drawn towards the axis
 CHECKED_ACROSS = 32
 CHECKED_RAYS = 16
 
 
 class Lens(Protocol):
     """camera_rays(film_mm [N, 2], pupil [N, 2], aim=...) -> Rays [N], as GeoLens has it; ``dtype``
-    where it is not float64, ``film_points`` for a first guess where gradients of silhouettes are
-    asked for, ``entrance_pupil_diameter_mm`` where there is an aperture."""
+    where it is not float64, ``entrance_pupil_diameter_mm`` where there is an aperture."""
 
     @property
     def camera_rays(self) -> Callable[..., Rays]: ...
@@ -349,7 +347,7 @@ def project(camera: Camera, points_cam_m: Tensor, pupil: Tensor | None = None) -
         guess = camera.film.middle_px + straight
         apart_px = _STEP_MM / camera.film.pixel_pitch_mm
         one = camera.in_one_colour()
-        rough = images(one, points_cam_m, pupil, colour, guess, apart_px, 1e-6, _SHRINK)
+        rough = images(one, points_cam_m, pupil, colour, guess, apart_px, 1e-6)
     rays = camera.rays_through(rough.at_px, pupil)
     base, slope = lines(rays)
     miss = base + slope * points_cam_m[:, 2:] - points_cam_m[:, :2]
@@ -384,44 +382,46 @@ def images(
     guess_px: Tensor,
     apart_px: float,
     within_px: float,
-    shrink: float = 0.0,
 ) -> Images:
     """Images of points [N, 3] in camera axes through points [N, 2] of the pupil, in the colours of
     their numbers [N].
 
     By Newton's method from a guess [N, 2] on the rays of the camera, their derivatives by
-    differences over ``apart_px``, until a step is below ``within_px``. What gets no light is drawn
-    towards the axis by ``shrink`` and tried again; 0 gives it up.
+    differences over ``apart_px``, until a step is below ``within_px``. A step that misses by more,
+    or gets no light, is halved; the first is that from the axis to the guess.
     """
-    at = guess_px.clone()
+    at = camera.film.middle_px.to(guess_px).repeat(len(guess_px), 1)  # the best so far
+    step = at - guess_px
+    missed_m = torch.full_like(at[:, 0], torch.inf)
     m_per_px = torch.eye(2, dtype=at.dtype, device=at.device).repeat(len(at), 1, 1)
     slope = torch.zeros_like(at)
     step_px = torch.full_like(at[:, 0], torch.inf)
-    middle = camera.film.middle_px
     shifts = apart_px * at.new_tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     rows = torch.arange(len(at), device=at.device)
     for _ in range(_NEWTON_STEPS):
-        film_px = (at[rows] + shifts[:, None]).reshape(-1, 2)
+        film_px = (at[rows] - step[rows] + shifts[:, None]).reshape(-1, 2)
         rays = camera.coloured_rays(film_px, pupil[rows].repeat(3, 1), colour[rows].repeat(3))
         origin, direction = (v.reshape(3, -1, 3) for v in (rays.origin_m, rays.direction))
         passes = ((rays.weight.reshape(3, -1) > 0) & (direction[..., 2] > 1e-6)).all(0)
         slopes = direction[..., :2] / torch.where(passes[:, None], direction[..., 2:], 1.0)
         meets = origin[..., :2] + slopes * (points_cam_m[rows, 2:] - origin[..., 2:])
         per_px = torch.stack([meets[1] - meets[0], meets[2] - meets[0]], -1) / apart_px
-        passes &= torch.linalg.det(per_px).abs() > 1e-12 * per_px.square().sum((1, 2))
-        lost, rows, per_px = rows[~passes], rows[passes], per_px[passes]
-        change = torch.linalg.solve(per_px, meets[0, passes] - points_cam_m[rows, :2])
-        at[rows] -= change
+        miss = meets[0] - points_cam_m[rows, :2]
+        miss_m = miss.norm(dim=1)
+        better = passes & (miss_m < missed_m[rows])
+        better &= torch.linalg.det(per_px).abs() > 1e-12 * per_px.square().sum((1, 2))
+        worse, rows, per_px = rows[~better], rows[better], per_px[better]
+        at[rows] -= step[rows]
+        step[rows] = torch.linalg.solve(per_px, miss[better])
+        missed_m[rows] = miss_m[better]
         m_per_px[rows] = per_px
-        slope[rows] = slopes[0, passes]
-        step_px[rows] = change.abs().amax(1)
-        rows = rows[step_px[rows] >= within_px]
-        if shrink:
-            at[lost] = middle + shrink * (at[lost] - middle)
-            rows = torch.cat([rows, lost])
+        slope[rows] = slopes[0, better]
+        step_px[rows] = step[rows].abs().amax(1)
+        step[worse] /= 2
+        rows = torch.cat([rows[step_px[rows] >= within_px], worse])
         if not rows.numel():
             break
-    return Images(at, m_per_px, slope, step_px)
+    return Images(at - step, m_per_px, slope, step_px)
 
 
 def angular_miss_rad(camera: Camera, pixels: Tensor, points_cam_m: Tensor) -> Tensor:

@@ -6,9 +6,10 @@ import math
 import pytest
 import torch
 
-from codesign import backend, pose, render
+from codesign import backend, lens, pose, render
 from codesign.lens import Pinhole, ThinLens
 from codesign.render import MitsubaScene
+from codesign.render.charts import glowing
 from codesign.render.moving import views_of
 from codesign.render.sequence import cheapest
 from codesign.render.silhouettes.curve_points import places as _places
@@ -41,6 +42,40 @@ def test_gradients_with_occluders(scene, kind, of, samples, without, within):
     )
     assert (plain - truth).norm() / truth.norm() > without
     assert (whole - truth).norm() / truth.norm() < within
+
+
+def test_an_outline_moves_through_a_wide_fast_lens_as_its_rays_do():
+    """Off its axis the real pupil lies far from the paraxial one, from where light would miss the
+    lens, and where one face of this prism of 32 sides is seen edge-on. The truth counts the rays of
+    a corner of the film that have corners of the prism on both their sides."""
+    angle = (2 * torch.arange(32, dtype=F64)[:, None] + 1) * math.pi / 32
+    face = torch.tensor([0.95, 1.0], dtype=F64) / math.hypot(0.95, 1.0)  # y and z
+    out = face.flip(0) * torch.tensor([-1.0, 1.0])
+    rim = 0.18 * face + 0.1 * (angle.sin() * face + (angle.cos() - math.cos(math.pi / 32)) * out)
+    a, b = (torch.nn.functional.pad(rim, (1, 0), value=x) for x in (-1.0, 0.0))
+    c, d = (end.roll(-1, 0) for end in (a, b))
+    scene = glowing(torch.cat([torch.stack([a, b, d], 1), torch.stack([a, d, c], 1)]))
+    film = render.Film(346, 260, 32, 32, 18.5e-3, ((0, 228),))
+
+    def camera(efl_mm, samples):
+        wide = lens.family("retrofocus-4").lens(efl_mm, 1.5, 5.4, 0.3)
+        return render.Camera(wide, 32, 32, 18.5e-3, samples, film=film)
+
+    def covered(down_m, efl_mm):
+        rays = camera(efl_mm, 256).rays()
+        y, z = (rim - rays.origin_m[:, None, 1:]).unbind(2)
+        side = rays.direction[:, 1:2] * z - rays.direction[:, 2:] * (y - down_m)
+        return float((rays.weight * (side.amin(1) * side.amax(1) < 0)).mean())
+
+    efl_mm = torch.tensor(2.6, dtype=F64, requires_grad=True)
+    twist = torch.zeros(1, 6, dtype=F64, requires_grad=True)
+    seen = render.frames(camera(efl_mm, 64), scene, pose.se3_exp(twist), "boundary", 20.0)
+    moved, zoomed = torch.autograd.grad(seen.double().mean(), (twist, efl_mm))
+    # about a pixel of motion; 600 points of the outline and 10,000 rays between know both to 1 %
+    down = (covered(1e-3, 2.6) - covered(-1e-3, 2.6)) / 2e-3
+    zoom = (covered(0, 2.61) - covered(0, 2.59)) / 0.02
+    assert float(moved[0, 1]) == pytest.approx(down, rel=0.04)
+    assert float(zoomed) == pytest.approx(zoom, rel=0.04)
 
 
 def test_a_bright_square_moves_by_its_closed_form():

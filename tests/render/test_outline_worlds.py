@@ -225,8 +225,9 @@ def test_an_edge_that_is_seen_end_on_is_no_line_in_the_picture():
     ahead = world + f64([[0.0, 0, 0.01], [0, 0.01, 0]])
     one, none = torch.ones(2, dtype=D), torch.zeros(2, dtype=torch.long)
     faces = 1e-4 * one, 1e-4 * one, torch.inf * one, torch.full((2, 2, 3), torch.nan, dtype=D)
+    at_px = f64([[16.0, 12.0]] * 2)
     points = CurvePoints(
-        world, ahead, one, *faces, torch.zeros(2, 2, dtype=D), none, none, none, none
+        world, ahead, one, *faces, at_px, torch.zeros(2, 2, dtype=D), none, none, none, none
     )
     camera = render.Camera(lens.Pinhole(8.0), 33, 25, 0.05)
     scene = render.TexturedPlane([[0.7, 0.3]], [0.4], [0.2])

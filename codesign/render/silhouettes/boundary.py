@@ -71,7 +71,7 @@ def _seen(camera, views, per_px):
     curves = [_curves(part) for part in parts(scene)]
     field = FieldOfView(camera)
     check_listed(camera, field, scene, curves, cameras)
-    points = curve_points(field, curves, cameras, views.batch[-1], per_px)
+    points = curve_points(camera, field, curves, cameras, views.batch[-1], per_px)
     found = None if points is None else jumps(camera, scene, cameras, points)
     return None if found is None else found[torch.nonzero(found.weight)[:, 0]]
 

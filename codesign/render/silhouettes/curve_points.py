@@ -11,11 +11,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from codesign.pose import apply, inverse
-from codesign.render.camera import Camera, lines
-from codesign.render.film import border_px, film_pupil_pattern
+from codesign.render.camera import Camera, images, lines
+from codesign.render.film import border_px, coarse_pixels, film_pupil_pattern
 from codesign.render.rows import Rows
 
 # length of a piece on the film, and its angle, at most: one that reaches behind the camera is left
@@ -30,6 +32,11 @@ WIDER = 1.02
 IN_FRONT_M = 1e-3
 STEP = 1e-4  # of a piece, for the direction of its curve
 PUPILS = 4096
+# px, of the film position for the derivative of a ray; the change up to which its root is taken as
+# found, since the next would be of its square
+STEP_PX = 1e-3
+FOUND_PX = 1e-4
+ACROSS = 32  # chief rays across the film, from which that search begins
 NEARBY = 0.07  # share of the distance from which what is not hidden is read again
 # by how much, at least: an edge of a face five times as wide as it is away moved by 1.2e-6
 NEAR_RAD = 2e-6
@@ -46,7 +53,8 @@ class CurvePoints(Rows):
     safely read from afar and from NEARBY of the way, both as seen from the viewpoint. face_slope
     [n]: tangent of the view's angle to the steeper of the faces on both sides, infinite where what
     is seen may lie far behind. apex_m [n, 2, 3]:
-    third corners of the triangles on both sides, NaN where there are none. pupil [n, 2]; colour,
+    third corners of the triangles on both sides, NaN where there are none. near_px [n, 2]: about
+    where they are seen, film position. pupil [n, 2]; colour,
     window, frame, part [n]: numbers of the wavelength, the window of the film, the frame and the
     part of the scene.
     """
@@ -58,6 +66,7 @@ class CurvePoints(Rows):
     near_rad: Tensor
     face_slope: Tensor
     apex_m: Tensor
+    near_px: Tensor
     pupil: Tensor
     colour: Tensor
     window: Tensor
@@ -66,6 +75,7 @@ class CurvePoints(Rows):
 
 
 def curve_points(
+    camera: Camera,
     view: "FieldOfView",
     curves: Sequence[Sequence[Any]],
     cameras: Tensor,
@@ -75,7 +85,7 @@ def curve_points(
     """Points on all curves that may fall on the film, about ``per_px`` per pixel length; None for
     none.
 
-    Args: field: of the camera. curves: of every part of the scene, in its own axes. cameras
+    Args: view: of the camera. curves: of every part of the scene, in its own axes. cameras
       [parts, F, 4, 4]: the camera in the axes of every part. frames_each: frames of a trajectory;
       every trajectory draws the same numbers.
     """
@@ -89,7 +99,9 @@ def curve_points(
                 pieces = _in_view(view, curve, cameras[part], frames)
                 if pieces is not None:
                     found.append(
-                        _on_pieces(view, curve, pieces, cameras[part], part, per_px, generator)
+                        _on_pieces(
+                            camera, view, curve, pieces, cameras[part], part, per_px, generator
+                        )
                     )
     return CurvePoints.joined(found) if found else None
 
@@ -128,7 +140,7 @@ def _in_view(view, curve, cameras, frames):
     return _Pieces.joined(found) if found else None
 
 
-def _on_pieces(view, curve, pieces, cameras, part, per_px, generator):
+def _on_pieces(camera, view, curve, pieces, cameras, part, per_px, generator):
     """CurvePoints on pieces of one curve."""
     piece, inside, fraction = places(pieces.length_px, per_px, generator)
     pieces = pieces[piece]
@@ -144,17 +156,38 @@ def _on_pieces(view, curve, pieces, cameras, part, per_px, generator):
     turn = torch.randint(PUPILS, (2,), generator=generator)
     number = torch.arange(count)
     pupil = view.pupils[(number + turn[0]) % PUPILS]
+    colour = (number + turn[1]) % view.colours
     pose = cameras[frame]
-    eye = pose[:, :3, 3]
-    viewpoint = eye + (pose[:, :3, :2] @ (pupil * view.viewpoint_m)[..., None])[..., 0]
+    # where the paraxial pupil is; the point's own ray then tells where the real one is
+    viewpoint = _in_pupil(pose, pupil * view.viewpoint_m)
+    y = apply(inverse(pose), curve.points(index, s, viewpoint)[:, None])[:, 0]
+    seen = images(camera, y, pupil, colour, _near_px(camera, y), STEP_PX, FOUND_PX)
+    found = seen.step_px < FOUND_PX
+    real = _in_pupil(pose, y[:, :2] - seen.slope * y[:, 2:])
+    viewpoint = torch.where(found[:, None], real, viewpoint)
     y = curve.points(index, s, viewpoint)
     on = curve.points(index, s + STEP * (high - low), viewpoint)
     share = share * curve.counts(index, y, viewpoint)
-    colour = (number + turn[1]) % view.colours
     beside = known_beside(curve, index, y, viewpoint)
-    return CurvePoints(
-        y, on, share, *beside, pupil, colour, pieces.window, frame, torch.full_like(frame, part)
-    )
+    of_rays = seen.at_px, pupil, colour, pieces.window, frame, torch.full_like(frame, part)
+    return CurvePoints(y, on, share, *beside, *of_rays)[found]
+
+
+def _in_pupil(pose, place_m):
+    """Points [n, 3] of the pupil's plane at [n, 2] in camera axes."""
+    return pose[:, :3, 3] + (pose[:, :3, :2] @ place_m[..., None])[..., 0]
+
+
+def _near_px(camera, y):
+    """Film position [n, 2] px of points y [n, 3]: of the chief ray, of some across the film, that
+    points nearest to them. Light that goes from a point to the paraxial pupil may miss the film or
+    the lens: off the axis of a wide one the pupil is elsewhere."""
+    pixels = coarse_pixels(camera.film, 1 + camera.film.sensor_width_px // ACROSS)
+    rays = camera.chief_rays(pixels)
+    lit = rays.weight > 0
+    lit |= ~lit.any()  # all meet an obstruction
+    _, nearest = cKDTree(rays.direction[lit].numpy()).query(normalize(y, dim=1).numpy())
+    return pixels[lit][nearest]
 
 
 def known_beside(curve: Any, index: Tensor, y: Tensor, viewpoint: Tensor) -> tuple[Tensor, ...]:
@@ -186,15 +219,16 @@ class FieldOfView:
         self.seed = camera.seed
         self.px_per_slope = 1 / camera.slope_per_px()
         self.colours = len(camera.colours)
-        self.aperture_m = camera.aperture_m
         _, pupils = film_pupil_pattern(PUPILS, camera.seed)
-        self.pupils = pupils * (self.aperture_m > 0)
+        self.pupils = pupils * (camera.aperture_m > 0)
         film = camera.film
         size = torch.tensor([film.width_px, film.height_px], dtype=torch.float64)
         boxes = [self._box(camera, border_px(corner, size, 9)) for corner in film.corners_px]
         self.low, self.high = (torch.stack(side) for side in zip(*boxes, strict=True))
         self.spread, self.shift, side = self._blur(camera)
-        self.viewpoint_m = side * self.aperture_m  # from the axis, of a unit point of the pupil
+        # from the axis, of a unit point of the paraxial pupil; and of the real one, at most
+        self.viewpoint_m = side * camera.aperture_m
+        self.aperture_m = max(camera.aperture_m, float(self.shift.norm(dim=1).max()))
 
     @property
     def steepest(self) -> float:
@@ -236,7 +270,7 @@ class FieldOfView:
         point through the pupil's rim and the straight line from its middle to where its chief ray
         points; and -1 where the pupil is seen turned by half a turn, or else 1."""
         none = torch.zeros(1, 2, dtype=torch.float64)
-        if not self.aperture_m:
+        if not camera.aperture_m:
             return none, none, 1
         angle = torch.arange(8, dtype=torch.float64) * (math.pi / 4)
         rim = torch.stack([angle.cos(), angle.sin()], 1)

@@ -20,13 +20,15 @@ from torch.nn.functional import normalize
 from codesign.pose import apply, inverse
 from codesign.render.camera import Camera, images
 from codesign.render.rows import Rows
-from codesign.render.silhouettes.curve_points import IN_FRONT_M, NEARBY, CurvePoints
+from codesign.render.silhouettes.curve_points import (
+    FOUND_PX,
+    IN_FRONT_M,
+    NEARBY,
+    STEP_PX,
+    CurvePoints,
+)
 from codesign.render.wavefront import look
 
-# px, of the film position for the derivative of a ray; the change up to which its root is taken as
-# found, since the next would be of its square
-STEP_PX = 1e-3
-FOUND_PX = 1e-4
 DOUBTFUL = 0.05  # share of the distance by which a slanting surface may come nearer beside its edge
 ROUNDING = 2.0**-21  # of float32 distances, four units in the last place
 SAFETY = 2.0
@@ -81,8 +83,7 @@ def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> J
     if not row.numel():
         return None
     points, y, on = points[row], y[row], on[row]
-    guess = _first_guess(camera, y, points)
-    seen_at = images(camera, y, points.pupil, points.colour, guess, STEP_PX, FOUND_PX)
+    seen_at = images(camera, y, points.pupil, points.colour, points.near_px, STEP_PX, FOUND_PX)
     x, per_px, slope = seen_at.at_px, seen_at.m_per_px, seen_at.slope
     pixel = _pixels(camera.film, x, points.window)
     moved = (on - y)[:, :2] - slope * (on - y)[:, 2:]
@@ -179,19 +180,6 @@ def _rad_per_px(y, per_px, slope, normal):
     moved = (per_px @ normal[..., None])[..., 0]
     moved = torch.cat([moved, torch.zeros_like(moved[:, :1])], 1)
     return torch.linalg.cross(moved, ray).norm(dim=1) / (y[:, 2] * ray.square().sum(1))
-
-
-def _first_guess(camera, y, points):
-    """Film position [n, 2] px of points y [n, 3]: as the lens sends light there, or else along the
-    chief ray of the axis's scale."""
-    film = camera.film
-    if not hasattr(camera.lens, "film_points"):
-        return film.middle_px + y[:, :2] / y[:, 2:] / camera.slope_per_px()
-    x = torch.zeros_like(y[:, :2])
-    for number, (line, _) in enumerate(camera.colours):
-        rows = points.colour == number
-        x[rows] = camera.lens.film_points(1e3 * y[rows], points.pupil[rows], **line)[0].to(x)
-    return x / film.pixel_pitch_mm + film.middle_px
 
 
 def _pixels(film, x, window):

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.pose import apply
-from codesign.render.camera import Camera
+from codesign.render.camera import Camera, lines
 from codesign.render.film import coarse_pixels, film_pupil_pattern
 from codesign.render.moving import parts, says_distance
 from codesign.render.rows import Rows
@@ -302,6 +302,7 @@ def _near_curves(camera, curves, cameras, found, seen):
     """Pairs of the numbers of steps [n] and of CurvePoints [n] on the curves that their rays
     ``seen`` pass by."""
     slope_per_px = camera.slope_per_px()
+    from_axis = lines(seen)[0].norm(dim=1)
     near = []
     for part, of_part in enumerate(curves):
         pose = cameras[part][found.frame]
@@ -311,7 +312,7 @@ def _near_curves(camera, curves, cameras, found, seen):
             rows = torch.nonzero((found.frame == frame) & found.distance.isfinite())[:, 0]
             eye = cameras[part, frame, :3, 3]
             for curve in of_part:
-                index, bounds = curve.pieces(eye, piece_rad(slope_per_px), camera.aperture_m)
+                index, bounds = curve.pieces(eye, piece_rad(slope_per_px), float(from_axis.max()))
                 rays = o[rows], d[rows], found.distance[rows]
                 ray, piece = _near(curve, index, bounds, eye, *rays, NEAR_PX * abs(slope_per_px))
                 if not ray.numel():
@@ -323,6 +324,7 @@ def _near_curves(camera, curves, cameras, found, seen):
                 ray, index, y, ahead = (v[count] for v in (ray, index, y, ahead))
                 beside = known_beside(curve, index, y, o[ray])
                 of_ray = (
+                    found.film_px[ray],
                     found.pupil[ray],
                     torch.zeros_like(ray),
                     found.window[ray],
