@@ -48,8 +48,8 @@ def test_an_outline_moves_through_a_wide_fast_lens_as_its_rays_do():
     """Off its axis the real pupil lies far from the paraxial one, from where light would miss the
     lens, and where one face of this prism of 32 sides is seen edge-on. The truth counts the rays of
     a corner of the film that have corners of the prism on both their sides."""
-    angle = (2 * torch.arange(32, dtype=F64)[:, None] + 1) * math.pi / 32
-    face = torch.tensor([0.95, 1.0], dtype=F64) / math.hypot(0.95, 1.0)  # y and z
+    angle = (2 * torch.arange(32, dtype=D)[:, None] + 1) * math.pi / 32
+    face = torch.tensor([0.95, 1.0], dtype=D) / math.hypot(0.95, 1.0)  # y and z
     out = face.flip(0) * torch.tensor([-1.0, 1.0])
     rim = 0.18 * face + 0.1 * (angle.sin() * face + (angle.cos() - math.cos(math.pi / 32)) * out)
     a, b = (torch.nn.functional.pad(rim, (1, 0), value=x) for x in (-1.0, 0.0))
@@ -67,8 +67,8 @@ def test_an_outline_moves_through_a_wide_fast_lens_as_its_rays_do():
         side = rays.direction[:, 1:2] * z - rays.direction[:, 2:] * (y - down_m)
         return float((rays.weight * (side.amin(1) * side.amax(1) < 0)).mean())
 
-    efl_mm = torch.tensor(2.6, dtype=F64, requires_grad=True)
-    twist = torch.zeros(1, 6, dtype=F64, requires_grad=True)
+    efl_mm = torch.tensor(2.6, dtype=D, requires_grad=True)
+    twist = torch.zeros(1, 6, dtype=D, requires_grad=True)
     seen = render.frames(camera(efl_mm, 64), scene, pose.se3_exp(twist), "boundary", 20.0)
     moved, zoomed = torch.autograd.grad(seen.double().mean(), (twist, efl_mm))
     # about a pixel of motion; 600 points of the outline and 10,000 rays between know both to 1 %
