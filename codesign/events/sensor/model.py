@@ -221,6 +221,12 @@ def check_generator(generator: object) -> None:
     check_kind(generator, Generator, "the generator", "give torch.Generator().manual_seed(0)")
 
 
+def apart(generators: Sequence[Generator]) -> list[Generator]:
+    """Generators that go on as these will, which stay as they are; what is one stays one."""
+    own = {each: each.clone_state() for each in generators}
+    return [own[each] for each in generators]
+
+
 def draw_thresholds(
     sensor: SensorModel,
     pixels: Sequence[int],
