@@ -22,7 +22,7 @@ BUDGETS = {
     "codesign/train": 5_570,  # moments of weights of as many axes
     "scenes": 14_530,  # size of a file, velocities with gradients
     "scenes/robots": 9_570,  # held joints, directions of axes, colours by name
-    "scenes/trajectories": 3_100,
+    "scenes/trajectories": 3_120,  # numbers that are finite, directions that lead somewhere
     "scenes/windows": 8_700,
     "setup": 6_020,  # four more parts of evidence, limits beside what is timed
     "studies": 7_810,  # joint_refiner

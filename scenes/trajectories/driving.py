@@ -128,8 +128,9 @@ class Driving(Trajectory):
             math.isfinite(speed_m_s)
             and math.isfinite(turn_rad_s)
             and math.isfinite(x_m + y_m + yaw_rad + height_m)
+            and math.isfinite(turn_swing_rad_s + heave_m + pitch_rad + roll_rad)
         ):
-            raise DomainError("driving: speed, turn rate and start must be finite numbers.")
+            raise DomainError("driving: speed, turn rate, shake and start must be finite numbers.")
         positive("speed_share", speed_share, 0, 1, inclusive=True)
         self.track_m = positive("track_m", track_m)
         self.side_slip_s = positive("side_slip_s", side_slip_s, inclusive=True)
