@@ -143,6 +143,9 @@ class EventLayer(nn.Module):
             its own generator; those of a batch that share one draw in the order of the calls.
         Returns: counts [..., T-1, 2, H, W] ([..., T, 2, H, W] with a state); state to carry on,
           with its graph.
+        Gradient: that of the whole, unless all pixels share two thresholds that differ by more than
+          a quarter: "memory", "srm" and "physical" (but through a long dead time) then follow pairs
+          of pixels, which begin anew with every chunk.
         """
         check_axes(frames)
         check_begun(state, generator)
