@@ -261,7 +261,7 @@ def test_a_refused_chunk_leaves_state_and_generator_as_they_were(sensor):
 
 
 def test_a_changed_noise_rate_is_drawn_anew():
-    noisy = layer("memory", SensorModel(theta_on=5.0, theta_off=5.0, shot_rate_hz=20.0))
+    noisy = layer("memory", SensorModel(theta_on=9.0, theta_off=9.0, shot_rate_hz=20.0))
     few = noisy(FRAMES, T_S).sum()
     noisy.sensor = replace(noisy.sensor, shot_rate_hz=2000.0)
     assert noisy(FRAMES, T_S).sum() > 20 * few > 0

@@ -15,7 +15,7 @@ from codesign.errors import DomainError, ShapeError, shown
 from codesign.events.entry import MOST_VALUES, as_seconds, check_dtype
 
 THETA_MINIMUM = 0.01  # no drawn threshold falls below, as in v2e
-THETA_MOST = 5.0  # light of 148 times as much; beyond, a percentage or gray levels are meant
+THETA_MOST = 10.0  # light of 22,000 times as much; beyond, a percentage or gray levels are meant
 MOST_NUMBER = 1e30
 TIMINGS = ("interpolated", "v2e")
 # fields of SensorModel that may carry a gradient
@@ -27,7 +27,7 @@ class SensorModel:
     """Parameters of an event sensor. The defaults are ideal: equal thresholds, no noise, no limit
     of speed.
 
-    theta_on, theta_off: nominal contrast thresholds, natural log units, > 0 and up to 5.
+    theta_on, theta_off: nominal contrast thresholds, natural log units, > 0 and up to 10.
     theta_sigma: standard deviation of the thresholds over pixels, natural log units, >= 0.
     cutoff_hz: bandwidth of the photoreceptor at full light, a one-pole low-pass of the log level;
       it shrinks with intensity as (I + 20)/275. 0: none.
