@@ -94,7 +94,7 @@ def sensor_counts(
     check_begun(state, generator)
     (state,) = _apart((state,))
     counts, after = _counts(frames, t_s, sensor, generator, state, log_input, design)
-    return counts, *_apart((after,))
+    return counts, _apart((after,))[0]
 
 
 def _apart(states):
