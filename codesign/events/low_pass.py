@@ -60,10 +60,10 @@ def one_pole(level: Tensor, pace: Tensor, start: Tensor | None = None) -> Tensor
       later.
     Gradient: level, pace, start; exact.
     Raises: ShapeError when there are not as many paces as intervals; DomainError for levels of
-      another type.
+      another type, and paces that are negative or not finite.
     """
     check(level, "T>=2 ...", "levels", FLOATS, finite=True)
-    check(pace, "T-1 ...", "paces", FLOATS)
+    check(pace, "T-1 ...", "paces", FLOATS, least=0.0, finite=True)
     if start is not None:
         check_level(start, level)
     if not 1 <= pace.ndim <= level.ndim or len(pace) != len(level) - 1:
@@ -99,11 +99,11 @@ def low_pass(
     Returns: [T, ...] filtered levels, the start included.
     Gradient: level, intensity, cutoff_hz, start; exact.
     Raises: ShapeError, DomainError as ``one_pole``; DomainError for a bandwidth that is not one
-      number above 0.
+      number above 0, and for negative intensities and intervals.
     """
     check(level, "T>=2 ...", "levels", FLOATS)
     check_positive(cutoff_hz, "cutoff_hz")
-    check(intensity, "T>=2 ...", "intensity", FLOATS, finite=True)
+    check(intensity, "T>=2 ...", "intensity", FLOATS, least=0.0, finite=True)
     if (
         not isinstance(interval_s, Tensor)
         or intensity.shape != level.shape
@@ -114,5 +114,6 @@ def low_pass(
             f"{list(getattr(interval_s, 'shape', ()))} do not fit; [T, ...] twice and [T-1] are needed."
         )
     light = light_share(0.5 * (intensity[1:] + intensity[:-1]))
+    check(interval_s.to(level), "T-1", "interval_s", least=0.0, finite=True)
     interval_s = interval_s.to(level).reshape(-1, *[1] * (level.ndim - 1))
     return one_pole(level, light * (2 * math.pi * cutoff_hz) * interval_s, start)

@@ -135,7 +135,7 @@ def load(name_or_path: str | Path, kind: Callable[..., Any] | None = None) -> "N
       name_or_path: "refiner", the one delivered with the package, or the path of a file that
         ``save`` wrote.
       kind: the class of a network of one's own, called with the stored ``config``.
-    Returns: the network, a callable from EventVolume to FlowField. Its weights still take
+    Returns: the network, of the precision it was saved in, a callable from EventVolume to FlowField. Its weights still take
       gradients; ``requires_grad_(False)`` saves their cost.
     Raises: FileFormatError when the file is missing, damaged, of another version, or does not fit
       its network.
@@ -191,6 +191,9 @@ def build(
         f"'{path}'", f"it was written by another version of the network '{stored.network}'"
     ):
         network = (kind or network_class(stored.network))(**stored.config)
+    kinds = {each.dtype for each in stored.weights.values() if each.is_floating_point()}
+    if len(kinds) == 1:  # of several the constructor knows
+        network.to(kinds.pop())
     fill(network, stored.weights, path)
     return network
 

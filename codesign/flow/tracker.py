@@ -4,6 +4,7 @@ confidence, as the chunks of a camera come in."""
 import inspect
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -141,27 +142,40 @@ class Tracker:
           chunk: EventStream, or arrays (t_us, x, y, p) of whole numbers, p +1 and -1 or 1 and 0,
             with rising times; of any length, 0 included.
         Raises: DomainError for what is no such stream, for events before those of the chunks before
-          or off the sensor; ShapeError for another sensor.
+          or off the sensor; ShapeError for another sensor. What it raises, or the estimator, leaves
+          the tracker as it was before the chunk.
         """
-        rows = self._checked(chunk)
-        if not rows.shape[1]:
-            return []
-        self._rows.append(rows)
-        self._last_us = int(rows[0, -1])
-        if self._start_us is None:
-            self._start_us = int(rows[0, 0])
-        if self.window_us is not None and self._last_us < self._start_us + self.window_us:
-            return []
-        if self.number is not None and sum(rows.shape[1] for rows in self._rows) <= self.number:
-            return []
-        return self._cut(self._start_us, last=False)
+        with self._whole():
+            rows = self._checked(chunk)
+            if not rows.shape[1]:
+                return []
+            self._rows.append(rows)
+            self._last_us = int(rows[0, -1])
+            if self._start_us is None:
+                self._start_us = int(rows[0, 0])
+            if self.window_us is not None and self._last_us < self._start_us + self.window_us:
+                return []
+            if self.number is not None and sum(rows.shape[1] for rows in self._rows) <= self.number:
+                return []
+            return self._cut(self._start_us, last=False)
 
     def finish(self) -> list[TrackedWindow]:
         """Return the last window, which ends at the last event (a microsecond later where that is
         its start), and forget stream and clock: what is added next is another stream."""
-        found = [] if self._start_us is None else self._cut(self._start_us, last=True)
+        with self._whole():
+            found = [] if self._start_us is None else self._cut(self._start_us, last=True)
         self._forget()
         return found
+
+    @contextmanager
+    def _whole(self):
+        """Within it, what fails leaves the tracker as it was."""
+        before = {**vars(self), "left_out": dict(self.left_out), "_rows": list(self._rows)}
+        try:
+            yield
+        except BaseException:
+            vars(self).update(before)
+            raise
 
     def _forget(self):
         self._rows: list[Tensor] = []  # of [4, N]: t_us, x, y, p

@@ -42,7 +42,8 @@ ROVER = Path(__file__).with_name("rover.urdf")  # four wheels, a mast, a camera 
 ROUND = 48  # faces around a cylinder
 FINE = 3  # subdivisions of a ball's icosahedron: 1,280 faces
 MOVES = ("revolute", "continuous", "prismatic")
-KINDS = (*MOVES, "fixed", "floating", "planar")
+HELD = ("floating", "planar")
+KINDS = (*MOVES, "fixed", *HELD)
 MOST_BYTES = 100_000_000
 
 
@@ -115,7 +116,7 @@ def from_urdf(
     if root not in names:
         raise DomainError(f"robot '{path}' has no frame '{base}'; it has {', '.join(names)}.")
     frames = {name: np.array(model.get_transform(name, root), dtype=np.float64) for name in names}
-    materials = {material.name: material for material in model.robot.materials}
+    colours = _colours(path, model.robot)
     finder = _Finder(path, dict(packages or {}))
     parts = []
     _check_places(path, frames.values())
@@ -126,7 +127,7 @@ def from_urdf(
         for shape in shapes:
             placed = frames[link.name] @ (np.eye(4) if shape.origin is None else shape.origin)
             _check_places(path, [placed])
-            colour = _colour(getattr(shape, "material", None), materials)
+            colour = _colour(path, getattr(shape, "material", None), colours)
             parts += [
                 _moved(part, placed, link.name, colour)
                 for part in _parts(shape.geometry, finder, link.name)
@@ -160,11 +161,18 @@ def _model(path):
         tree = etree.fromstring(data)
         if tree.tag != "robot":
             raise ValueError(f"its first element is <{tree.tag}> instead of <robot>")
+        for joint in tree.findall("joint"):
+            # yourdfpy finds the leader of a joint that mimics by counting a floating one before it as one number
+            if joint.get("type") in HELD:
+                joint.set("type", "fixed")
         with np.errstate(all="ignore"):  # what is not finite, or has no axis, is refused below
-            model = yourdfpy.URDF.load(io.BytesIO(data), load_meshes=False)
+            model = yourdfpy.URDF.load(io.BytesIO(etree.tostring(tree)), load_meshes=False)
         wrong = _no_tree(model) or _wrong_joint(model.robot.joints)
     if wrong:
         raise FileFormatError(f"robot '{path}' cannot be built: {wrong[:300]}; correct it.")
+    for joint in model.robot.joints:
+        if joint.type in MOVES:  # a direction, whatever its length
+            joint.axis = joint.axis / np.linalg.norm(joint.axis)
     return model
 
 
@@ -226,14 +234,25 @@ def _checked_angles(path, model, angles):
     return values
 
 
-def _colour(material, known):
+def _colours(path, robot):
+    """Linear luminance of materials by name: a colour said in one link is that of the name in all."""
+    said = [shape.material for link in robot.links for shape in link.visuals]
+    named = [each for each in (*robot.materials, *said) if each and each.name and each.color]
+    return {each.name: _colour(path, each, {}) for each in reversed(named)}
+
+
+def _colour(path, material, known):
     """Linear luminance of an URDF material, or None."""
     if material is None:
         return None
-    colour = material.color or getattr(known.get(material.name), "color", None)
-    if colour is None:
-        return None
-    return textures.linear(np.asarray(colour.rgba, dtype=float)[None, None, :3]).item()
+    if material.color is None:
+        return known.get(material.name)
+    rgb = np.asarray(material.color.rgba, dtype=float)[:3]
+    if len(rgb) < 3 or not ((rgb >= 0) & (rgb <= 1)).all():
+        raise FileFormatError(
+            f"robot '{path}' has the colour {' '.join(f'{v:g}' for v in rgb)}; red, green and blue go from 0 to 1."
+        )
+    return textures.linear(rgb[None, None]).item()
 
 
 def _parts(geometry, finder, link):

@@ -119,8 +119,10 @@ class Driving(Trajectory):
         yaw_rad=0.0,
     ):
         self.span_s = (0.0, positive("duration_s", duration_s, most=1e4))
-        if not math.isfinite(speed_m_s + turn_rad_s + x_m + y_m + yaw_rad + height_m):
-            raise DomainError("driving: speed, turn rate and start must be finite numbers.")
+        start = speed_m_s + turn_rad_s + x_m + y_m + yaw_rad + height_m
+        shake = turn_swing_rad_s + heave_m + pitch_rad + roll_rad
+        if not math.isfinite(start + shake):
+            raise DomainError("driving: speed, turn rate, shake and start must be finite numbers.")
         positive("speed_share", speed_share, 0, 1, inclusive=True)
         self.track_m = positive("track_m", track_m)
         self.side_slip_s = positive("side_slip_s", side_slip_s, inclusive=True)

@@ -5,6 +5,7 @@ import math
 
 import torch
 
+from codesign.checks import check, check_number, check_positive
 from codesign.pose import check_pose
 from scenes.trajectories.trajectory import Trajectory, positive, rigid
 
@@ -33,10 +34,12 @@ class Orbital(Trajectory):
         radius_period_s=2.0,
         rate_period_s=3.0,
     ):
-        self.centre_m = torch.tensor(centre_m, dtype=torch.float64)
+        self.centre_m = check(
+            torch.tensor(centre_m, dtype=torch.float64), (3,), "centre_m", finite=True
+        )
         self.radius_m = positive("radius_m", radius_m)
-        self.height_m = float(height_m)
-        self.phase_rad = float(phase_rad)
+        self.height_m = check_number(height_m, "height_m")
+        self.phase_rad = check_number(phase_rad, "phase_rad")
         self.rate_rad_s = math.copysign(
             positive("the size of rate_rad_s", abs(rate_rad_s)), rate_rad_s
         )
@@ -66,14 +69,17 @@ class Swinging(Trajectory):
 
     Args:
       T_world_start: [4, 4] body pose.
-      direction: [3] unit vector in the world.
+      direction: [3] in the world, of any length above 0.
       amplitude_m, frequency_hz: above 0.
     """
 
     def __init__(self, T_world_start, direction, amplitude_m, frequency_hz):
         self.start = check_pose(T_world_start.detach().double())
-        self.direction = torch.nn.functional.normalize(
-            torch.as_tensor(direction, dtype=torch.float64), dim=0
+        direction = check(
+            torch.as_tensor(direction, dtype=torch.float64), (3,), "the direction", finite=True
+        )
+        self.direction = direction / check_positive(
+            float(direction.norm()), "the direction's length"
         )
         self.amplitude_m = positive("amplitude_m", amplitude_m)
         self.frequency_hz = positive("frequency_hz", frequency_hz)

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.checks import check_finite
+from codesign.checks import check_finite, check_whole
 from codesign.errors import DomainError, ShapeError
 from codesign.mount.pose import AXES_BODY_CAM
 from codesign.pose import check_pose, look_at, se3_exp
@@ -134,8 +134,7 @@ def positive(name, value, least=0.0, most=float("inf"), inclusive=False):
 
 def times(count: int, rate_hz: float) -> Tensor:
     """Frame times [count] in seconds, starting at 0."""
-    if count < 2:
-        raise DomainError(f"a trajectory needs at least 2 frames, got {count}.")
+    count = check_whole(count, "the number of frames of a trajectory", 2)
     if not 0 < rate_hz < math.inf:
         raise DomainError(f"a trajectory's rate_hz = {rate_hz} must be positive and finite.")
     return torch.arange(count, dtype=torch.float64) / rate_hz
@@ -144,6 +143,7 @@ def times(count: int, rate_hz: float) -> Tensor:
 def body_twist(start: Tensor, twist_per_s: Tensor, t_s: Tensor) -> Tensor:
     """Constant velocity in the camera's own axes: start [4, 4], twist_per_s [..., 6] (m/s, rad/s),
     t_s [T] -> [..., T, 4, 4]."""
+    check_finite(twist_per_s, "the twist")
     return start @ se3_exp(t_s[:, None] * twist_per_s[..., None, :])
 
 

@@ -134,6 +134,12 @@ def test_one_file_gives_the_same_numbers_through_both_doors(name, tmp_path):
         ("1 2 3 1\n", {"columns": "xytp"}, [3]),
         ("1 2 3 1\n2 3 4 1\n", {"columns": "xytp", "time_unit": "ms"}, [3000, 4000]),
         ("2 9 3 1\n5 9 1 1\n", {}, [2, 5]),
+        # 256 ns from one number of double precision to the next
+        (
+            "1700000000000000499 1 1 1\n1700000000000001501 1 1 1\n",
+            {"time_unit": "ns"},
+            [1_700_000_000_000_000, 1_700_000_000_000_002],
+        ),
         ("2 9 3 1\n1 9 3 1\n", {}, [3, 3]),
         ("1 1 5 2\n", {"columns": "pxty"}, [5]),
         # a little late

@@ -214,6 +214,23 @@ def test_expected_counts_are_means_over_thresholds(spread):
         assert ((found - sample.mean(-2)).abs() <= error).all()
 
 
+@pytest.mark.parametrize("spread", [0.15, 0.17, 0.3, 0.5, 1.0])
+def test_expected_counts_are_the_sums_that_define_them(spread):
+    # before, at and beyond the ends of both ways to shorten a sum; 7.5 deviations: 1e-12 is left out
+    many = torch.tensor([0.3, 1.19, 1.21, 2.4, 7.99, 8.01, 20.0, 60.0], dtype=D)
+    events = torch.arange(1, math.ceil(60 * math.exp(7.5 * spread)), dtype=D)[:, None]
+    place = (many.log() - events.log()) / spread
+    lift = math.exp(spread**2 / 2)
+    counts, reference = expected(
+        torch.stack((0 * many, 0.2 * many)), 0.2, 0.2, spread, log_input=True
+    )
+    for found, truth in (
+        (counts[0, 0], torch.special.ndtr(place).sum(0)),
+        (reference, 0.2 * lift * torch.special.ndtr(place - spread).sum(0)),
+    ):
+        torch.testing.assert_close(found, truth, rtol=0, atol=4e-7)
+
+
 def test_expected_counts_stay_smooth_through_the_series_end():
     # the sum over events is left for its integral at 1.2/spread events
     around = 0.2 * 1.2 / 0.15 * f64([1 - 1e-9, 1 + 1e-9])
@@ -222,8 +239,12 @@ def test_expected_counts_stay_smooth_through_the_series_end():
     assert counts[0, 0].diff().abs() < 1e-7
     assert reference.diff().abs() < 1e-7
     thetas = [torch.tensor(value, dtype=D, requires_grad=True) for value in (0.07, 0.09, 0.2)]
-    frames = 50 + 30 * rand64(seeded(1), 4, 2)
-    assert torch.autograd.gradcheck(lambda *a: expected(*a), (frames.requires_grad_(), *thetas))
+    frames = 50 + 30 * torch.rand(4, 2, generator=seeded(1), dtype=D)
+    frames.requires_grad_()
+    assert torch.autograd.gradcheck(lambda *a: expected(*a), (frames, *thetas))
+    # of which the sum is cut, and the rest integrated
+    wide = torch.tensor(0.9, dtype=D, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda *a: expected(*a), (frames, *thetas[:2], wide))
 
 
 def test_frame_difference_caps_at_one_and_forgets():

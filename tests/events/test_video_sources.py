@@ -6,9 +6,11 @@ import imageio.v3 as iio
 import imageio_ffmpeg
 import numpy as np
 import pytest
+import tifffile
 import torch
 
 from codesign.errors import FileFormatError
+from codesign.events.sources.folder import read_picture
 from codesign.events.sources.opening import open_frames
 from tests.numbers import f64
 
@@ -109,6 +111,28 @@ def test_lossless_folders_come_back_bit_for_bit_in_natural_order(tmp_path, suffi
     check_frames(tmp_path, frames)
 
 
+def test_tiffs_mean_what_their_tag_says(tmp_path):
+    def stored(frame, **tags):
+        tifffile.imwrite(tmp_path / "a.tif", frame, **tags)
+        return read_picture(tmp_path / "a.tif")
+
+    gray = random_frames(np.uint8, 4, 6)
+    for frame in (gray, gray.astype(np.uint16) * 200):
+        full = np.iinfo(frame.dtype).max
+        np.testing.assert_array_equal(stored(full - frame, photometric="miniswhite"), frame)
+    black = gray > 99
+    for name, sign in (("minisblack", 1), ("miniswhite", -1)):
+        found = stored(black if sign > 0 else ~black, photometric=name)
+        np.testing.assert_array_equal(found, 255 * black)
+    colours = random_frames(np.uint16, 3, 256)
+    np.testing.assert_array_equal(
+        stored(gray, photometric="palette", colormap=colours), colours.T[gray]
+    )
+    for tags in ({"photometric": "ycbcr"}, {"photometric": "rgb", "extratags": [(274, 3, 1, 6)]}):
+        with pytest.raises(FileFormatError, match="save it upright as gray, palette or RGB"):
+            stored(np.repeat(gray[..., None], 3, -1), **tags)
+
+
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32, np.float64])
 def test_stacks_come_back_bit_for_bit_with_their_times(tmp_path, kind):
     stack = random_frames(kind, 9, 4, 5)
@@ -175,6 +199,7 @@ NO_SOURCES = [
     ("depths", {"a.png": GRAY, "b.png": GRAY.astype(np.uint16)}, "16 bits"),
     ("torn", {"a.png": GRAY, "b.png": DEEP[:20]}, "cannot be read"),
     ("deep", {"a.png": DEEP, "b.png": GRAY}, "16 bits"),
+    ("faint", {"a.png": DEEP[:25] + b"\4" + DEEP[26:], "b.png": GRAY}, "alpha at 16 bits"),
     ("clear", {"a.png": CLEAR, "b.png": CLEAR}, "transparent"),
     ("mixed", {"a.png": GRAY, "c.jpg": GRAY}, "several kinds"),
     ("a.png", GRAY, "single picture"),

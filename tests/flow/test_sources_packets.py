@@ -59,6 +59,18 @@ def test_a_recording_is_cut_into_windows_with_the_flow_of_its_rotation(place):
     assert all(len(packet.stream) in (500, 501) for packet in by_number)
 
 
+@pytest.mark.parametrize("count", [39, 40, 41, 42])
+def test_packets_by_number_hold_that_number(tmp_path, count):
+    t_us = 3 * np.arange(count)
+    np.savetxt(tmp_path / "e.txt", np.stack([t_us, 0 * t_us, 0 * t_us, 0 * t_us + 1], 1), "%d")
+    packets = read_packets(
+        tmp_path / "e.txt", options=PacketOptions(events=10, columns="txyp", count=9)
+    )
+    assert [len(packet.stream) for packet in packets] == [10] * (count // 10)
+    firsts = [int(packet.stream.t_us[0]) for packet in packets]
+    assert firsts == t_us[: count // 10 * 10 : 10].tolist()
+
+
 def test_motion_that_covers_a_part_of_the_windows_tells_of_that_part(place):
     gyroscope(place, 100.018, 101)
     options = PacketOptions(window_s=0.02, start_s=0.0, count=4)

@@ -80,6 +80,26 @@ def test_chunks_change_nothing_and_every_event_is_in_one_window(by):
         assert tracker.event_s == pytest.approx(sum(w.t1_us - w.t0_us for w in whole) * 1e-6)
 
 
+def test_a_chunk_whose_estimate_fails_may_come_again():
+    stream = stream_of(random_times(300))
+    calls = []
+
+    def failing(volume):
+        calls.append(volume)
+        if len(calls) == 3:
+            raise RuntimeError("out of memory")
+        return summed(volume)
+
+    tracker = flow.Tracker(failing, window_s=0.004)
+    first, second = pieces(stream, [20])
+    found = tracker.add(first)
+    with pytest.raises(RuntimeError):
+        tracker.add(second)
+    found += [*tracker.add(second), *tracker.finish()]
+    assert told(found) == told(flow.Tracker(summed, window_s=0.004).track([stream]))
+    assert (tracker.windows, tracker.events) == (len(found), 300)
+
+
 def test_windows_by_time_are_those_of_the_volume_and_empty_ones_are_handed_out():
     stream = stream_of(random_times(600))
     found = list(flow.Tracker(summed, window_s=0.004, bins=5).track([stream]))

@@ -85,6 +85,27 @@ def test_a_joint_that_mimics_another_follows_it(tmp_path):
         robots.from_urdf(arm(tmp_path, more=more), {"follower": 0.1})
 
 
+@pytest.mark.parametrize("kind", ["floating", "planar"])
+def test_followers_and_axes_behind_a_held_joint(tmp_path, kind):
+    box = '<visual><geometry><box size="1 1 1"/></geometry><material name="red">{}</material></visual>'
+    red = '<color rgba="1 0 0 1"/>'
+    path = tmp_path / "r.urdf"
+    path.write_text(
+        f'<robot name="r"><link name="a">{box.format("")}</link><link name="b"/><link name="c"/>'
+        f'<link name="d">{box.format(red)}</link>'
+        f'<joint name="f" type="{kind}"><parent link="a"/><child link="b"/></joint>'
+        '<joint name="s" type="prismatic"><parent link="b"/><child link="c"/><axis xyz="2 0 0"/>'
+        '<limit lower="0" upper="9" effort="1" velocity="1"/></joint><joint name="m" type="continuous">'
+        '<parent link="c"/><child link="d"/><axis xyz="0 0 3"/><mimic joint="s" multiplier="2"/></joint></robot>'
+    )
+    robot = robots.from_urdf(path, {"s": 0.5})
+    at = robot.frame("d").numpy()
+    np.testing.assert_allclose(at[:3, 3], [0.5, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(at[:3, :3], turn("z", 1.0), atol=1e-15)
+    # pure red of sRGB, named in one link and said in another
+    assert [part.colour[0] for part in robot.parts] == pytest.approx([0.2126] * 2, abs=1e-4)
+
+
 @pytest.mark.parametrize(
     ("geometry", "expected", "share"),
     [

@@ -79,12 +79,14 @@ def settled_unit(t, unit, name=""):
 
 
 def microseconds(t, unit):
-    """Times in microseconds, rounded; whole ones stay exact."""
-    return (
-        signed(t)
-        if unit == "us" and t.dtype.kind in "iu"
-        else np.rint(t.astype(np.float64) * UNITS_US[unit])
-    )
+    """Times in microseconds, rounded to the next, of two the even one; whole ones stay exact."""
+    if unit in ("us", "ns") and t.dtype.kind in "iu":
+        if unit == "us":
+            return signed(t)
+        # wide enough for what is done to them; double precision ends at a hundred days
+        whole, rest = np.divmod(t.astype(np.uint64 if t.dtype.kind == "u" else np.int64), 1000)
+        return signed(whole + (2 * rest + whole % 2 > 1000))
+    return np.rint(t.astype(np.float64) * UNITS_US[unit])
 
 
 def signed(t):

@@ -29,6 +29,7 @@ from codesign.events.layers.soft import dense, expected, soft
 from codesign.events.low_pass import low_pass
 from codesign.events.sensor.model import (
     SensorModel,
+    apart,
     draw_deviates,
     draw_shot_counts,
     of_pixels,
@@ -280,6 +281,8 @@ class ComparatorLayer(EventLayer):
         else:
             check_chunk(frames, state.shape, state.dtype)
             times_s = check_later(times_s, state.time_s)
+            # copies, so that a state used twice gives the same twice
+            state = replace(state, generators=apart(state.generators))
         deviates, shots = self._noise(frames, times_s.diff(), state)
         seen, level = self._seen(frames, times_s.diff(), state)
         drawn = (None, None) if deviates is None or not self.comparator.mismatched else deviates
@@ -292,9 +295,14 @@ class ComparatorLayer(EventLayer):
         if shots is not None:
             counts = counts + shots
         frame = None if level is None else frames[-1].clone()  # its buffer may be filled again
-        time_s = float(times_s[-1])
         return counts, replace(
-            state, comparator=comparator, level=level, frame=frame, deviates=deviates, time_s=time_s
+            state,
+            comparator=comparator,
+            level=level,
+            frame=frame,
+            deviates=deviates,
+            time_s=float(times_s[-1]),
+            generators=apart(state.generators),
         )
 
     def _noise(self, frames, interval_s, state):

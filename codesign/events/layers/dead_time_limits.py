@@ -35,7 +35,7 @@ def warn_beyond(
             f"is kept; gradients are measured up to {MOST_LOAD:g} (docs/events.md). Beyond, which event is "
             "kept depends on each one before, and the gradient of a shift is lost first (cosine 0.45 "
             "against differences at 8.8): shorten the dead time or raise the thresholds.",
-            stacklevel=4,
+            stacklevel=5,
         )
     elif most > THRESHOLD_LOAD and any(theta.requires_grad for theta in thetas):
         # no figure in it, so that a design loop says it once
@@ -43,7 +43,7 @@ def warn_beyond(
             f"rate x dead time is above {THRESHOLD_LOAD:g} for the average event: gradients to "
             "thresholds, one apart from the other, may point wrong there (docs/events.md); shorten the "
             "dead time, or set thresholds by differences.",
-            stacklevel=4,
+            stacklevel=5,
         )
 
 

@@ -138,11 +138,14 @@ class EventLayer(nn.Module):
 
         Args:
           as for ``forward``.
-          state: what the chunk before returned, which brings its own generators; then T frames give
-            T intervals. None: the first chunk. Noise is that of the whole where every sample has
+          state: what the chunk before returned, which brings copies of the generators as they were
+            then, and stays as it is; then T frames give T intervals. None: the first chunk. Noise is that of the whole where every sample has
             its own generator; those of a batch that share one draw in the order of the calls.
         Returns: counts [..., T-1, 2, H, W] ([..., T, 2, H, W] with a state); state to carry on,
           with its graph.
+        Gradient: that of the whole, unless all pixels share two thresholds that differ by more than
+          a quarter: "memory", "srm" and "physical" (but through a long dead time) then follow pairs
+          of pixels, which begin anew with every chunk.
         """
         check_axes(frames)
         check_begun(state, generator)

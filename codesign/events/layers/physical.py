@@ -24,6 +24,7 @@ from codesign.events.low_pass import low_pass
 from codesign.events.sensor.model import (
     DESIGN,
     SensorModel,
+    apart,
     of_pixels,
     with_design,
 )
@@ -91,6 +92,24 @@ def sensor_counts(
     """
     check_state(state, PhysicalState)
     check_begun(state, generator)
+    (state,) = _apart((state,))
+    counts, after = _counts(frames, t_s, sensor, generator, state, log_input, design)
+    return counts, _apart((after,))[0]
+
+
+def _apart(states):
+    """The states with generators of their own, so that one used twice gives the same twice."""
+    if None in states:
+        return states
+    generators = apart([state.sensor.generator for state in states])
+    return tuple(
+        replace(state, sensor=replace(state.sensor, generator=generator))
+        for state, generator in zip(states, generators, strict=True)
+    )
+
+
+def _counts(frames, t_s, sensor, generator, state, log_input, design):
+    """``sensor_counts`` that draws from the generator, or from that of the state."""
     front_end = FrontEnd(log_input)
     hard_sensor = with_design(sensor, design)
     value: dict[str, Any] = {name: design.get(name, getattr(sensor, name)) for name in DESIGN}
@@ -171,11 +190,11 @@ class PhysicalLayer(EventLayer):
                 f"{len(samples)} samples follow {len(state)}; a batch keeps its samples over the chunks."
             )
         none = [None] * len(samples)
-        befores, own = (state, none) if state else (none, generators)
-        options = {"log_input": self.log_input, **{name: self.value(name) for name in self.learnt}}
+        befores, own = (_apart(state), none) if state else (none, generators)
+        design = {name: self.value(name) for name in self.learnt}
         found = [
-            sensor_counts(sample, t_s, self.sensor, generator=generator, state=before, **options)
+            _counts(sample, t_s, self.sensor, generator, before, self.log_input, design)
             for sample, generator, before in zip(samples, own, befores, strict=True)
         ]
         counts, states = zip(*found, strict=True)
-        return torch.stack(counts, 2).reshape(-1, 2, *frames.shape[1:]), states
+        return torch.stack(counts, 2).reshape(-1, 2, *frames.shape[1:]), _apart(states)

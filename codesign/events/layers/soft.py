@@ -16,9 +16,12 @@ from codesign.events.intensity import front_end_of, log_levels
 
 # a pixel without change fires sigmoid(-5) = 0.67 % of an event per polarity and frame
 GHOST_LOGIT = -5.0
-# beyond a spread of so many events the sum over events equals its integral less a half, to exp(-2
-# pi^2 1.2^2) = 5e-13
+# beyond a spread of so many events the sum over events equals its integral less a half: to exp(-2
+# pi^2 1.2^2) = 5e-13 for small spreads, to 3e-7 for the largest, above which it no longer does
 SERIES_END = 1.2
+SERIES_SPREAD = 0.16
+# of larger spreads so many events over the spread are summed, and the rest integrated, to 3e-7
+SUMMED = 20.0
 LEAST_SPREAD = 0.01
 MOST_SPREAD = 1.0
 
@@ -184,7 +187,8 @@ def expected(
 def _mean_count(distance, theta, spread):
     """Mean count and mean movement of the memorised level for a distance >= 0."""
     many = distance / theta
-    far = many * spread > SERIES_END
+    wide = float(spread.detach())
+    far = many * spread > (SERIES_END if wide <= SERIES_SPREAD else math.inf)
     lift = torch.exp(spread**2 / 2)
     # where the series is not used its input is a harmless 1
     near = torch.where(far | (many <= 0), 1.0, many).log()
@@ -192,13 +196,24 @@ def _mean_count(distance, theta, spread):
     moved = torch.zeros_like(many)
     close = many.detach()[~far.detach()]
     # six deviations: what is left out is below 1e-9
-    last = (
-        math.ceil(float(close.max()) * math.exp(6 * float(spread.detach()))) if close.numel() else 0
-    )
-    for k in range(1, last + 1):
+    last = math.ceil(float(close.max()) * math.exp(6 * wide)) if close.numel() else 0
+    most = math.ceil(SUMMED / wide)
+    for k in range(1, min(last, most) + 1):
         place = (near - math.log(k)) / spread
         count = count + torch.special.ndtr(place)
         moved = moved + torch.special.ndtr(place - spread)
+    if last > most:
+        edge = most + 0.5
+        place = (near - math.log(edge)) / spread
+        count = count + _integral(many * lift, place, edge, spread)
+        moved = moved + _integral(many / lift, place - spread, edge, spread)
     rest = many <= 0
     count = torch.where(far, many * lift - 0.5, torch.where(rest, 0.0, count))
     return count, theta * torch.where(far, many - lift / 2, torch.where(rest, 0.0, lift * moved))
+
+
+def _integral(mean, place, edge, spread):
+    """The sum over k > ``edge`` of P(X > k) as an integral with its first correction, for a log-normal
+    X of that mean and P(X > edge) = Phi(place)."""
+    slope = torch.exp(-(place**2) / 2) / (math.sqrt(2 * math.pi) * spread * edge)
+    return mean * torch.special.ndtr(place + spread) - edge * torch.special.ndtr(place) - slope / 24

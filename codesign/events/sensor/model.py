@@ -15,6 +15,7 @@ from codesign.errors import DomainError, ShapeError, shown
 from codesign.events.entry import MOST_VALUES, as_seconds, check_dtype
 
 THETA_MINIMUM = 0.01  # no drawn threshold falls below, as in v2e
+THETA_MOST = 10.0  # light of 22,000 times as much; beyond, a percentage or gray levels are meant
 MOST_NUMBER = 1e30
 TIMINGS = ("interpolated", "v2e")
 # fields of SensorModel that may carry a gradient
@@ -26,7 +27,7 @@ class SensorModel:
     """Parameters of an event sensor. The defaults are ideal: equal thresholds, no noise, no limit
     of speed.
 
-    theta_on, theta_off: nominal contrast thresholds, natural log units, > 0.
+    theta_on, theta_off: nominal contrast thresholds, natural log units, > 0 and up to 10.
     theta_sigma: standard deviation of the thresholds over pixels, natural log units, >= 0.
     cutoff_hz: bandwidth of the photoreceptor at full light, a one-pole low-pass of the log level;
       it shrinks with intensity as (I + 20)/275. 0: none.
@@ -90,6 +91,9 @@ class SensorModel:
                     f"SensorModel.{name} is {shown(value)} ({type(value).__name__}); a finite Python "
                     f"number {'> 0' if positive else '>= 0'} is needed{hint}."
                 )
+        for name in ("theta_on", "theta_off"):
+            remedy = "it is of the natural logarithm: log(1.2) = 0.18 for a contrast of 20 %"
+            check_number(getattr(self, name), f"SensorModel.{name}", most=THETA_MOST, remedy=remedy)
         check_number(self.hot_pixel_share, "SensorModel.hot_pixel_share", 0.0, 1.0)
         if self.photoreceptor_noise and not (self.cutoff_hz > 0 and self.shot_rate_hz > 0):
             raise DomainError(
@@ -221,6 +225,12 @@ def check_generator(generator: object) -> None:
     check_kind(generator, Generator, "the generator", "give torch.Generator().manual_seed(0)")
 
 
+def apart(generators: Sequence[Generator]) -> list[Generator]:
+    """Generators that go on as these will, which stay as they are; what is one stays one."""
+    own = {each: each.clone_state() for each in generators}
+    return [own[each] for each in generators]
+
+
 def draw_thresholds(
     sensor: SensorModel,
     pixels: Sequence[int],
@@ -238,7 +248,7 @@ def draw_thresholds(
     Source: v2e (Hu et al., CVPR-W 2021), threshold mismatch.
     """
     check_generator(generator)
-    check_dtype(dtype)
+    check_dtype(dtype, fractions=True)
     pixels = _shape(pixels)
     draws = check_sensor(sensor).theta_sigma > 0
     deviates = draw_deviates(pixels, generator, dtype=dtype) if draws else (None, None)
@@ -371,8 +381,19 @@ def draw_shot_counts(
         return torch.zeros(shape, dtype=dtype)
     size = 2 * math.prod(pixels)
     means = (sensor.shot_rate_hz / 2 * interval_s.double()).tolist()
-    counts = [_poisson(mean, size, generator).to("cpu", dtype) for mean in means]
+    counts = [_in(dtype, _poisson(mean, size, generator)) for mean in means]
     return torch.stack(counts).reshape(shape) if counts else torch.zeros(shape, dtype=dtype)
+
+
+def _in(dtype, counts):
+    """Whole numbers in a type that holds them all; DomainError for another."""
+    most = 2 / torch.finfo(dtype).eps if dtype.is_floating_point else torch.iinfo(dtype).max
+    if len(counts) and int(counts.max()) > most:
+        raise DomainError(
+            f"{int(counts.max())} noise events fall into one interval of a pixel, more than {dtype} holds exactly; take "
+            "torch.float32."
+        )
+    return counts.to("cpu", dtype)
 
 
 def _poisson(mean, size, generator):

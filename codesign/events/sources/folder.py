@@ -17,6 +17,7 @@ iio = optional("imageio.v3", "video", "reading pictures")
 tifffile = optional("tifffile", "video", "reading TIFF")
 
 PACKINGS = (1, 5, 8, 32773, 32946)  # none, LZW, zlib, PackBits
+WHITE_IS_ZERO, BLACK_IS_ZERO, RGB, PALETTE = range(4)  # as the tag counts kinds of pixels
 MOST_BYTES = 2**30
 MOST_RATIO = 1040  # at most 1032 to 1
 
@@ -78,8 +79,8 @@ def natural(path):
 
 
 def read_picture(path):
-    """One picture as stored: [H, W] or [H, W, 3], uint8 or uint16. Palettes become colours, black
-    and white becomes 0 and 255.
+    """One picture as stored: [H, W] or [H, W, 3], uint8 or uint16, black at 0. Palettes become
+    colours (of 16 bits in a TIFF), black and white becomes 0 and 255.
 
     Raises: FileFormatError when it cannot be read, holds several pages, is partly transparent, or
       is of another depth.
@@ -95,11 +96,11 @@ def read_picture(path):
             if (
                 head[:4] == b"\x89PNG"
                 and head[24:25] == b"\x10"
-                and head[25:] in (b"\x02", b"\x06")
+                and head[25:] in (b"\x02", b"\x04", b"\x06")
             ):
                 raise FileFormatError(
-                    f"{path} is a PNG in colour with 16 bits, which the reader would cut to 8; convert it to "
-                    "TIFF, or to gray."
+                    f"{path} is a PNG in colour or with alpha at 16 bits, which the reader would cut to 8; convert "
+                    "it to TIFF, or to gray."
                 )
             file.seek(0)
             with PIL.Image.open(file) as opened:
@@ -150,4 +151,16 @@ def _tiff(path, file):
         with contextlib.suppress(IndexError):
             pages.pages.get(1)
             raise FileFormatError(f"{path} holds several pages; one is needed.")
-        return page.asarray()
+        kind, bits = page.photometric, page.bitspersample
+        turned = page.tags.valueof("Orientation", 1) != 1
+        if kind not in (WHITE_IS_ZERO, BLACK_IS_ZERO, RGB, PALETTE) or turned:
+            raise FileFormatError(
+                f"{path} holds {getattr(kind, 'name', kind)}{', turned' if turned else ''}; save it upright as gray, "
+                "palette or RGB."
+            )
+        if kind != PALETTE and bits not in (1, 8, 16):
+            raise FileFormatError(f"{path} has {bits} bits per colour; save it with 8 or 16.")
+        picture = page.asarray()
+        if kind == PALETTE:
+            return page.colormap[:, picture].transpose(1, 2, 0)
+        return ~picture if kind == WHITE_IS_ZERO else picture

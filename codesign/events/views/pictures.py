@@ -35,6 +35,7 @@ def picture(counts: Tensor, full_scale: float | None = None) -> Tensor:
       counts: [..., 2, H, W] counts >= 0, ON first.
       full_scale: count of full colour, > 0; None: the largest count, at least 1.
     Returns: [..., H, W, 3] uint8.
+    Raises: ShapeError for other axes; DomainError for counts that are negative or not finite.
     """
     on, off, full = _scaled(counts, full_scale)
     strength = torch.maximum(on, off).div(full).clamp(max=1)
@@ -69,7 +70,7 @@ def rates(counts: Tensor, t_s: Times) -> tuple[Tensor, Tensor]:
 
 
 def _scaled(counts, full_scale):
-    check(counts, "... 2 H W", "counts (ON first)", FLOATS)
+    check(counts, "... 2 H W", "counts (ON first)", FLOATS, least=0.0, finite=True)
     counts = counts.detach()
     if full_scale is None:
         full_scale = max(1.0, float(counts.max()))

@@ -124,8 +124,8 @@ def decay_from_stream(
         then not in the stream; None: nothing before.
     Returns: [K, 2, H, W], summed in float64, ON first.
     Gradient: none (timestamps are integers).
-    Raises: DomainError for reference times that are not whole or do not increase, and for tau;
-      ShapeError for a trace of another size.
+    Raises: DomainError for reference times that are not whole or do not increase, for tau, and for
+      events up to the time of the trace; ShapeError for a trace of another size.
     """
     tau_s = check_tau(tau_s)
     check_stream(stream)
@@ -142,6 +142,11 @@ def decay_from_stream(
         earlier, before_us = start[0], check_whole(start[1], "the time of the trace", None)
         check(earlier, (2, height, width), "the trace to go on with", FLOATS)
         trace += earlier.to(trace).flatten()
+        if len(stream) and int(stream.t_us[0]) <= before_us:
+            raise DomainError(
+                f"the trace is of {before_us} us, and the stream begins at {int(stream.t_us[0])} us with events that it "
+                "holds already; give those after it."
+            )
     traces = []
     for time_us, (cell, t_us) in segments(stream, at_us):
         if before_us is not None:

@@ -159,7 +159,12 @@ def windows(
             )
         last = len(held) - 1
         ends = ((k, min(k + options.events, last)) for k in starts)
-        times = [(int(held.t_us[a]), int(held.t_us[b])) for a, b in ends]
+        # an end at the last event takes it in: where one event is left over, the window ends before
+        # it, if there is a microsecond between them
+        spare = int(
+            first + len(starts) * options.events == last and held.t_us[-1] - held.t_us[-2] > 1
+        )
+        times = [(int(held.t_us[a]), int(held.t_us[b]) - (b == last) * spare) for a, b in ends]
         # events of one microsecond stay together
         possible = [(t0, t1) for t0, t1 in times if t1 > t0]
         if not possible:
