@@ -193,8 +193,9 @@ class Camera:
         return self
 
     def film_mm(self, pixels: Tensor) -> Tensor:
-        """Upright image position in millimetres of pixel coordinates [N, 2]."""
-        return (pixels - self.film.middle_px.to(pixels)) * self.film.pixel_pitch_mm
+        """Upright image position in millimetres of pixel coordinates [N, 2], float64."""
+        film = self.film
+        return (pixels.to(film.middle_px) - film.middle_px) * film.pixel_pitch_mm
 
     def __repr__(self):
         pixels = " x ".join(str(size) for size in self.film.shape)
@@ -262,7 +263,8 @@ class Camera:
 
     def chief_rays(self, pixels: Tensor) -> Rays:
         """Rays through the pupil's centre for pixel coordinates [N, 2]: Rays, float64."""
-        return self.lens.camera_rays(self.film_mm(pixels), torch.zeros_like(pixels), aim=self.aim)
+        at_mm = self.film_mm(pixels)
+        return self.lens.camera_rays(at_mm, torch.zeros_like(at_mm), aim=self.aim)
 
     def slope_per_px(self) -> float:
         """Slope of a chief ray per pixel, near the axis; no gradient."""
@@ -281,9 +283,11 @@ class Camera:
         line when none is given): Rays, float64. The axial ray goes along: only a lens that passes
         nothing at all is an error."""
         line = {} if wavelength_um is None else {"wavelength_um": wavelength_um}
-        at = torch.cat([self.film.middle_px[None].to(pixels), pixels])
-        through = torch.cat([pupil.new_zeros(1, 2), pupil])
-        rays = self.lens.camera_rays(self.film_mm(at), through, aim=self.aim, **line)
+        at_mm = self.film_mm(pixels)
+        pupil = pupil.to(at_mm)
+        axis = at_mm.new_zeros(1, 2)
+        film_mm, through = torch.cat([axis, at_mm]), torch.cat([axis, pupil])
+        rays = self.lens.camera_rays(film_mm, through, aim=self.aim, **line)
         return _columns(lambda column: column[1:], rays)
 
 

@@ -208,6 +208,15 @@ def test_pixels_are_in_image_order_with_the_axis_in_the_middle():
     assert at.tolist() == [[0, 0], [pytest.approx(0.1), 0]]
 
 
+@pytest.mark.parametrize("dtype", [torch.int64, torch.float32])
+def test_whole_and_single_numbers_mean_what_double_ones_do(dtype):
+    camera = Camera(lens.Pinhole(torch.tensor(8)), 8, 8, 0.5, 1)
+    pixels = torch.tensor([[0, 3], [4, 7]], dtype=dtype)
+    for rays in (camera.chief_rays(pixels), camera.rays_through(pixels, 0 * pixels)):
+        slope = (pixels.to(D) - 3.5) * 0.5 / 8
+        torch.testing.assert_close(rays.direction[:, :2] / rays.direction[:, 2:], slope)
+
+
 def test_single_precision_lenses_make_single_precision_rays_and_double_truth():
     double, single = (
         Camera(lens.load("cooke-triplet", dtype), 16, 12, 0.1, 4) for dtype in (D, torch.float32)
