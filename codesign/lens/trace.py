@@ -369,7 +369,9 @@ def trace(prescription: Prescription, origin_mm: Tensor, direction: Tensor) -> T
         depth = after - p.thickness_mm[gap] if gap >= 0 else after
         at, safe = onward(here)
         at = torch.cat([at[:, :2], depth.expand(len(at), 1)], 1)
-        rest = trace_surfaces(replace(p.part(gap + 1, last + 1), efficiency=1.0), at, safe)
+        # of all surfaces; those before the plate brought it where there are some
+        efficiency = 1.0 if gap >= 0 else p.efficiency
+        rest = trace_surfaces(replace(p.part(gap + 1, last + 1), efficiency=efficiency), at, safe)
     return joined(here, rest, gap + 1)
 
 
