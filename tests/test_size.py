@@ -16,11 +16,11 @@ BUDGETS = {
     "codesign/lens": 47_610,  # stops and apertures in their own axes, fields below 90 degrees
     "codesign/mount": 14_630,  # films looked at all over, angles in degrees
     "codesign/optimise": 3_900,
-    "codesign/render": 43_600,  # steps of differences by their motion on the film, maps of other cameras
+    "codesign/render": 43_700,  # chief rays of a spectrum, maps of other cameras
     "codesign/report": 7_180,  # says that there is nothing to draw; flow that is not known
     "codesign/system": 9_630,  # truth of what is read
     "codesign/train": 5_570,  # moments of weights of as many axes
-    "scenes": 14_530,  # size of a file, velocities with gradients
+    "scenes": 14_680,  # rooms and grounds that are too small for what is in them
     "scenes/robots": 9_500,
     "scenes/trajectories": 3_100,
     "scenes/windows": 8_700,
@@ -54,8 +54,8 @@ BUDGETS = {
     "tests/lens": 37_900,  # the same
     "tests/mount": 14_600,
     "tests/optimise": 3_650,  # a state is a copy; steps in single precision
-    "tests/render": 30_920,  # intermediate images, lenses changed after their map
-    "tests/scenes": 20_330,  # texels of large files
+    "tests/render": 31_100,  # whole-number pixels, chief rays of a spectrum
+    "tests/scenes": 20_540,  # bodies of any size, photographs of a turned camera
     "tests/studies": 33_400,  # tables that are damaged
     "tests/system": 7_120,
     "tests/train": 5_010,
