@@ -73,6 +73,23 @@ def test_chief_rays_of_an_aimed_camera_are_those_that_projection_brings_back():
     torch.testing.assert_close(found, pixels, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("weights", [(1.0, 0.0), (0.25, 0.75)])
+def test_a_point_is_projected_in_the_mean_wavelength_of_the_light(weights):
+    """Against the forward trace: the stop comes first, so the pupil is one for all colours."""
+    glass = lens.Glass.named("SF2")
+    stop = lens.Surface(math.inf, 10.0, None, 3.0, is_stop=True)
+    faces = lens.Surface(60.0, 4.0, glass, 9.0), lens.Surface(-60.0, 45.0, None, 9.0)
+    geo = lens.GeoLens([stop, *faces], 4.0)
+    light = lens.Spectrum((0.4861327, 0.6562725), weights)
+    field, mean_um = 0.2, weights[0] * 0.4861327 + weights[1] * 0.6562725
+    far = torch.tensor([[0.0, 1e6 * math.tan(field), 1e6]], dtype=D)
+    made = (Camera(geo, 8, 8, 0.01, 2, spectrum=s, aim=True) for s in (light, None))
+    found, d_line = (project(camera, far)[0, 1] - 3.5 for camera in made)
+    truth = lens.analysis.chief_ray(geo, field, mean_um).position_mm[0, 1].abs() / 0.01
+    torch.testing.assert_close(found, truth, rtol=0, atol=1e-6)
+    assert abs(float((d_line - truth).detach())) > 0.05
+
+
 def test_points_outside_the_field_are_nan_and_leave_the_others_alone():
     camera = on_sensor(fitted("cooke-triplet"))
     curvature = camera.lens.curvature_per_mm
