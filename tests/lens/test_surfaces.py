@@ -8,6 +8,7 @@ import torch
 
 from codesign import lens
 from codesign.lens import GeoLens, Phase, Status, Surface
+from codesign.lens.diffraction import ZernikePlate, with_plate
 from codesign.lens.trace import _active, trace
 from tests.lens.systems import PLANE, close, efl, f64, glass
 
@@ -174,9 +175,7 @@ def test_a_plate_before_a_diffractive_lens_takes_nothing_of_its_efficiency():
         Surface(60.0, 4.0, GLASS, 6.0, phase=Phase((-3.0,), 1, 0.55)),
         Surface(-60.0, 45.0, None, 6.0),
     ]
-    first = lens.diffraction.with_plate(
-        GeoLens(faces, 6.0), lens.diffraction.ZernikePlate({4: 0.0}, 4.0), z_mm=-1.0
-    )
+    first = with_plate(GeoLens(faces, 6.0), ZernikePlate({4: 0.0}, 4.0), z_mm=-1.0)
     x = math.pi * (0.55 / 0.7 - 1)
     weight = first.trace(*parallel_rays([(0.0, 0.0)], z=-5.0), 0.7).weight
     close(weight, (math.sin(x) / x) ** 2, 1e-14)
