@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import PIL.Image
+import PIL.ImageOps
 import torch
 from scipy.ndimage import gaussian_filter
 
+from codesign.checks import check_whole
 from codesign.doors import explain
 from codesign.errors import DomainError, FileFormatError
 from codesign.reading import read_bytes, reading
@@ -70,8 +72,9 @@ def file_size(source: str | Path) -> tuple[int, int] | None:
         return None
     if Path(source).suffix.lower() in HDR:
         return _unscaled(source, "texture").shape[:2]
-    with PIL.Image.open(source, formats=FORMATS) as image:  # its header alone
-        return image.height, image.width
+    with PIL.Image.open(source, formats=FORMATS) as image:
+        width, height = PIL.ImageOps.exif_transpose(image).size
+        return height, width
 
 
 def _stored(path):
@@ -85,8 +88,8 @@ def _stored(path):
 
 
 def decoded(data: bytes, what: str) -> np.ndarray:
-    """Values of a picture in the bytes of its file as they are stored: [H, W] or [H, W, 3];
-    FileFormatError, which begins with ``what``, for damaged, enormous and other ones."""
+    """Values of a picture in the bytes of its file as they are stored, upright as its EXIF says:
+    [H, W] or [H, W, 3]; FileFormatError, which begins with ``what``, for damaged, enormous and other ones."""
     with reading(what, "it is no whole picture; convert it to PNG"), warnings.catch_warnings():
         warnings.simplefilter("error", PIL.Image.DecompressionBombWarning)
         with PIL.Image.open(io.BytesIO(data), formats=FORMATS) as image:
@@ -95,7 +98,7 @@ def decoded(data: bytes, what: str) -> np.ndarray:
                     f"{what} has {image.width} x {image.height} pixels; at most {MOST_PIXELS / 1e6:.0f} million are read, "
                     "make it smaller."
                 )
-            return stored_values(image)
+            return stored_values(PIL.ImageOps.exif_transpose(image))
 
 
 def stored_values(image: PIL.Image.Image) -> np.ndarray:
@@ -163,6 +166,7 @@ def _radiance(linear, name):
 def shrunk(texture: np.ndarray, factor: int) -> np.ndarray:
     """The texture averaged over factor x factor texels, so that a few samples per pixel see no
     detail between them."""
+    factor = check_whole(factor, "texture to shrink: factor", 1, min(texture.shape))
     height, width = (n // factor * factor for n in texture.shape)
     return (
         texture[:height, :width]
@@ -274,9 +278,10 @@ def picture(
                 f"an array coded by sRGB has pixels [H, W] or [H, W, 3], uint8, uint16 or 0..1, not {pixels.dtype} "
                 f"{pixels.shape}; numbers of 0 to 255 become so by .astype(np.uint8)."
             )
-        if pixels.dtype.kind == "f" and pixels.max() > 1 + 1e-6:
+        if pixels.dtype.kind == "f" and (pixels.max() > 1 + 1e-6 or pixels.min() < 0):
+            odd = pixels.min() if pixels.min() < 0 else pixels.max()
             raise DomainError(
-                f"an array coded by sRGB has a {pixels.max():g}, and floating-point pixels go from 0 to 1; divide by "
+                f"an array coded by sRGB has a {odd:g}, and floating-point pixels go from 0 to 1; divide by "
                 "white."
             )
         return _radiance(linear(pixels).clip(max=1), "given as an array")

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from codesign import backend
 from codesign.doors import explain
+from codesign.errors import DomainError
 from codesign.render import MitsubaScene, TexturedPlane
 from scenes import bodies, textures
 from scenes.build import (
@@ -44,8 +45,10 @@ from scenes.tabletop import tabletop
 Picture = str | Path | np.ndarray
 PAINT = 60.0  # the wall colour that pictures fade to
 ROOM_M = (4.0, 4.0, 2.6)
+OBJECTS_M = (2.6, 3.0, 0.65)  # the least room that its objects fit into
 CORRIDOR_M = (14.0, 2.2, 2.6)  # length, width, height
 GROUND_M = 14.0  # half width of the outdoor world
+TRIES = 10_000  # to find a place for one more thing there
 SPOTS = 10  # of light in the dark room
 DARK, BRIGHT = 1.5, 255.0  # radiance there
 
@@ -127,8 +130,14 @@ def room(
 
     Every picture fades to one wall colour at its border, so walls meet without a jump of radiance;
     without objects the image has no discontinuities that move, and its interior gradient is the
-    whole gradient. Where it is lit, its ceiling is the lamp.
+    whole gradient. Where it is lit, its ceiling is the lamp. Raises: DomainError for a room that its
+    objects do not fit into.
     """
+    if objects and any(size < least for size, least in zip(size_m, OBJECTS_M, strict=True)):
+        raise DomainError(
+            f"room: its objects need {' x '.join(map(str, OBJECTS_M))} m, got {' x '.join(map(str, size_m))} m; "
+            "make it larger, or leave them out with objects=False."
+        )
     mi = backend.mitsuba(device)
     pictures = [textures.faded_to(textures.picture(p), PAINT) for p in photos]
     paints = [Paint(pictures[i % len(pictures)], glow=250.0 * (i == 5)) for i in range(6)]
@@ -205,6 +214,7 @@ def outdoor(
       meshes: robot bodies as (path, x, y, turn_deg) or (path, x, y, turn_deg, scale), each resting
         on the ground. Where it is lit, the sky lights it, with a sun of its own when the sky is
         procedural. The sky lies at infinity: no point of it has a depth.
+    Raises: DomainError where the ground has no place for so many things.
     """
     mi = backend.mitsuba(device)
     random = np.random.default_rng(seed)
@@ -216,13 +226,19 @@ def outdoor(
         )
     }
     pictures = [textures.picture(p) for p in ("brick", "speckle-1", "speckle-2", "grass")]
-    places = [(float(x), float(y), 1.0) for _, x, y, *_ in meshes]
+    places = []
     for k, (path, x, y, turn_deg, *scale) in enumerate(meshes):
-        shapes[f"body-{k}"] = (
-            bodies.read(path, *scale).placed(x, y, GAP_M, turn_deg),
-            Paint(np.full((4, 4), 120.0)),
-        )
+        body = bodies.read(path, *scale).placed(x, y, GAP_M, turn_deg)
+        shapes[f"body-{k}"] = (body, Paint(np.full((4, 4), 120.0)))
+        places.append((float(x), float(y), float(np.ptp(body.vertices_m[:, :2], axis=0).max()) / 2))
+    tries = 0
     while len(places) < clutter + len(meshes):
+        if tries == TRIES:
+            raise DomainError(
+                f"outdoor: the ground has no place for {clutter} things, {len(places) - len(meshes)} are there; "
+                "give a smaller clutter."
+            )
+        tries += 1
         x, y = random.uniform(-0.5, 0.5, 2) * GROUND_M
         size = random.uniform(0.15, 0.5)
         if abs(x) < 0.7 + 1.5 * size or any(
@@ -230,6 +246,7 @@ def outdoor(
         ):
             continue
         k = len(places)
+        tries = 0
         places.append((x, y, size))
         paint = Paint(pictures[k % 4])
         if k % 3 == 0:

@@ -13,15 +13,15 @@ BUDGETS = {
     "codesign/fidelity": 2_950,
     "codesign/flow": 43_020,  # truth that is unknown, windows that share no event, chunks that may come again
     "codesign/grad": 3_300,
-    "codesign/lens": 47_310,  # glass passed twice, fields as slopes, films that follow
+    "codesign/lens": 47_610,  # stops and apertures in their own axes, fields below 90 degrees
     "codesign/mount": 14_780,  # films looked at all over, angles in degrees, blur of the whole pupil
     "codesign/optimise": 3_900,
-    "codesign/render": 43_740,  # maps of other cameras, curves as the real pupil sees them
+    "codesign/render": 43_840,  # chief rays of a spectrum, curves as the real pupil sees them
     "codesign/report": 7_180,  # says that there is nothing to draw; flow that is not known
     "codesign/system": 9_630,  # truth of what is read
     "codesign/train": 5_570,  # moments of weights of as many axes
-    "scenes": 14_480,  # size of a file, velocities with gradients
-    "scenes/robots": 9_400,
+    "scenes": 14_640,  # rooms and grounds that are too small for what is in them
+    "scenes/robots": 9_490,  # held joints, directions of axes, colours by name
     "scenes/trajectories": 3_050,
     "scenes/windows": 8_710,  # what estimators are judged on, told twice in studies before
     "setup": 6_020,  # four more parts of evidence, limits beside what is timed

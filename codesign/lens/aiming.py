@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from codesign.lens.glass import D_UM
-from codesign.lens.trace import Prescription, Status, trace
+from codesign.lens.paraxial import field_angles
+from codesign.lens.trace import Prescription, Status, across, trace
 from codesign.lens.traced import TracedLens, in_float64
 
 NEWTON_STEPS = 12
@@ -50,7 +51,8 @@ def aim_at_stop(
     stop_radius_mm: Tensor,
     pupil_radius_mm: Tensor,
 ) -> Aim:
-    """Solve for the points of the pupil plane whose rays meet the stop at the targets.
+    """Solve for the points of the pupil plane whose rays meet the stop, in its own axes where it is
+    decentred or tilted, at the targets.
 
     Args:
       rays: function (points [K N, 2], share [K N, 1]) -> origin, direction [K N, 3], for the N rays
@@ -78,7 +80,7 @@ def aim_at_stop(
                     "takes that way); they keep their paraxial aim.",
                     stacklevel=3,
                 )
-    met = _meet(rays, until_stop, at, full).position_mm[:, :2]
+    met, _ = _meet(rays, until_stop, at, full)
     jacobian = _jacobian(rays, fixed, at, full, slice(None))
     still = ~found | (torch.linalg.det(jacobian).abs() <= SINGULAR)
     jacobian = _or_identity(jacobian, still)
@@ -102,7 +104,7 @@ def area_at_stop(
     line = torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]).to(aim.point_mm)
     points = aim.point_mm[None] + DIFFERENCE * size * line[:, None]
     full = torch.ones_like(points[..., :1])
-    met = _meet(rays, until_stop, points.reshape(-1, 2), full.reshape(-1, 1)).position_mm[:, :2]
+    met, _ = _meet(rays, until_stop, points.reshape(-1, 2), full.reshape(-1, 1))
     stop = met.reshape(4, -1, 2)
     jacobian = torch.stack([stop[0] - stop[1], stop[2] - stop[3]], -1) / (2 * DIFFERENCE * size)
     still = torch.linalg.det(jacobian.detach()).abs() <= SINGULAR
@@ -122,15 +124,17 @@ def aimed_rays(
 ) -> tuple[Tensor, Tensor]:
     """Parallel rays of one field angle (in +y) that meet the real stop at points of its disc.
 
-    Args: field_rad scalar; pupil [M, 2] on the unit disc, in units of the stop's paraxial radius.
+    Args: field_rad scalar; pupil [M, 2] on the unit disc, in units of the stop's paraxial radius,
+      which is that of the d line in every colour.
     Returns: origins and directions [M, 3], lens axes, in the lens's precision; solved in float64.
-    Gradient: origins to the lens. Warns: when some rays cannot be aimed.
+    Gradient: origins to the lens. Warns: when some rays cannot be aimed. Raises: DomainError for a
+      field of 90 degrees and more.
     """
     dtype = lens.dtype
     lens = in_float64(lens)
     f = lens.first_order(wavelength_um)
     pupil = pupil.to(f.entrance_pupil_z_mm)
-    tangent = torch.tan(torch.as_tensor(field_rad, dtype=pupil.dtype, device=pupil.device))
+    tangent = field_angles(lens, field_rad).tan().to(pupil)
 
     def rays(points, share):
         slope = torch.cat([0 * share, tangent * share, torch.ones_like(share)], 1)
@@ -142,7 +146,7 @@ def aimed_rays(
         rays,
         lens.prescription(wavelength_um).until(lens.stop_index),
         pupil,
-        f.stop_semi_aperture_mm,
+        lens.first_order().stop_semi_aperture_mm,
         f.entrance_pupil_diameter_mm / 2,
     )
     origin, direction = rays(aim.point_mm, torch.ones_like(pupil[:, :1]))
@@ -150,7 +154,9 @@ def aimed_rays(
 
 
 def _meet(rays, until_stop, points, share):
-    return trace(until_stop, *rays(points, share))
+    """Places [N, 2] on the stop, and whether the rays get there."""
+    out = trace(until_stop, *rays(points, share))
+    return across(until_stop, -1, out.position_mm), out.status == Status.OK
 
 
 def _newton(rays, until_stop, target, at, share, scale):
@@ -196,8 +202,8 @@ def _from_the_axis(rays, until_stop, target, guess, rows, scale):
 
 
 def _miss(rays, until_stop, target, at, share):
-    out = _meet(rays, until_stop, at, share)
-    return out.position_mm[:, :2] - target, out.status == Status.OK
+    met, passes = _meet(rays, until_stop, at, share)
+    return met - target, passes
 
 
 def _jacobian(rays, until_stop, at, share, rows):
@@ -205,7 +211,7 @@ def _jacobian(rays, until_stop, at, share, rows):
     on its own point only."""
     with torch.enable_grad():
         points = at.clone().requires_grad_(True)
-        stop = _meet(rays, until_stop, points, share).position_mm
+        stop, _ = _meet(rays, until_stop, points, share)
         found = [
             torch.autograd.grad(stop[:, i].sum(), points, retain_graph=i == 0)[0] for i in (0, 1)
         ]

@@ -45,10 +45,12 @@ def camera_rays(
             return towards(film.repeat(q.shape[0] // film.shape[0], 1) * share, q)
 
         until = back.until(at_stop)
-        at = aim_at_stop(field, until, pupil.to(lens.dtype), f.stop_semi_aperture_mm, radius)
+        # the opening is one for all colours
+        stop_mm = lens.first_order().stop_semi_aperture_mm
+        at = aim_at_stop(field, until, pupil.to(lens.dtype), stop_mm, radius)
         area = area_at_stop(field, until, at, radius)
         start, direction = (v.to(film_mm.dtype) for v in towards(film, at.point_mm))
-        spread = ((f.stop_semi_aperture_mm / radius).square() / area.abs()).to(film_mm.dtype)
+        spread = ((stop_mm / radius).square() / area.abs()).to(film_mm.dtype)
     else:
         start, direction = (
             v.to(film_mm.dtype) for v in towards(film_mm, pupil * radius.to(film_mm.dtype))

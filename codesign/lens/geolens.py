@@ -88,7 +88,6 @@ class GeoLens(Replaceable):
     ) -> None:
         super().__init__()
         surfaces, stop = checked(name, surfaces)
-        check_positive(entrance_pupil_diameter_mm, f"{name}: entrance_pupil_diameter_mm")
         check_number(
             soft_edge_mm, f"{name}: soft_edge_mm", 0.0, remedy="about 0.1 keeps gradients true"
         )
@@ -97,6 +96,8 @@ class GeoLens(Replaceable):
         self.name = name
         self.surfaces = surfaces
         self.stop_index = stop
+        # the pupil's diameter where gradients go to it: ``with_pupil``
+        self.register_buffer("pupil_mm", None, persistent=False)
         self.entrance_pupil_diameter_mm = float(entrance_pupil_diameter_mm)
         self.soft_edge_mm = float(soft_edge_mm)
         self.half_field_deg = half_field_deg
@@ -110,12 +111,20 @@ class GeoLens(Replaceable):
                 self.register_buffer(tensor, value)
         glass = [s.medium not in (None, AIR) and not s.mirror for s in surfaces]
         self.register_buffer("glass", torch.tensor(glass), persistent=False)
-        # the pupil's diameter where gradients go to it: ``with_pupil``
-        self.register_buffer("pupil_mm", None, persistent=False)
 
     @property
     def dtype(self) -> torch.dtype:
         return self.semi_aperture_mm.dtype
+
+    @property
+    def entrance_pupil_diameter_mm(self) -> float:
+        """The entrance pupil as it is now, also where a tensor makes it."""
+        return self._diameter_mm if self.pupil_mm is None else float(self.pupil_mm.detach())
+
+    @entrance_pupil_diameter_mm.setter
+    def entrance_pupil_diameter_mm(self, value: float | torch.Tensor) -> None:
+        self._diameter_mm = check_positive(value, f"{self.name}: entrance_pupil_diameter_mm")
+        self.pupil_mm = value.to(self.semi_aperture_mm) if isinstance(value, torch.Tensor) else None
 
     def variables(
         self,
@@ -283,15 +292,12 @@ class GeoLens(Replaceable):
     def with_pupil(self, diameter_mm: float | torch.Tensor) -> "GeoLens":
         """The lens with another entrance pupil, all else as it is; gradients reach a tensor."""
         twin = self._with(self._now())
-        twin.entrance_pupil_diameter_mm = check_positive(
-            diameter_mm, f"{self.name}: pupil diameter, mm,"
-        )
-        twin.pupil_mm = torch.as_tensor(diameter_mm).to(self.semi_aperture_mm)
+        twin.entrance_pupil_diameter_mm = diameter_mm
         return twin
 
     def scaled(self, factor: float) -> "GeoLens":
-        """A new lens with all lengths multiplied by ``factor`` (same f-number and angles), from the
-        current values."""
+        """A new lens with all lengths multiplied by ``factor`` (same f-number and angles, also of
+        diffractive phases in the same light), from the current values."""
         surfaces = [scaled(s, factor) for s in self.to_surfaces()]
         return GeoLens(
             surfaces,

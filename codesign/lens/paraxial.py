@@ -232,12 +232,7 @@ def paraxial_rays(
     Gradient: to every lens tensor that bends or moves light, and to the vergence. Raises:
       DomainError for a field of 90 degrees and more, or an entrance pupil at infinity.
     """
-    field = torch.as_tensor(field_rad, dtype=torch.float64)
-    if not abs(float(field.detach())) < math.pi / 2:
-        raise DomainError(
-            f"{lens.name}: a paraxial chief ray at {math.degrees(float(field)):.4g} degrees has no slope; "
-            "give a field below 90 degrees."
-        )
+    field = field_angles(lens, field_rad)
     f = lens.first_order(wavelength_um)
     if not math.isfinite(float(f.entrance_pupil_z_mm.detach())):
         raise DomainError(
@@ -265,6 +260,19 @@ def paraxial_rays(
     return ParaxialRays(
         y, angles, y_bar, chief_angles, slope * index[0] * (f.entrance_pupil_diameter_mm / 2)
     )
+
+
+def field_angles(lens: ParaxialLens, fields_rad: float | Sequence[float] | Tensor) -> Tensor:
+    """The angles as float64. Raises: DomainError for 90 degrees and more, as of degrees given for
+    radians."""
+    fields = torch.as_tensor(fields_rad, dtype=torch.float64)
+    beyond = fields.detach()[~(fields.detach().abs() < math.pi / 2)]
+    if beyond.numel():
+        raise DomainError(
+            f"{lens.name}: light at {math.degrees(float(beyond[0])):.4g} degrees does not enter from the "
+            "front; give fields in radians, below 90 degrees."
+        )
+    return fields
 
 
 def focused_image(

@@ -47,7 +47,8 @@ class ThinLens(Replaceable):
         image_distance_mm: float | Tensor | None = None,
     ) -> None:
         super().__init__()
-        efl = torch.as_tensor(efl_mm, dtype=None if torch.is_tensor(efl_mm) else torch.float64)
+        real = torch.is_tensor(efl_mm) and efl_mm.is_floating_point()
+        efl = torch.as_tensor(efl_mm, dtype=None if real else torch.float64)
         self._hold("efl_mm", efl)
         image = (
             None

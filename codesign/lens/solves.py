@@ -7,6 +7,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from codesign.checks import check_number
 from codesign.errors import DomainError
 from codesign.lens import paraxial
 from codesign.lens.analysis.rays import pupil_grid, source_rays, trace_source
@@ -61,10 +62,12 @@ def hold_efl(lens: L, efl_mm: float | Tensor, surface: int | None = None) -> L:
       surface: index of the curvature to solve; ``holding_surface(lens)`` when left out.
     Gradient: the solved curvature carries that of all others, of thicknesses and of indices; efl_mm
       too when it is a tensor.
-    Raises: DomainError when that curvature cannot do it.
+    Raises: DomainError for a focal length of 0, or when that curvature cannot do it.
     Source: the y-u trace, whose last angle is linear in the power of each surface (Smith, Modern
       Optical Engineering, ch. 2).
     """
+    if check_number(efl_mm, f"{lens.name}: the focal length to hold, mm,") == 0:
+        raise DomainError(f"{lens.name}: no lens has a focal length of 0; give one in mm.")
     c, t, n, power = lens.curvature_per_mm, lens.thickness_mm, lens.index(), lens.surface_power()
     at = holding_surface(lens) if surface is None else range(c.numel())[surface]
     one = torch.ones_like(c[0])

@@ -200,7 +200,7 @@ def scaled_asphere(coefficients: Sequence[float], factor: float) -> tuple[float,
 
 
 def scaled_phase(phase: Phase | None, factor: float) -> Phase | None:
-    """The phase when all lengths are multiplied by ``factor``."""
+    """The same phase in another unit of length, of which ``factor`` are one of the old."""
     if phase is None:
         return None
     return replace(
@@ -210,7 +210,8 @@ def scaled_phase(phase: Phase | None, factor: float) -> Phase | None:
 
 
 def scaled(surface: Surface, factor: float) -> Surface:
-    """The same surface with all lengths multiplied by ``factor``."""
+    """The same surface with all lengths multiplied by ``factor``, and its phase so that light of the
+    same wavelength is turned as far."""
     lengths = {
         name: getattr(surface, name) * factor
         for name in ("radius_mm", "thickness_mm", "semi_aperture_mm", "inner_semi_aperture_mm")
@@ -219,7 +220,8 @@ def scaled(surface: Surface, factor: float) -> Surface:
         surface,
         **lengths,
         asphere=scaled_asphere(surface.asphere, factor),
-        phase=scaled_phase(surface.phase, factor),
+        phase=surface.phase
+        and replace(surface.phase, coefficients=scaled_asphere(surface.phase.coefficients, factor)),
         decentre_mm=(surface.decentre_mm[0] * factor, surface.decentre_mm[1] * factor),
     )
 

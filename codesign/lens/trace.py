@@ -369,7 +369,9 @@ def trace(prescription: Prescription, origin_mm: Tensor, direction: Tensor) -> T
         depth = after - p.thickness_mm[gap] if gap >= 0 else after
         at, safe = onward(here)
         at = torch.cat([at[:, :2], depth.expand(len(at), 1)], 1)
-        rest = trace_surfaces(replace(p.part(gap + 1, last + 1), efficiency=1.0), at, safe)
+        # of all surfaces; those before the plate brought it where there are some
+        efficiency = 1.0 if gap >= 0 else p.efficiency
+        rest = trace_surfaces(replace(p.part(gap + 1, last + 1), efficiency=efficiency), at, safe)
     return joined(here, rest, gap + 1)
 
 
@@ -378,9 +380,21 @@ def at_surfaces(
     origin_mm: Tensor,
     direction: Tensor,
 ) -> list[TraceResult]:
-    """The rays on each surface [S], before it bends them; positions relative to its vertex."""
+    """The rays on each surface [S], before it bends them; positions relative to where its vertex
+    would lie on the axis, see ``across``."""
     count = len(prescription.mirrors)
     return [trace(prescription.until(i), origin_mm, direction) for i in range(count)]
+
+
+def across(prescription: Prescription, surface: int, position_mm: Tensor) -> Tensor:
+    """Places [N, 2] across a surface, in its own decentred and tilted axes, of points [N, 3] relative
+    to its vertex on the axis of the lens."""
+    shift, tilt = prescription.decentre_mm[surface], prescription.tilt_rad[surface]
+    cosine, sine = tilt.cos(), tilt.sin()
+    x, y = (position_mm[:, :2] - shift).unbind(1)
+    z = position_mm[:, 2]
+    depth = z * cosine[0] - y * sine[0]
+    return torch.stack([x * cosine[1] - depth * sine[1], y * cosine[0] + z * sine[0]], 1)
 
 
 def to_plate(

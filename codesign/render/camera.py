@@ -40,7 +40,8 @@ class Camera:
     The same seed gives the same film and pupil samples in every frame and for every lens state
     (common random numbers).
     spectrum: anything with wavelengths_um and weights (sum 1), such as lens.Spectrum: each takes an
-      equal share of the samples; None is the d line.
+      equal share of the samples, and chief rays (true flow, ``project``) are those of the mean
+      wavelength; None is the d line.
     falloff: whether the natural illumination falloff (cos^4 and pupil growth) darkens the image;
       without it the image is as after flat-field correction.
     aim: whether pupil samples lie on the real stop instead of the paraxial exit pupil; several
@@ -96,6 +97,7 @@ class Camera:
         ).check()
         check_memory(self.film, self.samples_per_pixel)
         self.spectrum = spectrum
+        self._line = _mean_line(spectrum)
         self.falloff = falloff
         self.aim = aim
 
@@ -126,10 +128,11 @@ class Camera:
         share."""
         film, colours = self.film, {"spectrum": self.spectrum, "falloff": self.falloff}
         size = film.width_px, film.height_px, film.pixel_pitch_mm
-        return Camera(self.lens, *size, samples_per_pixel, self.seed, film, aim=self.aim, **colours)
+        made = Camera(self.lens, *size, samples_per_pixel, self.seed, film, aim=self.aim, **colours)
+        return made._with(_line=self._line)
 
     def in_one_colour(self) -> "Camera":
-        """The same camera for light of the d line, without falloff."""
+        """The same camera for light of the colour of its chief rays alone, without falloff."""
         return self._with(spectrum=None, falloff=False)
 
     @property
@@ -137,7 +140,7 @@ class Camera:
         """Of each colour what ``camera_rays`` has to be told, and how its light counts beside an
         equal share."""
         if self.spectrum is None:
-            return [({}, 1.0)]
+            return [(self._line, 1.0)]
         lines = self.spectrum.wavelengths_um
         return [
             ({"wavelength_um": line}, weight * len(lines))
@@ -191,8 +194,9 @@ class Camera:
         return self
 
     def film_mm(self, pixels: Tensor) -> Tensor:
-        """Upright image position in millimetres of pixel coordinates [N, 2]."""
-        return (pixels - self.film.middle_px.to(pixels)) * self.film.pixel_pitch_mm
+        """Upright image position in millimetres of pixel coordinates [N, 2], float64."""
+        film = self.film
+        return (pixels.to(film.middle_px) - film.middle_px) * film.pixel_pitch_mm
 
     def __repr__(self):
         pixels = " x ".join(str(size) for size in self.film.shape)
@@ -259,8 +263,10 @@ class Camera:
         return _columns(lambda *column: torch.cat(column)[back], *parts)
 
     def chief_rays(self, pixels: Tensor) -> Rays:
-        """Rays through the pupil's centre for pixel coordinates [N, 2]: Rays, float64."""
-        return self.lens.camera_rays(self.film_mm(pixels), torch.zeros_like(pixels), aim=self.aim)
+        """Rays through the pupil's centre for pixel coordinates [N, 2], of the spectrum's mean
+        wavelength (the d line without one): Rays, float64."""
+        at_mm = self.film_mm(pixels)
+        return self.lens.camera_rays(at_mm, torch.zeros_like(at_mm), aim=self.aim, **self._line)
 
     def slope_per_px(self) -> float:
         """Slope of a chief ray per pixel, near the axis; no gradient."""
@@ -275,14 +281,25 @@ class Camera:
         pupil: Tensor,
         wavelength_um: float | None = None,
     ) -> Rays:
-        """Rays of pixel coordinates [N, 2] through points [N, 2] of the pupil, of one colour (the d
-        line when none is given): Rays, float64. The axial ray goes along: only a lens that passes
-        nothing at all is an error."""
-        line = {} if wavelength_um is None else {"wavelength_um": wavelength_um}
-        at = torch.cat([self.film.middle_px[None].to(pixels), pixels])
-        through = torch.cat([pupil.new_zeros(1, 2), pupil])
-        rays = self.lens.camera_rays(self.film_mm(at), through, aim=self.aim, **line)
+        """Rays of pixel coordinates [N, 2] through points [N, 2] of the pupil, of one colour (that of
+        the chief rays when none is given): Rays, float64. The axial ray goes along: only a lens that
+        passes nothing at all is an error."""
+        line = self._line if wavelength_um is None else {"wavelength_um": wavelength_um}
+        at_mm = self.film_mm(pixels)
+        pupil = pupil.to(at_mm)
+        axis = at_mm.new_zeros(1, 2)
+        film_mm, through = torch.cat([axis, at_mm]), torch.cat([axis, pupil])
+        rays = self.lens.camera_rays(film_mm, through, aim=self.aim, **line)
         return _columns(lambda column: column[1:], rays)
+
+
+def _mean_line(spectrum):
+    """What ``camera_rays`` has to be told for light of the mean wavelength of a spectrum."""
+    if spectrum is None:
+        return {}
+    shares = zip(spectrum.wavelengths_um, spectrum.weights, strict=True)
+    mean_um = sum(line * share for line, share in shares) / sum(spectrum.weights)
+    return {"wavelength_um": mean_um}
 
 
 def device_of(lens: Any) -> torch.device:

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.checks import check_number
+from codesign.checks import check, check_number
 from codesign.errors import DomainError
 from codesign.pose import Poses, check_pose
 
@@ -54,7 +54,8 @@ class TexturedPlane:
         )
         self.dtype = dtype
         self.mean = float(mean)
-        self.frequency = torch.as_tensor(frequency_per_m, dtype=torch.float64).reshape(-1, 2)
+        frequency = torch.as_tensor(frequency_per_m, dtype=torch.float64)
+        self.frequency = check(frequency, "K 2", "textured plane: frequency_per_m")
         self.amplitude = torch.as_tensor(amplitude, dtype=torch.float64)
         self.phase = torch.as_tensor(phase_rad, dtype=torch.float64)
         sizes = self.frequency.shape[0], self.amplitude.numel(), self.phase.numel()

@@ -80,13 +80,8 @@ def exposed_frames(
     check_number(exposure_s, "exposure_s", 0.0)
     check_number(line_s, "line_s", remedy="the seconds from one row of the sensor to the next")
     samples = check_whole(samples, "time samples of an exposure")
-    worlds = scene if isinstance(scene, tuple | list) else (scene,)
-    moving = any(isinstance(world, MovingScene) and world.names for world in worlds)
-    if moving and (line_s or (exposure_s and samples > 1)):
-        raise DomainError(
-            "the objects of a MovingScene stand still during an exposure and from line to line; give a function "
-            "of time that returns one, see codesign.render.time."
-        )
+    if line_s or (exposure_s and samples > 1):
+        _check_function(scene, "during an exposure and from line to line")
     nodes_s = [((k + 0.5) / samples - 0.5) * exposure_s for k in range(samples)]
     if not line_s:
         return _exposed(camera, scene, trajectory, t_s, nodes_s, gradient, per_px)
@@ -175,8 +170,8 @@ def adaptive_times(
     parts. Linear interpolation between the frames then times a crossing of a pattern of wave number
     k to within k largest_px^2 / (8 s) pixels of motion, s the slope there as a share of the
     largest: a chord misses by h^2 max|L''| / 8 at most.
-    Raises: DomainError when the interval is empty, largest_px is not positive, or a displacement
-      does not shrink with the step (a jump).
+    Raises: DomainError when the interval is empty, largest_px is not positive, objects move by no
+      function of time, or a displacement does not shrink with the step (a jump).
     Source: Rebecq, Gehrig and Scaramuzza, ESIM: an open event camera simulator, CoRL 2018 (adaptive
       sampling by the largest displacement).
     """
@@ -184,6 +179,7 @@ def adaptive_times(
     end_s = check_number(end_s, "adaptive times: end_s", above=start_s)
     check_positive(largest_px, "adaptive times: largest_px")
     every_px = check_whole(every_px, "adaptive times: every_px")
+    _check_function(scene, "between its frames")
     shortest = SMALLEST_STEP * (end_s - start_s)
     with torch.no_grad():
         grids = [
@@ -247,6 +243,16 @@ def _lost_px(camera, found, rays, lost):
     after = found.points_cam_m[lost]
     moved = after[:, :2] / after[:, 2:] - before[:, :2] / before[:, 2:]
     return float(moved.norm(dim=1).max()) / abs(camera.slope_per_px())
+
+
+def _check_function(scene, when):
+    """Objects that move do so as a function of time."""
+    worlds = scene if isinstance(scene, tuple | list) else (scene,)
+    if any(isinstance(world, MovingScene) and world.names for world in worlds):
+        raise DomainError(
+            f"the objects of a MovingScene stand still {when}; give a function of time that returns one, see "
+            "codesign.render.time."
+        )
 
 
 def _at(scene, t_s):

@@ -53,6 +53,30 @@ def test_aimed_rays_meet_the_stop(name):
     assert missed > (0.4 * stop_mm if name == "wide" else 1e-3)
 
 
+@pytest.mark.parametrize("um", [0.4861327, 0.5875618, 0.6562725])
+def test_rays_are_aimed_at_the_stop_where_it_is_and_at_one_opening_in_all_colours(um):
+    """A flat stop, 1 mm up and turned by 20 degrees about y, behind a lens that disperses."""
+    geo = GeoLens(
+        [
+            Surface(60.0, 4.0, Glass.named("SF2"), 9.0),
+            Surface(-200.0, 8.0, None, 9.0),
+            Surface(PLANE, 45.0, None, 5.0, is_stop=True, decentre_mm=(0.0, 1.0), tilt_deg=(0, 20)),
+        ],
+        6.0,
+    )
+    pupil, first = pupil_grid(8), geo.first_order()
+    wanted = pupil * first.stop_semi_aperture_mm.detach() * f64([math.cos(math.radians(20)), 1.0])
+    film_mm = f64([[1.0, -4.0]]).expand(len(pupil), 2)
+    back = geo.camera_rays(film_mm, pupil, um, aim=True)
+    flip = f64([1.0, 1.0, -1.0])
+    start = back.origin_m * 1e3 * flip + f64([0, 0, 1.0]) * first.entrance_pupil_z_mm
+    forwards = -back.direction * flip
+    start = start - forwards * ((start[:, 2:] + 5.0) / forwards[:, 2:])
+    for rays in (aimed_rays(geo, 0.1, pupil, um), (start, forwards)):
+        met = trace(geo.prescription(um).until(2), *rays).position_mm.detach()
+        close(met[:, :2], wanted + f64([0.0, 1.0]), atol=1e-9)
+
+
 def test_rays_that_cannot_be_aimed_are_told_and_keep_their_paraxial_aim():
     geo = wide_angle()
     pupil = pupil_grid(4)

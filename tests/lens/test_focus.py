@@ -135,6 +135,13 @@ def test_light_widens_by_its_field_and_its_cone():
     close(near, 3.0 * (1 + 20.0 / 100.0), 1e-12)
 
 
+def test_apertures_of_a_decentred_lens_are_about_its_own_middle():
+    """Light of 3 mm on planes whose middles are 0.4 and 1 mm aside reaches as much farther there."""
+    aside = planes().replace(decentre_mm=f64([[0.0, 0.4], [1.0, 0.0], [0.0, 0.0], [0.0, 0.0]]))
+    fitted = fit_apertures(aside, (0.0,), margin=0.0).semi_aperture_mm[:2]
+    close(fitted, [3.4, 4.0], 1e-12)
+
+
 def test_a_sphere_ends_at_its_radius():
     ball = [Surface(5.0, 10.0, glass(1.2), 4.0, is_stop=True), Surface(-5.0, 5.0, None, 4.0)]
     fitted = fit_apertures(GeoLens(ball, 9.8).freeze(), (0.0,), margin=0.05)

@@ -264,3 +264,15 @@ def test_the_offset_of_the_old_glass_goes_with_it_and_variables_stay_what_they_a
     moved.trace(*rays()).position_mm.square().sum().backward()
     assert focus.grad.abs() > 0
     assert [v.numel() for v in moved.variables("index", "focus")] == [3, 1]
+
+
+def test_a_pupil_has_one_diameter_whoever_set_it_last():
+    diameter = f64(5.0).requires_grad_()
+    geo = lens.load("cooke-triplet").with_pupil(diameter)
+    with torch.no_grad():
+        diameter.mul_(1.6)
+    found = (geo, geo.scaled(0.5).scaled(2.0), geo.thin(), geo.replace())
+    assert [g.entrance_pupil_diameter_mm for g in found] == [8.0] * 4
+    member = lens.family("retrofocus-4").lens(4.0, 2.0)
+    member.entrance_pupil_diameter_mm = 1.0
+    close(member.first_order().fno, 4.0, 1e-12)

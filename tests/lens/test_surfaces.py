@@ -8,7 +8,7 @@ import torch
 
 from codesign import lens
 from codesign.lens import GeoLens, Phase, Status, Surface
-from codesign.lens.surface import scaled
+from codesign.lens.diffraction import ZernikePlate, with_plate
 from codesign.lens.trace import _active, trace
 from tests.lens.systems import PLANE, close, efl, glass
 from tests.numbers import f64
@@ -153,8 +153,33 @@ def test_an_obstruction_blocks_the_middle_with_a_soft_edge():
 def test_mirrors_take_the_index_before_them_and_scale():
     assert MANGIN.index().tolist() == [1.0, 1.6, 1.6, 1.0]
     close(efl(MANGIN.scaled(0.5)), 0.5 * efl(MANGIN), 1e-13)
-    flat = GeoLens([scaled(Surface(PLANE, 80.0, None, 5.0, phase=Phase((-3.0, 0.1))), 2.0)], 6.0)
-    assert flat.phase.tolist() == [[-0.75, 0.1 / 16]]
+
+
+def test_a_diffractive_lens_scales_as_a_whole():
+    """In the same light: a surface alone, with powers 1/f of -2 a w / (2 pi), and every ray."""
+    plain = [
+        Surface(50.0, 4.0, GLASS, 9.0),
+        Surface(PLANE, 80.0, None, 9.0, phase=Phase((-3, 0.1))),
+    ]
+    small = GeoLens(plain, 6.0)
+    large = small.scaled(2.0)
+    assert large.phase.tolist()[1] == [-1.5, 0.0125]
+    close(efl(large), 2 * efl(small), 1e-13)
+    origin, direction = parallel_rays([(0.0, 1.0), (2.0, 1.5)], angle=0.1)
+    found, wanted = large.trace(2 * origin, direction), small.trace(origin, direction)
+    close(found.position_mm, 2 * wanted.position_mm, atol=1e-12)
+
+
+def test_a_plate_before_a_diffractive_lens_takes_nothing_of_its_efficiency():
+    faces = [
+        Surface(PLANE, 2.0, None, 4.0, is_stop=True),
+        Surface(60.0, 4.0, GLASS, 6.0, phase=Phase((-3.0,), 1, 0.55)),
+        Surface(-60.0, 45.0, None, 6.0),
+    ]
+    first = with_plate(GeoLens(faces, 6.0), ZernikePlate({4: 0.0}, 4.0), z_mm=-1.0)
+    x = math.pi * (0.55 / 0.7 - 1)
+    weight = first.trace(*parallel_rays([(0.0, 0.0)], z=-5.0), 0.7).weight
+    close(weight, (math.sin(x) / x) ** 2, 1e-14)
 
 
 @pytest.mark.parametrize("geo", [MANGIN, ODD, EYE, ASPHERIC, lens.load("double-gauss")])

@@ -65,6 +65,23 @@ def test_projection_brings_points_of_chief_rays_back(name, generator):
     assert (found - pixels)[lit].detach().abs().max() <= 1e-9
 
 
+@pytest.mark.parametrize("weights", [(1.0, 0.0), (0.25, 0.75)])
+def test_a_point_is_projected_in_the_mean_wavelength_of_the_light(weights):
+    """Against the forward trace: the stop comes first, so the pupil is one for all colours."""
+    glass = lens.Glass.named("SF2")
+    stop = lens.Surface(math.inf, 10.0, None, 3.0, is_stop=True)
+    faces = lens.Surface(60.0, 4.0, glass, 9.0), lens.Surface(-60.0, 45.0, None, 9.0)
+    geo = lens.GeoLens([stop, *faces], 4.0)
+    light = lens.Spectrum((0.4861327, 0.6562725), weights)
+    field, mean_um = 0.2, weights[0] * 0.4861327 + weights[1] * 0.6562725
+    far = torch.tensor([[0.0, 1e6 * math.tan(field), 1e6]], dtype=D)
+    made = (Camera(geo, 8, 8, 0.01, 2, spectrum=s, aim=True) for s in (light, None))
+    found, d_line = (project(camera, far)[0, 1] - 3.5 for camera in made)
+    truth = lens.analysis.chief_ray(geo, field, mean_um).position_mm[0, 1].abs() / 0.01
+    torch.testing.assert_close(found, truth, rtol=0, atol=1e-6)
+    assert abs(float((d_line - truth).detach())) > 0.05
+
+
 def test_points_outside_the_field_are_nan_and_leave_the_others_alone():
     camera = on_sensor(fitted("cooke-triplet"))
     curvature = camera.lens.curvature_per_mm
@@ -150,6 +167,15 @@ def test_pixels_are_in_image_order_with_the_axis_in_the_middle():
     assert film.pixels()[[0, 1, 2, 6, 7]].tolist() == [[1, 0], [2, 0], [1, 1], [4, 1], [5, 1]]
     at = Camera(lens.Pinhole(5.0), 6, 4, 0.1, 1).film_mm(f64([[2.5, 1.5], [3.5, 1.5]]))
     assert at.tolist() == [[0, 0], [pytest.approx(0.1), 0]]
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.float32])
+def test_whole_and_single_numbers_mean_what_double_ones_do(dtype):
+    camera = Camera(lens.Pinhole(torch.tensor(8)), 8, 8, 0.5, 1)
+    pixels = torch.tensor([[0, 3], [4, 7]], dtype=dtype)
+    for rays in (camera.chief_rays(pixels), camera.rays_through(pixels, 0 * pixels)):
+        slope = (pixels.to(D) - 3.5) * 0.5 / 8
+        torch.testing.assert_close(rays.direction[:, :2] / rays.direction[:, 2:], slope)
 
 
 def test_single_precision_lenses_make_single_precision_rays_and_double_truth():

@@ -148,7 +148,32 @@ def test_a_robot_stands_on_the_ground(shared):
     assert (points[valid][:, 2] > 0.01).double().mean() > 0.05
 
 
+def test_things_outdoors_keep_clear_of_a_body_of_any_size(tmp_path):
+    """A plate of 4 m in the middle: balls of radius r lie beyond 2 m + r along x or y."""
+    corners = ((-2, -2), (2, -2), (2, 2), (-2, 2))
+    vertices = "".join(f"v {x} {y} 0\n" for x, y in corners) + "v 0 0 1\n"
+    (tmp_path / "plate.obj").write_text(f"{vertices}f 1 2 5\nf 2 3 5\nf 3 4 5\nf 4 1 5\n")
+    meshes = [(tmp_path / "plate.obj", 0.0, 0.0, 0.0)]
+    world = worlds.outdoor(clutter=24, meshes=meshes, light=lambda world, device: world)
+    balls = [np.array(world.shapes[f"ball-{k}"][0]["to_world"].matrix) for k in range(1, 25, 3)]
+    for frame in balls:
+        assert np.abs(frame[:2, 3]).max() > 2 + frame[0, 0]
+
+
 # ---- skies
+
+
+def test_a_photograph_stands_as_its_exif_says(tmp_path):
+    """Orientation 6: its first row is the right-hand side of what is seen (EXIF 2.3, 4.6.4)."""
+    stored = np.full((4, 6, 3), 30, np.uint8)
+    stored[0] = 220
+    exif = PIL.Image.Exif()
+    exif[0x0112] = 6
+    PIL.Image.fromarray(stored).save(tmp_path / "turned.png", exif=exif)
+    seen = textures.photo(tmp_path / "turned.png")
+    assert seen.shape == textures.file_size(tmp_path / "turned.png") == (6, 4)
+    assert (seen[:, -1] > 100).all()
+    assert (seen[:, :-1] < 100).all()
 
 
 def test_a_texel_of_a_large_file_is_a_pixel_of_the_file(tmp_path):

@@ -14,6 +14,7 @@ from codesign.checks import check_whole
 from codesign.errors import DomainError, ShapeError
 from codesign.lens.distance import PARALLEL, Distances, one_distance, vergence_per_mm
 from codesign.lens.glass import D_UM
+from codesign.lens.paraxial import field_angles
 from codesign.lens.traced import TracedLens
 
 
@@ -79,12 +80,12 @@ def source_rays(
       start_z_mm: plane on which the rays are given, from the first vertex.
     Returns: SourceRays with the axes [D, F], as far as several were given.
     Gradient: to the lens, whose pupil moves, and to at_m. Raises: DomainError for a distance inside
-      the lens.
+      the lens, or a field of 90 degrees and more.
     """
     if pupil.ndim != 2 or pupil.shape[1] != 2 or pupil.shape[0] == 0:
         raise ShapeError(f"pupil points must be [M >= 1, 2], got {tuple(pupil.shape)}.")
     f = lens.first_order()
-    fields = torch.as_tensor(fields_rad, dtype=torch.float64)
+    fields = field_angles(lens, fields_rad)
     sine, cosine = fields.sin().to(pupil), fields.cos().to(pupil)
     vergence = vergence_per_mm(lens, at_m, f.entrance_pupil_z_mm).reshape(-1, *[1] * fields.ndim)
     # 1 / distance of the object point from the pupil's centre

@@ -146,6 +146,7 @@ def evaluate(
     Args:
       semi_aperture_mm: [S] where edges and gaps are measured (may carry a gradient); the lens's own
         when left out. See hits for semi-apertures sized by rays.
+    Raises: DomainError for a limit on gaps or edges of surfaces that are tilted, or not on one axis.
     Gradient: to every lens tensor the figure depends on. A least gap has that of its narrowest
       place.
     """
@@ -208,6 +209,8 @@ def _lengths(lens, limits, apertures) -> Iterator[tuple[Any, ...]]:
     gaps = gap_mm(lens, heights, apertures)
     lowest, edges = gaps.amin(1), gaps[:, -1]
     unit = limits.scale_mm, "mm"
+    shift, tilt = lens.decentre_mm.detach(), lens.tilt_rad.detach()
+    apart = ((shift[1:] != shift[:-1]) | (tilt[1:] != 0) | (tilt[:-1] != 0)).any(1).tolist()
     for i, filled in enumerate(is_glass(lens)[:-1]):
         where = f"between surfaces {i + 1} and {i + 2}"
         if filled:
@@ -217,6 +220,11 @@ def _lengths(lens, limits, apertures) -> Iterator[tuple[Any, ...]]:
             yield f"edge of glass {where}", edges[i], limits.glass_edge_mm, LEAST, *unit
         else:
             yield f"air {where}", lowest[i], limits.air_gap_mm, LEAST, *unit
+        if (limits.glass_edge_mm if filled else limits.air_gap_mm) is not None and apart[i]:
+            raise DomainError(
+                f"{lens.name}: of surfaces {i + 1} and {i + 2} one is tilted or decentred against the other, and gaps and "
+                "edges all round are not computed; centre it, or leave glass_edge_mm and air_gap_mm out."
+            )
     yield "total track", lens.thickness_mm.sum(), limits.track_mm, MOST, *unit
     yield "back focus", lens.thickness_mm[-1], limits.back_focus_mm, LEAST, *unit
     steep = (lens.curvature_per_mm * apertures).abs() * (1 + lens.conic).clamp_min(1e-12).sqrt()

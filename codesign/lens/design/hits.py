@@ -14,14 +14,14 @@ from codesign.lens.distance import PARALLEL, Distances, one_distance, vergence_p
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import D_UM
 from codesign.lens.paraxial import paraxial_rays
-from codesign.lens.trace import at_surfaces, onward, trace
+from codesign.lens.trace import across, at_surfaces, onward, trace
 
 DENSER = 1.5  # index behind a surface whose normal is looked for: no ray is totally reflected
 
 
 @dataclass(frozen=True)
 class Hits:
-    """Rays at every surface. height_mm: [S, N] distance from the vertex across the axis. cosine:
+    """Rays at every surface. height_mm: [S, N] distance from the vertex across its own axis. cosine:
     [S, N] of the angle of incidence, 1 on a dummy that borders no glass. passed: [S, N], False from
     the surface on where a ray failed; its numbers then mean nothing."""
 
@@ -74,7 +74,7 @@ def surface_hits(
             cosines.append(torch.where(ok, ((bend * before).sum(1) / length).abs(), 1.0))
         else:
             cosines.append(torch.ones_like(before[:, 0]))
-        heights.append(torch.linalg.vector_norm(here.position_mm[:, :2], dim=1))
+        heights.append(torch.linalg.vector_norm(across(whole, i, here.position_mm), dim=1))
         passed.append(ok)
     return Hits(torch.stack(heights), torch.stack(cosines), torch.stack(passed))
 
@@ -114,7 +114,9 @@ def traced_semi_aperture_mm(
             f"{lens.name}: {int(failed.sum())} of {failed.numel()} rim rays fail, so its "
             "apertures cannot be sized; use a smaller field or weaker curvatures."
         )
-    reached = torch.stack([at.position_mm[:, :2] for at in at_surfaces(lens.prescription(), *rays)])
+    whole = lens.prescription()
+    places = enumerate(at_surfaces(whole, *rays))
+    reached = torch.stack([across(whole, i, at.position_mm) for i, at in places])
     return torch.linalg.vector_norm(reached, dim=2).amax(1) * (1 + margin)
 
 
