@@ -11,6 +11,7 @@ from codesign.lens import GeoLens, Glass, Pinhole, Surface, ThinLens, analysis
 from codesign.lens.design import fit_apertures
 from codesign.lens.solves import focus_paraxial, hold_efl, holding_surface
 from tests.lens.systems import PLANE, close, efl, glass
+from tests.numbers import f64
 
 CROWN = glass(1.5)
 
