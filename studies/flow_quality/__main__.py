@@ -145,10 +145,11 @@ def study(run: Run[Config]) -> None:
         _worlds(run, about["worlds"][1])
     if packets:
         recordings.show(run, who, bins, packets, left_out)
+    worlds = ", the worlds are seen by no training" if "worlds" in found else ""
     run.finish(
         "Quality of event flow",
         f"{answer(found, config.network)} Hard events with threshold mismatch and background noise; textures are photographs, unseen speckle "
-        "and few shapes, the worlds are seen by no training.",
+        f"and few shapes{worlds}.",
     )
 
 
