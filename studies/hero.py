@@ -35,6 +35,7 @@ from studies.codesign.cells import space_of
 from studies.codesign.design import Space, Whole
 from studies.codesign.problem import Drawn
 from studies.codesign.race import answers
+from studies.frame.config import check_least
 from studies.frame.fidelity import Tolerant, chosen
 from studies.frame.run import Run, main
 from studies.placement.figures import draw_pair
@@ -81,6 +82,8 @@ class Film:
 
 def study(run: Run[Config]) -> None:
     config = run.config
+    check_least(config, 0, "world")
+    check_least(config, 1, "pictures", "rays")
     setting, rows = answers(config.answers)
     drawn = Drawn(driving(space_of(setting), config), (config.world,), 1, config.pictures)
     titles = ("as it came", "designed together")
@@ -97,8 +100,9 @@ def study(run: Run[Config]) -> None:
     came, together = errors.values()
     run.finish(
         "The chain on a moving robot",
-        f"In worlds that no search saw the design that came has a velocity error of {came:.2f}, the "
-        f"one designed together {together:.2f} (1: all is lost); hero.webp shows both on one drive.",
+        f"On the drives of {config.answers.name}, in worlds that no search saw, the design that came has a velocity error of "
+        f"{came:.2f}, the one designed together {together:.2f} (1: all is lost). hero.webp shows both on another drive, at "
+        f"{config.speed:g} m/s, to which these errors do not belong.",
     )
 
 
@@ -193,7 +197,8 @@ def _draw_velocity(axis, film, k, colour):
     since_s = STEP_S * np.arange(len(forward))
     axis.plot(since_s, forward, color="black", linewidth=1)
     axis.plot(since_s[: k + 1], film.velocity[: k + 1, 0].numpy(), "o", ms=3, color=colour)
-    axis.set(xlim=(-STEP_S, since_s[-1] + STEP_S), ylim=(0, 2 * forward.max()), xticks=[0, 0.5, 1])
+    low, high = sorted((0.0, 2 * forward[0] or 0.1))
+    axis.set(xlim=(-STEP_S, since_s[-1] + STEP_S), ylim=(low, high), xticks=[0, 0.5, 1])
     axis.set_title("forward speed, m/s, over time, s", fontsize=9)
     axis.tick_params(labelsize=7)
 

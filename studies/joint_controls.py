@@ -55,8 +55,6 @@ class Config(StudyConfig):
 
 def study(run: Run[Config]) -> None:
     config = run.config
-    if not config.raw.is_file():
-        raise DomainError(f"--raw {config.raw}: there is no such file.")
     setting, rows = answers(config.raw)
     found = {(row["seed"], row["arm"]): row["share"] for row in rows}
     seeds = sorted({seed for seed, _ in found})[: config.starts]

@@ -23,6 +23,7 @@ from codesign.report.prose import counted
 from scenes.robots import pair as robot_pair
 from scenes.robots.pair import Design, RobotPair
 from scenes.robots.pairs import PAIRS, check_pairs
+from studies.frame.compare import log_ratio
 from studies.frame.config import check_least
 from studies.frame.run import Run, StudyConfig, main
 
@@ -72,19 +73,26 @@ def study(run: Run[Config]) -> None:
     torch.manual_seed(config.seed)
     head = VelocityHead(EgoVelocity(tuple(range(6)), (1.0,) * 6), config.width)
     # fresh weights are least squares as it is
-    plain = [typical_error(head, each) for each in held_out]
+    plain = [errors(head, each) for each in held_out]
     fit(head, lessons, held_out, config)
     content = {name: str(value) for name, value in asdict(config).items()}
     head.save(run.path("head.safetensors"), {"config": content, "run": "studies.velocity_head"})
-    ours = [typical_error(head, each) for each in held_out]
-    for name, before, after in zip(config.pair, plain, ours, strict=True):
+    ours = [errors(head, each) for each in held_out]
+    said = []
+    for name, *both in zip(config.pair, plain, ours, strict=True):
+        before, after = map(typical, both)
+        by_design = [each.unflatten(0, (config.designs, -1)).mean(1).tolist() for each in both]
+        over = log_ratio(by_design[1], by_design[0])
         run.record(**{f"{name}_plain_error": before, f"{name}_head_error": after})
+        run.record(**over.metrics(f"{name}_log_ratio"))
         run.card(name, f"{after:.2f}", f"typical error; {before:.2f} by least squares")
-    ahead = sum(after < before for before, after in zip(plain, ours, strict=True))
+        said.append(
+            f"{over.outcome} in '{name}' ({counted(len(both[0]), 'sample')} of {counted(over.count, 'design')}: bounded error "
+            f"{over.percent()})"
+        )
     run.finish(
         "One velocity head for all designs",
-        f"The one head errs less than least squares on {ahead} of {counted(len(ours), 'pair')} of robot and world, in worlds "
-        "that were kept from training.",
+        f"Against least squares, in worlds that were kept from training, the one head {', '.join(said)}.",
     )
 
 
@@ -164,9 +172,14 @@ def bounded(velocity: Tensor, samples: Samples) -> Tensor:
 
 
 @torch.no_grad()
-def typical_error(head: VelocityHead, samples: Samples) -> float:
+def errors(head: VelocityHead, samples: Samples) -> Tensor:
+    """[N]: the bounded errors of a head."""
+    return bounded(head.judged(samples.seen)[0], samples)
+
+
+def typical(errors: Tensor) -> float:
     """The error, in units of the task, that all samples would have at their mean bounded one."""
-    mean = float(bounded(head.judged(samples.seen)[0], samples).mean())
+    mean = float(errors.mean())
     return math.sqrt(mean / (1 - mean))
 
 

@@ -71,6 +71,18 @@ def test_a_lens_is_drawn_with_rays_to_its_field_and_a_notebook_shows_it():
     assert figure._repr_png_().startswith(b"\x89PNG")
 
 
+def test_poses_are_a_path_from_above_with_headings():
+    start = codesign.pose.look_at((1.0, -2.0, 0.5), (2.0, -2.0, 0.5))
+    poses = start.repeat(5, 1, 1)
+    poses[:, 0, 3] += torch.arange(5.0) / 10
+    for given in (poses, poses.numpy()):
+        axis = codesign.show(given).axes[0]
+        np.testing.assert_allclose(axis.lines[0].get_xdata(), 1 + np.arange(5) / 10, rtol=1e-6)
+        np.testing.assert_allclose(axis.lines[0].get_ydata(), -2, rtol=1e-6)
+        (headings,) = axis.collections
+        np.testing.assert_allclose((headings.U, headings.V), (np.ones(5), np.zeros(5)), atol=1e-6)
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float64])
 def test_arrays_are_drawn_as_tensors(dtype):
     frames = np.arange(4 * 6 * 8).reshape(4, 6, 8)
@@ -119,6 +131,8 @@ def test_light_through_a_thin_lens_meets_where_geometry_has_it():
         (3, DomainError, "nothing is known of how to draw int"),
         (torch.tensor(1.0), ShapeError, "frames are torch.float32 \\[\\]"),
         (np.zeros((0, 4, 4)), ShapeError, "with a pixel is needed"),
+        (np.zeros((8, 9, 3)), ShapeError, "look like colour"),
+        (torch.full((2, 8, 9), -1.0), ShapeError, "look like flow"),
         (
             FlowField(torch.zeros(0, 2, 4, 4), torch.zeros(0, 4, 4, dtype=torch.bool), 0.1),
             ShapeError,

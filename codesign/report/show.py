@@ -32,9 +32,10 @@ from codesign.types import EventStream, EventVolume, FlowField
 MOST = 4  # pictures of a batch or of a film
 FIELDS = (0.0, 0.7, 1.0)  # shares of the half field whose rays are drawn
 QUANTILE = 0.98  # of lengths and counts, that has full colour
+TICKS = 12  # headings on a path
 WHEEL = 0.22  # of the picture's width
 HANDLED = (
-    "a lens, a camera, frames [..., H, W], an EventStream, an EventVolume, a FlowField, a Mount (with camera= and body=), "
+    "a lens, a camera, frames [..., H, W], poses [T, 4, 4], an EventStream, an EventVolume, a FlowField, a Mount (with camera= and body=), "
     "or what a system's `begin` returns"
 )
 
@@ -68,7 +69,8 @@ def show(
     Args:
       x: lens (traced, thin or a pinhole) or camera: cross-section with rays to the middle, 0.7 and
         the corner of the field. Frames [..., H, W], tensor or array of numpy, linear light: at most
-        four of them over time, with the screen's gamma. ``EventStream`` and ``EventVolume``: ON red, OFF blue, both purple.
+        four of them over time, with the screen's gamma. Poses ``T_world_cam`` [..., T, 4, 4]: their
+        paths from above, with where the camera looks (+z). ``EventStream`` and ``EventVolume``: ON red, OFF blue, both purple.
         ``FlowField``: hue the direction, saturation the length, with a wheel that says how far.
         ``Mount``, with the camera that it carries and the meshes of its robot. What
         ``System.begin`` returns: all of the chain in a row.
@@ -103,10 +105,20 @@ def show(
         figure = _row(
             [(f"flow {k}" if k else "flow", (px, full), _flow) for k, px in enumerate(flows)]
         )
+    elif isinstance(x, Tensor) and _are_poses(x):
+        figure = _row([("from above", x.detach().double().cpu(), _paths)])
     elif isinstance(x, Tensor):
         if x.ndim < 2 or not x.numel() or x.dtype.is_complex:
             raise ShapeError(
                 f"frames are {x.dtype} {list(x.shape)}; real [..., H, W] with a pixel is needed."
+            )
+        if x.ndim > 2 and x.shape[-1] == 3:
+            raise ShapeError(
+                f"frames {list(x.shape)} look like colour, [..., H, W, 3]; give their light, [..., H, W]."
+            )
+        if x.ndim > 2 and x.shape[-3] == 2 and bool((x < 0).any()):
+            raise ShapeError(
+                f"frames {list(x.shape)} with values below 0 look like flow, [..., 2, H, W]; give a FlowField."
             )
         films = x.detach().float().reshape(-1, *x.shape[-2:])
         picked = np.unique(np.linspace(0, len(films) - 1, MOST).round().astype(int)).tolist()
@@ -146,13 +158,32 @@ def _row(parts):
     for axis, (title, what, draw) in zip(axes, parts, strict=True):
         draw(axis, what)
         axis.set_title(title, fontsize=10)
-        if draw is not _lens:
+        if draw not in (_lens, _paths):
             axis.set(xticks=[], yticks=[])
     return figure
 
 
 def _frame(axis, frame_and_films):
     draw_image(axis, *frame_and_films)
+
+
+def _are_poses(x):
+    """Whether it is [..., T, 4, 4] with the last row of rigid motions."""
+    if x.ndim < 3 or x.shape[-2:] != (4, 4) or not x.numel():
+        return False
+    return bool((x[..., 3, :] == x.new_tensor([0, 0, 0, 1])).all())
+
+
+def _paths(axis, T_world_cam):
+    """Paths over the ground, and where the camera looks, at most TICKS times on each."""
+    for poses in T_world_cam.reshape(-1, *T_world_cam.shape[-3:]):
+        x, y = poses[:, :2, 3].T.numpy()
+        (line,) = axis.plot(x, y, linewidth=1)
+        some = slice(None, None, math.ceil(len(poses) / TICKS))
+        ahead = poses[some, :2, 2].T.numpy()
+        axis.quiver(x[some], y[some], *ahead, color=line.get_color(), width=0.006)
+    axis.set_aspect("equal", "datalim")
+    axis.set(xlabel="x (m)", ylabel="y (m)")
 
 
 def _events(axis, counts):

@@ -1,12 +1,12 @@
 """What a flow network is trained to make small: scalars of its predictions and the windows."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from torch import Tensor, nn
 
-from codesign.errors import DomainError
+from codesign.errors import DomainError, ShapeError
 from codesign.flow.losses import (
     contrast_loss,
     laplace_loss,
@@ -23,7 +23,16 @@ GAMMA = 0.8
 
 def flow_predictions(network: nn.Module, windows: FlowWindows) -> list[FlowField]:
     """All predictions of a flow network, the last one counting most; of a plain one, its one flow.
-    A network that refines begins with the start of the windows where they have one."""
+    A network that refines begins with the start of the windows where they have one.
+
+    Raises: ShapeError for windows of other bins than the network's ``config`` has.
+    """
+    config, given = getattr(network, "config", None), windows.volume.counts.shape[2]
+    own = config.get("bins", given) if isinstance(config, Mapping) else given
+    if own != given:
+        raise ShapeError(
+            f"the windows have {given} time bins, the network {own}; give both the same number."
+        )
     if windows.start is not None and hasattr(network, "refined"):
         return network.refined(windows.volume, windows.start, through=False)
     several = getattr(network, "predictions", None)

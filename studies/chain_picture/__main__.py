@@ -17,6 +17,7 @@ from codesign.atomic import write_atomic
 from codesign.system import Batch, System
 from scenes import textures, trajectories, worlds
 from studies.chain_picture import panels
+from studies.frame.config import check_least
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.show import panels as charts
 from studies.hero import looped
@@ -41,6 +42,8 @@ class Config(StudyConfig):
 
 def study(run: Run[Config]):
     config = run.config
+    # a lens that sharpens edges is a curve
+    check_least(config, 2, "lens_steps")
     published = lens.load(config.lens)
     geo = published.scaled(11.0 / float(published.first_order().efl_mm.detach())).freeze()
     size = config.width_px, config.height_px, PITCH_MM

@@ -87,7 +87,7 @@ class Config(StudyConfig):
     near: bool = False
     """Start within a tenth of the bounds of the best design looked at, instead of all over them."""
     steps: int = 16
-    """Steps of every descent, looks of every search: the budget."""
+    """Steps of every descent, looks of every search: the budget, a multiple of 16."""
     worlds: int = 12
     """Training worlds."""
     per_draw: int = 12

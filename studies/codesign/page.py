@@ -240,6 +240,11 @@ def looked(run: Run[Any], space: Space, gates: Landscape) -> None:
         f"The ninetieth percentile of {len(gates.designs)} designs is {gates.spread:.2f} times the "
         f"tenth: {enough}.{at_walls}{told}"
     )
+    if missed := sum(row["hard"] is None for row in gates.grid):
+        run.text(
+            f"{missed} of {len(gates.grid)} designs of the grid miss a requirement: they were not looked at, and curves leave them "
+            "out."
+        )
     charts = []
     for name in space.free:
         of = [row for row in gates.grid if row["number_of"] == name and row["hard"] is not None]

@@ -13,6 +13,7 @@ import drjit
 import torch
 from torch import Tensor
 
+from codesign import shipped
 from codesign.errors import DomainError, FileFormatError
 from codesign.mount import VelocityHead
 from codesign.mount.requirements import first_missed
@@ -163,10 +164,15 @@ def taken_up(path: Path, setting: Mapping[str, Any]) -> tuple[bytes, bytes]:
 
 
 def answers(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Setting and rows of a table of judged answers, each with its seed and arm.
+    """Setting and rows of a table of judged answers, each with its seed and arm. A path is looked
+    for beside the studies too, where the published answers lie.
 
     Raises: FileFormatError for what is no such table.
     """
+    if not path.is_file():
+        path = shipped.FOLDER / path
+    if not path.is_file():
+        raise FileFormatError(f"no such file: '{path}'; give answers.jsonl of a run.")
     rows = [row for line in path.read_bytes().splitlines() for row in _parsed(path, line)]
     if not rows or not all("errors" in row for row in rows):
         raise FileFormatError(f"'{path}' has no judged answers; give answers.jsonl of a run.")

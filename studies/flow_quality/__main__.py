@@ -97,7 +97,7 @@ class Config(StudyConfig):
     windows: int = 256
     """Windows of every set of flat textures and of every cell, 64 x 64."""
     world_windows: int = 75
-    """Windows of 3-D worlds, 128 x 128, the worlds in turn."""
+    """Windows of 3-D worlds, 128 x 128, the worlds in turn; at least one of each."""
     real_windows: int = 128
     """Windows of every set of scenes.windows.sets: packets of few events, bent images, vibration,
     rotation."""
@@ -145,10 +145,11 @@ def study(run: Run[Config]) -> None:
         _worlds(run, about["worlds"][1])
     if packets:
         recordings.show(run, who, bins, packets, left_out)
+    worlds = ", the worlds are seen by no training" if "worlds" in found else ""
     run.finish(
         "Quality of event flow",
         f"{answer(found, config.network)} Hard events with threshold mismatch and background noise; textures are photographs, unseen speckle "
-        "and few shapes, the worlds are seen by no training.",
+        f"and few shapes{worlds}.",
     )
 
 

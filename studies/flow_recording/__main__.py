@@ -8,6 +8,7 @@ says so.
 """
 
 import sys
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,6 +23,7 @@ from codesign.flow.checkpoint import DELIVERED
 from codesign.flow.checkpoint import load as load_network
 from codesign.flow.sources import PacketOptions, read_packets, read_recording
 from studies.flow_recording import made, page, video
+from studies.frame.config import check_least
 from studies.frame.run import Run, StudyConfig, main
 from studies.train_flow import peers  # noqa: F401  which network files know
 
@@ -92,6 +94,7 @@ class Config(StudyConfig):
 
 def study(run: Run[Config]) -> None:
     config = run.config
+    check_least(config, 2, "bins")
     estimators = load(config.estimator)
     recording = config.recording
     if recording is None:
@@ -192,8 +195,10 @@ def measured(packet, estimate, bins):
             found["truth_fwl"] = metrics.fwl(known, truth, *span)
             found["fwl_where_known"] = metrics.fwl(known, field.flow_px, *span)
     if len(packet.stream):
-        found["fwl"] = metrics.fwl(packet.stream, field.flow_px, *span)
-        found["rsat"] = metrics.rsat(packet.stream, field.flow_px, *span)
+        for name, sharpness in (("fwl", metrics.fwl), ("rsat", metrics.rsat)):
+            # undefined for few events: as many on every pixel, all at the start, all moved off
+            with suppress(DomainError):
+                found[name] = sharpness(packet.stream, field.flow_px, *span)
     return field, {name: float(value) for name, value in found.items()}
 
 

@@ -64,6 +64,11 @@ def show(run, packets, rows, names, film):
     )
     table = [(name, *map(mine.get, UNITS)) for name, mine in means.items()]
     run.table("Means over packets", ("estimator", *UNITS.values()), table)
+    if len(packets) < (run.config.packets or 0):
+        run.text(
+            f"**{len(packets)} of the {run.config.packets} windows asked for**: no more fit in the recording, and a true flow "
+            "without times tells of one window only, at its start."
+        )
     for sentence in doubts(packets, rows, best):
         run.text(sentence)
     if film is not None:

@@ -47,7 +47,7 @@ class Config(StudyConfig):
     film_samples: int = 256
     """Samples per pixel of the frames of the five scenes."""
     draws: int = 16
-    """Draws of these samples, over which gradients and differences are averaged."""
+    """Draws of these samples, over which gradients and differences are averaged, at least 2."""
     directions: int = 2
     """Random directions of a lens tensor or of an object's pose (scenes); 0: every number by
     itself."""
@@ -57,7 +57,7 @@ class Config(StudyConfig):
     samples: int = 1024
     """Samples per pixel of differences and precise gradients at silhouettes."""
     seeds: int = 4
-    """Seeds of these."""
+    """Seeds of these, at least 2."""
 
 
 def study(run: Run[Config]) -> None:

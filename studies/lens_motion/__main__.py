@@ -260,6 +260,8 @@ def _finish(run, lenses, motion, rows):
     spots_and_mtf = {page.LABELS[name]: along[name] for name in ("spots", "mtf")}
     said += " " + verdict("the design by MTF along the motion", spots_and_mtf)
     run.section("Who wins", page.EXPLAINED)
+    if not motion.directed:
+        run.text(f"Motion {config.motion} has no direction, so none is turned: no --judged-turned.")
     titles = {
         "lens": "designer",
         "rms_px": "RMS spot (px)",

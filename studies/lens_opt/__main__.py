@@ -49,7 +49,7 @@ class Config(StudyConfig):
         "spot_starts": 1,
     }
     lens: str = "cooke-triplet"
-    """Lens to start from: cooke-triplet, double-gauss, la1509, or a lens .json file."""
+    """Lens to start from: cooke-triplet, double-gauss, la1509, or a lens file (.zmx, .seq, .json)."""
     objective: Literal["flow", "edge"] = "flow"
     """flow: log angular error of event flow; edge: the seed project's edge energy of event frames.
     The other of the two is a rival."""

@@ -48,21 +48,25 @@ def verdict(design: str, rivals: Mapping[str, Interval]) -> str:
       design: what it is called, "the flow design".
       rivals: what each is called -> log ratio of the design over it.
     """
+    alike = [name for name, pair in rivals.items() if pair.low == pair.high == 0]
+    others = {name: pair for name, pair in rivals.items() if name not in alike}
     said = []
     undecided = ("is undecided", "are undecided")
     for outcome, words in (("loses", ("wins", "win")), (undecided[0], undecided)):
-        found = {name: pair for name, pair in rivals.items() if pair.outcome == outcome}
+        found = {name: pair for name, pair in others.items() if pair.outcome == outcome}
         if found:
             several = len(found) > 1
             said.append(
                 f"{' and '.join(found)} {words[several]}: the flow error of {design} against "
                 f"{'them' if several else 'it'} is {' and '.join(pair.percent() for pair in found.values())}"
             )
-    if not said:
-        name, closest = max(rivals.items(), key=lambda item: item[1].value)
+    if others and not said:
+        name, closest = max(others.items(), key=lambda item: item[1].value)
         said.append(
             f"{design} wins: its flow error against its best rival, {name}, is {closest.percent()}"
         )
+    if alike:
+        said.append(f"{' and '.join(alike)} and {design} err exactly alike")
     sentence = f"{'; '.join(said)} on {next(iter(rivals.values())).count} unseen cases."
     return sentence[0].upper() + sentence[1:]
 

@@ -32,6 +32,11 @@ def estimator(name: str, train: bool, objective: str, weights: int, seed: int) -
         raise DomainError(
             "--flow closed-form has no weights, so there is nothing to train; leave --train-network out."
         )
+    if name in WEIGHTS and objective == "edge":
+        raise DomainError(
+            f"--objective edge looks at event frames only, so --flow {name} would keep its random weights, whose flow "
+            "means nothing; choose closed-form, refiner or the file of a trained network."
+        )
     if train and objective == "edge":
         raise DomainError(
             "--objective edge looks at event frames only, so it gives a network no gradient; leave --train-network "

@@ -125,6 +125,8 @@ def checked(size: Config) -> None:
         raise DomainError(
             f"--pair {size.pair}: choose from {', '.join(PAIRS)}, or give --robot and a .yaml file."
         )
+    if size.robot and size.pair != Config.pair:
+        raise DomainError("--robot and --pair are both given; leave one of them out.")
     check_least(size, 1, "seeds", "steps", "worlds", "per_world", "judged_worlds", "judged_drives")
     check_drives(per_world=size.per_world, judged_drives=size.judged_drives)
     if len(set(size.searches)) < len(size.searches):

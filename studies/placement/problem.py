@@ -253,7 +253,8 @@ def traced_camera(pair: RobotPair, name: str, focal_mm: float | None = None) -> 
       name: in the catalogue, or a lens file.
       focal_mm: to which the lens is scaled; None: that of the pair's design. The lens is focused
         where the
-    pair's is. Raises: as ``lens.load``; DomainError for a focal length that is not positive.
+    pair's is. Raises: as ``lens.load``; DomainError for a focal length that is not positive, or a
+      film that is larger than the image circle.
     """
     design = pair.design
     wanted = design.efl_mm if focal_mm is None else focal_mm
@@ -262,4 +263,4 @@ def traced_camera(pair: RobotPair, name: str, focal_mm: float | None = None) -> 
     geo = lens.load(name).requires_grad_(False)
     geo = geo.scaled(wanted / float(geo.first_order().efl_mm.detach()))
     focused = geo.focus_at(1 / design.focus_per_m if design.focus_per_m else math.inf).freeze()
-    return design.camera().with_lens(focused)
+    return design.camera().with_lens(focused).check()

@@ -61,8 +61,9 @@ def fitted(run, recording, recorded):
     """FittedSensor of the first intervals, whose counts are ``recorded``; a stopped fit goes on
     exactly."""
     seen = slice(0, len(recorded) + 1)
-    sensor = FittedSensor()
-    fit = Fit(sensor, recording.frames[seen], recording.mid_s[seen], recorded, run.config.steps)
+    fit = Fit(
+        FittedSensor(), recording.frames[seen], recording.mid_s[seen], recorded, run.config.steps
+    )
     stored = run.load_state() if run.resumed else None
     if stored:
         fit.restore(stored.tensors, stored.numbers)
@@ -71,7 +72,8 @@ def fitted(run, recording, recorded):
         while len(fit.losses) < fit.steps:
             progress.advance(loss=fit.step())
     run.save_state(*fit.state())
-    run.record(first_loss=fit.losses[0], last_loss=fit.losses[-1])
+    sensor = fit.keep_best()
+    run.record(first_loss=fit.losses[0], best_loss=min(fit.losses))
     run.record(**{name: value.detach() for name, value in sensor.values().items()})
     return sensor
 
@@ -135,13 +137,16 @@ def show(run, recording, sensor, simulated, figures):
         "ON − OFF per pixel; red: more ON. The second half: its busiest, a middling and its quietest "
         "interval.",
     )
-    best = figures["fitted"]
-    truer = best["correlation"] > figures["ideal"]["correlation"]
+    best, ideal = figures["fitted"], figures["ideal"]
+    truer = ["shape"] * (best["correlation"] > ideal["correlation"])
+    truer += ["number"] * (best["rate_factor"] < ideal["rate_factor"])
+    alone = f" in {truer[0]} alone" if len(truer) == 1 else ""
     lead = (
-        f"The fitted sensor is {'truer' if truer else 'no truer'} than an ideal one. On the half that was not fitted, signed counts correlate by **{best['correlation']:.3f}** "
-        f"(ideal sensor {figures['ideal']['correlation']:.3f}); ON and OFF events number "
+        f"The fitted sensor's events are {'truer' if truer else 'no truer'} than those of an ideal one{alone}. "
+        f"On the half that was not fitted, signed counts correlate by **{best['correlation']:.3f}** "
+        f"(ideal sensor {ideal['correlation']:.3f}); ON and OFF events number "
         f"{best['ratio_on']:.2f} and {best['ratio_off']:.2f} times the recorded ones "
-        f"({figures['ideal']['ratio_on']:.2f} and {figures['ideal']['ratio_off']:.2f})."
+        f"({ideal['ratio_on']:.2f} and {ideal['ratio_off']:.2f})."
     )
     run.finish("A sensor fitted to a recording", lead)
 

@@ -2,6 +2,7 @@
 noise that fades with light."""
 
 import json
+import math
 from pathlib import Path
 
 import torch
@@ -125,8 +126,10 @@ def match(simulated, recorded):
 
 
 class Fit:
-    """Adam on a sensor's parameters, step by step; ``state`` and ``restore`` go on with it
-    exactly."""
+    """Adam on a sensor's parameters, step by step; ``state`` and ``restore`` go on with it exactly,
+    ``keep_best`` sets the parameters that fitted best. The first interval is left out: the camera's
+    pixels began it with a memory that nobody knows.
+    """
 
     def __init__(self, sensor, frames, t_s, recorded, steps):
         self.sensor = sensor
@@ -134,6 +137,7 @@ class Fit:
         self.recorded = recorded
         self.steps = steps
         self.losses = []
+        self.best = {}
         self.optimiser = torch.optim.Adam(sensor.parameters(), lr=LEARNING_RATE)
 
     def step(self):
@@ -141,7 +145,11 @@ class Fit:
         for group in self.optimiser.param_groups:
             group["lr"] = LEARNING_RATE * (1 - len(self.losses) / self.steps)
         self.optimiser.zero_grad()
-        loss = match(self.sensor.expected(*self.seen), self.recorded)
+        loss = match(self.sensor.expected(*self.seen)[1:], self.recorded[1:])
+        if float(loss.detach()) <= min(self.losses, default=math.inf):
+            self.best = {
+                f"best.{name}": value.clone() for name, value in self.sensor.state_dict().items()
+            }
         loss.backward()
         self.optimiser.step()
         self.losses.append(float(loss.detach()))
@@ -152,13 +160,20 @@ class Fit:
         tensors = {
             f"{index}/{name}": value for index, of in moments.items() for name, value in of.items()
         }
-        return {**tensors, **self.sensor.state_dict()}, {"losses": self.losses}
+        return {**tensors, **self.sensor.state_dict(), **self.best}, {"losses": self.losses}
 
     def restore(self, tensors, numbers):
         self.losses = list(numbers["losses"])
         self.sensor.load_state_dict({name: tensors[name] for name in self.sensor.state_dict()})
+        self.best = {name: tensors[name] for name in tensors if name.startswith("best.")}
         moments = {}
-        for name in tensors.keys() - self.sensor.state_dict().keys():
+        for name in tensors.keys() - self.sensor.state_dict().keys() - self.best.keys():
             index, key = name.split("/")
             moments.setdefault(int(index), {})[key] = tensors[name]
         self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": moments})
+
+    def keep_best(self):
+        """The sensor with the parameters of the smallest loss."""
+        best = {name.removeprefix("best."): value for name, value in self.best.items()}
+        self.sensor.load_state_dict(best)
+        return self.sensor

@@ -54,7 +54,7 @@ CAPTION = (
 class Config(StudyConfig):
     QUICK: ClassVar = {"frames": 60, "steps": 8}
     frames: int = 200
-    """Frames of every rendered sequence, at 500 per second."""
+    """Frames of every rendered sequence, at 500 per second; at least 40."""
     steps: int = 160
     """Optimisation steps of our generator; the thesis network gets half as many from either of two
     starts."""

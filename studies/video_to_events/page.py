@@ -153,7 +153,10 @@ def write_page(view, state, sensor, clock, written):
     )
     verdict = "**The video is too slow for its motion, see below.**"
     if not slow:
-        verdict = "The video is fast enough for its motion." if state.events else "Nothing moved."
+        fast = "The video is fast enough for its motion."
+        if view.config.upsample:
+            fast = "The frames that were put between are fast enough; whether the video is was not judged."
+        verdict = fast if state.events else "Nothing moved."
     run.finish("Video to events", f"{verdict} {lead}")
 
 
@@ -170,6 +173,8 @@ def warnings(view, state, sensor, slow):
         else "frames between with --upsample 0.5"
     )
     remedy = f"Record at about {math.ceil(state.remedy)} times the frame rate, or take {finer}."
+    if view.config.upsample:
+        share += " Judged with the frames put between, whose motion is a guess along optical flow."
     yield f"**Too slow for its motion.** {share} {remedy}" if slow else share
     if not state.events:
         yield (

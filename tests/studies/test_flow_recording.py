@@ -119,6 +119,18 @@ def test_a_recording_without_truth_has_its_sharpness_only(tmp_path):
     assert metrics["lk_fwl"] > 0
 
 
+def test_sharpness_that_is_not_defined_is_left_out(recording):
+    options = PacketOptions(window_s=0.02, start_s=0.0, count=1, size_px=SIZE)
+    (packet,) = read_packets(recording[0], options=options)
+    early = replace(
+        packet.stream, **{name: getattr(packet.stream, name)[:3] for name in ("x", "y", "p")}
+    )
+    early = replace(early, t_us=torch.full_like(early.x, packet.t0_us, dtype=torch.int64))
+    field = FlowField(torch.zeros(1, 2, *SIZE), torch.ones(1, *SIZE, dtype=torch.bool), 0.02)
+    _, found = study.measured(replace(packet, stream=early, truth=None), lambda _: field, 8)
+    assert found == {"fwl": 1.0}  # mean times of 0 on every pixel have no ratio
+
+
 def test_bins_are_those_asked_for(recording, tmp_path, monkeypatch):
     seen = []
 

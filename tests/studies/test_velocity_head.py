@@ -11,7 +11,7 @@ from studies import velocity_head
 from studies.velocity_head import designs
 from tests import refusals
 from tests.studies.browser import check_page
-from tests.studies.runs import numbers, ran
+from tests.studies.runs import numbers, page, ran
 
 D = torch.float64
 WINDOWS = 4
@@ -74,6 +74,8 @@ def test_a_little_training_lowers_the_error_on_worlds_kept_from_it_and_what_it_s
     check_page("velocity_head", out)
     metrics = numbers(out)
     assert metrics["corridor_head_error"] < 0.6 * metrics["corridor_plain_error"]
+    assert metrics["corridor_log_ratio_high"] < 0
+    assert "wins in &#39;corridor&#39; (360 samples of 60 designs" in page(out)
     head = VelocityHead.load(EgoVelocity(tuple(range(6)), (1.0,) * 6), out / "head.safetensors")
     again = {name: tensor.double() for name, tensor in made(600, 1000).items()}
     samples = velocity_head.Samples(
@@ -81,7 +83,7 @@ def test_a_little_training_lowers_the_error_on_worlds_kept_from_it_and_what_it_s
         again["twist"],
         PAIRS["corridor"]().axes,
     )
-    error = velocity_head.typical_error(head, samples)
+    error = velocity_head.typical(velocity_head.errors(head, samples))
     assert error == pytest.approx(metrics["corridor_head_error"], rel=0.3)
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from codesign.errors import ShapeError
 from codesign.flow.losses import laplace_loss
 from codesign.train import Contrast, Photometric, Supervised
 from codesign.train.objectives import flow_predictions
@@ -51,6 +52,15 @@ def test_the_likelihood_teaches_the_claim_and_leaves_the_flow_alone():
     assert torch.equal(flow, same)
     assert unseen is None
     assert float(claim.abs().min()) > 0
+
+
+def test_windows_of_other_bins_than_the_network_are_refused():
+    network = torch.nn.Conv2d(10, 2, 3)
+    network.config = {"bins": 5}
+    windows = Made().batch(range(4))
+    given = windows.volume.counts.shape[2]
+    with pytest.raises(ShapeError, match=f"windows have {given} time bins, the network 5"):
+        flow_predictions(network, windows)
 
 
 def test_windows_with_a_start_are_refined_from_it():
