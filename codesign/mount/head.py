@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import silu
@@ -26,7 +27,9 @@ from codesign.types import ChiefRayCamera, EventVolume, FlowField
 
 LEAST_CONFIDENCE = 1e-6
 FOCAL_PX = 300.0  # focal lengths are told as the logarithm of their share of this
-RIM = 0.5**0.5  # four points of the pupil there spread light as all of a uniform pupil does
+# points of the pupil by which blur is measured: exact for spreads of up to the sixth power of the
+# radius (coma, spherical aberration), where a single ring knows defocus and astigmatism alone
+RINGS, SPOKES = 3, 8
 # what becomes of the numbers told of windows, lens and mount in a mirror before which left is right
 TOLD = (1, 1, 1, 1, -1, 1, 1, 1, 1, 1, 1)
 LENS = (1, -1, 1, 1, 1, 1)
@@ -168,18 +171,34 @@ def _lens(camera, windows, nearness, mounts):
 def _blur_px(camera, pixels, base, slope, base_step, slope_step, nearness):
     if not hasattr(camera, "rays_through"):
         return torch.zeros_like(nearness)
-    rim = RIM * pixels.new_tensor([[1.0, 0.0], [-1, 0], [0, 1], [0, -1]])
-    rays = camera.rays_through(pixels.repeat_interleave(4, 0), rim.repeat(len(pixels), 1))
-    lit = (rays.weight.detach() > 0).double().reshape(-1, 4)
-    along = torch.where(rays.weight.detach()[:, None] > 0, rays.direction, 1.0).double()
-    off_slope = (along[:, :2] / along[:, 2:]).reshape(-1, 4, 2) - slope[:, None]
-    start = rays.origin_m.double().reshape(-1, 4, 3)
+    points, weight = _pupil()
+    count = len(points)
+    rays = camera.rays_through(
+        pixels.repeat_interleave(count, 0), points.to(pixels).repeat(len(pixels), 1)
+    )
+    passes = rays.weight.detach() > 0
+    lit = passes.double().reshape(-1, count) * weight.to(pixels)
+    along = torch.where(passes[:, None], rays.direction, 1.0).double()
+    off_slope = (along[:, :2] / along[:, 2:]).reshape(-1, count, 2) - slope[:, None]
+    start = rays.origin_m.double().reshape(-1, count, 3)
     off_base = start[..., :2] - (off_slope + slope[:, None]) * start[..., 2:] - base[:, None]
     near = nearness[..., None, None]
-    # [N, W, 2, 4]
+    share = lit / lit.sum(-1, keepdim=True).clamp_min(1e-12)
+    # [N, W, 2, points]
     shift = torch.linalg.solve(near * base_step + slope_step, (near * off_base + off_slope).mT)
-    share = lit / lit.sum(-1, keepdim=True).clamp_min(1)
+    shift = shift - (shift * share[:, None]).sum(-1, keepdim=True)
     return ((shift.square().sum(-2) * share).sum(-1) + 1e-12).sqrt()
+
+
+def _pupil():
+    """Points [24, 2] of the unit disc and their shares [24] of it."""
+    node, weight = np.polynomial.legendre.leggauss(RINGS)  # in the square of the radius
+    radius = torch.from_numpy(((node + 1) / 2) ** 0.5)
+    angle = 2 * torch.pi * (torch.arange(SPOKES, dtype=torch.float64) + 0.5) / SPOKES
+    points = torch.stack(
+        [radius[:, None] * angle.cos(), radius[:, None] * angle.sin()], -1
+    ).flatten(0, 1)
+    return points, torch.from_numpy(weight / 2).repeat_interleave(SPOKES) / SPOKES
 
 
 # of what the solution so far makes of a window; -1 is mirrored, as in TOLD

@@ -314,11 +314,13 @@ class OwnBody:
     def covered(self, T_body_cam: Tensor, camera: Camera) -> Tensor:
         """[..., windows] share of every window of the film that the body covers. Gradient: mount
         and lens."""
-        # of which the pictures are the same
-        way = "boundary" if torch.is_grad_enabled() else "interior"
         poses = T_body_cam.reshape(-1, 4, 4)
-        # by falloff a dark corner would be free
-        found = frames(camera.in_one_colour(), self.scene, poses, way, self.per_px).double()
+        camera = camera.in_one_colour()  # by falloff a dark corner would be free
+        rays = camera.rays()
+        moves = any(each.requires_grad for each in (poses, rays.direction, rays.weight))
+        # of which the pictures are the same
+        way = "boundary" if moves and torch.is_grad_enabled() else "interior"
+        found = frames(camera, self.scene, poses, way, self.per_px, rays=rays).double()
         return found.flatten(-2).mean(-1).reshape(*T_body_cam.shape[:-2], -1)
 
     @torch.no_grad()

@@ -3,7 +3,8 @@
 One set of drives is rendered for the design itself. What lens and mount change around it is
 geometry: surfaces, their true flow, blur, what the robot covers; how well flow is told there is
 carried over by a trend that knows blur and magnification; all of these designs are looked through
-in one cast of rays. What sensor, estimator and light change is seen on the recorded frames, one of
+in one cast of rays. Behind one lens blur goes with distance, so what it does is learnt by
+experiment: from the recorded frames behind a blur that is drawn. What sensor, estimator and light change is seen on the recorded frames, one of
 these numbers a step.
 """
 
@@ -48,9 +49,7 @@ class Objective:
         along the free ones, and what was rendered."""
         looked = self.drawn.looked(self.space.made(share), samples)
         if learn:
-            self.trend.add(
-                looked.seen.surfaces, looked.seen.flow_px, looked.seen.covered, looked.optics
-            )
+            self._learn(looked)
         slope = torch.zeros_like(share)
         moved = [k for k in free if self.space.free[k] in GEOMETRY]
         if moved:
@@ -72,6 +71,13 @@ class Objective:
                 share, moved, PENALTY_STEP, looked.whole, self._penalties
             )
         return value + penalty, slope, looked
+
+    def _learn(self, looked):
+        """The trend takes in what was read, on the frames as they are and behind a drawn blur."""
+        generator = torch.Generator().manual_seed(looked.samples.seed)
+        for each, optics in ((looked, looked.optics), looked.blurred(generator)):
+            seen = each.seen
+            self.trend.add(seen.surfaces, seen.flow_px, seen.covered, optics)
 
     def look(self, share: Tensor, draw: int) -> tuple[float, Looked]:
         """Error to be expected of shares [V] on a draw, and what was rendered."""

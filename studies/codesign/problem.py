@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import torch
+from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
 from codesign.mount import (
@@ -26,6 +27,8 @@ from studies.codesign.design import Space, Whole
 from studies.codesign.rig import Rig
 from studies.placement.problem import Problem, Samples
 
+BLURS_PX = (0.1, 2.0)  # root mean square radius, that recorded frames are blurred by
+BLUR_TAPS = (13, 13)
 DRAWS = 64  # of an error that is to be expected
 EVERY_PX = 2  # of the pixels that tell what the robot covers
 
@@ -211,11 +214,28 @@ class Looked:
     def again(self, other: Whole, kind: str = "memory", **kept: Any) -> "Looked":
         """The same frames, and what else is kept of the run, through another sensor and estimator,
         or in the light of another f-number."""
-        kept["frames"] = self.run["frames"]
+        kept = {"frames": self.run["frames"], **kept}
         with torch.no_grad():
             run = self.drawn.system(other, kind).begin(self.batch, kept)
         alike = other.camera is self.whole.camera
         return replace(self, whole=other, run=run, known=self.seen if alike else None)
+
+    def blurred(self, generator: torch.Generator) -> tuple["Looked", Tensor]:
+        """The same frames behind a blur that is drawn for every window, and the optics [N, windows,
+        2] of what is read there."""
+        frames, own = self.run["frames"], self.optics
+        low, high = BLURS_PX
+        drawn = torch.rand(own.shape[:2], generator=generator, dtype=own.dtype)
+        more_px = low * (high / low) ** drawn
+        # an even spread of light of that root mean square radius
+        deviation = (more_px / 2**0.5).to(frames).reshape(-1, 1).expand(-1, 2)
+        # [worlds, drives, T, windows, h, w] -> [N x windows, T, h, w]
+        stack = frames.flatten(0, 1).movedim(2, 1)
+        soft = gaussian_blur2d(stack.flatten(0, 1), BLUR_TAPS, deviation, border_type="replicate")
+        soft = soft.reshape(stack.shape).movedim(1, 2).reshape(frames.shape)
+        radius = (own[..., 1].expm1() ** 2 + more_px**2).sqrt()
+        looked = self.again(self.whole, frames=soft)
+        return looked, torch.stack([own[..., 0], radius.log1p()], -1)
 
     @cached_property
     def seen(self) -> Seen:

@@ -49,8 +49,8 @@ def in_processes(
         finally:
             ending.set()
             pool.shutdown(wait=False, cancel_futures=True)
-            # one that is just being started is met by a later round
-            while wait(waiting, timeout=0.1).not_done:
+            # those that have begun; one that is just being started is met by a later round
+            while wait([each for each in waiting if not each.cancelled()], timeout=0.1).not_done:
                 bench.end_running()
 
 

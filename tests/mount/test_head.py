@@ -121,6 +121,38 @@ def test_blur_and_focal_length_are_those_of_the_thin_lens(mount):
         torch.testing.assert_close(found[..., column].expm1(), expected, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("fno", [1.6, 2.2, 4.0])
+def test_blur_of_a_wide_lens_is_the_spot_of_its_whole_pupil(mount, fno):
+    """Whose corners are blurred by powers of the pupil that a single ring of it does not know."""
+    geo = lens.family("retrofocus-4").lens(2.5, fno, 1.0, 0.2)
+    windows = tuple((x, 30) for x in (0, 20, 40))
+    camera = render.Camera(geo, 32, 32, 0.0185, 1, 0, render.Film(112, 92, 32, 32, 0.0185, windows))
+    plain = plain_of()
+    read = plain.read(noisy(1), camera, None, mount, mount.expand(1, 3, 4, 4))
+    found = evidence(read, plain.solve(read), camera, mount, plain.prior).lens[0, :, 5].expm1()
+    middle = camera.film.pixels().reshape(3, -1, 2).double().mean(1)
+
+    def slope(pixels, pupil):
+        rays = camera.rays_through(pixels, pupil)
+        return (rays.direction[:, :2] / rays.direction[:, 2:]).double()
+
+    turn, count = torch.arange(2000) * math.pi * (3 - 5**0.5), 2000
+    radius = ((torch.arange(count) + 0.5) / count).sqrt()
+    pupil = torch.stack([radius * turn.cos(), radius * turn.sin()], 1).double()
+    for number, pixel in enumerate(middle):
+        steps = pixel + torch.eye(2, dtype=D)
+        chief = slope(torch.stack([pixel, *steps]), torch.zeros(3, 2, dtype=D))
+        off = slope(pixel.expand(count, 2), pupil)
+        shift = torch.linalg.solve((chief[1:] - chief[:1]).mT, (off - off.mean(0)).mT)
+        assert float(found[number]) == pytest.approx(
+            float(shift.square().sum(0).mean().sqrt()), rel=0.02
+        )
+    # the other way through the lens, from a point far away to the film: alike, not the same
+    sine = camera.chief_rays(middle).direction[:, :2].norm(dim=1)
+    spot = lens.rms_spot_mm(geo, sine.asin().tolist(), vignetting=True) / 0.0185
+    torch.testing.assert_close(found, spot.double(), rtol=0.15, atol=0.02)
+
+
 def test_the_order_of_windows_does_not_matter(mount):
     order = [2, 0, 1]
     field = noisy(3)

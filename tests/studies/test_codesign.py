@@ -375,6 +375,39 @@ def test_designs_are_carried_together_as_each_alone(drawn, space):
     assert len({round(value, 6) for value in alone.tolist()}) == 4
 
 
+def test_frames_are_blurred_by_what_their_optics_say(drawn, space):
+    """A point of light in every window, whose mean square radius is that of the blur; the trend
+    learns what it is told."""
+    looked = drawn.looked(space.made(space.start), drawn.draw(0))
+    frames = torch.zeros_like(looked.run["frames"])
+    frames[..., 16, 16] = 255.0
+    points = replace(looked, run={"field": looked.run["field"], "frames": frames})
+    soft, optics = points.blurred(torch.Generator().manual_seed(0))
+    light = soft.run["frames"].double()
+    away = torch.arange(32, dtype=F) - 16
+    square = away[:, None] ** 2 + away**2
+    radius = ((light * square).sum((-2, -1)) / light.sum((-2, -1))).sqrt()
+    expected = (optics[..., 1].expm1() ** 2 - looked.optics[..., 1].expm1() ** 2).sqrt()
+    assert 0.1 < float(expected.min()) < 0.5 < 1.2 < float(expected.max()) < 2.0
+    wide = expected > 1.0  # below, a Gaussian's taps on whole pixels spread it otherwise
+    torch.testing.assert_close(
+        radius.flatten(0, 1).movedim(1, 2)[wide],
+        expected[..., None].expand(-1, -1, frames.shape[2])[wide],
+        rtol=0.02,
+        atol=0,
+    )
+    torch.testing.assert_close(optics[..., 0], looked.optics[..., 0])
+    objective = Objective(drawn)
+    objective._learn(looked)
+    told = [
+        objective.trend.told(looked.seen.surfaces, looked.seen.flow_px, looked.seen.covered, each)
+        for each in (looked.optics, looked.optics + torch.tensor([0.0, 0.5], dtype=F))
+    ]
+    seen = looked.seen.surfaces.share > 0
+    # flow is told worse behind more blur: log precision falls
+    assert float((told[1] - told[0])[seen][:, 0].mean()) < -0.1
+
+
 def test_an_answer_that_is_not_allowed_gives_way_to_one_that_is_settled_too(monkeypatch):
     """Allowed are cameras below 0.4 m: of the way 0.3 m is the last one."""
     space = Space.of("outdoors", None, free=("z_m", "theta"))

@@ -92,6 +92,12 @@ def test_cells_whose_worker_is_killed_are_asked_again(run, way, tmp_path):
     assert len((run.folder / "table.jsonl").read_text().splitlines()) == 3
 
 
+def test_a_cell_that_fails_ends_those_that_wait_for_their_turn(run):
+    with pytest.raises(CodesignError, match=r"power\(-1, 2\).*not below 0"):
+        sweep(run, power, processes=1, given={"base": 2}, exponent=(-1, 1, 2, 3))
+    assert not bench.RUNNING
+
+
 def test_a_worker_that_is_killed_again_and_again_ends_the_sweep(run):
     with pytest.raises(CodesignError, match=r"killed\(1\) ended with code -9"):
         sweep(run, killed, processes=1, exponent=(1,))
