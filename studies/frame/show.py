@@ -141,7 +141,7 @@ def pictures(
         len(rows), len(titles), figsize=size, squeeze=False, layout="constrained"
     )
     signed = set(signed)
-    for line, (label, row) in zip(axes, rows.items(), strict=True):
+    for number, (line, (label, row)) in enumerate(zip(axes, rows.items(), strict=True)):
         for axis, title in zip(line, titles, strict=True):
             axis.set(xticks=[], yticks=[])
             if title not in row:
@@ -151,7 +151,7 @@ def pictures(
                 image for other, image in row.items() if (other in signed) == (title in signed)
             ]
             draw_image(axis, row[title], of_scale, title in signed)
-            axis.set_title(title if line is axes[0] else "", fontsize=9)
+            axis.set_title("" if number else title, fontsize=9)
         line[0].set_ylabel(label, fontsize=9, rotation=0, ha="right", va="center")
     return figure
 
