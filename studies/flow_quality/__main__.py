@@ -304,7 +304,7 @@ def _pictures(shown, who):
             claimed = ((covariance[k, 0] + covariance[k, 2]) / 2).sqrt() / DEVIATION_PX
             grey = claimed.clamp(max=1)[..., None].expand(-1, -1, 3)
             rows[label][f"claimed (white: {DEVIATION_PX:g} px)"] = grey
-    return pictures(rows, signed=["events"], side=2.1, flow=True)
+    return pictures(rows, signed=["events"], side=1.5, flow=True)
 
 
 if __name__ == "__main__":
