@@ -195,8 +195,10 @@ def _draw_velocity(axis, film, k, colour):
     """Forward speed, as it is and as it was read so far."""
     forward = film.true[:, 0].numpy()
     since_s = STEP_S * np.arange(len(forward))
-    axis.plot(since_s, forward, color="black", linewidth=1)
-    axis.plot(since_s[: k + 1], film.velocity[: k + 1, 0].numpy(), "o", ms=3, color=colour)
+    read = film.velocity[: k + 1, 0].numpy()
+    axis.plot(since_s, forward, color="black", linewidth=1, label="true")
+    axis.plot(since_s[: k + 1], read, "o", ms=3, color=colour, label="read from flow")
+    axis.legend(loc="upper right", fontsize=7, frameon=False)
     low, high = sorted((0.0, 2 * forward[0] or 0.1))
     axis.set(xlim=(-STEP_S, since_s[-1] + STEP_S), ylim=(low, high), xticks=[0, 0.5, 1])
     axis.set_title("forward speed, m/s, over time, s", fontsize=9)

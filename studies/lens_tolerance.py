@@ -209,8 +209,9 @@ def report_linear(run, slopes, trials):
         forecast = trials.amounts[good] @ slopes[k]
         ends = [float(forecast.min()), float(forecast.max())]
         simulated = trials.figures[good, k] - trials.nominal[k]
+        # below the marks, which lie on it
+        axis.plot(ends, ends, color="0.8", linewidth=4)
         axis.plot(forecast.numpy(), simulated.numpy(), ".", markersize=3, color="#1b6ca8")
-        axis.plot(ends, ends, color="k", linewidth=0.8)
         axis.set(xlabel="forecast", ylabel="simulated", title=f"change of {LINEAR_FIGURES[k]}")
     run.figure(
         figure,
@@ -275,13 +276,15 @@ def report_spot(run, name, forecast, amounts, squares):
     )
     figure, axes = plt.subplots(1, len(FIELDS), figsize=(11, 3.4), layout="constrained")
     for f, axis in enumerate(axes):
-        _, edges, _ = axis.hist(
-            truth_um[:, f].numpy(), bins=30, density=True, color="#9cc3dd", label="simulated"
-        )
-        shape = {"bins": edges, "density": True, "histtype": "step", "color": "#c0392b"}
-        axis.hist(drawn_um[:, f].numpy(), label="forecast", **shape)
+        # all of both: a part alone would have another density
+        both = torch.cat([truth_um[:, f], drawn_um[:, f]])
+        shape = {"bins": 40, "range": (float(both.min()), float(both.max())), "density": True}
+        axis.hist(truth_um[:, f].numpy(), color="#9cc3dd", label="simulated", **shape)
+        shape |= {"histtype": "step", "color": "#c0392b", "label": "forecast"}
+        axis.hist(drawn_um[:, f].numpy(), **shape)
         axis.axvline(float(nominal_um[f]), color="k", linewidth=1, label="nominal")
         axis.set(xlabel="RMS spot (µm)", title=f"field {FIELDS[f]:g}")
+    axes[0].set_ylabel("share of the lenses per µm")
     axes[0].legend(frameon=False, fontsize=8)
     run.figure(
         figure,

@@ -320,3 +320,18 @@ def image_scale_mm(
     # Lagrange's invariant of the chief ray and of this one, whose height at the pupil is 1 / (1 -
     # vergence z)
     return -lens.index(wavelength_um)[0] / ((1 - vergence_per_mm * pupil_z) * angle)
+
+
+def chief_scale_mm(lens: ParaxialLens, wavelength_um: float = D_UM) -> Tensor:
+    """Height on the image plane, wherever it stands, per tangent of the field, of the paraxial ray
+    through the centre of the d line's entrance pupil, scalar mm; that of ``image_scale_mm`` where
+    the plane is in focus. Gradient: to every lens tensor that bends or moves light."""
+    index = lens.index(wavelength_um)
+    heights, angles = yu_trace(
+        lens.surface_power(wavelength_um),
+        lens.thickness_mm,
+        index,
+        -lens.first_order().entrance_pupil_z_mm,
+        index[0],
+    )
+    return heights[-1] + lens.thickness_mm[-1] * angles[-1] / index[-1]

@@ -1,6 +1,7 @@
 """Pictures, curves and matrices drawn into axes: what pages of runs are made of."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -51,12 +52,16 @@ def draw_curves(
     axis.set_xscale("log" if "x" in log else "linear")
     axis.set_yscale("log" if "y" in log else "linear")
     for side in (axis.xaxis, axis.yaxis):
-        if side.axis_name in log:  # plain numbers; between powers of ten 2 and 5 alone
+        if side.axis_name in log:
             side.set_major_formatter(lambda value, _: f"{value:g}")
-            side.set_minor_formatter(
-                lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "25" else ""
-            )
+            side.set_minor_formatter(partial(_between_powers, side))
     axis.grid(alpha=0.3)
+
+
+def _between_powers(side, value, _):
+    """The number at a tick between powers of ten: 2 and 5 alone, and all where the axis is short."""
+    low, high = side.get_view_interval()
+    return f"{value:g}" if high < 4 * low or f"{value:.0e}"[0] in "25" else ""
 
 
 def heat_map(values: Any, rows: Sequence[str], columns: Sequence[str], label: str) -> Figure:

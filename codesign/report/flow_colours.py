@@ -1,5 +1,8 @@
 """Flow as colour: hue says where to, saturation how far."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 from matplotlib.colors import hsv_to_rgb
 
@@ -19,3 +22,14 @@ def flow_colours(flow_px: np.ndarray, full_px: float | None = None) -> np.ndarra
             -1,
         )
     )
+
+
+def draw_wheel(axis: Any, place: Sequence[float]) -> None:
+    """Draw the wheel of these colours beside an axis or into it: left, bottom, width and height as
+    shares of the axis."""
+    across = np.linspace(-1, 1, 61)
+    wheel = np.stack(np.meshgrid(across, across))
+    inside = np.hypot(*wheel) <= 1
+    small = axis.inset_axes(place)
+    small.imshow(np.concatenate([flow_colours(wheel, 1.0), inside[..., None]], -1))
+    small.set_axis_off()

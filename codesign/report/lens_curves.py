@@ -34,24 +34,28 @@ def field_errors(
     count: int = 21,
     at_m: float = PARALLEL,
 ) -> Figure:
-    """Figure over the field: tangential and sagittal focus, distortion, and lateral colour."""
+    """Figure over the field: tangential and sagittal focus, distortion, and, of several wavelengths,
+    lateral colour."""
     reference, *others = analysis.spectral_lines(light)[0]
     fields = [half_field_rad * i / (count - 1) for i in range(count)]
     angles = np.degrees(fields)
-    figure, axes = plt.subplots(1, 3, figsize=(10, 3.8), sharey=True, layout="constrained")
+    figure, axes = plt.subplots(
+        1, 3 if others else 2, figsize=(10, 3.8), sharey=True, layout="constrained"
+    )
     shifts = analysis.focus_shift_mm(lens, fields, reference, at_m=at_m)
     for column, style, side in zip(shifts.T, ("-", "--"), SIDES, strict=True):
         axes[0].plot(column.numpy(), angles, style, color=COLOURS[0], label=side)
     axes[0].set(xlabel="focus shift (mm)", ylabel="field (degrees)", title="Field curvature")
-    # on the axis it is 0 by definition
-    distortion = analysis.distortion_percent(lens, fields[1:], wavelength_um=reference, at_m=at_m)
-    axes[1].plot(distortion.numpy(), angles[1:], color=COLOURS[2])
+    distortion = analysis.distortion_percent(lens, fields, wavelength_um=reference, at_m=at_m)
+    axes[1].plot(distortion.numpy(), angles, color=COLOURS[2])
     axes[1].set(xlabel="distortion (%), f-tan", title="Distortion")
-    colours = analysis.lateral_colour_mm(lens, fields, others, reference, at_m).T if others else ()
-    for k, (wavelength, shift) in enumerate(zip(others, colours, strict=True)):
-        label = f"{wavelength * 1e3:.0f} nm"
-        axes[2].plot(1e3 * shift.numpy(), angles, color=COLOURS[1:][k % 3], label=label)
-    axes[2].set(xlabel=f"height − that at {reference * 1e3:.0f} nm (µm)", title="Lateral colour")
+    if others:
+        colours = analysis.lateral_colour_mm(lens, fields, others, reference, at_m).T
+        for k, (wavelength, shift) in enumerate(zip(others, colours, strict=True)):
+            label = f"{wavelength * 1e3:.0f} nm"
+            axes[2].plot(1e3 * shift.numpy(), angles, color=COLOURS[1:][k % 3], label=label)
+        label = f"height − that at {reference * 1e3:.0f} nm (µm)"
+        axes[2].set(xlabel=label, title="Lateral colour")
     for axis in axes:
         axis.axvline(0, color="0.5", lw=0.6)
         widest = np.abs(axis.get_xlim()).max()
@@ -73,7 +77,7 @@ def through_focus(
     frequency."""
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
     z = np.asarray(defocus_mm, dtype=float)
-    sizes = analysis.through_focus_spot_mm(lens, fields_rad, z, light, 24, vignetting, at_m) * 1e3
+    sizes = analysis.through_focus_spot_mm(lens, fields_rad, z, light, 32, vignetting, at_m) * 1e3
     for (field, colour), row in zip(coloured(fields_rad), sizes, strict=True):
         axes[0].plot(z, row.numpy(), color=colour, label=degrees(field))
         curves = analysis.through_focus_mtf(

@@ -107,7 +107,7 @@ def ray_fans(
     """Figure of ray fans: transverse aberration (upper) and optical path difference (lower) over
     the pupil, a pair of columns per field, relative to the chief ray."""
     lines = list(_lines(light))
-    figure, axes = _grid(2, 2 * len(fields_rad), 1.7, 2.3, sharey="row", sharex=True)
+    figure, axes = _grid(2, 2 * len(fields_rad), 1.35, 2.1, sharey="row", sharex=True)
     for k, field in enumerate(fields_rad):
         reference = analysis.chief_ray(lens, field, lines[0][0], at_m=at_m).position_mm[0]
         for wavelength, colour, label in lines:
@@ -118,7 +118,7 @@ def ray_fans(
                 for axis, value in zip(axes[:, column], values, strict=True):
                     shown = torch.where(weight > 0, value, math.nan)
                     axis.plot(fan.pupil.numpy(), shown.numpy(), color=colour, lw=1.1, label=label)
-                axes[0, column].set_title(f"{degrees(field)}, {side}", fontsize=8)
+                axes[0, column].set_title(f"{degrees(field)}\n{side}", fontsize=10)
     for axis in axes.flat:
         axis.axhline(0, color="0.5", lw=0.6)
         axis.axvline(0, color="0.5", lw=0.6)
@@ -240,6 +240,6 @@ def _legend(figure, axes, **options):
     """The figure with the legend of its first axis above all."""
     handles = axes[0, 0].get_legend_handles_labels()
     figure.legend(
-        *handles, loc="outside upper center", ncols=5, frameon=False, fontsize=8, **options
+        *handles, loc="outside upper center", ncols=5, frameon=False, fontsize=10, **options
     )
     return figure

@@ -23,7 +23,7 @@ from codesign.events import picture, to_counts
 from codesign.lens.pinhole import ThinLens
 from codesign.mount import Mount
 from codesign.report.chain_figures import draw_image
-from codesign.report.flow_colours import flow_colours
+from codesign.report.flow_colours import draw_wheel, flow_colours
 from codesign.report.lens_layout import draw_layout, draw_thin
 from codesign.report.robot_figures import draw_robot, view_lines
 from codesign.system.run import Pass
@@ -204,13 +204,7 @@ def _flow(axis, flow_and_full):
     known = np.isfinite(flow_px).all(0)
     colours = flow_colours(np.where(known, flow_px, 0.0), full)
     axis.imshow(np.where(known[..., None], colours, 0))  # black where it is not known
-    across = np.linspace(-1, 1, 61)
-    wheel = np.stack(np.meshgrid(across, across))
-    inside = np.hypot(*wheel) <= 1
-    colours = np.concatenate([flow_colours(wheel, 1.0), inside[..., None]], -1)
-    small = axis.inset_axes([1 - WHEEL, 0, WHEEL, WHEEL])
-    small.imshow(colours)
-    small.set_axis_off()
+    draw_wheel(axis, (1 - WHEEL, 0, WHEEL, WHEEL))
     axis.text(
         0.99 - WHEEL, 0.02, f"rim {full:.2g} px", transform=axis.transAxes, ha="right", size=8
     )

@@ -74,7 +74,7 @@ def study(run: Run[Config]):
         f"true motion {moved:.2f} px in {DURATION_S * 1e3:g} ms",
     )
     run.figure(
-        codesign.show(seen),
+        codesign.show(seen, width_in=13.0),
         "chain",
         "Lens, middle frame, signed events, flow as estimated and as it is.",
         dpi=110,

@@ -258,7 +258,7 @@ class Whole:
     def __str__(self) -> str:
         of = self.numbers
         return (
-            f"{of['efl_mm']:.2f} mm f/{of['fno']:.2f} focused at {of['focus_per_m']:.2f} / m,\nx {of['x_m']:.3f} z "
-            f"{of['z_m']:.3f} m pitch {math.degrees(of['pitch_rad']):.1f} deg,\ntheta {of['theta']:.3f}, "
+            f"{of['efl_mm']:.2f} mm f/{of['fno']:.2f} focused at {of['focus_per_m']:.2f} / m, x {of['x_m']:.3f} z "
+            f"{of['z_m']:.3f} m pitch {math.degrees(of['pitch_rad']):.1f} deg, theta {of['theta']:.3f}, "
             f"{of['cutoff_hz']:.0f} Hz, prior {of['prior_px']:.1f} px"
         )

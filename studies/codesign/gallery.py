@@ -26,23 +26,21 @@ def side_by_side(judge: Judge, designs: Mapping[str, Whole]) -> Figure:
     one unseen drive."""
     drawn = judge.drawn
     samples = fastest(drawn.base, JUDGED)
-    figure = plt.figure(figsize=(15, 2.9 * len(designs)), layout="constrained")
-    for row, (title, whole) in enumerate(designs.items()):
+    figure = plt.figure(figsize=(13, 3.2 * len(designs)), layout="constrained")
+    parts = figure.subfigures(len(designs), squeeze=False)[:, 0]
+    for row, (part, (title, whole)) in enumerate(zip(parts, designs.items(), strict=True)):
+        part.suptitle(title, x=0.01, ha="left", fontsize=13)
         axes = [
-            figure.add_subplot(
-                len(designs),
-                len(COLUMNS),
-                len(COLUMNS) * row + column + 1,
-                projection="3d" if name == "robot and view" else None,
+            part.add_subplot(
+                1, len(COLUMNS), number, projection="3d" if name == "robot and view" else None
             )
-            for column, name in enumerate(COLUMNS)
+            for number, name in enumerate(COLUMNS, 1)
         ]
         looked = drawn.looked(whole, samples, "sensor")
         if isinstance(whole.camera.lens, lens.GeoLens):
             draw_layout(axes[0], whole.camera.lens, FIELDS_RAD, rays=3)
             axes[0].get_legend().remove()  # it would lie over the robot
         axes[0].set_axis_off()
-        axes[0].set_title(title, fontsize=9, loc="left")
         draw_pair(axes[1], whole.space.pair, whole.camera, whole.T_body_cam)
         draw_seen(
             axes[2:], looked.batch, whole.camera, whole.T_body_cam, looked.run, titled=row == 0

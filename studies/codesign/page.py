@@ -186,7 +186,7 @@ def shown(
     for row in rows:
         if row["seed"] == seed and row["arm"] in arms:
             whole = space.made(torch.tensor(row["share"], dtype=torch.float64))
-            title = f"{row['arm']}: {mean[seed, row['arm']]:.3f}\n{whole}"
+            title = f"{row['arm']}: {mean[seed, row['arm']]:.3f}, {whole}"
             designs[row["arm"]] = title, whole
     run.section(
         "Designs side by side",
@@ -250,7 +250,9 @@ def looked(run: Run[Any], space: Space, gates: Landscape) -> None:
         of = [row for row in gates.grid if row["number_of"] == name and row["hard"] is not None]
         values = [row["value"] for row in of]
         series = {kind: (values, [row[kind] for row in of]) for kind in ("hard", "expected")}
-        charts.append(Panel(series, name, "error"))
+        # a lone design is no curve
+        if len(of) > 1:
+            charts.append(Panel(series, name, "error"))
     half = (len(charts) + 1) // 2
     for name, part in (("grid_first", charts[:half]), ("grid_last", charts[half:])):
         if part:

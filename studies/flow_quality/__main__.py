@@ -296,15 +296,16 @@ def _pictures(shown, who):
         flows = {"true flow": given.truth.flow_px[k]}
         flows |= {name.replace("_", " "): fields[name].flow_px[k] for name in who}
         most = float(flows["true flow"].square().sum(0).sqrt().max())
-        rows[f"{number}"] = {"events": (counts[0] - counts[1]).sum(0)} | {
+        label = f"{number}, full colour {most:.1f} px"
+        rows[label] = {"events": (counts[0] - counts[1]).sum(0)} | {
             name: flow_colours(flow.numpy(), most) for name, flow in flows.items()
         }
         covariance = fields[BEST].covariance_px2
         if covariance is not None:
             claimed = ((covariance[k, 0] + covariance[k, 2]) / 2).sqrt() / DEVIATION_PX
             grey = claimed.clamp(max=1)[..., None].expand(-1, -1, 3)
-            rows[f"{number}"][f"claimed (white: {DEVIATION_PX:g} px)"] = grey
-    return pictures(rows, signed=["events"], side=2.1)
+            rows[label][f"claimed (white: {DEVIATION_PX:g} px)"] = grey
+    return pictures(rows, signed=["events"], side=1.5, flow=True)
 
 
 if __name__ == "__main__":

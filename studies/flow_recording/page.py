@@ -229,7 +229,7 @@ def pictures(packet, fields):
         }
         if truth is not None:
             row["true flow"] = _colours(truth.flow_px[0], truth.valid[0], full)
-    return show_pictures(rows, side=3.0)
+    return show_pictures(rows, side=3.0, flow=True)
 
 
 def _colours(flow_px, known, full):

@@ -17,9 +17,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import matplotlib.pyplot as plt
+import numpy as np
 from matplotlib.figure import Figure
 
 from codesign.report.chain_figures import draw_curves, draw_image
+from codesign.report.flow_colours import draw_wheel
 from studies.frame.compare import Interval
 from studies.frame.run import Run
 from studies.frame.sweep import metrics, plain
@@ -103,8 +105,8 @@ class Panel:
 
 
 def panels(*charts: Panel, width: float = 4.5) -> Figure:
-    """Figure of charts beside one another; a legend for all stands below where there are several
-    series."""
+    """Figure of charts beside one another; below stands a legend for all where they have the same
+    series, else one of its own below each chart that has several."""
     figure, axes = plt.subplots(
         1, len(charts), figsize=(width * len(charts), 3.4), squeeze=False, layout="constrained"
     )
@@ -113,14 +115,15 @@ def panels(*charts: Panel, width: float = 4.5) -> Figure:
         colours = {line.get_label(): line.get_color() for line in axis.get_lines()}
         for label, (x, low, high) in chart.bands.items():
             axis.fill_between(x, low, high, color=colours[label], alpha=0.12, linewidth=0)
-    if max(len(chart.series) for chart in charts) > 1:
-        handles = {
-            label: line
-            for axis in axes[0]
-            for line, label in zip(*axis.get_legend_handles_labels(), strict=True)
-        }
-        how = {"loc": "outside lower center", "ncols": 4, "frameon": False, "fontsize": 8}
-        figure.legend(handles.values(), handles.keys(), **how)
+    how = {"frameon": False, "fontsize": 8}
+    if all(chart.series.keys() == charts[0].series.keys() for chart in charts):
+        if len(charts[0].series) > 1:
+            handles = axes[0, 0].get_legend_handles_labels()
+            figure.legend(*handles, loc="outside lower center", ncols=4, **how)
+        return figure
+    for axis, chart in zip(axes[0], charts, strict=True):
+        if len(chart.series) > 1:
+            axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, **how)
     return figure
 
 
@@ -128,20 +131,24 @@ def pictures(
     rows: Mapping[str, Mapping[str, Any]],
     signed: Iterable[str] = (),
     side: float = 2.3,
+    flow: bool = False,
 ) -> Figure:
     """Figure of pictures: row label -> column title -> [H, W] or, in colours of 0 to 1, [H, W, 3].
 
     Grey pictures of a row share their scale, with a display's gamma; columns that are ``signed``
     are red above zero and blue below, on one scale per row. A picture that a row lacks leaves its
-    place empty.
+    place empty. ``flow``: beside them stands the wheel of the colours of flow.
     """
     titles = list(dict.fromkeys(title for row in rows.values() for title in row))
-    size = (side * len(titles), side * len(rows))
+    shapes = [np.shape(image)[:2] for row in rows.values() for image in row.values()]
+    tallest = max(height / width for height, width in shapes)
+    # room for labels, titles and the wheel
+    size = (side * len(titles) + 1.2 + 0.8 * flow, side * len(rows) * tallest + 0.3)
     figure, axes = plt.subplots(
         len(rows), len(titles), figsize=size, squeeze=False, layout="constrained"
     )
     signed = set(signed)
-    for line, (label, row) in zip(axes, rows.items(), strict=True):
+    for number, (line, (label, row)) in enumerate(zip(axes, rows.items(), strict=True)):
         for axis, title in zip(line, titles, strict=True):
             axis.set(xticks=[], yticks=[])
             if title not in row:
@@ -151,8 +158,10 @@ def pictures(
                 image for other, image in row.items() if (other in signed) == (title in signed)
             ]
             draw_image(axis, row[title], of_scale, title in signed)
-            axis.set_title(title if line is axes[0] else "", fontsize=9)
+            axis.set_title("" if number else title, fontsize=9)
         line[0].set_ylabel(label, fontsize=9, rotation=0, ha="right", va="center")
+    if flow:
+        draw_wheel(axes[0, -1], (1.05, 0, 0.35, 0.35))
     return figure
 
 

@@ -27,9 +27,16 @@ from studies.lens_report.depth import depth
 
 SHARES = (0.0, 0.7, 1.0)
 WIDEST_DEG = 10.0  # where a lens does not say
+ALL_PASS = 0.995  # share from which the page does not say how many
 FEWEST = 0.05  # share of the rays of a field that must arrive for it to be shown
 # across the pupil; where a wavefront or a picture asks for more, rays tell nearly the same
 MOST_CELLS = 512
+# periods of the highest frequency within the radius that holds the rays: beyond, an MTF is hardly
+# more than 0 and asks for ever more rays
+SPREADS = 16.0
+# across the pupil, of every spot and of every wavefront that a figure is taken from
+SPOT_CELLS = 32
+FRONT_CELLS = 96
 
 
 @dataclass(frozen=True)
@@ -78,14 +85,12 @@ def study(run: Run[Config]) -> None:
     ]
     first_order(run, geo, light, half_deg, at_m)
     seidel(run, geo, math.radians(half_deg), light[0], at_m)
-    radii = pictures(run, geo, fields, light, quick, at_m)
+    spots = pictures(run, geo, fields, light, quick, at_m)
     sharpness(run, geo, fields, light, quick, at_m)
-    depth(run, geo, fields, light[0], distances)
+    depth(run, geo, fields, light, distances)
     run.record(half_field_deg=half_deg, seconds=time.perf_counter() - start)
-    spots = ", ".join(
-        f"{radius:.1f} µm at {degrees(field)}" for field, radius in zip(fields, radii, strict=True)
-    )
-    said = f"At f/{run.metrics['fno']:.3g} the lens makes RMS spots of {spots}."
+    said = f"At f/{run.metrics['fno']:.3g} the lens makes RMS spots of {', '.join(spots)}"
+    said += "." if math.isinf(at_m) else f" of an object at {at_m:g} m."
     run.finish(f"Lens report: {geo.name}", " ".join([said, *notes]))
 
 
@@ -193,7 +198,7 @@ def seidel(run, geo, half_rad, wavelength_um, at_m):
 
 
 def pictures(run, geo, fields, light, quick, at_m):
-    """Layout, spots, fans, field errors; returns the RMS spots, µm."""
+    """Layout, spots, fans, field errors; returns what is said of the RMS spot of each field."""
     run.section("Layout")
     run.figure(
         lens_figures.lens_layout(geo, fields, at_m=at_m),
@@ -202,9 +207,10 @@ def pictures(run, geo, fields, light, quick, at_m):
     )
     run.section("Rays")
     run.figure(
-        lens_figures.spots_by_wavelength(geo, fields, light, 16 if quick else 24, True, at_m),
+        lens_figures.spots_by_wavelength(geo, fields, light, SPOT_CELLS, True, at_m),
         "spots",
-        f"Spots about the chief ray at {light[0] * 1e3:.0f} nm; the circle is the Airy disc.",
+        f"Spots about the chief ray at {light[0] * 1e3:.0f} nm; the RMS is that of all wavelengths; the "
+        "circle is the Airy disc.",
     )
     run.figure(
         lens_figures.ray_fans(geo, fields, light, True, at_m),
@@ -221,12 +227,15 @@ def pictures(run, geo, fields, light, quick, at_m):
     run.figure(
         lens_curves.field_errors(geo, half, light, count=9 if quick else 21, at_m=at_m),
         "field_errors",
-        "Field curvature of thin bundles, distortion against f tan, and lateral colour of the chief ray.",
+        "Field curvature of thin bundles, and distortion against the tangent"
+        + (", and lateral colour of the chief ray." if len(light) > 1 else "."),
     )
     rows = []
-    radii = []
+    said = []
     for field in fields:
-        positions, weight = analysis.polychromatic_spot(geo, field, light, 32, True, at_m=at_m)
+        positions, weight = analysis.polychromatic_spot(
+            geo, field, light, SPOT_CELLS, True, at_m=at_m
+        )
         shift = analysis.focus_shift_mm(geo, [field], light[0], at_m=at_m)[0]
         radius = 1e3 * float(analysis.spot_radius_mm(positions, weight))
         distortion = float(
@@ -236,16 +245,25 @@ def pictures(run, geo, fields, light, quick, at_m):
         record_at(
             run, field, rms_spot_um=radius, distortion_percent=distortion, passed_share=passed
         )
-        radii.append(radius)
+        said.append(
+            f"{radius:.1f} µm at {degrees(field)}"
+            + (f" (of the {passed:.0%} of its rays that pass)" if passed < ALL_PASS else "")
+        )
         foci = (f"{s:.4f}" for s in shift)
         rows.append((degrees(field), f"{radius:.2f}", f"{distortion:.3f}", *foci, f"{passed:.3f}"))
     run.table(
         "By field",
-        ("field", "RMS spot (µm)", "distortion (%)", "tangential focus (mm)", "sagittal focus (mm)")
+        (
+            "field",
+            "RMS spot, all wavelengths (µm)",
+            "distortion (%)",
+            "tangential focus (mm)",
+            "sagittal focus (mm)",
+        )
         + ("share that passes",),
         rows,
     )
-    return radii
+    return said
 
 
 def record_at(run, field, **figures):
@@ -259,13 +277,13 @@ def sharpness(run, geo, fields, light, quick, at_m):
         f"At {light[0] * 1e3:.0f} nm, against the sphere about the chief ray's image point.",
     )
     run.figure(
-        lens_figures.opd_maps(geo, fields, light[0], 48 if quick else 96, True, at_m),
+        lens_figures.opd_maps(geo, fields, light[0], FRONT_CELLS, True, at_m),
         "wavefront",
         "Optical path difference over the entrance pupil, piston and tilt removed.",
     )
     rows = []
     for field in fields:
-        front = analysis.wavefront(geo, field, light[0], 64, True, at_m=at_m)
+        front = analysis.wavefront(geo, field, light[0], FRONT_CELLS, True, at_m=at_m)
         flat = analysis.remove_fit(front)
         rms, extent = analysis.rms_waves(front), analysis.peak_to_valley_waves(front)
         figures = rms, analysis.rms_waves(flat), extent, analysis.strehl_direct(flat)
@@ -285,7 +303,8 @@ def sharpness(run, geo, fields, light, quick, at_m):
     )
     pixels = 64 if quick else 96
     pixel = max(2.6 * widest, 12 * airy) / pixels
-    frequency = torch.linspace(0, round_frequency(min(1 / airy, 250.0)), 51, dtype=geo.dtype)
+    highest = round_frequency(min(1 / airy, 250.0, SPREADS / max(widest, airy)))
+    frequency = torch.linspace(0, highest, 51, dtype=geo.dtype)
     ideal = analysis.ideal_mtf(frequency, fno, light[0])
     psfs = {}
     curves = {}
@@ -299,7 +318,7 @@ def sharpness(run, geo, fields, light, quick, at_m):
         psfs[f"{degrees(field)}, {how}"] = psf
         given = geo, field, frequency, light
         if steep:
-            curve = ideal * analysis.geometric_mtf(*given, 96, True, at_m=at_m)
+            curve = ideal * analysis.geometric_mtf(*given, vignetting=True, at_m=at_m)
         else:
             cells = 256 if quick else MOST_CELLS
             curve = analysis.diffraction_mtf(*given, cells, True, at_m=at_m)

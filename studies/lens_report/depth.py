@@ -9,14 +9,16 @@ from codesign.lens.distance import vergence_per_mm
 from codesign.report import lens_curves
 
 
-def depth(run, geo, fields, wavelength_um, distances):
+def depth(run, geo, fields, light, distances):
     """Depth of field of the film as it stands, hyperfocal distance, and spots at the distances
     asked for."""
+    wavelength_um = light[0]
     blur_mm = run.config.blur_um * 1e-3
     run.section(
         "Over the distance",
         f"A point is sharp enough where its blur disc is at most {run.config.blur_um:g} µm across: of paraxial rays, "
-        "and of traced ones by the RMS spot of such a disc. Metres from the entrance pupil.",
+        f"and of traced ones by the RMS spot of such a disc, both at {wavelength_um * 1e3:.0f} nm. Metres from the "
+        "entrance pupil.",
     )
     limits = []
     refused = []
@@ -50,10 +52,20 @@ def depth(run, geo, fields, wavelength_um, distances):
             "Depth of field on the axis", ("rays", "near (m)", "far (m)", "sharpest (m)"), limits
         )
     run.text(" ".join(refused))
-    spots = analysis.rms_spot_mm(geo, fields, wavelength_um, at_m=distances, vignetting=True)
-    sizes = (1e3 * spots).tolist()
+    sizes = [
+        [
+            1e3
+            * float(
+                analysis.spot_radius_mm(
+                    *analysis.polychromatic_spot(geo, f, light, vignetting=True, at_m=d)
+                )
+            )
+            for f in fields
+        ]
+        for d in distances
+    ]
     run.table(
-        f"RMS spot (µm) at {wavelength_um * 1e3:.0f} nm, film where it stands",
+        "RMS spot, all wavelengths (µm), film where it stands",
         ("object at (m)", *(f"{math.degrees(f):.3g}°" for f in fields)),
         [(f"{d:g}", *(f"{v:.2f}" for v in row)) for d, row in zip(distances, sizes, strict=True)],
     )
@@ -68,5 +80,6 @@ def depth(run, geo, fields, wavelength_um, distances):
         run.figure(
             lens_curves.depth_curves(geo, fields, nearest, math.inf, blur_mm, wavelength_um),
             "depth",
-            "RMS spot over the distance of the object; dashed: that of a disc of the blur allowed.",
+            f"RMS spot at {wavelength_um * 1e3:.0f} nm over the distance of the object; dashed: that of a disc of the blur "
+            "allowed.",
         )

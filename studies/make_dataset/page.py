@@ -109,7 +109,7 @@ def show(run, names, spent, wall_s, frames_made):
         "next frame (hue: direction, saturation: length, full at the longest), depth (dark is near)."
     )
     sheet = {name.removeprefix("sequence_"): _pictures(folder) for name, folder in folders.items()}
-    run.figure(pictures(sheet), "contact_sheet", text)
+    run.figure(pictures(sheet, flow=True), "contact_sheet", text)
     run.table("Every sequence", *table(rows, **COLUMNS))
     times = [
         {"part": part, "seconds": seconds, "ms per frame": 1e3 * seconds / max(frames_made, 1)}

@@ -254,4 +254,4 @@ def pictures(job, scores):
         shown["truth"] = np.where(truth.valid[0].numpy()[..., None], shown["truth"], 0.6)
         label = f"{name}, up to {longest:.1f} px"
         rows[label] = {"events": (counts[0] - counts[1]).sum(0), **shown}
-    return show_pictures(rows, signed=["events"])
+    return show_pictures(rows, signed=["events"], flow=True)

@@ -75,6 +75,15 @@ def test_a_concentric_mirror_has_its_image_on_a_sphere():
     close(analysis.distortion_percent(geo, fields, "f-theta"), truth, atol=1e-11)
 
 
+@pytest.mark.parametrize("wavelength_um", LINES)
+def test_distortion_goes_with_the_square_of_the_field_on_a_film_out_of_focus(wavelength_um):
+    # the third order: S_V of the field's cube over the height
+    geo, fields = lens.load("la1509").focus_at(1.0).freeze(), (1e-3, 1e-2, 0.1)
+    for at_m in (0.3, math.inf):
+        found = analysis.distortion_percent(geo, fields, wavelength_um=wavelength_um, at_m=at_m)
+        close(found / f64(fields).square(), found[1].expand(3) / fields[1] ** 2, 0.1)
+
+
 def test_fans_show_lateral_colour_about_a_common_point():
     geo = lens.load("cooke-triplet")
     field = half_field("cooke-triplet")

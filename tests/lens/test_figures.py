@@ -74,7 +74,9 @@ FIGURES = {
     "axial colour": lambda geo, at_m: analysis.chromatic_focus_shift_mm(geo, [0.48], at_m=at_m),
     "encircled": lambda geo, at_m: analysis.encircled_radius_mm(geo, 0.15, grid=8, at_m=at_m),
     "polychromatic spot": polychromatic_spot,
-    "geometric MTF": lambda geo, at_m: analysis.geometric_mtf(geo, 0.15, [5.0], grid=8, at_m=at_m),
+    "geometric MTF": lambda geo, at_m: analysis.geometric_mtf(geo, 0.15, [5.0], at_m=at_m),
+    # an object at 0.9 m asks for 128 cells
+    "fine geometric MTF": lambda geo, at_m: analysis.geometric_mtf(geo, 0.15, [15.0], at_m=at_m),
     "through focus": lambda geo, at_m: analysis.through_focus_spot_mm(
         geo, FIELDS, [0.1], grid=8, at_m=at_m
     ),
@@ -137,7 +139,8 @@ def test_gradients_of_figures_to_the_lens_are_those_of_differences(name, triplet
     )
 
 
-@pytest.mark.parametrize("name", [*FIGURES, *FOCUSED])
+# a chief ray, and its distortion, is the same at every distance
+@pytest.mark.parametrize("name", [name for name in ALL if name not in {*STILL, "distortion"}])
 def test_gradients_of_figures_to_the_distance_are_those_of_differences(name, triplet):
     geo = triplet.focus_at(1.0) if name in FOCUSED else triplet
     step, rel = (1e-5, 1e-6) if name == "MTF" else STEPS.get(name, (1e-4, 1e-6))

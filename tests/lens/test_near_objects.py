@@ -141,9 +141,8 @@ def paraxial(system, at_m):
         k: np.array([ld.field_rays(system, k, f, CENTRE, at).position[0, 1] for f in FIELDS])
         for k in LINES
     }
-    ideal = (
-        -at / ld.paraxial(system, "d", at - ld.entrance_pupil(system), 1)[1][-1] * np.tan(L(FIELDS))
-    )
+    y, nu = ld.paraxial(system, "d", -ld.entrance_pupil(system), 1)
+    ideal = (y[-1] + system.thickness[-1] * nu[-1] / system.index["d"][-1]) * np.tan(L(FIELDS))
     shifts = np.stack([ld.focus_shifts(system, f, at) for f in FIELDS])
     film = {k: ld.crossing(system, k, at) for k in LINES}
     return {

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from codesign import lens
+from codesign.errors import DomainError
 from codesign.lens import GeoLens, Surface, analysis
 from codesign.lens.analysis import (
     diffraction_mtf,
@@ -100,6 +101,22 @@ def test_the_geometric_mtf_is_the_transform_of_the_spot():
     truth = torch.where(x == 0, 1.0, 2 * torch.special.bessel_j1(x) / torch.where(x == 0, 1, x))
     found = geometric_mtf(paraboloid(defocus_mm=0.05), 0.0, frequency, grid=256)
     close(found, truth.abs().expand(2, -1), atol=2e-3)
+
+
+@torch.no_grad()
+def test_the_geometric_mtf_takes_the_cells_that_its_frequencies_ask_for():
+    # rays of a disc 1 mm across, far beyond the zeros of 2 J1(x) / x, where coarse sums alias
+    geo, frequency = paraboloid(defocus_mm=20.0), f64([5.0, 20.0, 40.0])
+    x = 2 * math.pi * 20.0 * 2.5 / 100 * frequency
+    truth = (2 * torch.special.bessel_j1(x) / x).abs()
+    close(geometric_mtf(geo, 0.0, frequency), truth.expand(2, -1), atol=2e-3)
+    # where 64 suffice it is their sum
+    close(geometric_mtf(geo, 0.0, [5.0]), geometric_mtf(geo, 0.0, [5.0], grid=64), atol=0)
+    with pytest.raises(DomainError, match=r"64 rays .* lie up to 0\.0156 mm .* use grid=None"):
+        geometric_mtf(geo, 0.0, frequency, grid=64)
+    with pytest.raises(DomainError, match=r"1024 rays .* use fewer line pairs per mm"):
+        geometric_mtf(geo, 0.0, [400.0])
+    assert geometric_mtf(geo, 0.0, [0.0], grid=1).tolist() == [[1.0], [1.0]]
 
 
 def test_several_wavelengths():

@@ -139,7 +139,9 @@ def test_seidel_sums(page, geo, name):
 def test_distortion_and_colour(page, geo, name):
     field, others_um = half_field(name), [lens.WAVELENGTH_UM[line] for line in "FC"]
     truth = page["distortion_full_field_d"]["percent"]
-    close(analysis.distortion_percent(geo, [field])[0], truth, atol=1e-9)
+    # published against f tan, on a film a little out of focus
+    ideal = geo.first_order().efl_mm * math.tan(field)
+    close(100 * (analysis.chief_height_mm(geo, [field])[0] / ideal - 1), truth, atol=1e-9)
     chiefs = (row for row in page["rays"] if row["px"] == row["py"] == 0 and row["H"] == 1)
     height = {row["w"]: float(row["mp30"]["y"]) for row in chiefs}
     # the reference pupil is rounded to 1e-9

@@ -330,10 +330,14 @@ def test_figures_hold_what_they_are_given():
     assert (left.get_xscale(), left.get_yscale(), right.get_yscale()) == ("log", "log", "linear")
     assert [np.asarray(line.get_ydata()).tolist() for line in left.lines] == [[3, 4], [2, 2]]
     image = np.linspace(0, 1, 12).reshape(3, 4)
+    assert left.get_legend() is None is right.get_legend()
+    ticks = [label.get_text() for label in left.get_yticklabels(minor=True)]
+    assert any(ticks), "a short axis has numbers"
     grid = show.pictures(
         {"r": {"i": image, "s": image - 0.5}, "q": {"i": np.ones((3, 4, 3))}}, signed=["s"]
     )
     assert [axis.axison for axis in grid.axes] == [True, True, True, False]
+    assert [axis.get_title() for axis in grid.axes] == ["i", "s", "", ""]
     low, high = grid.axes[1].images[0].get_clim()
     assert low == -high == pytest.approx(-0.5, abs=0.01)
     drawn = show.bars({"a": 2.0, "b": Interval(1, 0.5, 2, 9)}, "s", log=True, level=1.5)

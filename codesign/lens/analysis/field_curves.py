@@ -26,7 +26,7 @@ from codesign.lens.analysis.wavefront import path_difference_mm
 from codesign.lens.distance import PARALLEL, Distances, one_distance, vergence_per_mm
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import D_UM
-from codesign.lens.paraxial import image_place_mm, image_scale_mm
+from codesign.lens.paraxial import chief_scale_mm, image_place_mm
 from codesign.lens.traced import in_float64
 
 
@@ -83,20 +83,22 @@ def distortion_percent(
     wavelength_um: float = D_UM,
     at_m: Distances = PARALLEL,
 ) -> Tensor:
-    """100 (y / (f m(field)) - 1) of the real chief ray, [F] percent, [D, F] for D distances; 0 on
-    the axis.
+    """100 (y / (s m(field)) - 1) of the real chief ray's height y, [F] percent, [D, F] for D
+    distances; 0 on the axis and, as a limit, near it.
+
+    s is the height of the paraxial chief ray per tangent on the same image plane: a plane out of
+    focus makes a picture larger or smaller, which is no distortion. Where the plane is in focus, s
+    is the focal length (parallel light) or magnification x distance (``paraxial.image_scale_mm``).
 
     Args:
       mapping: "f-tan" (a picture without distortion) or "f-theta" (a scan lens or fisheye).
-      at_m: metres to the object plane. f is the height of the paraxial image of that plane per
-        tangent: the focal length for parallel light. On a film that is not focused there
-        (``GeoLens.focus_at``) the change of scale by defocus is part of the figure.
-    Gradient: to every lens tensor and to at_m. Raises: DomainError for another mapping, or when a
-      chief ray does not arrive.
+      at_m: metres to the object plane; the chief ray and its distortion are the same at every
+        distance.
+    Gradient: to every lens tensor. Raises: DomainError for another mapping, or when a chief ray
+      does not arrive.
     """
     check_choice(mapping, "mapping", MAPPINGS)
-    scale = image_scale_mm(lens, vergence_per_mm(lens, at_m), wavelength_um)
-    ideal = scale[..., None] * torch.tensor(
+    ideal = chief_scale_mm(lens, wavelength_um) * torch.tensor(
         [MAPPINGS[mapping](float(field)) for field in fields_rad],
         dtype=lens.dtype,
         device=lens.curvature_per_mm.device,

@@ -10,14 +10,17 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.lens.analysis.rays import Light, Values
-from codesign.lens.analysis.spots import lit_points
+from codesign.lens.analysis.rays import Light, Values, pupil_grid
+from codesign.lens.analysis.spots import polychromatic_spot
 from codesign.lens.diffraction.pupil import pupil_functions
 from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import D_UM
 
 PADDING = 2  # the line spread is then free of aliasing up to the cut-off
+PERIOD_SHARE = 0.25  # of a period of the pattern, that neighbouring rays may lie apart
+CELLS = (64, 128, 256, 512, 1024)  # across the pupil, tried in turn
+PHASES = 2**24  # of frequencies times rays, held at a time
 
 
 def ideal_mtf(
@@ -66,7 +69,7 @@ def geometric_mtf(
     field_rad: float,
     frequency_per_mm: Values,
     light: Light = D_UM,
-    grid: int = 64,
+    grid: int | None = None,
     vignetting: bool = False,
     at_m: float | Tensor = PARALLEL,
 ) -> Tensor:
@@ -74,16 +77,50 @@ def geometric_mtf(
     Arguments and gradient as for ``diffraction_mtf``.
 
     Multiply by ``ideal_mtf`` for the usual estimate between the two limits.
+
+    Args:
+      grid: pupil cells across; None takes the first of 64, 128, ... 1024 at which neighbouring rays
+        lie at most a quarter of a period of the highest frequency apart: coarser sums alias.
+    Raises: DomainError where the grid, or the finest one, is too coarse for the frequencies.
     """
     frequency = _frequencies(lens, frequency_per_mm)
-    points, weight = lit_points(lens, field_rad, light, grid, vignetting, at_m)
-    away = points - (points * weight[:, None]).sum(0)
+    highest = max(frequency.tolist(), default=0.0)
+    for cells in CELLS if grid is None else (grid,):
+        points, weight = polychromatic_spot(lens, field_rad, light, cells, vignetting, at_m)
+        lit = weight.detach() > 0
+        step_mm = _largest_step_mm(points.detach(), lit, cells)
+        if not highest or step_mm * highest <= PERIOD_SHARE:
+            return _transform(points[lit], weight[lit], frequency)
+    remedy = "use fewer line pairs per mm or a sharper image" if grid is None else "use grid=None"
+    raise DomainError(
+        f"{lens.name}: {cells} rays across the pupil lie up to {step_mm:.3g} mm apart in the image, too far "
+        f"for {highest:.4g} line pairs per mm (at most {PERIOD_SHARE / step_mm:.3g}); {remedy}."
+    )
+
+
+def _largest_step_mm(points_mm, lit, cells):
+    """Largest distance in x or y between neighbours of a ``pupil_grid`` that both arrive, of points
+    [W, M, 2] and lit [W, M]; infinite where none has a neighbour."""
+    pupil = pupil_grid(cells, torch.float64, points_mm.device)
+    column, row = ((pupil + 1) / 2 * cells).long().unbind(1)
+    places = points_mm.new_full((len(points_mm), cells, cells, 2), math.nan)
+    places[:, row, column] = torch.where(lit[..., None], points_mm, math.nan)
+    steps = torch.cat([places.diff(dim=axis).abs().flatten() for axis in (1, 2)])
+    known = steps[steps.isfinite()]
+    return float(known.max()) if len(known) else math.inf
+
+
+def _transform(points_mm, weight, frequency):
+    """|Mean of exp(-2 pi i frequency x)| of points [N, 2] of weights [N], [2, K]."""
+    away = points_mm - (points_mm * weight[:, None]).sum(0)
     found = []
     for axis in (1, 0):
-        phase = 2 * math.pi * frequency[:, None] * away[:, axis]
-        found.append(
-            torch.complex((phase.cos() * weight).sum(1), -(phase.sin() * weight).sum(1)).abs()
-        )
+        parts = []
+        for some in frequency.split(max(1, PHASES // len(weight))):
+            phase = 2 * math.pi * some[:, None] * away[:, axis]
+            cosine, sine = (phase.cos() * weight).sum(1), (phase.sin() * weight).sum(1)
+            parts.append(torch.complex(cosine, -sine).abs())
+        found.append(torch.cat(parts))
     return torch.stack(found)
 
 
