@@ -29,14 +29,16 @@ ON_FRAMES = ("fno", *BLOCKS["sensor"], *BLOCKS["network"])
 
 
 class Objective:
-    """drawn: worlds and drives. trend: what flow's precision does, learnt on the way.
+    """drawn: worlds and drives. penalised: with what is required, or errors alone. trend: what
+    flow's precision does, learnt on the way.
 
     Of the numbers that act on recorded frames one takes its turn in every call; the others keep the
     slope that they had.
     """
 
-    def __init__(self, drawn: Drawn) -> None:
+    def __init__(self, drawn: Drawn, penalised: bool = True) -> None:
         self.drawn = drawn
+        self.penalised = penalised
         self.space = drawn.space
         self.trend = PrecisionTrend()
         self._known: dict[int, float] = {}
@@ -65,7 +67,7 @@ class Objective:
         for k in again:
             slope[k] += self._known[k]
         value = float(looked.expected.mean())
-        penalty = self.penalty(share)
+        penalty = self.penalty(share) if self.penalised else 0.0
         if penalty and moved:
             slope[moved] += self._differences(
                 share, moved, PENALTY_STEP, looked.whole, self._penalties

@@ -62,7 +62,7 @@ def slopes(
 
     @cache
     def objective(place):
-        found = Objective(drawn)
+        found = Objective(drawn, penalised=False)
         for draw in range(1, LEARNT + 1):
             found(at[place], drawn.draw(FIRST - draw), free)
         return found

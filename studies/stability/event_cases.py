@@ -167,7 +167,7 @@ THETA, THRESHOLDS, NUDGE = Span(0.05, 0.4), Span(1, 20), Span(0, 0, (2,))
 RISING = {"theta": THETA, "thresholds": THRESHOLDS, "nudge": NUDGE}
 BRIGHT = RISING | {"first": Span(1e2, 1e30, log=True)}
 DIM = RISING | {"theta": Span(1e-4, 1e-3, log=True), "thresholds": Span(100, 900)}
-HIGH = {"theta": Span(1e2, 1e6, log=True), "gray": Span(50, 90), "nudge": Span(5, 50)}
+HIGH = {"theta": Span(2, 10), "gray": Span(50, 90), "nudge": Span(5, 50)}
 TURN = RISING | {"thresholds": Span(2, 20), "share": Span(0, 0.99), "nudge": Span(0, 0, (3,))}
 GRAYS = Span(21, 254), Span(0, 0), Span(255, 255), Span(1e-320, 1e-39, log=True)
 NAMES = "flat scene", "black frames", "clipped frames", "denormals"

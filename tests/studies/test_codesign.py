@@ -263,7 +263,7 @@ def test_slopes_of_a_resumed_run_are_those_of_one_in_one_go(space, tmp_path, mon
     """Of an objective whose slope is the draws that it learnt from: the same for every draw."""
 
     class Learning:
-        def __init__(self, drawn):
+        def __init__(self, drawn, penalised):
             self.learnt = []
 
         def __call__(self, share, draw, free, learn=True):
