@@ -9,6 +9,7 @@ its flow was read short, and solves again.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -190,6 +191,7 @@ def _blur_px(camera, pixels, base, slope, base_step, slope_step, nearness):
     return ((shift.square().sum(-2) * share).sum(-1) + 1e-12).sqrt()
 
 
+@cache
 def _pupil():
     """Points [24, 2] of the unit disc and their shares [24] of it."""
     node, weight = np.polynomial.legendre.leggauss(RINGS)  # in the square of the radius

@@ -154,12 +154,13 @@ def study(run: Run[Config]) -> None:
     judge = Judge(space, size.judged_worlds, size.judged_drives)
     rows = raced(run, judge, setting) if size.seeds else []
     said = page.lead(run, space, rows, judge)
+    answer = best_joint(drawn, rows) if rows and (size.couplings or size.slopes) else gates.best
     if rows and size.couplings:
-        around(run, drawn, rows, setting["near"])
+        around(run, drawn, rows, answer, setting["near"])
     page.looked(run, space, gates)
     if size.slopes:
-        place = {"answer": best_joint(drawn, rows)} if rows else {"best": gates.best}
-        places = {**place, "start": start(space, size.seed, setting["near"])}
+        first = start(space, size.seed, setting["near"])
+        places = {"answer" if rows else "best": answer, "start": first}
         slopes.show(run, space, slopes.slopes(run, space, drawn, places, size.slopes))
     if rows:
         page.designs(run, space, rows)
@@ -185,11 +186,15 @@ def best_joint(drawn: Drawn, rows: Sequence[Row]) -> Tensor:
 
 
 def around(
-    run: Run[Config], drawn: Drawn, rows: Sequence[Row], near: Sequence[float] | None
+    run: Run[Config],
+    drawn: Drawn,
+    rows: Sequence[Row],
+    answer: Tensor,
+    near: Sequence[float] | None,
 ) -> None:
-    """Couplings around the joint answer of which least is expected, and what the orders would leave
+    """Couplings around the best joint answer [V], and what the orders would leave
     by them."""
-    at = best_joint(drawn, rows).clamp(couplings.STEP, 1 - couplings.STEP)
+    at = answer.clamp(couplings.STEP, 1 - couplings.STEP)
     seeds = dict.fromkeys(row["seed"] for row in rows)
     starts = [start(drawn.space, seed, near) for seed in seeds]
     measured = {arm: math.exp(-over.value) for arm, (over, _) in compared(rows).items()}

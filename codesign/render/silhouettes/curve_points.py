@@ -161,7 +161,7 @@ def _on_pieces(camera, view, curve, pieces, cameras, part, per_px, generator):
     # where the paraxial pupil is; the point's own ray then tells where the real one is
     viewpoint = _in_pupil(pose, pupil * view.viewpoint_m)
     y = apply(inverse(pose), curve.points(index, s, viewpoint)[:, None])[:, 0]
-    seen = images(camera, y, pupil, colour, _near_px(camera, y), STEP_PX, FOUND_PX)
+    seen = images(camera, y, pupil, colour, view.near_px(y), STEP_PX, FOUND_PX)
     found = seen.step_px < FOUND_PX
     real = _in_pupil(pose, y[:, :2] - seen.slope * y[:, 2:])
     viewpoint = torch.where(found[:, None], real, viewpoint)
@@ -176,18 +176,6 @@ def _on_pieces(camera, view, curve, pieces, cameras, part, per_px, generator):
 def _in_pupil(pose, place_m):
     """Points [n, 3] of the pupil's plane at [n, 2] in camera axes."""
     return pose[:, :3, 3] + (pose[:, :3, :2] @ place_m[..., None])[..., 0]
-
-
-def _near_px(camera, y):
-    """Film position [n, 2] px of points y [n, 3]: of the chief ray, of some across the film, that
-    points nearest to them. Light that goes from a point to the paraxial pupil may miss the film or
-    the lens: off the axis of a wide one the pupil is elsewhere."""
-    pixels = coarse_pixels(camera.film, 1 + camera.film.sensor_width_px // ACROSS)
-    rays = camera.chief_rays(pixels)
-    lit = rays.weight > 0
-    lit |= ~lit.any()  # all meet an obstruction
-    _, nearest = cKDTree(rays.direction[lit].numpy()).query(normalize(y, dim=1).numpy())
-    return pixels[lit][nearest]
 
 
 def known_beside(curve: Any, index: Tensor, y: Tensor, viewpoint: Tensor) -> tuple[Tensor, ...]:
@@ -229,6 +217,17 @@ class FieldOfView:
         # from the axis, of a unit point of the paraxial pupil; and of the real one, at most
         self.viewpoint_m = side * camera.aperture_m
         self.aperture_m = max(camera.aperture_m, float(self.shift.norm(dim=1).max()))
+        pixels = coarse_pixels(film, 1 + film.sensor_width_px // ACROSS)
+        rays = camera.chief_rays(pixels)
+        lit = rays.weight > 0
+        lit |= ~lit.any()  # all meet an obstruction
+        self._chief_px, self._chief = pixels[lit], cKDTree(rays.direction[lit].numpy())
+
+    def near_px(self, y: Tensor) -> Tensor:
+        """Film position [n, 2] px of points y [n, 3] in camera axes: of the chief ray, of some
+        across the film, that points nearest to them. Light that goes from a point to the paraxial
+        pupil may miss the film or the lens: off the axis of a wide one the pupil is elsewhere."""
+        return self._chief_px[self._chief.query(normalize(y, dim=1).numpy())[1]]
 
     @property
     def steepest(self) -> float:
