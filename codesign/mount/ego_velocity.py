@@ -11,7 +11,7 @@ read.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ from codesign.checks import check_finite, check_positive, check_whole
 from codesign.errors import DomainError
 from codesign.mount import unknown_depth
 from codesign.mount.depth import at_frame, ground_and_scene_depth, ground_depth, scene_depth
-from codesign.mount.observability import PLANAR, body_flow, flow_precision
+from codesign.mount.observability import PLANAR, flow_along, flow_precision, pixel_lines
 from codesign.mount.unknown_depth import UnknownDepth
 from codesign.render.moving import MovingScene
 from codesign.types import ChiefRayCamera, FlowField
@@ -86,6 +86,18 @@ class Readings:
         standard deviation."""
         miss = self.missed_px(velocity)
         return (miss[..., None, :] @ self.precision @ miss[..., :, None])[..., 0, 0]
+
+
+class _Looked(NamedTuple):
+    """Where N bodies are read. places: camera, pixels, poses and scene of a depth. told: flow,
+    precision, confidence."""
+
+    places: tuple[Any, ...]
+    told: tuple[Tensor, Tensor, Tensor]
+    lines: Any
+    mounts: Tensor
+    interval_s: float
+    windows: int
 
 
 class EgoVelocity:
@@ -169,6 +181,32 @@ class EgoVelocity:
 
         depth: other than the estimator believes in, such as ``mount.scene_depth`` for what is true.
         """
+        looked = self._looked(field, camera, scene, T_body_cam, T_world_cam, t_s)
+        known = depth or self.depth
+        return self._read(looked, known, known(*looked.places))
+
+    def read_beside_truth(
+        self, *given: Any, depths_m: tuple[Tensor, Tensor] | None = None
+    ) -> tuple[Readings, Readings]:
+        """``read`` by the depth that is believed, and the same points with the depths that they
+        have in the scene.
+
+        given: arguments of ``read`` but the last. depths_m: [N, P] m, believed and true, where they
+          are known; looked up when None, over flat ground by one cast of rays for both.
+        """
+        looked = self._looked(*given)
+        if depths_m is None and self.depth is scene_depth:
+            read = self._read(looked, scene_depth, scene_depth(*looked.places))
+            return read, read
+        if depths_m is None and self.depth is ground_depth:
+            depths_m = ground_and_scene_depth(*looked.places)
+        elif depths_m is None:
+            depths_m = self.depth(*looked.places), scene_depth(*looked.places)
+        believed, true = depths_m
+        return self._read(looked, self.depth, believed), self._read(looked, scene_depth, true)
+
+    def _looked(self, field, camera, scene, T_body_cam, T_world_cam, t_s=None):
+        """Where is read, whatever the depth there."""
         poses = T_world_cam.reshape(-1, *T_world_cam.shape[-3:])
         pixels, flow, precision, confidence = self._measured(field, camera, len(poses))
         frame, over = _middle(poses.shape[1], t_s, field.interval_s)
@@ -181,39 +219,35 @@ class EgoVelocity:
             .expand(*T_world_cam.shape[:-3], 4, 4)
             .reshape(-1, 4, 4)
         )
-        known = depth or self.depth
-        depth_m = known(camera, middle, poses[:, frame], at_frame(scene, frame))
-        rows, on_surface = self._rows(camera, depth_m, mounts, middle, field.interval_s)
+        return _Looked(
+            (camera, middle, poses[:, frame], at_frame(scene, frame)),
+            (flow, precision, confidence[..., 0]),
+            pixel_lines(camera, middle),
+            mounts,
+            field.interval_s,
+            _windows(camera),
+        )
+
+    def _read(self, looked, known, depth_m):
+        flow, precision, confidence = looked.told
+        rows, on_surface = self._rows(looked, depth_m)
         parallax = None
         if isinstance(known, UnknownDepth):
             nearest = torch.where(on_surface, known.nearest_m, torch.inf)
-            near, _ = self._rows(camera, nearest, mounts, middle, field.interval_s)
+            near, _ = self._rows(looked, nearest)
             parallax = (near - rows) / (1 / known.nearest_m - known.mean_per_m)
-        windows = _windows(camera)
-        share = INDEPENDENT * windows / flow.shape[1] * on_surface.to(flow)
+        share = INDEPENDENT * looked.windows / flow.shape[1] * on_surface.to(flow)
         return Readings(
-            middle, flow, precision, confidence[..., 0], depth_m, rows, share, windows, parallax
+            looked.places[1],
+            flow,
+            precision,
+            confidence,
+            depth_m,
+            rows,
+            share,
+            looked.windows,
+            parallax,
         )
-
-    def read_beside_truth(self, *given: Any) -> tuple[Readings, Readings]:
-        """``read`` by the depth that is believed, and the same points with the depths that they
-        have in the scene.
-
-        given: arguments of ``read`` but the last. Over flat ground rays are cast once for both
-          depths.
-        """
-        if self.depth is scene_depth:
-            read = self.read(*given)
-            return read, read
-        if self.depth is not ground_depth:
-            return self.read(*given), self.read(*given, depth=scene_depth)
-        depths: list[Tensor] = []
-
-        def believed(*places):
-            depths.extend(ground_and_scene_depth(*places))
-            return depths[0]
-
-        return self.read(*given, depth=believed), self.read(*given, depth=lambda *places: depths[1])
 
     def solve(self, read: Readings) -> Motion:
         """Least squares, reweighted for outliers. Gradient: all readings."""
@@ -300,9 +334,9 @@ class EgoVelocity:
         points = per_body(pixels[None].expand(count, *pixels.shape).flatten(0, 1))
         return points, flow, precision, confidence
 
-    def _rows(self, camera, depth, mounts, pixels, interval_s):
-        rows, seen = body_flow(camera, depth, mounts, pixels)
-        return rows[..., list(self.axes)] * interval_s, seen
+    def _rows(self, looked, depth_m):
+        rows, seen = flow_along(looked.lines, depth_m, looked.mounts)
+        return rows[..., list(self.axes)] * looked.interval_s, seen
 
 
 def _middle(frames: int, t_s: Tensor | None, interval_s: float) -> tuple[int, float]:

@@ -48,18 +48,30 @@ def body_flow(
     [-3, 0, 80, 7, -163, 0]
     """
     pixels = camera.film.pixels() if pixels is None else pixels
-    if depth_m.shape[-1:] != pixels.shape[-2:-1] or T_body_cam.shape[-2:] != (4, 4):
+    return flow_along(pixel_lines(camera, pixels), depth_m, T_body_cam)
+
+
+def pixel_lines(camera: ChiefRayCamera, pixels: Tensor) -> tuple[Tensor, ...]:
+    """``chief_lines`` of pixels [..., P, 2], in that shape."""
+    lines = chief_lines(camera, pixels.reshape(-1, 2))
+    return tuple(part.unflatten(0, pixels.shape[:-1]) for part in lines)
+
+
+def flow_along(
+    lines: tuple[Tensor, ...], depth_m: Tensor, T_body_cam: Tensor
+) -> tuple[Tensor, Tensor]:
+    """``body_flow`` along chief rays that are known (``pixel_lines``)."""
+    base, slope, base_step, slope_step = lines
+    count = slope.shape[-2]
+    if depth_m.shape[-1:] != (count,) or T_body_cam.shape[-2:] != (4, 4):
         raise ShapeError(
-            f"the flow of a body needs depths [..., {pixels.shape[-2]}] (one per pixel) and a mount [..., 4, 4], "
+            f"the flow of a body needs depths [..., {count}] (one per pixel) and a mount [..., 4, 4], "
             f"got {tuple(depth_m.shape)} and {tuple(T_body_cam.shape)}."
         )
     check_finite(T_body_cam, "T_body_cam")
     depth = depth_m.double()
     seen = depth.detach().isfinite() & (depth.detach() > 0)
     depth = torch.where(seen, depth, 1.0)[..., None]
-    base, slope, base_step, slope_step = (
-        part.unflatten(0, pixels.shape[:-1]) for part in chief_lines(camera, pixels.reshape(-1, 2))
-    )
     point = torch.cat([base + slope * depth, depth], -1)  # [..., P, 3]
     moving = _point_velocity(point, T_body_cam.double())  # [..., P, 3, 3]
     flow = flow_of_points(moving, slope, base_step + slope_step * depth[..., None])

@@ -4,7 +4,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from types import MappingProxyType
 from typing import Any
 
@@ -239,7 +239,7 @@ class Whole:
         if kind == "sensor":
             stage: nn.Module = events.HardSensor(self.sensor, bins, robot_pair.LEAD_S)
         else:
-            stage = events.Settled(events.layer("memory", self.sensor, learn=()), robot_pair.LEAD_S)
+            stage = _memory(self.sensor)
         most = costs.bus_hz * robot_pair.DURATION_S * OF_SENSOR
         return Exposed(stage, costs.gain(self.numbers["fno"]), most, WINDOWS)
 
@@ -262,3 +262,9 @@ class Whole:
             f"{of['z_m']:.3f} m pitch {math.degrees(of['pitch_rad']):.1f} deg, theta {of['theta']:.3f}, "
             f"{of['cutoff_hz']:.0f} Hz, prior {of['prior_px']:.1f} px"
         )
+
+
+@lru_cache(maxsize=4)
+def _memory(sensor):
+    """One stage for all designs of a sensor: it remembers the noise that it drew last."""
+    return events.Settled(events.layer("memory", sensor, learn=()), robot_pair.LEAD_S)

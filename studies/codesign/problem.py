@@ -166,10 +166,8 @@ class Drawn:
             covered = covered.repeat_interleave(each, 0).repeat(worlds, 1)
         else:
             covered = known.covered
-            read, true = (
-                estimator.read(*given, depth=lambda *places, depth_m=each.depth_m: depth_m)
-                for each in (known.read, known.surfaces)
-            )
+            depths_m = known.read.depth_m, known.surfaces.depth_m
+            read, true = estimator.read_beside_truth(*given, depths_m=depths_m)
         flow_px = (true.rows @ twist[:, None, :, None])[..., 0]
         surfaces = replace(read, depth_m=true.depth_m)
         return Seen(batch.twist, twist, read, surfaces, true.rows, flow_px, covered), rig.optics(

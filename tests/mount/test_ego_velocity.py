@@ -71,6 +71,9 @@ def test_readings_beside_the_truth_are_two_readings(camera, drive, depth):
     for found, asked in ((read, ours.read(*given)), (true, ours.read(*given, depth=scene_depth))):
         close(found.rows, asked.rows)
         close(found.depth_m, asked.depth_m)
+    again, still = ours.read_beside_truth(*given, depths_m=(read.depth_m, true.depth_m))
+    close(again.rows, read.rows)
+    close(still.rows, true.rows)
 
 
 def test_least_squares_written_out_with_covariance_and_confidence(camera, drive):
