@@ -38,7 +38,7 @@ BUDGETS = {
     "studies/make_dataset": 3_990,
     "studies/placement": 7_900,
     "studies/sensor_fit": 2_140,  # the best step, rates beside correlation
-    "studies/speed_error": 7_650,  # the same
+    "studies/speed_error": 7_900,  # growth of the whole chain
     "studies/spike_esim": 2_940,
     "studies/stability": 8_220,
     "studies/train_flow": 5_100,  # steps of a race
