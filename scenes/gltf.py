@@ -32,6 +32,7 @@ SHORTEST = 1e-3  # of a quaternion, whose length is 1
 OWN_BUFFER = "codesign:the binary chunk"
 # extensions that change neither shape nor base colour
 LIGHT_ONLY = ("KHR_materials_", "KHR_lights_", "KHR_xmp")
+DIFFUSE = "KHR_materials_pbrSpecularGlossiness"  # but this one, in which it is called diffuse
 # which change what is seen even where not required
 UNREAD = ("EXT_mesh_gpu_instancing", "KHR_texture_transform")
 
@@ -145,7 +146,10 @@ def _surfaces(tree, folder):
     pictures: dict[int, np.ndarray] = {}
     found = {}
     for number, material in enumerate(tree.get("materials", [])):
-        base = material.get("pbrMetallicRoughness", {})
+        older = material.get("extensions", {}).get(DIFFUSE, {})
+        base = material.get("pbrMetallicRoughness") or {
+            key.replace("diffuse", "baseColor"): value for key, value in older.items()
+        }
         factor = np.asarray(base.get("baseColorFactor", [1, 1, 1, 1]))[:3] @ textures.LUMINANCE
         texture = base.get("baseColorTexture")
         if texture is None:

@@ -246,6 +246,13 @@ def test_colours_of_16_bits_are_read_to_their_last_bit(tmp_path):
     assert part.colour == pytest.approx(levels[:3] / 65535, rel=1e-12)
 
 
+def test_a_diffuse_colour_of_the_older_extension_is_the_base_colour(tmp_path):
+    older = {"diffuseTexture": {"index": 0}, "diffuseFactor": [0.5, 0.5, 0.5, 1]}
+    given = [{"extensions": {"KHR_materials_pbrSpecularGlossiness": older}}]
+    [part] = mesh_files.read(write_gltf(tmp_path, "gltf", materials=given))
+    assert 2 + 253 * 2 * part.colour == pytest.approx(np.vectorize(radiance_of)(PICTURE))
+
+
 def test_every_file_of_materials_of_an_obj_is_read(tmp_path):
     for name in "12":
         (tmp_path / f"{name}.mtl").write_text(f"newmtl m{name}\nKd 0.{name} 0.{name} 0.{name}\n")
