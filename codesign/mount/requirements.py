@@ -333,7 +333,7 @@ class OwnBody:
         """[..., windows] share of the pixels of every window of the film, or of every so many in
         both directions, whose chief ray meets the body. No gradient."""
         size = camera.film.shape[-2:]
-        first = every_px // 2
+        first = min(every_px, *size) // 2
         pixels = camera.film.pixels().reshape(-1, *size, 2)[:, first::every_px, first::every_px]
         rays = camera.chief_rays(pixels.reshape(-1, 2))
         hits = hits_of(rays, self.scene, views_of(self.scene, T_body_cam.reshape(-1, 4, 4)).cameras)
