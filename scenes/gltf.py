@@ -25,10 +25,14 @@ MAGIC = b"glTF"
 WRAPS = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
 REPEAT = 10497  # where no sampler says
 FLOAT = 5126
+FAN = 6  # mode of a primitive
+FLOATING = {"POSITION", "TEXCOORD_0"}
+READ = FLOATING | {"COLOR_0", "indices"}
 SHORTEST = 1e-3  # of a quaternion, whose length is 1
 OWN_BUFFER = "codesign:the binary chunk"
 # extensions that change neither shape nor base colour
 LIGHT_ONLY = ("KHR_materials_", "KHR_lights_", "KHR_xmp")
+DIFFUSE = "KHR_materials_pbrSpecularGlossiness"  # but this one, in which it is called diffuse
 # which change what is seen even where not required
 UNREAD = ("EXT_mesh_gpu_instancing", "KHR_texture_transform")
 
@@ -92,22 +96,32 @@ def _tree(data, folder):
 
 
 def _check_read(path, tree):
-    used = {
+    """Refuse what trimesh would leave out or read as something else. Coloured vertices without a
+    material get the standard's own, white: without one trimesh cuts their colours to 8 bits."""
+    found = {
         name for name in tree.get("extensionsRequired", []) if not name.startswith(LIGHT_ONLY)
     } | {name for name in tree.get("extensionsUsed", []) if name in UNREAD}
-    if used:
+    materials, meshes = (tree.setdefault(key, []) for key in ("materials", "meshes"))
+    for primitive in (each for mesh in meshes for each in mesh["primitives"]):
+        if primitive.get("mode") == FAN:
+            found.add("triangle fans")
+        if "COLOR_0" in primitive["attributes"]:
+            primitive.setdefault("material", len(materials))
+        numbers = {**primitive["attributes"], **primitive}
+        for name in READ & numbers.keys():
+            accessor = tree["accessors"][numbers[name]]
+            if "sparse" in accessor:
+                found.add("sparse accessors")
+            if name in FLOATING and accessor["componentType"] != FLOAT:
+                found.add(f"{name} in whole numbers")
+    materials.append({})
+    if any(any(each.get("weights", [])) for each in (*meshes, *tree.get("nodes", []))):
+        found.add("morph targets at work")
+    if found:
         raise FileFormatError(
-            f"mesh '{path}' needs {', '.join(sorted(used))}, which is not read here; export it without compression, "
-            "instancing and texture transforms."
+            f"mesh '{path}' needs {', '.join(sorted(found))}, which is not read here; export it without compression, "
+            "quantisation, instancing, texture transforms and shape keys, as plain triangles."
         )
-    for mesh in tree.get("meshes", []):
-        for primitive in mesh["primitives"]:
-            for attribute in ("POSITION", "TEXCOORD_0"):
-                number = primitive["attributes"].get(attribute)
-                if number is not None and tree["accessors"][number]["componentType"] != FLOAT:
-                    raise FileFormatError(
-                        f"mesh '{path}' has its {attribute} in whole numbers; export it without quantisation."
-                    )
 
 
 def _check_nodes(nodes):
@@ -132,7 +146,10 @@ def _surfaces(tree, folder):
     pictures: dict[int, np.ndarray] = {}
     found = {}
     for number, material in enumerate(tree.get("materials", [])):
-        base = material.get("pbrMetallicRoughness", {})
+        older = material.get("extensions", {}).get(DIFFUSE, {})
+        base = material.get("pbrMetallicRoughness") or {
+            key.replace("diffuse", "baseColor"): value for key, value in older.items()
+        }
         factor = np.asarray(base.get("baseColorFactor", [1, 1, 1, 1]))[:3] @ textures.LUMINANCE
         texture = base.get("baseColorTexture")
         if texture is None:

@@ -28,6 +28,18 @@ KINDS = (".obj", ".ply", ".stl", ".dae", ".gltf", ".glb")
 MOST_FACES = 4_000_000  # some 10 s to read; their silhouettes take minutes and GiB
 MOST_BYTES = 1 << 30
 UNCOLOURED = 0.5  # linear luminance of what says none
+LIBRARY = "codesign:all materials"
+# what trimesh would read as something else
+MISREAD = {
+    ".obj": (
+        rb"^f(?=[ \t])[^\n]*?[ \t/](-\d+|0+)(?=[ \t/\r\n]|$)",
+        "a face with index {}; indices must count from 1, so export it anew",
+    ),
+    ".ply": (
+        rb"^property[ \t]+(ushort|uint16)[ \t]+(?:red|green|blue)\b",
+        "colours of the type {}; export them as uchar, or as float from 0 to 1",
+    ),
+}
 # rows: the axes x, y, z here in terms of the file's; x_up and y_up as COLLADA 1.4 names right, up
 # and in
 AXES = {
@@ -97,8 +109,10 @@ def read(
         data = path.read_bytes()
     told = _faces_told(kind, data)
     _check_count(path, told)
-    if kind == ".obj":
-        _check_obj(path, data)
+    if kind in MISREAD:
+        pattern, sentence = MISREAD[kind]
+        if wrong := re.search(pattern, data, re.MULTILINE):
+            raise FileFormatError(f"mesh '{path}' has {sentence.format(wrong[1].decode())}.")
     scene = _loaded(path, data, folder, ".gltf" if surfaces is not None else kind, materials)
     if materials:
         folder.check()
@@ -165,14 +179,13 @@ def _check_count(path, count):
         )
 
 
-def _check_obj(path, data):
-    """What trimesh would read as something else: indices of 0, and those that count back from the
-    line."""
-    wrong = re.search(rb"^f(?=[ \t])[^\n]*?[ \t/](-\d+|0+)(?=[ \t/\r\n]|$)", data, re.MULTILINE)
-    if wrong:
-        raise FileFormatError(
-            f"mesh '{path}' has a face with index {wrong[1].decode()}; indices must count from 1, so export it anew."
-        )
+def _one_library(data, folder):
+    """An .obj that names one file of materials for all it names: trimesh reads the first alone."""
+    names = dict.fromkeys(re.findall(rb"^mtllib[ \t]+(.*?)[ \t\r]*$", data, re.MULTILINE))
+    if len(names) < 2:
+        return data
+    folder.given[LIBRARY] = b"\n".join(folder.get(name.decode()) for name in names)
+    return f"mtllib {LIBRARY}\n".encode() + data
 
 
 def _loaded(path, data, folder, kind, materials):
@@ -188,6 +201,8 @@ def _loaded(path, data, folder, kind, materials):
             reading(f"mesh '{path}'", f"export it anew as {path.suffix[1:].upper()}"),
             warnings.catch_warnings(),
         ):
+            if kind == ".obj" and materials:
+                data = _one_library(data, folder)
             # numpy reads numbers as far as it can, and only warns
             warnings.filterwarnings("error", message=".*could not be read to its end")
             return trimesh.load_scene(
@@ -243,16 +258,21 @@ def _coloured(where, name, vertices, faces, whole, visual, surfaces):
     plain = np.full(len(faces), UNCOLOURED)
     kind = None if visual is None else visual.kind
     if kind == "face":
-        of_face = _vertex_colour(np.asarray(visual.face_colors)[whole], False)
-        return Part(name, vertices, faces, of_face)
+        colours = visual.face_colors
+        if len(colours) != len(whole):
+            raise FileFormatError(
+                f"{where}: it has colours of {len(colours)} faces, which are {len(whole)} triangles; export triangles."
+            )
+        return Part(name, vertices, faces, _from_srgb(colours[whole]))
     if kind == "vertex":
-        of_vertex = _vertex_colour(visual.vertex_colors, surfaces is not None)
-        return Part(name, vertices, faces, of_vertex, smooth=True)
+        return Part(name, vertices, faces, _from_srgb(visual.vertex_colors), smooth=True)
     if kind != "texture":
         return Part(name, vertices, faces, plain, coloured=False)
     surface = surfaces[visual.material.name] if surfaces else _surface(visual.material)
     tint = visual.vertex_attributes.get("color") if surfaces is not None else None
-    tint = None if tint is None else _vertex_colour(tint, True)
+    if tint is not None:
+        scale = np.iinfo(tint.dtype).max if tint.dtype.kind == "u" else 1.0
+        tint = tint[:, :3].astype(np.float64) / scale @ textures.LUMINANCE
     if surface.picture is None:
         if tint is None:
             return Part(name, vertices, faces, plain * 0 + surface.factor)
@@ -271,14 +291,9 @@ def _coloured(where, name, vertices, faces, whole, visual, surfaces):
     return Part(name, vertices, faces, surface.factor * surface.picture, uv, wrap=surface.wrap)
 
 
-def _vertex_colour(values, is_linear):
-    """Luminance [V] of colours [V, 3 or 4] of vertices or faces, of whole numbers of 8 or 16 bits
-    or of 0..1."""
-    values = np.asarray(values)[:, :3]
-    if not is_linear:
-        return textures.linear(values[:, None])[:, 0]
-    scale = np.iinfo(values.dtype).max if values.dtype.kind == "u" else 1.0
-    return values.astype(np.float64) / scale @ textures.LUMINANCE
+def _from_srgb(colours):
+    """Linear luminance [N] of colours [N, 4] of 8 bits."""
+    return textures.linear(colours[:, None, :3])[:, 0]
 
 
 def _surface(material: Any) -> gltf.Surface:

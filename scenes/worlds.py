@@ -138,6 +138,8 @@ def room(
             f"room: its objects need {' x '.join(map(str, OBJECTS_M))} m, got {' x '.join(map(str, size_m))} m; "
             "make it larger, or leave them out with objects=False."
         )
+    if not photos:
+        raise DomainError("room: there are no photos; give at least one picture.")
     mi = backend.mitsuba(device)
     pictures = [textures.faded_to(textures.picture(p), PAINT) for p in photos]
     paints = [Paint(pictures[i % len(pictures)], glow=250.0 * (i == 5)) for i in range(6)]

@@ -172,7 +172,7 @@ class LookAhead:
     def angles(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
         """By how much each pixel [..., P] looks beyond the distance: the sine of the angle between
         its ray and the plane through the line at that distance and the camera, or the vertical
-        plane across, whichever is smaller."""
+        plane across, whichever is smaller; of a camera beyond that line, the latter."""
         if not hasattr(camera, "chief_rays"):
             raise DomainError(
                 "look-ahead: it looks through the camera; give one with chief rays, as render.Camera."
@@ -183,7 +183,7 @@ class LookAhead:
         direction = rays.direction.double() @ pose[..., :3, :3].mT
         forward = direction[..., 0]
         origin = pose[..., None, :3, 3] + rays.origin_m.double() @ pose[..., :3, :3].mT
-        before = self.distance_m - origin[..., 0]
+        before = (self.distance_m - origin[..., 0]).clamp_min(0)
         height = origin[..., 2] - self.ground_z_m
         line_m = torch.hypot(height, before).clamp_min(1e-9)
         over = (height * forward + before * direction[..., 2]) / line_m
@@ -333,7 +333,7 @@ class OwnBody:
         """[..., windows] share of the pixels of every window of the film, or of every so many in
         both directions, whose chief ray meets the body. No gradient."""
         size = camera.film.shape[-2:]
-        first = every_px // 2
+        first = min(every_px, *size) // 2
         pixels = camera.film.pixels().reshape(-1, *size, 2)[:, first::every_px, first::every_px]
         rays = camera.chief_rays(pixels.reshape(-1, 2))
         hits = hits_of(rays, self.scene, views_of(self.scene, T_body_cam.reshape(-1, 4, 4)).cameras)

@@ -69,8 +69,7 @@ def psf_frames(
     views = views_of(scene, T_world_cam, psf.sharp)
     light, per_m = light_and_nearness(psf.sharp, views)
     lit = (psf.sharp.weight.detach() > 0).to(light)
-    numbers, step = _layers(psf, per_m.detach(), lit)
-    found = [_frame(psf, *frame, lit, numbers, step) for frame in zip(light, per_m, strict=True)]
+    found = [_frame(psf, *frame, lit) for frame in zip(light, per_m, strict=True)]
     return torch.stack(found).reshape(*views.batch, *camera.film.shape)
 
 
@@ -95,8 +94,8 @@ def _check_map(psf, camera):
 
 
 def _layers(psf, per_m, lit):
-    """Layers of depth for what is seen, as numbers (near to far) of a step in 1 / distance: the
-    map's, halved while there are few. Raises: DomainError for surfaces nearer than the map's, or a
+    """Layers of depth for what one frame shows, as numbers (near to far) of a step in 1 / distance:
+    the map's, halved while there are few. Raises: DomainError for surfaces nearer than the map's, or a
     film without chief rays."""
     if not bool(lit.any()):
         raise DomainError(
@@ -117,9 +116,10 @@ def _layers(psf, per_m, lit):
     return numbers, step
 
 
-def _frame(psf, light, per_m, lit, numbers, step):
+def _frame(psf, light, per_m, lit):
     """One frame [*film.shape] of light and 1 / depth along the sharp picture's rays."""
     film = psf.camera.film
+    numbers, step = _layers(psf, per_m.detach(), lit)
     place = torch.tensor(list(numbers))[:, None].to(per_m)
     share = (1 - (per_m / step - place).abs()).clamp_min(0) * lit
     size = (film.height_px + 2 * psf.radius_px, film.width_px + 2 * psf.radius_px)

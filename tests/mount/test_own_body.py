@@ -64,7 +64,8 @@ def test_the_share_covered_is_told_by_window():
     tilt = torch.tensor(0.05, dtype=D, requires_grad=True)
     level = Mount((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     numbers = torch.stack([*torch.zeros(3, dtype=D), tilt, *torch.zeros(2, dtype=D)])
-    covered = OwnBody(sheet((-9, 0), (9, 9)), 0.5).covered(level(numbers), camera)
+    required = OwnBody(sheet((-9, 0), (9, 9)), 0.5)
+    covered = required.covered(level(numbers), camera)
     shift_px = 8.0 / 0.1 * torch.tan(tilt.detach())
     middle = (
         torch.tensor([8.0, 8.0, 32.0, 56.0]) - 32 - shift_px
@@ -73,6 +74,8 @@ def test_the_share_covered_is_told_by_window():
     assert torch.allclose(covered.detach().double(), exact.double(), atol=0.02)
     (slope,) = torch.autograd.grad(covered[2], tilt)
     assert float(slope) == pytest.approx(8.0 / 0.1 / 16, rel=0.03)
+    # one pixel of each, about its middle: the upper two windows
+    assert required.met(level(), camera, 40).sum() == 2
 
 
 def test_hits_are_those_of_the_triangles(rover):

@@ -67,9 +67,10 @@ def beyond(camera, T_body_cam, distance_m):
 @pytest.mark.parametrize("pitch_rad", [-0.4, 0.2, 0.6, 1.3])
 def test_what_looks_ahead_is_counted(camera, pitch_rad, angles):
     pose = mount_at(pitch_rad, (0.2, -0.1, HEIGHT), **angles)
-    counted = beyond(camera, pose, 2.0)
-    ahead = LookAhead(2.0, share=0.25)
-    assert torch.equal(ahead.angles(pose, camera) >= 0, counted)
+    for distance_m in (2.0, 0.15):  # the camera is beyond the latter
+        ahead = LookAhead(distance_m, share=0.25)
+        counted = beyond(camera, pose, distance_m)
+        assert torch.equal(ahead.angles(pose, camera) >= 0, counted)
 
 
 @pytest.mark.parametrize("share", [0.001, 0.1, 0.5, 0.77, 1.0])

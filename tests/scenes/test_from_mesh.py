@@ -232,6 +232,37 @@ def test_colours_of_faces_and_vertices_are_shown_in_the_light_of_a_plain_sky(tmp
     assert seen(scene, (0.5, 0, -0.5)) == pytest.approx(share * 100, rel=1e-5)
 
 
+def test_colours_of_16_bits_are_read_to_their_last_bit(tmp_path):
+    levels = np.array([13107, 655, 65535, 40000], dtype="<u2")  # where texture coordinates were
+    colours = {"bufferView": 1, "componentType": 5123, "count": 3, "type": "VEC4"}
+    path = write_gltf(
+        tmp_path,
+        "gltf",
+        uv=levels.repeat(4).view("<f4").reshape(4, 2),
+        meshes=[{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}}]}],
+        accessors=[{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}, colours],
+    )
+    [part] = mesh_files.read(path)
+    assert part.colour == pytest.approx(levels[:3] / 65535, rel=1e-12)
+
+
+def test_a_diffuse_colour_of_the_older_extension_is_the_base_colour(tmp_path):
+    older = {"diffuseTexture": {"index": 0}, "diffuseFactor": [0.5, 0.5, 0.5, 1]}
+    given = [{"extensions": {"KHR_materials_pbrSpecularGlossiness": older}}]
+    [part] = mesh_files.read(write_gltf(tmp_path, "gltf", materials=given))
+    assert 2 + 253 * 2 * part.colour == pytest.approx(np.vectorize(radiance_of)(PICTURE))
+
+
+def test_every_file_of_materials_of_an_obj_is_read(tmp_path):
+    for name in "12":
+        (tmp_path / f"{name}.mtl").write_text(f"newmtl m{name}\nKd 0.{name} 0.{name} 0.{name}\n")
+    path = tmp_path / "t.obj"
+    path.write_text(
+        "mtllib 1.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m2\nf 1 2 3\nmtllib 2.mtl\nusemtl m1\nf 3 2 1\n"
+    )
+    assert sorted(part.colour[0] for part in mesh_files.read(path)) == pytest.approx([0.1, 0.2])
+
+
 def cube(folder, kind, size=0.5):
     """A cube whose three lower coordinates are 0, facing outwards, written by hand as .obj or by
     trimesh."""
