@@ -222,8 +222,8 @@ class Verdict:
     kept: bool
 
     def __str__(self):
-        said = "kept with" if self.kept else "missed by"
-        return f"{self.name}: {said} {abs(self.slack):.3g} {self.unit}"
+        said, left = ("kept with", " to spare") if self.kept else ("missed by", "")
+        return f"{self.name}: {said} {abs(self.slack):.3g} {self.unit}{left}"
 
 
 @torch.no_grad()

@@ -131,7 +131,9 @@ def show(
         raise DomainError(f"nothing is known of how to draw {type(x).__name__}; give {HANDLED}.")
     if width_in is not None:
         width_in = check_number(width_in, "width_in", 1.0, 30.0, remedy="give it in inches")
-        figure.set_size_inches(width_in, figure.get_figheight() * width_in / figure.get_figwidth())
+        figure.set_size_inches(width_in, 1.0 + width_in * figure.bbox.height / figure.bbox.width)
+        figure.draw_without_rendering()
+        figure.set_figheight(figure.get_tightbbox().height + 0.1)
     if path is not None:
         write_atomic(Path(path), figure.image(Path(path).suffix[1:] or "png", 150))
     return figure
