@@ -253,7 +253,7 @@ def _chain(run):
         flows = {"flow, estimated": run["field"]}
         with suppress(CodesignError):  # a recording has no truth
             flows["flow, true"] = run["truth"]
-        fields = {title: _sample(field, 0) for title, field in flows.items()}
-        full = max(_longest(flow_px) for flow_px in fields.values())
-        parts += [(title, (flow_px, full), _flow) for title, flow_px in fields.items()]
+        known = {title: _sample(f, 0) for title, f in flows.items() if isinstance(f, FlowField)}
+        full = max(map(_longest, known.values()), default=1e-9)
+        parts += [(title, (flow_px, full), _flow) for title, flow_px in known.items()]
     return _row(parts)
