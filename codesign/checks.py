@@ -50,7 +50,9 @@ def check(
       shape.
     """
     if not isinstance(value, Tensor):
-        raise DomainError(f"{name} must be a torch tensor, got {shown(value)}.")
+        raise DomainError(
+            f"{name} must be a torch tensor, got {shown(value)}; see torch.as_tensor."
+        )
     if value.dtype not in dtypes if dtypes else not value.is_floating_point():
         wanted = (
             " or ".join(str(dtype).removeprefix("torch.") for dtype in dtypes)

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from codesign.checks import check_finite, check_number, check_positive
+from codesign.checks import check_finite, check_kind, check_number, check_positive
 from codesign.errors import DomainError, ShapeError
 from codesign.mount.body import Body, Housing
 from codesign.render import Camera, MitsubaScene, frames
@@ -71,6 +71,7 @@ class Clearance:
     def __post_init__(self):
         check_number(self.margin_m, "clearance: margin_m", 0.0)
         check_positive(self.step, "clearance: step")
+        check_kind(self.body, Body, "clearance: the body")
 
     def slack(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
         """[..., solids] m of clearance beyond the margin. Gradient: mount."""
@@ -222,8 +223,8 @@ class Verdict:
     kept: bool
 
     def __str__(self):
-        said = "kept with" if self.kept else "missed by"
-        return f"{self.name}: {said} {abs(self.slack):.3g} {self.unit}"
+        said, left = ("kept with", " to spare") if self.kept else ("missed by", "")
+        return f"{self.name}: {said} {abs(self.slack):.3g} {self.unit}{left}"
 
 
 @torch.no_grad()
@@ -301,6 +302,7 @@ class OwnBody:
     def __post_init__(self):
         check_number(self.largest_share, "own body: largest_share", 0.0, 1.0)
         check_positive(self.step, "own body: step")
+        check_kind(self.body, Body, "own body: the body", "see Body.of")
 
     @cached_property
     def scene(self) -> MitsubaScene:

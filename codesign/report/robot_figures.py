@@ -37,7 +37,7 @@ def draw_robot(axis: Any, triangles: np.ndarray, shade: np.ndarray, lines: np.nd
         ylabel="y, m",
         zlabel="z, m",
     )
-    axis.set_box_aspect(np.maximum(high - low, 1e-3))
+    axis.set_box_aspect(np.maximum(high - low, 1e-3), zoom=0.85)  # room for letters
     for side, extent in zip((axis.xaxis, axis.yaxis, axis.zaxis), high - low, strict=True):
         side.set_major_locator(MaxNLocator(1 + round(4 * extent / (high - low).max())))
     axis.view_init(elev=22, azim=-125)

@@ -131,7 +131,9 @@ def show(
         raise DomainError(f"nothing is known of how to draw {type(x).__name__}; give {HANDLED}.")
     if width_in is not None:
         width_in = check_number(width_in, "width_in", 1.0, 30.0, remedy="give it in inches")
-        figure.set_size_inches(width_in, figure.get_figheight() * width_in / figure.get_figwidth())
+        figure.set_size_inches(width_in, 1.0 + width_in * figure.bbox.height / figure.bbox.width)
+        figure.draw_without_rendering()
+        figure.set_figheight(figure.get_tightbbox().height + 0.1)
     if path is not None:
         write_atomic(Path(path), figure.image(Path(path).suffix[1:] or "png", 150))
     return figure
@@ -251,7 +253,7 @@ def _chain(run):
         flows = {"flow, estimated": run["field"]}
         with suppress(CodesignError):  # a recording has no truth
             flows["flow, true"] = run["truth"]
-        fields = {title: _sample(field, 0) for title, field in flows.items()}
-        full = max(_longest(flow_px) for flow_px in fields.values())
-        parts += [(title, (flow_px, full), _flow) for title, flow_px in fields.items()]
+        known = {title: _sample(f, 0) for title, f in flows.items() if isinstance(f, FlowField)}
+        full = max(map(_longest, known.values()), default=1e-9)
+        parts += [(title, (flow_px, full), _flow) for title, flow_px in known.items()]
     return _row(parts)

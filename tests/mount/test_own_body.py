@@ -101,6 +101,8 @@ def test_it_is_a_requirement_like_any_other(rover):
     assert covered < 0
     verdict = judge([required], poses[1], camera)[0]
     assert str(verdict).startswith("own body in view: missed by 0.")
+    spare = judge([required], poses[0], camera)[0]
+    assert str(spare) == "own body in view: kept with 0.05 of the picture to spare"
     assert penalty([required], poses[0], camera) == 0
 
 

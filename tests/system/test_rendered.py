@@ -6,6 +6,7 @@ import copy
 import pytest
 import torch
 
+import codesign
 from codesign import System, events, flow, lens, pose, render
 from codesign.errors import DomainError, GradientError
 from codesign.system import Batch, check
@@ -57,6 +58,11 @@ def test_a_deep_copy_shares_the_scene_and_nothing_else(wall):
             parameter.add_(5.0)
     assert twin(batch()).loss.item() != pytest.approx(before, rel=1e-3)
     assert system(batch()).loss.item() == pytest.approx(before, rel=1e-6)
+
+
+def test_an_estimate_of_ones_own_kind_is_left_out_of_the_picture(wall):
+    run = system_of(triplet(), wall, flow=lambda volume: volume.counts).begin(batch(1))
+    assert codesign.show(run).axes[3].get_title() == "flow, true"
 
 
 def test_saved_and_loaded_it_is_the_same_system(wall):
