@@ -25,7 +25,7 @@ from codesign.flow import checkpoint
 from codesign.lens.design import edge_thickness_mm
 from codesign.system import check
 from studies.frame.compare import log_ratio
-from studies.frame.config import check_least
+from studies.frame.config import check_least, check_unused
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.sweep import column
 from studies.lens_motion import __main__ as lens_motion
@@ -171,6 +171,10 @@ def _check(config):
         "spot_steps",
         "spot_starts",
     )
+    if config.train_network:
+        check_unused(config, "with --train-network", "after_steps")
+    else:
+        check_unused(config, "without --train-network", "weights", "learning_rate")
     if config.samples % len(LIGHT.weights):
         raise DomainError(
             f"--samples is {config.samples}; the light has {len(LIGHT.weights)} wavelengths, so give a multiple of that."
