@@ -31,7 +31,14 @@ from studies.frame.sweep import column
 from studies.lens_motion import __main__ as lens_motion
 from studies.lens_opt import page as lens_opt_page
 from studies.lens_opt import rivals
-from studies.lens_opt.descend import JUDGED, Job, development_error, prepare
+from studies.lens_opt.descend import (
+    JUDGED,
+    PER_SEED,
+    TRAINED,
+    Job,
+    development_error,
+    prepare,
+)
 from studies.lens_opt.page import label
 from studies.lens_opt.task import HELD_OUT, LIGHT, draw_case, make_worlds
 
@@ -171,6 +178,11 @@ def _check(config):
         "spot_steps",
         "spot_starts",
     )
+    steps = max(config.steps, config.after_steps)
+    if (config.seed + 1) * PER_SEED + steps * config.cases > TRAINED:
+        raise DomainError(
+            f"--seed is {config.seed}, whose training cases are those that judge; give 0 to 60."
+        )
     if config.train_network:
         check_unused(config, "with --train-network", "after_steps")
     else:

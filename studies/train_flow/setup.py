@@ -26,7 +26,7 @@ from codesign.train import (
 )
 from codesign.train import checkpoint as training
 from codesign.train.batches import probe
-from scenes.windows.sets import TRAINING, VALIDATION, Shape
+from scenes.windows.sets import TRAINING, UNSEEN, VALIDATION, Shape
 from studies.frame.config import check_unused
 from studies.train_flow import peers  # noqa: F401  which networks files know
 
@@ -79,6 +79,7 @@ LIMITS = (
         "0 or more",
     ),
     (("cpu_minutes", "learning_rate", "clip"), lambda value: value > 0, "more than 0"),
+    (("seed",), lambda value: value < UNSEEN - 10, "less than the seeds that judge"),
     (("warm_up", "average"), lambda value: 0 <= value < 1, "a share from 0 to below 1"),
 )
 
