@@ -33,10 +33,10 @@ BUDGETS = {
     "studies/frame": 8_790,  # titles of columns, options without effect
     "studies/gradient_flow": 6_300,  # a first line that answers
     "studies/lens_motion": 4_120,  # a table read case by case
-    "studies/lens_opt": 6_470,  # seeds that judge;  # where windows lie, designs that err alike
+    "studies/lens_opt": 6_470,  # seeds that judge; where windows lie, designs that err alike
     "studies/lens_report": 2_380,  # one number for one thing
     "studies/make_dataset": 3_990,
-    "studies/placement": 7_875,
+    "studies/placement": 7_890,
     "studies/sensor_fit": 2_140,  # the best step, rates beside correlation
     "studies/speed_error": 7_650,  # the same
     "studies/spike_esim": 2_940,

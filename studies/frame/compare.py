@@ -197,7 +197,7 @@ def sign_flip(differences: Any) -> float:
         signs[0] = 1
     flipped = (signs * found).mean(1).abs()
     # of NaN, which decides nothing, 1
-    return 1 - float((flipped < found.mean().abs() * (1 - 1e-12)).double().mean())
+    return float((~(flipped < found.mean().abs() * (1 - 1e-12))).double().mean())
 
 
 def holm(p: Sequence[float]) -> list[float]:
