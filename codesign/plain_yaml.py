@@ -16,6 +16,7 @@ import yaml
 from codesign.errors import DomainError, FileFormatError
 
 MOST = 10_000  # lines, and brackets
+STRING = "tag:yaml.org,2002:str"
 SCALARS = {
     "bool": r"true|false",
     "null": r"null",
@@ -55,6 +56,10 @@ class _Dumper(yaml.SafeDumper):
 _Dumper.add_representer(
     list, lambda to, row: to.represent_sequence("tag:yaml.org,2002:seq", row, flow_style=True)
 )
+# U+0085 is a line break to YAML: unless it is escaped it is read as a blank
+_Dumper.add_representer(
+    str, lambda to, text: to.represent_scalar(STRING, text, '"' * ("\x85" in text))
+)
 for _kind, _pattern in SCALARS.items():
     for _class in (_Loader, _Dumper):
         _class.add_implicit_resolver(
@@ -67,7 +72,7 @@ def dump(page: Mapping[str, Any], comment: str = "") -> str:
 
     Args:
       comment: lines for the top of the file.
-    Raises: DomainError for keys that are no text, values that are not finite, or of other kinds.
+    Raises: DomainError for values that are not finite, or of other kinds. Keys become text.
 
     >>> print(dump({"pose": {"z": 0.25, "tiny": 1e-7, "frame": "base_link"}, "box": [0.1, 2]}), end="")
     pose:

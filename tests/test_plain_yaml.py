@@ -27,7 +27,7 @@ def test_pages_come_back():
     page = {
         "a": {
             "b": {"c": 1, "d": [1, 2.5, [True, None], "x: #y"]},
-            "text": 'quotes " and \n lines, #, é',
+            "text": 'quotes " and \n lines, #, é, \x85',
         },
         "last": -3,
         "yes": "yes",

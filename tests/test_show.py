@@ -59,6 +59,8 @@ def test_frames_are_picked_over_time_and_shown_with_a_gamma(tmp_path):
     ]
     np.testing.assert_allclose(picture(figure.axes[2]), (50 / 70) ** (1 / 2.2), rtol=1e-6)
     assert (tmp_path / "frames.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(DomainError, match="the kind of file must be one of 'eps'"):
+        codesign.show(frames, tmp_path / "frames.docx")
 
 
 def test_a_lens_is_drawn_with_rays_to_its_field_and_a_notebook_shows_it():

@@ -8,18 +8,18 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 UNCOUNTED = (ast.expr_context, ast.operator, ast.unaryop, ast.cmpop, ast.boolop)
 BUDGETS = {
-    "codesign": 9_900,
+    "codesign": 9_930,  # a line break that YAML keeps
     "codesign/events": 48_250,  # kinds of TIFFs, sums over wide spreads, states that stay, whole nanoseconds, counts that a type holds
-    "codesign/fidelity": 2_950,
-    "codesign/flow": 43_020,  # truth that is unknown, windows that share no event, chunks that may come again
+    "codesign/fidelity": 2_960,  # stages without a level
+    "codesign/flow": 43_050,  # truth that is unknown, windows that share no event, chunks that may come again
     "codesign/grad": 3_300,
     "codesign/lens": 47_930,  # stops and apertures in their own axes, as many rays as an MTF asks for
-    "codesign/mount": 14_910,  # rays traced once for several depths, films looked at all over, angles in degrees, blur of the whole pupil
+    "codesign/mount": 14_940,  # rays traced once for several depths, films looked at all over, angles in degrees, blur of the whole pupil
     "codesign/optimise": 3_900,
     "codesign/render": 43_840,  # chief rays of a spectrum, curves as the real pupil sees them
-    "codesign/report": 7_460,  # unknown flow, paths from above, wheels beside flow
-    "codesign/system": 9_630,  # truth of what is read
-    "codesign/train": 5_630,  # bins of windows and network
+    "codesign/report": 7_480,  # unknown flow, paths from above, wheels beside flow
+    "codesign/system": 9_640,  # truth of what is read, a lens in its camera
+    "codesign/train": 5_600,  # bins of windows and network
     "scenes": 14_770,  # rooms too small for what is in them, mesh files that are read in part
     "scenes/robots": 9_490,  # held joints, directions of axes, colours by name
     "scenes/trajectories": 3_080,  # numbers that are finite, directions that lead somewhere
@@ -30,18 +30,18 @@ BUDGETS = {
     "studies/codesign": 15_320,  # a refiner in the joint optimiser, what blur does by experiment
     "studies/flow_quality": 5_560,  # names of recordings, no truth of rotation alone
     "studies/flow_recording": 3_360,  # windows that are not judged
-    "studies/frame": 8_760,  # titles of columns
+    "studies/frame": 8_790,  # titles of columns, options without effect
     "studies/gradient_flow": 6_300,  # a first line that answers
     "studies/lens_motion": 4_120,  # a table read case by case
-    "studies/lens_opt": 6_420,  # where windows lie, designs that err alike
+    "studies/lens_opt": 6_470,  # seeds that judge; where windows lie, designs that err alike
     "studies/lens_report": 2_380,  # one number for one thing
     "studies/make_dataset": 3_990,
-    "studies/placement": 7_900,
+    "studies/placement": 7_890,
     "studies/sensor_fit": 2_140,  # the best step, rates beside correlation
     "studies/speed_error": 7_900,  # growth of the whole chain
     "studies/spike_esim": 2_940,
     "studies/stability": 8_220,
-    "studies/train_flow": 5_100,  # steps of a race
+    "studies/train_flow": 5_115,  # steps of a race, options without effect
     "studies/viewer": 3_450,  # says what a fail may be
     "studies/video_to_events": 4_290,
     "tests": 15_570,  # words of numbers for all rooms, pictures of poses
@@ -52,13 +52,13 @@ BUDGETS = {
     "tests/hard_cases": 2_600,
     "tests/hostile": 19_090,
     "tests/lens": 36_760,  # stops of their own axes, dense transforms
-    "tests/mount": 13_800,  # blur of a wide lens
+    "tests/mount": 13_840,  # blur of a wide lens
     "tests/optimise": 3_650,  # a state is a copy; steps in single precision
     "tests/render": 28_980,  # outlines from the real pupil
     "tests/scenes": 19_820,  # rooms too small, held joints, colours of 16 bits
     "tests/studies": 34_010,  # blur that is drawn, first lines that are true
-    "tests/system": 7_150,  # estimates of their own kind
-    "tests/train": 5_070,  # bins of windows
+    "tests/system": 7_210,  # estimates of their own kind
+    "tests/train": 5_110,  # bins of windows
 }
 
 

@@ -90,6 +90,8 @@ def levels_of(task: Task, only: Mapping[str, Any] | None = None) -> Levels:
                 f"{stage} has no level {wrong[0]!r} here; it has {', '.join(map(str, known[stage]))}."
             )
         known[stage] = tuple(levels)
+    if empty := [stage for stage, found in pickable(task, known).items() if not found]:
+        raise DomainError(f"{empty[0]} has no level to choose; give one ('hard' has no gradient).")
     return known
 
 

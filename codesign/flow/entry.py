@@ -2,7 +2,8 @@
 bring it to the weights' type, normalise it, pad it to the stride, and fade the flow in with the
 events."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar, cast
@@ -98,6 +99,17 @@ def _in_type(found, dtype):
     return replace(
         found, **{name: part.to(dtype) for name, part in parts.items() if part is not None}
     )
+
+
+@contextmanager
+def modes_kept(network: nn.Module) -> Iterator[None]:
+    """Every part of a network is afterwards in training or evaluation as it was."""
+    modes = {module: module.training for module in network.modules()}
+    try:
+        yield
+    finally:
+        for module, training in modes.items():
+            module.training = training
 
 
 def normalise(counts: Tensor) -> Tensor:

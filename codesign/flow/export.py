@@ -16,6 +16,7 @@ from codesign.atomic import replacing
 from codesign.checks import check, check_kind, check_path, check_whole
 from codesign.errors import DomainError
 from codesign.flow.checks import MOST_SIDE_PX
+from codesign.flow.entry import modes_kept
 from codesign.flow.lk.lanes import plain_operations
 from codesign.flow.sources.windows import bin_times
 from codesign.optional import require
@@ -102,21 +103,15 @@ def trace(
         raise DomainError(
             f"a {type(network).__name__} has no config['bins'], so it is no flow network of this package."
         )
-    was_training = network.training
-    network.eval()
     device = next((weight.device for weight in network.parameters()), None)
     counts = torch.zeros(batch, 2, config["bins"], height_px, width_px, device=device)
-    try:
-        with torch.no_grad(), plain_operations():
-            # traced with values, since torch.export alone cannot follow a check for finite input or
-            # a number computed from the bins' times
-            graph = make_fx(program, tracing_mode="real", _error_on_data_dependent_ops=False)(
-                counts
-            )
-            _tidy(graph)
-            return torch.export.export(graph, (counts,), strict=False)
-    finally:
-        network.train(was_training)
+    with modes_kept(network), torch.no_grad(), plain_operations():
+        network.eval()
+        # traced with values, since torch.export alone cannot follow a check for finite input or a
+        # number computed from the bins' times
+        graph = make_fx(program, tracing_mode="real", _error_on_data_dependent_ops=False)(counts)
+        _tidy(graph)
+        return torch.export.export(graph, (counts,), strict=False)
 
 
 def _tidy(graph):

@@ -17,16 +17,14 @@ def by_autograd(residuals: Callable[[Tensor], Tensor], variables: Tensor, value:
     at = variables.detach().requires_grad_()
     with torch.enable_grad():
         found = residuals(at)
-    if not found.requires_grad:
-        raise DomainError(
-            "the residuals do not depend on the variables through torch; use by_differences."
-        )
-    rows = [
-        torch.autograd.grad(entry, at, retain_graph=True, allow_unused=True)[0] for entry in found
-    ]
-    return torch.stack(
-        [torch.zeros_like(variables) if row is None else row for row in rows]
-    ).detach()
+        if not found.requires_grad:
+            raise DomainError(
+                "the residuals do not depend on the variables through torch; use by_differences."
+            )
+        slopes = variables.new_zeros(len(found), len(variables))
+        for row, entry in zip(slopes, found, strict=True):
+            row += torch.autograd.grad(entry, at, retain_graph=True, materialize_grads=True)[0]
+    return slopes
 
 
 def by_differences(step: float | Tensor, central: bool = False) -> Jacobian:

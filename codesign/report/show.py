@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from codesign.atomic import write_atomic
-from codesign.checks import check_number
+from codesign.checks import check_choice, check_number
 from codesign.errors import CodesignError, DomainError, ShapeError
 from codesign.events import picture, to_counts
 from codesign.lens.pinhole import ThinLens
@@ -135,7 +135,9 @@ def show(
         figure.draw_without_rendering()
         figure.set_figheight(figure.get_tightbbox().height + 0.1)
     if path is not None:
-        write_atomic(Path(path), figure.image(Path(path).suffix[1:] or "png", 150))
+        kind = Path(path).suffix[1:].lower() or "png"
+        check_choice(kind, "the kind of file", figure.canvas.get_supported_filetypes())
+        write_atomic(Path(path), figure.image(kind, 150))
     return figure
 
 

@@ -145,8 +145,6 @@ class Pass(Mapping[str, Any]):
         camera = self.system.camera
         if not hasattr(camera, "rays"):
             camera = self._call("camera", camera)
-        elif camera.lens is not self.system.lens:
-            camera = camera.with_lens(self.system.lens)
         if self.seed is not None:
             camera = camera.with_seed(self.seed)
         if self.junctions is not None:

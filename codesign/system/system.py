@@ -132,10 +132,15 @@ class System(nn.Module):
             value = nn.ModuleList(dict.fromkeys(held))  # their parameters are the system's too
         elif name == "gradient":
             check_choice(value, "gradient", render_stage.sequence.WAYS)
-        elif name == "camera" and hasattr(value, "rays"):
-            self.__dict__.pop("lens", None)
-            super().__setattr__("lens", value.lens)
-        elif name in PARTS and value is not None:
+        elif name == "lens":
+            if not hasattr(self.camera, "rays"):
+                raise DomainError("the camera is a function, with a lens of its own; exchange it.")
+            name, value = "camera", self.camera.with_lens(value)
+        elif (
+            name in PARTS
+            and value is not None
+            and not (name == "camera" and hasattr(value, "rays"))
+        ):
             if hasattr(value, "camera_rays"):
                 raise DomainError(
                     f"stage '{name}' is a lens; put it into a camera: render.Camera(lens, ...)."
@@ -147,9 +152,13 @@ class System(nn.Module):
                 name == "events" and isinstance(owner, nn.Module) and value == event_call(owner)
             )
             value = owner if of_layer else registrable(value)
-        if name in (*PARTS, "lens"):  # a Module in the place of a function, or the other way round
-            self.__dict__.pop(name, None)
-            self._modules.pop(name, None)
+        if name in PARTS:  # a Module in the place of a function, or the other way round
+            for held in (self.__dict__, self._modules):
+                held.pop(name, None)
+                if name == "camera":
+                    held.pop("lens", None)
+        if name == "camera" and hasattr(value, "rays"):
+            super().__setattr__("lens", value.lens)
         super().__setattr__(name, value)  # pyright: ignore[reportArgumentType] - None and functions are parts too
 
     def _checked(self, objectives: Any) -> dict[str, Callable[..., Tensor]]:

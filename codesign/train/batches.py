@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 import torch
 
+from codesign.checks import check_number, check_positive
 from codesign.system.contents import mapped
 from codesign.types import EventVolume, FlowField, FlowWindows
 
@@ -63,6 +64,8 @@ class Batches:
         pool: int = 16,
         mine: Callable[[Sequence[int]], Sequence[int]] = _all,
     ):
+        shares = (check_number(share, "a share of the mix", 0.0) for share, _ in parts)
+        check_positive(sum(shares), "the sum of the mix's shares")
         self.parts = parts
         self.batch = batch
         self.reuse = reuse

@@ -11,10 +11,11 @@ from torch import Tensor, nn
 
 from codesign.checks import check_number, check_positive, check_whole
 from codesign.errors import DomainError
+from codesign.flow.entry import modes_kept
 from codesign.interrupt import Interruption
 from codesign.train import checkpoint, loop
 from codesign.train.batches import Batches, Source, probe
-from codesign.train.learner import Learner, modes_kept
+from codesign.train.learner import Learner
 from codesign.train.loop import Budget, Cosine, Progress
 from codesign.train.objectives import Supervised, flow_predictions
 from codesign.train.parallel import ALONE, Ranks

@@ -3,8 +3,7 @@ seen."""
 
 import copy
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +12,7 @@ from torch import Tensor, nn
 
 from codesign.errors import DomainError, FileFormatError, NonFiniteError, ShapeError
 from codesign.flow import checkpoint
+from codesign.flow.entry import modes_kept
 from codesign.train.batches import to_device
 from codesign.train.objectives import flow_predictions
 from codesign.train.parallel import ALONE, Ranks
@@ -56,17 +56,6 @@ def adamw(
         {"params": others, "weight_decay": 0.0},
     ]
     return torch.optim.AdamW([group for group in groups if group["params"]], lr=learning_rate)
-
-
-@contextmanager
-def modes_kept(network: nn.Module) -> Iterator[None]:
-    """Every part of a network is afterwards in training or evaluation as it was."""
-    modes = {module: module.training for module in network.modules()}
-    try:
-        yield
-    finally:
-        for module, training in modes.items():
-            module.training = training
 
 
 class Learner:

@@ -89,17 +89,17 @@ def score(
                 )
             ]
     error, zero, pixels = sums.tolist()
-    if not judged and blurs:
+    if not judged and not blurs:
+        raise DomainError("there are no windows to judge on; give one at least.")
+    if not judged:
         share = sum(blur > 1 for blur in blurs) / len(blurs)
         return Score(0.0, 0.0, 100 * share, len(blurs), sum(blurs) / len(blurs))
-    if judged and not zero > 0:
+    if not zero > 0:
         raise DomainError(
             "the true flow of the validation windows is 0 everywhere, so no error can be a share of it; validate on "
             "windows that move."
         )
-    return Score(
-        error / max(pixels, 1.0), zero / max(pixels, 1.0), 100 * worse / max(judged, 1), judged
-    )
+    return Score(error / pixels, zero / pixels, 100 * worse / judged, judged)
 
 
 def error_ratio(source: Source, count: int = 48) -> Callable[[nn.Module], float]:

@@ -92,6 +92,15 @@ def check_least(config: StudyConfig, least: float, *names: str) -> None:
             raise DomainError(f"--{name.replace('_', '-')} is {value}; at least {least} is needed.")
 
 
+def check_unused(config: StudyConfig, why: str, *names: str) -> None:
+    """Raises: DomainError for the first of these options that is given where it has no effect;
+    ``why`` it has none ends the sentence."""
+    plain = configured(type(config), config.quick)
+    for name in names:
+        if getattr(config, name) != getattr(plain, name):
+            raise DomainError(f"--{name.replace('_', '-')} has no effect {why}; leave it out.")
+
+
 def resume_command(study: str, folder: Path) -> str:
     """The line that goes on with the run in ``folder``, fit to be pasted into a shell."""
     return f"{shipped.command(study)} --resume {shlex.quote(str(folder))}"

@@ -25,13 +25,20 @@ from codesign.flow import checkpoint
 from codesign.lens.design import edge_thickness_mm
 from codesign.system import check
 from studies.frame.compare import log_ratio
-from studies.frame.config import check_least
+from studies.frame.config import check_least, check_unused
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.sweep import column
 from studies.lens_motion import __main__ as lens_motion
 from studies.lens_opt import page as lens_opt_page
 from studies.lens_opt import rivals
-from studies.lens_opt.descend import JUDGED, Job, development_error, prepare
+from studies.lens_opt.descend import (
+    JUDGED,
+    PER_SEED,
+    TRAINED,
+    Job,
+    development_error,
+    prepare,
+)
 from studies.lens_opt.page import label
 from studies.lens_opt.task import HELD_OUT, LIGHT, draw_case, make_worlds
 
@@ -171,6 +178,15 @@ def _check(config):
         "spot_steps",
         "spot_starts",
     )
+    steps = max(config.steps, config.after_steps)
+    if (config.seed + 1) * PER_SEED + steps * config.cases > TRAINED:
+        raise DomainError(
+            f"--seed is {config.seed}, whose training cases are those that judge; give 0 to 60."
+        )
+    if config.train_network:
+        check_unused(config, "with --train-network", "after_steps")
+    else:
+        check_unused(config, "without --train-network", "weights", "learning_rate")
     if config.samples % len(LIGHT.weights):
         raise DomainError(
             f"--samples is {config.samples}; the light has {len(LIGHT.weights)} wavelengths, so give a multiple of that."

@@ -25,6 +25,7 @@ from studies.lens_opt.task import (
 )
 
 PENALTY = 10.0  # of edges thinner than allowed, against the objective
+PER_SEED = 100_000  # training cases
 TRAINED = 7_000_000  # first seeds of the cases that decide which lens is kept
 DEVELOPED = 8_000_000  # of the development cases
 JUDGED = 9_000_000  # of the held-out cases
@@ -108,7 +109,7 @@ def prepare(
         return PENALTY * task.design.penalty(camera.optics())
 
     def samples(step):
-        first = (config.seed + 1) * 100_000 + step * config.cases
+        first = (config.seed + 1) * PER_SEED + step * config.cases
         return (system(draw_case(pool, first + k)).loss + penalty() for k in range(config.cases))
 
     def score():

@@ -26,7 +26,7 @@ from scenes.robots import pair as robot_pair
 from scenes.robots.check import check_pair
 from scenes.robots.own import own_pair
 from scenes.robots.pairs import PAIRS
-from studies.frame.config import check_least
+from studies.frame.config import check_least, check_unused
 from studies.frame.fidelity import Tolerant, chosen
 from studies.frame.run import Run, main
 from studies.placement.look import look, size_in_words
@@ -133,8 +133,8 @@ def checked(size: Config) -> None:
         raise DomainError(f"--searches {' '.join(size.searches)} names one twice; name each once.")
     if not 0 <= size.seed <= HIGHEST_SEED:
         raise DomainError(f"--seed is {size.seed}; the searches need 0 to {HIGHEST_SEED}.")
-    if size.focal_mm is not None and size.lens is None:
-        raise DomainError("--focal-mm scales a traced lens; give --lens too, or leave it out.")
+    if size.lens is None:
+        check_unused(size, "without --lens", "focal_mm")
 
 
 if __name__ == "__main__":

@@ -164,17 +164,18 @@ def evolved(start: Tensor, seed: int) -> Proposals:
         "signals_filename": "",
     }
     yield start
-    mean = start.tolist()
+    # pycma needs two numbers
+    mean = [*start.tolist(), *[0.5] * (len(start) == 1)]
     while True:
         strategy = cma.CMAEvolutionStrategy(mean, SIGMA, options)
         while not strategy.stop():
             asked = strategy.ask()
             errors = []
             for share in asked:
-                errors.append((yield torch.as_tensor(share, dtype=torch.float64)))
+                errors.append((yield torch.as_tensor(share[: len(start)], dtype=torch.float64)))
             strategy.tell(asked, errors)
         options["popsize"] = 2 * strategy.popsize
-        mean = random.random(len(start)).tolist()
+        mean = random.random(len(mean)).tolist()
 
 
 def estimated(start: Tensor, seed: int) -> Proposals:

@@ -20,6 +20,7 @@ from codesign.flow.refiner import Refiner
 from codesign.report.prose import counted
 from codesign.train.validation import batches, score
 from scenes.windows.sets import judging
+from studies.frame.config import check_unused
 from studies.train_flow.setup import named_class
 
 NAMES = {
@@ -36,7 +37,7 @@ ASKED = 0.6  # of a rival's error, at most
 # to every training, or of the race itself
 PASSED = (
     *("mix", "batch", "learning_rate", "steps", "cpu_minutes", "final_windows"),
-    *("race", "own", "seeds", "jobs", "seed", "device", "out", "resume", "quick"),
+    *("race", "own", "seeds", "jobs", "device", "out", "resume", "quick"),
 )
 SEED = 55  # of what is judged here
 
@@ -49,19 +50,10 @@ def race(run):
         raise DomainError(
             "a race needs at least one of --seeds, one of --jobs, and three of --final-windows."
         )
-    plain = type(config)(**(config.QUICK if config.quick else {}), quick=config.quick)
-    lost = [
-        field.name
-        for field in fields(config)
-        if field.name not in PASSED and getattr(config, field.name) != getattr(plain, field.name)
-    ]
-    if not config.own and config.learning_rate != plain.learning_rate:
-        lost.append("learning_rate")  # the five networks have their own
-    if lost:
-        raise DomainError(
-            "a race trains every network with its own settings on windows that are made; leave "
-            f"--{lost[0].replace('_', '-')} out."
-        )
+    lost = [field.name for field in fields(config) if field.name not in PASSED]
+    # the five networks have their own
+    lost += [] if config.own else ["learning_rate"]
+    check_unused(config, "in a race: settings are the networks' own, windows are made", *lost)
     names = NAMES | {name: name.partition(":")[2] for name in config.own}
     kinds = {name: named_class(name) for name in config.own}
     wanted = [(network, seed) for seed in config.seeds for network in names]

@@ -26,7 +26,8 @@ from codesign.train import (
 )
 from codesign.train import checkpoint as training
 from codesign.train.batches import probe
-from scenes.windows.sets import TRAINING, VALIDATION, Shape
+from scenes.windows.sets import TRAINING, UNSEEN, VALIDATION, Shape
+from studies.frame.config import check_unused
 from studies.train_flow import peers  # noqa: F401  which networks files know
 
 # the last window in so many of a data set is judged on: whole stretches, since neighbours look
@@ -78,7 +79,16 @@ LIMITS = (
         "0 or more",
     ),
     (("cpu_minutes", "learning_rate", "clip"), lambda value: value > 0, "more than 0"),
+    (("seed",), lambda value: value < UNSEEN - 10, "less than the seeds that judge"),
     (("warm_up", "average"), lambda value: 0 <= value < 1, "a share from 0 to below 1"),
+)
+
+# when options have no effect
+UNUSED = (
+    (lambda config: True, "without --race", ("own", "seeds", "jobs")),
+    (lambda config: config.data is None, "without --data", ("window_frames", "window_ms")),
+    (lambda config: config.loss != "supervised", "with that --loss", ("unit", "claim_weight")),
+    (lambda config: config.loss == "supervised", "with that --loss", ("smoothness",)),
 )
 
 
@@ -100,6 +110,9 @@ def check_numbers(config, processes):
             value = getattr(config, name)
             if value is not None and not fits(value):
                 raise DomainError(f"--{name.replace('_', '-')} is {value}; {wanted} is needed.")
+    for unused, why, names in UNUSED:
+        if unused(config):
+            check_unused(config, why, *names)
     if config.batch % processes:
         raise DomainError(
             f"--batch {config.batch} cannot be shared evenly by {processes} processes; give a multiple."

@@ -230,6 +230,7 @@ def test_wrong_input_is_refused(call, error, sentence):
         call()
 
 
+@torch.no_grad()
 def test_jacobians_against_derivatives_by_hand():
     x = vector(-1.2, 1.0)
     truth = torch.tensor([[-20 * -1.2, 10.0], [-1.0, 0.0]], dtype=D)

@@ -230,6 +230,7 @@ def test_units_that_share_groups_count_as_their_groups():
 def test_drawn_signs_have_those_that_were_found_among_them():
     assert compare.sign_flip([1.0] * 60) == pytest.approx(1 / 20_000)
     assert compare.sign_flip([1.0] * 3) == pytest.approx(2 / 8)
+    assert compare.sign_flip([1.0, math.nan]) == 1, "NaN decides nothing"
 
 
 def test_intervals_print_and_record():

@@ -74,17 +74,17 @@ def test_the_valley_is_followed():
         assert float(SEARCHES[name](valley, start, count, 3).error.min()) < limit, name
 
 
-@pytest.mark.parametrize("corner", [0.0, 1.0])
-def test_a_minimum_in_a_corner_is_found_and_bounds_are_kept(search, corner):
+@pytest.mark.parametrize(("corner", "numbers"), [(0.0, 3), (1.0, 3), (1.0, 1)])
+def test_a_minimum_in_a_corner_is_found_and_bounds_are_kept(search, corner, numbers):
     asked = []
 
     def slope(share):
         asked.append(share)
         return float((share - corner).abs().sum())
 
-    trail = search(slope, torch.full((3,), 1 - corner, dtype=D), 150, 5)
+    trail = search(slope, torch.full((numbers,), 1 - corner, dtype=D), 150, 5)
     assert torch.equal(trail.share, torch.stack(asked))
-    assert trail.share[0].tolist() == [1 - corner] * 3
+    assert trail.share[0].tolist() == [1 - corner] * numbers
     assert float(trail.share.min()) >= 0
     assert float(trail.share.max()) <= 1
     # the best of 150 even points in a unit cube has 150 V = 1 at the corner's simplex, V = e^3 / 6:

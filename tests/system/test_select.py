@@ -64,6 +64,8 @@ def test_levels_share_the_ends_of_the_drive_and_colours_their_samples():
     assert levels_of(replace(task(lens.Pinhole(8.0)), camera=coloured))["samples"] == (6, 24)
     with pytest.raises(DomainError, match="events has no level 'soft' here"):
         levels_of(task(lens.Pinhole(8.0)), {"events": ("soft",)})
+    with pytest.raises(DomainError, match="events has no level to choose"):
+        levels_of(task(lens.Pinhole(8.0), gradient=True), {"events": ("hard",)})
 
 
 def made_up():

@@ -297,9 +297,12 @@ def test_parts_can_be_exchanged_in_place_and_are_looked_at():
     system.events = volume_of
     assert system(BATCH).loss.item() == pytest.approx(2.25)  # (3 * 0.5)^2
     system.lens = Glass(1.0)
-    assert system(BATCH).loss.item() == pytest.approx(9.0)
+    for each in (system, system.replaced(bins=5), copy.deepcopy(system)):
+        assert each(BATCH).loss.item() == pytest.approx(9.0)
     system.camera = ToyCamera(Glass(2.0))
     assert system(BATCH).loss.item() == pytest.approx(36.0)
+    system.camera = lambda: ToyCamera(Glass(1.0))
+    assert not list(system.parameters()), "the lens left with its camera"
     with pytest.raises(DomainError, match="no part 'event', did you mean 'events'"):
         system.replaced(event=doubled)
 

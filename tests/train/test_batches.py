@@ -4,6 +4,7 @@
 import pytest
 import torch
 
+from codesign.errors import DomainError
 from codesign.train.batches import (
     Batches,
     Started,
@@ -79,6 +80,10 @@ def test_a_mix_keeps_its_shares():
     for share, name in parts:
         # discrepancy of the golden ratio's multiples: of order log(1000)
         assert abs(chosen.count(name) - 1000 * share) <= 3
+    with pytest.raises(
+        DomainError, match="a share of the mix must be a finite number >= 0, got -1"
+    ):
+        Batches([(-1.0, Made()), (0.5, Made())], 2)
 
 
 def test_a_finite_source_is_shown_whole_and_in_another_order_each_time():

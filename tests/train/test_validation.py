@@ -84,3 +84,5 @@ def test_windows_that_stand_still_judge_no_network():
     windows = FlowWindows(evenly_timed(torch.ones(1, 2, 2, 4, 4)), truth, None)
     with pytest.raises(DomainError, match="is 0 everywhere"):
         score(lambda volume: truth, [windows])
+    with pytest.raises(DomainError, match="no windows to judge on"):
+        score(lambda volume: truth, [])
