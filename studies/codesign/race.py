@@ -32,6 +32,8 @@ EDGE = 0.1  # of the cube, that starts keep from its walls
 NEAR = 0.1  # of the cube, that near starts lie away at most
 TRIES = 10_000
 SPACE = ("pair", "family", "light", "speed", "free", "held")  # of a setting (``Space.of``)
+PER_SEED = 10_000  # draws of one start
+MOST_SEEDS = 500  # then come draws that measure slopes, and the judge's
 MOST_WORLDS = 200  # from 500 on are those of the landscape
 JUDGED = 7_700_000  # number of the judge's draw
 
@@ -103,7 +105,7 @@ def run_arm(
     """One arm from one start (``settled_and_kept``)."""
     begun, rendered = time.process_time(), drawn.rendered
     space = drawn.space
-    task = Task(Objective(drawn), start(space, seed, near), steps, 10_000 * seed, seed, settling)
+    task = Task(Objective(drawn), start(space, seed, near), steps, PER_SEED * seed, seed, settling)
     answer, way = ARMS[arm](task)
     chosen, keeps = settled_and_kept(task, answer, way)
     return {

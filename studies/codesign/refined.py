@@ -14,7 +14,7 @@ from studies.codesign.cells import space_of
 from studies.codesign.design import PARTS, Whole
 from studies.codesign.objective import Objective
 from studies.codesign.problem import Drawn, Looked
-from studies.codesign.race import JUDGED, last_kept, spread_over, start, with_threads
+from studies.codesign.race import JUDGED, PER_SEED, last_kept, spread_over, start, with_threads
 from studies.frame.sweep import Row
 
 FIRST, LAST = 0.08, 0.01  # of the cube, a step of a number of the design
@@ -58,7 +58,7 @@ def descended(
     optimiser = torch.optim.Adam(groups) if groups else None
     way, seen = [], []
     for step in range(setting["steps"]):
-        draw = drawn.draw(10_000 * seed + step)
+        draw = drawn.draw(PER_SEED * seed + step)
         if design:
             _, slope, looked = objective(share.detach(), draw, range(len(share)))
             optimiser.param_groups[0]["lr"] = FIRST * (LAST / FIRST) ** (
