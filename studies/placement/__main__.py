@@ -77,6 +77,13 @@ class Config(Tolerant):
     is blind to."""
 
 
+# options of a search
+SEARCHED = (
+    *("seeds", "steps", "worlds", "per_world", "searches"),
+    *("judged_worlds", "judged_drives", "tolerance"),
+)
+
+
 def study(run: Run[Config]) -> None:
     size = run.config
     checked(size)
@@ -135,6 +142,8 @@ def checked(size: Config) -> None:
         raise DomainError(f"--seed is {size.seed}; the searches need 0 to {HIGHEST_SEED}.")
     if size.lens is None:
         check_unused(size, "without --lens", "focal_mm")
+    if size.look:
+        check_unused(size, "with --look", *SEARCHED)
 
 
 if __name__ == "__main__":

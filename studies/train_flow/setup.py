@@ -87,6 +87,7 @@ LIMITS = (
 UNUSED = (
     (lambda config: True, "without --race", ("own", "seeds", "jobs")),
     (lambda config: config.data is None, "without --data", ("window_frames", "window_ms")),
+    (lambda config: config.data is not None, "with --data", ("mix", "validate_on")),
     (lambda config: config.loss != "supervised", "with that --loss", ("unit", "claim_weight")),
     (lambda config: config.loss == "supervised", "with that --loss", ("smoothness",)),
 )
