@@ -153,7 +153,7 @@ def test_the_last_tenth_of_a_data_set_is_judged_on_alone(tmp_path, monkeypatch):
         return Folder(before=lambda indices: asked.append(list(indices)))
 
     monkeypatch.setattr(train_flow_setup, "open_windows", open_windows)
-    options = f"--data {tmp_path} --window-frames 2 --steps 14 --validate-every 100"
+    options = f"--data {tmp_path} --mix real --window-frames 2 --steps 14 --validate-every 100"
     assert train(tmp_path / "run", options) == 0
     assert opened == [(tmp_path, 2, 2, (16, 16), 0, 0.02)]
     assert asked[:30] == [[k] for k in range(30)], "whether they hold events"
