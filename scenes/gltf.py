@@ -61,7 +61,7 @@ def opened(path: Path, folder: Folder, materials: bool) -> tuple[bytes, dict[str
             tree = _tree(path.read_bytes(), folder)
             if str(tree["asset"]["version"]).split(".")[0] != "2":
                 raise ValueError(f"version {tree['asset']['version']}")
-            _check_read(path, tree)
+            _made_readable(path, tree)
             _check_nodes(tree.get("nodes", []))
             surfaces = _surfaces(tree, folder) if materials else {}
     except FileFormatError:
@@ -95,7 +95,7 @@ def _tree(data, folder):
     return tree
 
 
-def _check_read(path, tree):
+def _made_readable(path, tree):
     """Refuse what trimesh would leave out or read as something else. Coloured vertices without a
     material get the standard's own, white: without one trimesh cuts their colours to 8 bits."""
     found = {

@@ -247,6 +247,10 @@ def check_sizes(size: Any) -> None:
         raise DomainError(
             f"--worlds is {size.worlds}; at most {MOST_WORLDS} (others are for calibration)."
         )
+    if size.seed + size.seeds > MOST_SEEDS:
+        raise DomainError(
+            f"--seeds {size.seeds} from --seed {size.seed}: starts are below {MOST_SEEDS} in all; later draws judge."
+        )
     check_least(
         size, 1, "steps", "worlds", "per_draw", "judged_worlds", "judged_drives", "settling"
     )

@@ -14,8 +14,8 @@ class Config(StudyConfig):
     stages: tuple[Name, ...] = ("chain",)
     """What is measured: chain (every stage's cheaper and finer levels, and whole chains of them, on
     one small scene); select (what codesign.select picks on six scenes); lens (ray tracing beside
-    optiland), render, growth (rendering and outlines over objects and faces, the chain over pixels, rays, frames and bins), events, spiking
-    (beside snnTorch and norse), flow (estimators)."""
+    optiland), render, growth (rendering and outlines over objects and faces, the chain over pixels,
+    rays, frames and bins), events, spiking (beside snnTorch and norse), flow (estimators)."""
     repeats: int = 7
     """Timed repeats of each thing; at least 3."""
     rounds: int = 2
