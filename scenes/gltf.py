@@ -115,12 +115,15 @@ def _made_readable(path, tree):
             if name in FLOATING and accessor["componentType"] != FLOAT:
                 found.add(f"{name} in whole numbers")
     materials.append({})
-    if any(any(each.get("weights", [])) for each in (*meshes, *tree.get("nodes", []))):
+    nodes = tree.get("nodes", [])
+    if any(any(each.get("weights", [])) for each in (*meshes, *nodes)):
         found.add("morph targets at work")
+    if any({"mesh", "skin"} <= node.keys() for node in nodes):
+        found.add("meshes on bones")
     if found:
         raise FileFormatError(
             f"mesh '{path}' needs {', '.join(sorted(found))}, which is not read here; export it without compression, "
-            "quantisation, instancing, texture transforms and shape keys, as plain triangles."
+            "quantisation, instancing, texture transforms, shape keys and armatures (apply them first), as plain triangles."
         )
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from codesign.errors import DomainError, FileFormatError
 from codesign.optional import optional
 from codesign.reading import open_regular, reading
-from scenes import gltf, textures
+from scenes import gltf, obj, textures
 from scenes.mesh_folder import Folder
 
 trimesh = optional("trimesh", "worlds", "reading meshes")
@@ -28,7 +28,7 @@ KINDS = (".obj", ".ply", ".stl", ".dae", ".gltf", ".glb")
 MOST_FACES = 4_000_000  # some 10 s to read; their silhouettes take minutes and GiB
 MOST_BYTES = 1 << 30
 UNCOLOURED = 0.5  # linear luminance of what says none
-LIBRARY = "codesign:all materials"
+FOLDED = 0.999  # cosine of what lies upon each other
 # what trimesh would read as something else
 MISREAD = {
     ".obj": (
@@ -116,7 +116,8 @@ def read(
     scene = _loaded(path, data, folder, ".gltf" if surfaces is not None else kind, materials)
     if materials:
         folder.check()
-    parts = list(_parts(path, scene, told, axes, surfaces if materials else None, materials))
+    cut = kind == ".dae" and b"<poly" in data
+    parts = list(_parts(path, scene, told, cut, axes, surfaces if materials else None, materials))
     if not parts:
         raise FileFormatError(
             f"mesh '{path}' has no faces that can be read: it is cut short, damaged, or holds points and lines alone; "
@@ -179,15 +180,6 @@ def _check_count(path, count):
         )
 
 
-def _one_library(data, folder):
-    """An .obj that names one file of materials for all it names: trimesh reads the first alone."""
-    names = dict.fromkeys(re.findall(rb"^mtllib[ \t]+(.*?)[ \t\r]*$", data, re.MULTILINE))
-    if len(names) < 2:
-        return data
-    folder.given[LIBRARY] = b"\n".join(folder.get(name.decode()) for name in names)
-    return f"mtllib {LIBRARY}\n".encode() + data
-
-
 def _loaded(path, data, folder, kind, materials):
     options: dict = {"process": False, "validate": False}
     if kind in (".obj", ".gltf"):
@@ -202,7 +194,8 @@ def _loaded(path, data, folder, kind, materials):
             warnings.catch_warnings(),
         ):
             if kind == ".obj" and materials:
-                data = _one_library(data, folder)
+                obj.check_colours(data)
+                data = obj.with_one_library(data, folder)
             # numpy reads numbers as far as it can, and only warns
             warnings.filterwarnings("error", message=".*could not be read to its end")
             return trimesh.load_scene(
@@ -213,7 +206,7 @@ def _loaded(path, data, folder, kind, materials):
         raise
 
 
-def _parts(path, scene, told, axes, surfaces, materials) -> Iterator[Part]:
+def _parts(path, scene, told, cut, axes, surfaces, materials) -> Iterator[Part]:
     count = sum(
         len(getattr(scene.geometry[scene.graph[n][1]], "faces", ()))
         for n in scene.graph.nodes_geometry
@@ -223,6 +216,7 @@ def _parts(path, scene, told, axes, surfaces, materials) -> Iterator[Part]:
         raise FileFormatError(
             f"mesh '{path}' has {told} faces, of which {told - count} cannot be read; export it anew."
         )
+    cut = cut or 0 < told < count  # polygons, into fans of triangles
     for node in scene.graph.nodes_geometry:
         frame, name = scene.graph[node]
         mesh = scene.geometry[name]
@@ -239,6 +233,12 @@ def _parts(path, scene, told, axes, surfaces, materials) -> Iterator[Part]:
             wrong = "vertices are not all finite"
         elif faces.min() < 0 or faces.max() >= len(vertices):
             wrong = f"a face asks for vertex {faces.max()} of {len(vertices)}"
+        elif cut and _folded(vertices, faces):
+            wrong = (
+                "a face of several corners has one that points inwards; give triangles"
+            )
+        elif materials and path.suffix.lower() == ".ply" and _brightest(mesh) > 1:
+            wrong = f"colours of its vertices reach {_brightest(mesh):g}, where 1 is the most"
         if wrong:
             raise FileFormatError(f"{where}: {wrong}; export it anew.")
         turn = axes @ frame[:3, :3]
@@ -250,6 +250,33 @@ def _parts(path, scene, told, axes, surfaces, materials) -> Iterator[Part]:
         if whole.any():
             visual = mesh.visual if materials else None
             yield _merged(_coloured(where, str(name), vertices, faces, whole, visual, surfaces))
+
+
+def _folded(vertices, faces):
+    """Whether two triangles with an edge in common lie upon each other: a fan over a polygon with a
+    corner that points inwards does."""
+    first, second, third = vertices[faces].swapaxes(0, 1)
+    normal = np.cross(second - first, third - first)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
+    start, end, apex = (np.roll(faces, -shift, 1).reshape(-1) for shift in range(3))
+    along, back = start * len(vertices) + end, end * len(vertices) + start
+    order = np.argsort(along)
+    place = np.minimum(np.searchsorted(along, back, sorter=order), len(along) - 1)
+    other = order[place]
+    for _ in range(2):  # corners on a line give triangles without area: their neighbours' normal
+        flat = ~normal.any(1).repeat(3) & (along[other] == back)
+        normal[np.flatnonzero(flat) // 3] = normal[other[flat] // 3]
+    cosine = (normal.repeat(3, 0) * normal[other // 3]).sum(1)
+    return bool(((along[other] == back) & (cosine < -FOLDED) & (apex != apex[other])).any())
+
+
+def _brightest(mesh):
+    """Of colours that a .ply gives as fractions."""
+    raw = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
+    names = (raw.dtype.names or ()) if isinstance(raw, np.ndarray) else raw  # binary, or text
+    given = [np.asarray(raw[name]) for name in ("red", "green", "blue") if name in names]
+    return max((float(one.max()) for one in given if one.dtype.kind == "f" and one.size), default=0)
 
 
 def _coloured(where, name, vertices, faces, whole, visual, surfaces):

@@ -162,6 +162,17 @@ def check_dtype(dtype: torch.dtype, fractions: bool = False) -> None:
         )
 
 
+def exactly(counts: Tensor, dtype: torch.dtype, what: str = "events") -> Tensor:
+    """Whole counts in a type that holds them all; DomainError for another."""
+    most = 2 / torch.finfo(dtype).eps if dtype.is_floating_point else torch.iinfo(dtype).max
+    if counts.numel() and int(counts.max()) > most:
+        raise DomainError(
+            f"{int(counts.max())} {what} fall into one interval of a pixel, more than {dtype} holds exactly; take "
+            "torch.float32."
+        )
+    return counts.to(dtype)
+
+
 def check_room(values: float, what: str) -> None:
     """Raise DomainError where a result would hold more values than are made in one call."""
     if not values <= MOST_VALUES:

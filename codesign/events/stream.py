@@ -7,7 +7,7 @@ from torch import Tensor
 
 from codesign.checks import check_kind, check_whole
 from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import Times, check_dtype, check_room, check_times
+from codesign.events.entry import Times, check_dtype, check_room, check_times, exactly
 from codesign.types import EventStream
 
 
@@ -142,4 +142,5 @@ def to_counts(stream: EventStream, t_s: Times, *, dtype: torch.dtype = torch.flo
     ) * stream.width_px + stream.x[inside]
     shape = (len(times_us) - 1, 2, stream.height_px, stream.width_px)
     check_room(torch.Size(shape).numel(), "the counts")
-    return torch.bincount(cell, minlength=torch.Size(shape).numel()).reshape(shape).to(dtype)
+    counts = torch.bincount(cell, minlength=torch.Size(shape).numel())
+    return exactly(counts.reshape(shape), dtype)

@@ -182,6 +182,7 @@ class Tracker:
         self._last_us: int | None = None
         self._start_us: int | None = None
         self._before: TrackedWindow | None = None
+        self._off: int | None = None
 
     def _checked(self, chunk):
         """The chunk as rows [4, N] of this sensor, no event before the last one of the chunks
@@ -198,6 +199,8 @@ class Tracker:
             rows = torch.stack([stream.t_us, stream.x, stream.y, stream.p])
         else:
             rows = _rows_of(chunk)
+            self._off = _off(rows[3], self._off)
+            rows[3] = torch.where(rows[3] == 0, -1, rows[3])
         if self.size_px is None:
             raise DomainError(
                 "events as arrays do not say how large the sensor is; give size_px to the tracker."
@@ -315,7 +318,7 @@ def _takes_start(estimate):
 
 
 def _rows_of(chunk):
-    """t_us, x, y, p [4, N] int64 of arrays, p +1 and -1."""
+    """t_us, x, y, p [4, N] int64 of arrays."""
     if not isinstance(chunk, (tuple, list)) or len(chunk) != 4:
         raise DomainError(
             f"the chunk is {shown(chunk)}; an EventStream or arrays (t_us, x, y, p) are needed."
@@ -335,9 +338,18 @@ def _rows_of(chunk):
         raise ShapeError(
             f"t_us, x, y, p have {[len(values) for values in columns]} entries; equal lists are needed."
         )
-    rows = torch.stack(columns)
-    rows[3] = torch.where(rows[3] == 0, -1, rows[3])
-    return rows
+    return torch.stack(columns)
+
+
+def _off(polarity, before):
+    """By which number a stream tells events OFF, 0 or -1; None where none has come. Raises:
+    DomainError where both come."""
+    told = {number for number in (0, -1) if number == before or bool((polarity == number).any())}
+    if len(told) > 1:
+        raise DomainError(
+            "polarities hold 0 and -1, so events OFF cannot be told from events without one; give +1 and -1, or 1 and 0."
+        )
+    return told.pop() if told else None
 
 
 def _carried_on(before, duration_us):

@@ -5,7 +5,7 @@ import difflib
 import functools
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from typing import Any
@@ -56,6 +56,12 @@ ALIASES = {
 }
 _CODE = re.compile(r"([0-9]{3})([0-9]{3})(?:\.[0-9]{3})?|([0-9]{3,9})\.([0-9]{3,9})")
 _PAIR = re.compile(r"([0-9]\.[0-9]{1,16}) ?[/:] ?([0-9]{1,3}(?:\.[0-9]{1,16})?)")
+
+
+def _maker(text):
+    """The maker of glass that a text names; None where it names none, or a catalogue of several."""
+    found = next((maker for maker in _MAKERS[:-3] if maker in text.upper()), None)
+    return "HIKARI" if found == "NIKON" else found  # one catalogue
 
 
 def _conrady(wavelength_um):
@@ -225,9 +231,12 @@ class Glass:
         return Glass.from_indices(index_F, nd, index_F - spread, name or f"{nd:.6g}/{Vd:.5g}")
 
     @staticmethod
-    def named(name: str) -> "Glass":
+    def named(name: str, catalogues: Sequence[str] = ()) -> "Glass":
         """Glass by its catalogue name; case, "-", "_", spaces and a manufacturer suffix
         (NBK7_SCHOTT) do not matter.
+
+        catalogues: that a file takes its glasses from (GCAT of a .zmx: makers, SUMITA_AUG2011).
+          Where all of them are makers known here, a glass of that name by another maker is refused.
 
         What looks like a code stands for nd and Vd, as in ``from_abbe``: 517642, 517.642,
         517642.251, 517000.642000, 1.5168/64.17.
@@ -260,6 +269,13 @@ class Glass:
             raise DomainError(
                 f"glass {_cut(name)} is not in the catalogue; the nearest names are {offers}; else give "
                 "Glass.from_indices or Glass.from_abbe, in a .zmx a line such as GLAS ___BLANK 1 0 nd Vd."
+            )
+        told = [_maker(catalogue) for catalogue in catalogues]
+        maker = _maker(glass.source)
+        if told and maker and None not in told and maker not in told:
+            raise DomainError(
+                f"glass {_cut(name)} is that of {maker.title()} in the catalogue, and the file takes its glasses from "
+                f"{_cut(' '.join(catalogues))}; give its indices, in a .zmx as GLAS ___BLANK 1 0 nd Vd."
             )
         return glass
 

@@ -29,7 +29,7 @@ def ground_depth(
       scene: as for ``scene_depth``; only the objects of a MovingScene are looked at, which hide the
         ground.
     Returns: [N, P] m along the camera's z axis, float64; infinite where a ray goes up or along the
-      ground, or meets an object that moves.
+      ground, begins below it, or meets an object that moves.
     Gradient: pose, and the lens behind the chief rays.
     """
     rays = camera.chief_rays(pixels.reshape(-1, 2))
@@ -53,7 +53,7 @@ def _over_ground(rays, pixels, T_world_cam, hidden):
     rising, above = ((v.reshape(*pixels.shape[:2], 1, 3) @ up)[..., 0, 0] for v in (slope, base))
     falling = -rising
     height = T_world_cam[:, 2, 3].double()[:, None] + above
-    meets = (falling.detach() > LEVEL) & ~hidden
+    meets = (falling.detach() > LEVEL) & (height.detach() > 0) & ~hidden
     return torch.where(meets, height / torch.where(meets, falling, 1.0), torch.inf)
 
 

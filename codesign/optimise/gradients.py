@@ -12,14 +12,15 @@ from codesign.errors import DomainError, GradientError, ShapeError
 def sample_gradients(
     losses: Iterable[Tensor],
     parameters: Sequence[Tensor],
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, list[bool]]:
     """Values and gradients of sample losses, each taken as soon as it is made, so that one graph
     lives at a time.
 
     Args:
       losses: scalars, S of them; a generator makes each when it is needed.
       parameters: leaves that ask for gradients, of any shapes.
-    Returns: values [S] and gradients [S, V] to the parameters' numbers in order, float64.
+    Returns: values [S] and gradients [S, V] to the parameters' numbers in order, float64; whether
+      any sample depends on each parameter.
     Raises: GradientError when a loss does not depend on any of the parameters, or shares its graph
       with another; DomainError, ShapeError for samples that are no scalar tensors, or none.
     """
@@ -29,6 +30,7 @@ def sample_gradients(
         )
     values = []
     rows = []
+    felt = [False] * len(parameters)
     for loss in losses:
         if not isinstance(loss, Tensor) or loss.numel() != 1:
             given = tuple(loss.shape) if isinstance(loss, Tensor) else type(loss).__name__
@@ -52,11 +54,12 @@ def sample_gradients(
             raise GradientError(
                 "a sample's loss does not depend on any parameter that is optimised."
             )
+        felt = [known or g is not None for known, g in zip(felt, grads, strict=True)]
         values.append(float(loss.detach()))
         rows.append(torch.cat([_flat(g, p) for g, p in zip(grads, parameters, strict=True)]))
     if not rows:
         raise DomainError("there are no samples in this step; give at least one loss.")
-    return torch.tensor(values, dtype=torch.float64), torch.stack(rows)
+    return torch.tensor(values, dtype=torch.float64), torch.stack(rows), felt
 
 
 def clipped_mean(gradients: Tensor, limit: float | None) -> Tensor:
@@ -68,11 +71,12 @@ def clipped_mean(gradients: Tensor, limit: float | None) -> Tensor:
     return (gradients * (longest / lengths.clamp_min(1e-300)).clamp(max=1.0)[:, None]).mean(0)
 
 
-def assign(parameters: Sequence[Tensor], gradient: Tensor) -> None:
-    """Put a flat gradient [V] where torch's optimisers look for it."""
+def assign(parameters: Sequence[Tensor], gradient: Tensor, felt: Sequence[bool]) -> None:
+    """Put a flat gradient [V] where torch's optimisers look for it; none where a parameter was not
+    ``felt``, which they then leave alone, weight decay included."""
     sizes = [p.numel() for p in parameters]
-    for parameter, part in zip(parameters, gradient.split(sizes), strict=True):
-        parameter.grad = part.reshape(parameter.shape).to(parameter)
+    for parameter, part, known in zip(parameters, gradient.split(sizes), felt, strict=True):
+        parameter.grad = part.reshape(parameter.shape).to(parameter) if known else None
 
 
 def _flat(gradient: Tensor | None, parameter: Tensor) -> Tensor:

@@ -86,7 +86,6 @@ class Loop:
         self.record = Record()
         self.best = self._now()
         self.best_score = math.inf
-        self._first_lr = [float(group["lr"]) for group in optimiser.param_groups]
         self._shrunk = 1.0
 
     @property
@@ -125,20 +124,23 @@ class Loop:
                 f"{error} Optimisation stopped at step {self.step_number + 1}; the parameters are back at the "
                 "best point so far."
             ) from error
-        finally:
-            for group, lr in zip(self.optimiser.param_groups, self._first_lr, strict=True):
-                group["lr"] = lr
         self._go(self.best)
         return self.best
 
     def _step(self) -> None:
-        values, gradients = sample_gradients(self.samples(self.step_number), self.parameters)
+        values, gradients, felt = sample_gradients(self.samples(self.step_number), self.parameters)
         if not bool(values.isfinite().all() and gradients.isfinite().all()):
             raise NonFiniteError("a sample's loss or its gradient is infinite or NaN.")
-        assign(self.parameters, self._clipped(gradients))
-        for group, lr in zip(self.optimiser.param_groups, self._first_lr, strict=True):
-            group["lr"] = lr * self._shrunk
-        self.optimiser.step()
+        assign(self.parameters, self._clipped(gradients), felt)
+        groups = self.optimiser.param_groups
+        told = [group["lr"] for group in groups]  # by a schedule, or the user
+        try:
+            for group in groups:
+                group["lr"] = group["lr"] * self._shrunk
+            self.optimiser.step()
+        finally:
+            for group, lr in zip(groups, told, strict=True):
+                group["lr"] = lr
         self.record.loss.append(float(values.mean()))
         self.record.gradient.append(float(gradients.norm(dim=1).mean()))
 

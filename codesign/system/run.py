@@ -250,11 +250,16 @@ class Pass(Mapping[str, Any]):
         self._check_count("events", volume.counts.shape[0])
         if self._looked_at("events"):
             look_at(by, volume)
-        wanted = built_bins(self.system.flow)
+        built = built_bins(self.system.flow)
+        wanted = self.system.asked_bins if built is None else built
         if wanted is not None and volume.counts.shape[2] != wanted:
+            who = (
+                f"the system was given bins={wanted}"
+                if built is None
+                else f"stage 'flow' ({label(self.system.flow)}) was built for {wanted} time bins"
+            )
             raise ShapeError(
-                f"stage 'flow' ({label(self.system.flow)}) was built for {wanted} time bins, stage 'events' "
-                f"made {volume.counts.shape[2]}; give the one as many as the other."
+                f"{who}, stage 'events' made {volume.counts.shape[2]}; give the one as many as the other."
             )
 
     def _events(self):

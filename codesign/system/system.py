@@ -26,7 +26,10 @@ OTHER_NAMES = {
     "poses": "trajectory",
     "losses": "objectives",
 }
-_ALSO = ("lens", "objectives", "named_objectives", "gradient", "scene", "bins", "training")
+_ALSO = (
+    *("lens", "objectives", "named_objectives", "gradient", "scene", "training"),
+    *("bins", "asked_bins"),
+)
 
 
 Init = TypeVar("Init", bound=Callable[..., None])
@@ -68,8 +71,9 @@ class System(nn.Module):
       estimate: what follows the flow, for example a velocity; its input is the field.
       render: () -> frames [..., T, *film.shape] of one scene, for other than ``render.frames``.
       gradient: "interior", "boundary", "difference" or "auto", of ``render.frames``.
-      scene: for batches without one. bins: time bins of the volume; by default those the flow stage
-        was built for (its ``config``), or 5.
+      scene: for batches without one. bins: time bins of the volume, which an event stage that makes
+        its own then has to have; by default those the flow stage was built for (its ``config``), or
+        5 of an event stage that makes none.
     Samples: N counts trajectories times windows of the film, trajectory by trajectory.
     Raises: DomainError for a part that a system does not have, naming the nearest; when a stage
       asks for what it does not have, or estimator and bins do not fit.
@@ -117,7 +121,7 @@ class System(nn.Module):
         self.events = events
         self.flow = flow
         self.estimate = estimate
-        self.bins = _bins(flow, bins)
+        self.bins = bins
         self.objectives: Any = objectives
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -130,6 +134,9 @@ class System(nn.Module):
                 module for part in self.named_objectives.values() for module in modules_of(part)
             ]
             value = nn.ModuleList(dict.fromkeys(held))  # their parameters are the system's too
+        elif name == "bins":
+            self.asked_bins = value
+            value = _bins(self.flow, value)
         elif name == "gradient":
             check_choice(value, "gradient", render_stage.sequence.WAYS)
         elif name == "lens":
@@ -226,12 +233,12 @@ class System(nn.Module):
     def replaced(self, **parts: Any) -> "System":
         """The same system with other parts, for example the hard sensor for ``events``; what stays
         is shared."""
-        now = {name: getattr(self, name) for name in (*PARTS, "gradient", "scene", "bins")}
-        now["objectives"] = self.named_objectives
+        now = {name: getattr(self, name) for name in (*PARTS, "gradient", "scene")}
+        now |= {"objectives": self.named_objectives, "bins": self.asked_bins}
         unknown = [name for name in parts if name not in now]
         if unknown:
             raise _unknown(unknown[0], tuple(now))
-        if "flow" in parts and "bins" not in parts:
+        if "flow" in parts:
             now["bins"] = None  # those of the new estimator
         return System(**{**now, **parts})
 

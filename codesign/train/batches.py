@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import torch
 
 from codesign.checks import check_number, check_positive
+from codesign.errors import DomainError
 from codesign.system.contents import mapped
 from codesign.types import EventVolume, FlowField, FlowWindows
 
@@ -161,7 +162,10 @@ class Part:
         return self.last - self.first
 
     def batch(self, indices: Sequence[int]) -> Any:
-        """The samples of these numbers, counted from the first."""
+        """The samples of these numbers, counted from the first. Raises: DomainError beyond the
+        last."""
+        if beyond := [index for index in indices if not 0 <= index < len(self)]:
+            raise DomainError(f"window {beyond[0]} of {len(self)}; give 0 to {len(self) - 1}.")
         return self.source.batch([self.first + index for index in indices])
 
 
@@ -174,7 +178,11 @@ class Started:
       start: EventVolume -> FlowField with covariance, equivariant to turns and mirrors.
       foreign: share of the samples that begin elsewhere, as from the window before: with half to
         one and a fifth of the start's flow, and a covariance of 1 px^2 along both axes.
+    It has an end where the source has one.
     """
+
+    def __new__(cls, source: Source, *_: Any, **__: Any) -> "Started":
+        return super().__new__(_Finite if hasattr(source, "__len__") else cls)
 
     def __init__(
         self,
@@ -207,6 +215,14 @@ class Started:
                 start, flow_px=torch.stack(flows), covariance_px2=torch.stack(covariances)
             ),
         )
+
+
+class _Finite(Started):
+    """That of a source with an end."""
+
+    def __len__(self) -> int:
+        source: Any = self.source
+        return len(source)
 
 
 def probe(source: Source) -> Any:

@@ -2,6 +2,7 @@
 is like, every design."""
 
 import math
+import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -27,6 +28,7 @@ def lead(run: Run[Any], space: Space, rows: Sequence[Row], judge: Judge) -> str:
         return "This run looks at the landscape and races nothing."
     found = compared(rows)
     race(run, plain(space.pair.name), found, rows)
+    answers(run, space, rows)
     shown(run, space, found, rows, judge)
     return answer(run, space.pair.name, found, rows)
 
@@ -108,24 +110,24 @@ def race(
     if found:
         every = every_ratio(rows)
         best = best_order(found)
-        named = {plain(arm, "over", other): ratio for (arm, other), ratio in every.items()}
+        named = {plain(arm, "over", other): told for (arm, other), told in every.items()}
         for arm in ("joint", "nested"):
             if (arm, best) in every and ">" in best:
                 named[f"{arm}_over_best_order"] = every[arm, best]
-        for name, ratio in named.items():
-            ends = {"median": ratio.value, "low95": ratio.low, "high95": ratio.high}
+        for name, (ratio, p) in named.items():
+            ends = {"median": ratio.value, "low95": ratio.low, "high95": ratio.high, "p": p}
             run.record(**{f"{name}_{end}_{pair}": value for end, value in ends.items()})
         arms = ["joint", *found]
         run.table(
             "Error of each arm over that of every other",
             ("arm", *(f"over {other}" for other in arms)),
             [
-                (arm, *("" if arm == other else f"{every[arm, other]:.2f}" for other in arms))
+                (arm, *("" if arm == other else f"{every[arm, other][0]:.2f}" for other in arms))
                 for arm in arms
             ],
             "Medians over starts, 95 % of resampled starts and worlds.",
         )
-        ratios = {arm: every["joint", arm] for arm in found}
+        ratios = {arm: every["joint", arm][0] for arm in found}
         caption = (
             "Error of the joint design over that of each arm: median over starts, 95 % of "
             "resampled starts and worlds."
@@ -136,13 +138,29 @@ def race(
         run.card(f"joint over {best}", f"{ratios[best].value:.2f}", f"{ratios[best]:.2f}")
 
 
-def every_ratio(rows: Sequence[Row]) -> dict[tuple[str, str], Interval]:
-    """(arm, other) -> the ratio of their errors over paired starts and worlds."""
+def every_ratio(rows: Sequence[Row]) -> dict[tuple[str, str], tuple[Interval, float]]:
+    """(arm, other) -> the ratio of their errors over paired starts and worlds, and its p after
+    Holm over the rivals of the arm."""
     return {
-        (arm, other): Interval(*map(math.exp, (over.value, over.low, over.high)), over.count)
+        (arm, other): (Interval(*map(math.exp, (over.value, over.low, over.high)), over.count), p)
         for arm in dict.fromkeys(row["arm"] for row in rows)
-        for other, (over, _) in compared(rows, arm).items()
+        for other, (over, p) in compared(rows, arm).items()
     }
+
+
+def answers(run: Run[Any], space: Space, rows: Sequence[Row]) -> None:
+    """Where in their bounds the arms end: medians over starts."""
+    lines = [
+        {
+            "arm": arm,
+            **{
+                name: statistics.median(row[name] for row in rows if row["arm"] == arm)
+                for name in space.free
+            },
+        }
+        for arm in run.config.arms
+    ]
+    tabulate(run, "Where they end", lines, "arm", prefix="ends", caption="Medians over starts.")
 
 
 def trails(run: Run[Any], rows: Sequence[Row]) -> None:

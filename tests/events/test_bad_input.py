@@ -232,3 +232,14 @@ def test_a_changed_noise_rate_is_drawn_anew():
     few = noisy(FRAMES, T_S).sum()
     noisy.sensor = replace(noisy.sensor, shot_rate_hz=2000.0)
     assert noisy(FRAMES, T_S).sum() > 20 * few > 0
+
+
+def test_a_sensor_with_other_values_of_what_is_learnt_is_refused():
+    learning = layer("memory", SensorModel(0.2, 0.2))
+    with pytest.raises(DomainError, match="theta_on is learnt here"):
+        learning.sensor = SensorModel(0.1, 0.2)
+    assert learning.fitted() == learning.sensor == SensorModel(0.2, 0.2)
+    fixed = layer("memory", SensorModel(0.2, 0.2), learn=())
+    fixed.sensor = SensorModel(0.1, 0.1, cutoff_hz=60.0)
+    again = layer("memory", SensorModel(0.1, 0.1, cutoff_hz=60.0), learn=())
+    assert torch.equal(fixed(FRAMES, T_S), again(FRAMES, T_S))

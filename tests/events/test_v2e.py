@@ -89,8 +89,12 @@ def test_counts_of_the_interpolated_sensor_equal_v2e_in_every_pixel_and_frame(
     assert (moved != 0).sum() <= 1e-4 * len(stream)
 
 
-@pytest.mark.parametrize("timing", ["v2e", "interpolated"])
-@pytest.mark.parametrize("case", STATISTICS)
+# v2e's leaks all begin with the run and give half an event less: test_sensor has our rates
+@pytest.mark.parametrize(
+    ("timing", "case"),
+    [("v2e", case) for case in STATISTICS]
+    + [("interpolated", case) for case in STATISTICS if case.startswith("shot")],
+)
 def test_noise_rates_are_those_of_v2e(shared, timing, case):
     truth = json.loads(shared("refs/events/v2e_stats.json").read_text())[case]
     frames = torch.full((truth["frames"], *truth["shape"]), float(truth["dn"]))

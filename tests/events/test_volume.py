@@ -6,7 +6,8 @@ import math
 import pytest
 import torch
 
-from codesign.events import decay, from_counts, from_stream, surface_from_counts
+from codesign.errors import DomainError
+from codesign.events import decay, from_counts, from_stream, surface_from_counts, to_counts
 from codesign.events.stream import ordered
 from codesign.events.volumes.surface import decay_from_stream, surface_from_stream
 from codesign.events.volumes.volume import spikes_from_stream
@@ -151,3 +152,18 @@ def test_traces_of_counts_fade_exponentially():
     on = [3, 3 * math.exp(-1), 3 * math.exp(-1.5) + 1, (3 * math.exp(-1.5) + 1) * math.exp(-2.5)]
     off = [0, 2, 2 * math.exp(-0.5), 2 * math.exp(-3)]
     torch.testing.assert_close(traces, f64([on, off]).T)
+
+
+def test_counts_that_a_type_does_not_hold_are_refused():
+    many = 40_000
+    zero = torch.zeros(many, dtype=torch.int64)
+    stream = ordered(torch.arange(many), zero, zero, zero + 1, 1, 1)
+    assert to_counts(stream, [0.0, 1.0], dtype=torch.int32).sum() == many
+    for kind in (torch.int16, torch.float16, torch.bfloat16):
+        with pytest.raises(DomainError, match=f"40000 events .*, more than {kind} holds exactly"):
+            to_counts(stream, [0.0, 1.0], dtype=kind)
+    twice = ordered(*(torch.cat([v, v]) for v in (stream.t_us, zero, zero, zero + 1)), 1, 1)
+    with pytest.raises(DomainError, match=r"8e\+04 events, more than torch.float16 can"):
+        from_stream(twice, 0, many, 1, dtype=torch.float16)
+    with pytest.raises(DomainError, match=r"1.7e\+18 us is too long for 8 bins"):
+        from_stream(stream, 0, 17 * 10**17, 8)

@@ -203,8 +203,9 @@ def test_arrays_are_taken_and_faults_left_out_on_request():
     def tracker(*skip):
         return flow.Tracker(summed, window_s=0.001, size_px=SIZE, skip=skip)
 
-    chunks = [(t_us, x, y, on), (t_us + 2000, x.astype(np.int16), y.tolist(), 2 * on - 1)]
+    chunks = [(t_us, x, y, on), (t_us + 2000, x.astype(np.int16), y.tolist(), on > 0)]
     assert sum(window.events for window in tracker().track(chunks)) == 40
+    assert sum(window.events for window in tracker().track([(t_us, x, y, 2 * on - 1)])) == 20
     x[3], y[5] = 16, -1
     t_us[10] = 150
     skip = ("events_off_sensor", "events_back_in_time")
@@ -221,3 +222,14 @@ def test_arrays_are_taken_and_faults_left_out_on_request():
     again.add(stream_of(np.arange(20) * 100))
     with pytest.raises(DomainError, match="lies before 1900 us"):
         again.add(stream_of(np.arange(20) * 100))
+
+
+def test_polarities_that_cannot_be_told_are_refused():
+    """0 is OFF in files of 1 and 0, and nothing in those of 1, 0 and -1."""
+    at = np.arange(4) * 100, np.arange(4), np.arange(4)
+    tracker = flow.Tracker(summed, window_s=0.001, size_px=SIZE)
+    with pytest.raises(DomainError, match="polarities hold 0 and -1"):
+        tracker.add((*at, np.array([1, 0, -1, 1])))
+    tracker.add((*at, np.array([1, 0, 0, 1])))
+    with pytest.raises(DomainError, match="polarities hold 0 and -1"):
+        tracker.add((at[0] + 400, *at[1:], np.array([1, -1, -1, 1])))

@@ -216,3 +216,16 @@ def test_spots_behind_apertures_are_of_the_rays_that_pass():
     found = lens.rms_spot_mm(geo, [field], vignetting=True)[0]
     close(found, analysis.spot_radius_mm(*passed), 1e-9)
     assert found < 0.8 * lens.rms_spot_mm(geo, [field])[0]
+
+
+@pytest.mark.parametrize("name", ["cooke-triplet", "double-gauss"])
+def test_fans_of_a_lens_in_single_precision_are_those_of_its_numbers(name):
+    """A wave is 1e-5 of the paths: in single precision their differences would be noise."""
+    geo = lens.load(name)
+    fan, single = (analysis.ray_fan(each, 0.12, count=9) for each in (geo, geo.float()))
+    assert single.tangential_waves.dtype == torch.float32
+    close(single.tangential_waves.double(), fan.tangential_waves, atol=2e-3)
+    colours = [
+        analysis.lateral_colour_mm(each, [0.12], [LINES[1]]).item() for each in (geo, geo.float())
+    ]
+    assert colours[1] == pytest.approx(colours[0], rel=1e-3)

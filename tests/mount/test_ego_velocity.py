@@ -196,3 +196,9 @@ def test_a_plate_on_the_camera_has_no_depth_whenever_the_interval_ends(camera):
         covered.append(read.depth_m.isinf())
     assert torch.equal(*covered)
     assert 0.2 < covered[0].double().mean() < 0.8
+
+
+def test_ground_has_no_depth_from_below_it():
+    camera = render.Camera(lens.Pinhole(8.0), 20, 15, 0.4)
+    below = pose.look_at((0, 0, -1.0), (5, 0, -2.0))[None]
+    assert ground_depth(camera, f64([[[9.5, 7.0], [9.5, 14.0]]]), below).isinf().all()

@@ -83,7 +83,8 @@ def test_a_normalised_step_in_single_precision_is_as_long_for_any_gradient(size)
 def test_sample_gradients_are_clipped_one_by_one():
     x = parameter(0.0, 0.0)
     slopes = torch.tensor([[3.0, 4.0], [0.3, 0.4], [0.0, -1.0]], dtype=torch.float64)
-    values, gradients = sample_gradients(((x * s).sum() + 1 for s in slopes), [x])
+    values, gradients, felt = sample_gradients(((x * s).sum() + 1 for s in slopes), [x])
+    assert felt == [True]
     assert values.tolist() == [1.0, 1.0, 1.0]
     torch.testing.assert_close(gradients, slopes)
     for limit in (1.0, None):  # the median length is 1
@@ -228,3 +229,31 @@ def test_a_state_is_of_its_moment_and_loops_resumed_from_it_go_apart():
     for loop in (first, second, third):
         assert loop.record == whole.record
         torch.testing.assert_close(loop.best[0], whole.best[0], rtol=0, atol=1e-12)
+
+
+def test_a_schedule_and_a_rate_set_between_runs_are_kept():
+    x = parameter(0.0)
+    optimiser = torch.optim.SGD([x], lr=0.1)
+    halves = torch.optim.lr_scheduler.ExponentialLR(optimiser, 0.5)
+    loop = Loop(optimiser, lambda step: [-x.sum()], clip=10.0)
+    way = []
+
+    def advance(**shown):
+        halves.step()
+        way.append(x.item())
+
+    loop.run(5, advance)
+    # 0.1 (1 + 1/2 + 1/4 ...)
+    assert way == pytest.approx([0.2 * (1 - 0.5**k) for k in range(1, 6)])
+    optimiser.param_groups[0]["lr"] = 0.01
+    loop.run(7)
+    assert x.item() == pytest.approx(way[-1] + 0.02)
+    assert optimiser.param_groups[0]["lr"] == 0.01
+
+
+def test_weight_decay_leaves_alone_what_no_sample_reaches():
+    """As torch does without the loop."""
+    reached, far = parameter(1.0), parameter(1.0)
+    optimiser = torch.optim.AdamW([reached, far], lr=0.1, weight_decay=0.5)
+    Loop(optimiser, lambda step: [reached.square().sum()]).run(10)
+    assert far.item() == 1.0 != reached.item()

@@ -263,6 +263,131 @@ def test_every_file_of_materials_of_an_obj_is_read(tmp_path):
     assert sorted(part.colour[0] for part in mesh_files.read(path)) == pytest.approx([0.1, 0.2])
 
 
+OUTLINES = {  # the same polygon from each of its corners
+    "L": [(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)],
+    "T": [(0, 0), (1, 0), (1, 2), (2, 2), (2, 3), (-1, 3), (-1, 2), (0, 2)],
+    "arrow": [(0, 0), (2, 1), (0, 2), (1, 1)],
+    "house": [(0, 0), (1, 0), (2, 0), (2, 2), (1, 3), (0, 2)],  # a corner on a line
+}
+
+
+@pytest.mark.parametrize("kind", ["obj", "ply", "dae"])
+@pytest.mark.parametrize("name", OUTLINES)
+def test_polygons_have_their_area_or_are_refused(tmp_path, name, kind):
+    """By the shoelace formula, whichever corner comes first; a fan of triangles is right where every
+    corner lies in sight of the first."""
+    outline = np.array(OUTLINES[name], dtype=float)
+    x, y = outline.T
+    area = abs((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) / 2
+    refused = 0
+    for turn in range(len(outline)):
+        path = polygon(tmp_path, np.roll(outline, turn, 0), kind)
+        try:
+            [part] = mesh_files.read(path, 1.0, "z")
+        except FileFormatError:
+            with pytest.raises(FileFormatError, match="points inwards; give triangles"):
+                mesh_files.read(path, 1.0, "z")
+            refused += 1
+            continue
+        corners = part.vertices_m[part.faces]
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        assert np.linalg.norm(across, axis=1).sum() / 2 == pytest.approx(area, rel=1e-6)
+    assert 0 < refused < len(outline) if name != "house" else refused == 0
+
+
+def polygon(folder, outline, kind):
+    """A file with one face, as modelling programs write them."""
+    count = len(outline)
+    if kind == "obj":
+        text = "".join(f"v {x} {y} 0\n" for x, y in outline)
+        text += f"f {' '.join(str(i + 1) for i in range(count))}\n"
+    elif kind == "ply":
+        text = (
+            f"ply\nformat ascii 1.0\nelement vertex {count}\nproperty float x\nproperty float y\n"
+            "property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+            + "".join(f"{x} {y} 0\n" for x, y in outline)
+            + f"{count} {' '.join(map(str, range(count)))}\n"
+        )
+    else:
+        text = (
+            '<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">'
+            "<asset/><library_geometries><geometry id='g'><mesh><source id='s'><float_array id='a' "
+            f"count='{3 * count}'>{' '.join(f'{x} {y} 0' for x, y in outline)}</float_array><technique_common>"
+            f"<accessor source='#a' count='{count}' stride='3'><param name='X' type='float'/><param name='Y' "
+            "type='float'/><param name='Z' type='float'/></accessor></technique_common></source><vertices id='v'>"
+            "<input semantic='POSITION' source='#s'/></vertices><polylist count='1'><input semantic='VERTEX' "
+            f"source='#v' offset='0'/><vcount>{count}</vcount><p>{' '.join(map(str, range(count)))}</p></polylist>"
+            "</mesh></geometry></library_geometries><library_visual_scenes><visual_scene id='w'><node id='n'>"
+            "<instance_geometry url='#g'/></node></visual_scene></library_visual_scenes><scene>"
+            "<instance_visual_scene url='#w'/></scene></COLLADA>"
+        )
+    (folder / f"one.{kind}").write_text(text)
+    return folder / f"one.{kind}"
+
+
+@pytest.mark.parametrize(
+    ("library", "used", "found"),
+    [
+        ("newmtl m\nKd 0.3 0.3 0.3 # paint", "m", 0.3),
+        ("newmtl m\n  kd 0.3", "m", 0.3),  # one number stands for three
+        ("newmtl Material #25\nKd 0.3 0.3 0.3", "Material #25", 0.3),
+        ("newmtl m\nKd 0,3 0,3 0,3", "m", "'Kd 0,3 0,3 0,3' is not three numbers"),
+        ("newmtl red\nKd 0.3 0.3 0.3", "Red", "uses the material 'Red', which its library"),
+    ],
+)
+def test_colours_of_materials_are_read_or_refused(tmp_path, library, used, found):
+    (tmp_path / "q.mtl").write_text(library + "\n")
+    path = tmp_path / "q.obj"
+    path.write_text(f"mtllib q.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl {used}\nf 1 2 3\n")
+    if isinstance(found, str):
+        with pytest.raises(FileFormatError, match=found):
+            mesh_files.read(path)
+    else:
+        [part] = mesh_files.read(path)
+        assert part.colour == pytest.approx([found])
+
+
+@pytest.mark.parametrize(
+    ("kind", "colours", "found"),
+    [
+        ("obj", ["0.5 0.5 0.5"] * 3, 0.5),
+        ("obj", ["128 128 128"] * 3, "reach 128; export them from 0 to 1"),
+        ("obj", ["1 1 1", "", "1 1 1"], "2 of its 3 vertices have a colour"),
+        ("ply", ["0.5 0.5 0.5"] * 3, 0.5),
+        ("ply", ["128 128 128"] * 3, "reach 128, where 1 is the most"),
+    ],
+)
+def test_colours_of_vertices_are_read_or_refused(tmp_path, kind, colours, found):
+    places = ["0 0 0", "1 0 0", "0 1 0"]
+    lines = [f"{place} {colour}" for place, colour in zip(places, colours, strict=True)]
+    if kind == "obj":
+        text = "".join(f"v {line}\n" for line in lines) + "f 1 2 3\n"
+    else:
+        numbers = "".join(
+            f"property float {name}\n" for name in ("x", "y", "z", "red", "green", "blue")
+        )
+        text = f"ply\nformat ascii 1.0\nelement vertex 3\n{numbers}element face 1\n"
+        text += (
+            "property list uchar int vertex_indices\nend_header\n"
+            + "\n".join(lines)
+            + "\n3 0 1 2\n"
+        )
+    (tmp_path / f"c.{kind}").write_text(text)
+    if isinstance(found, str):
+        with pytest.raises(FileFormatError, match=found):
+            mesh_files.read(tmp_path / f"c.{kind}")
+    else:
+        [part] = mesh_files.read(tmp_path / f"c.{kind}")
+        # of sRGB, in 8 bits
+        assert 2 + 253 * part.colour == pytest.approx([radiance_of(255 * found)] * 3, rel=0.01)
+
+
+def test_a_mesh_on_bones_is_refused(tmp_path):
+    nodes = [{"mesh": 0, "skin": 0, "translation": [9, 0, 0]}, {"translation": [3, 0, 0]}]
+    with pytest.raises(FileFormatError, match="meshes on bones"):
+        mesh_files.read(write_gltf(tmp_path, "gltf", nodes=nodes, skins=[{"joints": [1]}]))
+
+
 def cube(folder, kind, size=0.5):
     """A cube whose three lower coordinates are 0, facing outwards, written by hand as .obj or by
     trimesh."""

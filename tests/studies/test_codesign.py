@@ -229,10 +229,11 @@ def test_the_comparison_is_of_pairs():
     assert found["random"][0].outcome == "is undecided"
     every = every_ratio(rows)
     assert len(every) == 6
-    assert every["book", "random"].value == pytest.approx(1.25)
-    for (arm, other), ratio in every.items():
+    assert every["book", "random"][0].value == pytest.approx(1.25)
+    assert every["joint", "book"][1] == p
+    for (arm, other), (ratio, _) in every.items():
         ends = [1 / each for each in (ratio.value, ratio.high, ratio.low)]
-        back = every[other, arm]
+        back, _ = every[other, arm]
         assert [back.value, back.low, back.high] == pytest.approx(ends, rel=1e-9)
 
 

@@ -297,8 +297,10 @@ def test_parts_can_be_exchanged_in_place_and_are_looked_at():
     system.events = volume_of
     assert system(BATCH).loss.item() == pytest.approx(2.25)  # (3 * 0.5)^2
     system.lens = Glass(1.0)
-    for each in (system, system.replaced(bins=5), copy.deepcopy(system)):
+    for each in (system, system.replaced(bins=1), copy.deepcopy(system)):
         assert each(BATCH).loss.item() == pytest.approx(9.0)
+    with pytest.raises(ShapeError, match="was given bins=5, stage 'events' made 1"):
+        system.replaced(bins=5)(BATCH)
     system.camera = ToyCamera(Glass(2.0))
     assert system(BATCH).loss.item() == pytest.approx(36.0)
     system.camera = lambda: ToyCamera(Glass(1.0))

@@ -7,6 +7,7 @@ import torch
 from codesign.errors import DomainError
 from codesign.train.batches import (
     Batches,
+    Part,
     Started,
     pick,
     probe,
@@ -154,3 +155,26 @@ def test_some_begin_elsewhere():
     assert 1.1 < float(factor[elsewhere].max()) <= 1.2
     alone = source.batch([int(elsewhere.nonzero()[0])])
     assert torch.equal(alone.start.flow_px[0], windows.start.flow_px[elsewhere][0])
+
+
+class Ten:
+    """A source with an end that gives its numbers."""
+
+    def __len__(self):
+        return 10
+
+    def batch(self, indices):
+        return list(indices)
+
+
+def test_a_part_has_no_windows_beyond_itself():
+    part = Part(Ten(), 4, 7)
+    assert part.batch([0, 2]) == [4, 6]
+    for beyond in (-1, 3):
+        with pytest.raises(DomainError, match=f"window {beyond} of 3; give 0 to 2"):
+            part.batch([0, beyond])
+
+
+def test_what_begins_somewhere_ends_where_its_source_does():
+    assert len(Started(Ten(), lambda volume: None)) == 10
+    assert not hasattr(Started(Made(), lambda volume: None), "__len__")

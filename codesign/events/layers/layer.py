@@ -80,7 +80,7 @@ class EventLayer(nn.Module):
         log_input: bool = False,
     ):
         super().__init__()
-        self.sensor = SensorModel() if sensor is None else check_sensor(sensor)
+        self._sensor = SensorModel() if sensor is None else check_sensor(sensor)
         self.log_input = FrontEnd(log_input).log_input
         if isinstance(learn, str) or not isinstance(learn, Sequence):
             raise DomainError(
@@ -97,6 +97,23 @@ class EventLayer(nn.Module):
                     f"{name} is 0 in the sensor, so it is switched off; give a value above 0 to learn it."
                 )
         self.learnt = PositiveValues({name: getattr(self.sensor, name) for name in learn})
+
+    @property
+    def sensor(self) -> SensorModel:
+        """The sensor that the layer was made of. One with other values of what is learnt is refused:
+        those are parameters, which begin at the first."""
+        return self._sensor
+
+    @sensor.setter
+    def sensor(self, sensor: SensorModel) -> None:
+        check_sensor(sensor)
+        for name in self.learnt:
+            if getattr(sensor, name) != getattr(self._sensor, name):
+                raise DomainError(
+                    f"{name} is learnt here, so another sensor cannot change it; make a layer of the new sensor, or leave "
+                    f"it out of learn=."
+                )
+        self._sensor = sensor
 
     def value(self, name: str) -> Tensor | float:
         """A field of the sensor as it is now: a 0-dim tensor with a gradient where it is learnt, a

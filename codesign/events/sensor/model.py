@@ -12,7 +12,7 @@ from torch import Generator, Tensor
 
 from codesign.checks import check_choice, check_flag, check_kind, check_number
 from codesign.errors import DomainError, ShapeError, shown
-from codesign.events.entry import MOST_VALUES, as_seconds, check_dtype
+from codesign.events.entry import MOST_VALUES, as_seconds, check_dtype, exactly
 
 THETA_MINIMUM = 0.01  # no drawn threshold falls below, as in v2e
 THETA_MOST = 10.0  # light of 22,000 times as much; beyond, a percentage or gray levels are meant
@@ -46,6 +46,9 @@ class SensorModel:
       shot_rate_hz above 0.
     hot_pixel_share: share of pixels that fire by themselves. hot_pixel_rate_hz: their rate
       (ON, as a leak), events per second.
+    Leaks and hot pixels have been at it for a while when the first frame begins, each pixel by a
+      drawn share of a threshold: n seconds have n events per Hz on average, however short (not with
+      timing "v2e", where all begin together).
     timing: "interpolated": each event at the time its pixel crosses the threshold, log level linear
       in time between frames; events inside the dead time are lost (ESIM). "v2e": the frame-wide
       time slots of v2e, where events inside the dead time are deferred.
@@ -381,19 +384,10 @@ def draw_shot_counts(
         return torch.zeros(shape, dtype=dtype)
     size = 2 * math.prod(pixels)
     means = (sensor.shot_rate_hz / 2 * interval_s.double()).tolist()
-    counts = [_in(dtype, _poisson(mean, size, generator)) for mean in means]
+    counts = [
+        exactly(_poisson(mean, size, generator).cpu(), dtype, "noise events") for mean in means
+    ]
     return torch.stack(counts).reshape(shape) if counts else torch.zeros(shape, dtype=dtype)
-
-
-def _in(dtype, counts):
-    """Whole numbers in a type that holds them all; DomainError for another."""
-    most = 2 / torch.finfo(dtype).eps if dtype.is_floating_point else torch.iinfo(dtype).max
-    if len(counts) and int(counts.max()) > most:
-        raise DomainError(
-            f"{int(counts.max())} noise events fall into one interval of a pixel, more than {dtype} holds exactly; take "
-            "torch.float32."
-        )
-    return counts.to("cpu", dtype)
 
 
 def _poisson(mean, size, generator):

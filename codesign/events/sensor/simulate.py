@@ -24,7 +24,7 @@ from codesign.events.kernels import Lanes
 from codesign.events.sensor import crossing, v2e
 from codesign.events.sensor.crossing import DenseCounts, EventKeys, KeyLayout
 from codesign.events.sensor.model import SensorModel, check_generator, check_sensor, draw_keys
-from codesign.events.sensor.state import SensorState, begin, change, check_state
+from codesign.events.sensor.state import SensorState, begin, change, check_state, leak_before
 from codesign.events.stream import concatenate, ordered
 from codesign.exclusive import exclusive
 from codesign.types import EventStream
@@ -180,6 +180,8 @@ def _open(frames, t_s, sensor, generator, state, front_end):
             level, _ = kernel_levels(frames[:1], front_end)  # as those of all later frames
         intensity = frames[0].exp() if front_end.log_input else frames[0]
         begin(state, sensor, intensity, level[0], float(times_s[0]), generator)
+        if sensor.timing == "interpolated":  # v2e's leaks begin together
+            leak_before(state, sensor, generator)
         return state, frames[1:], times_s[1:].tolist(), generator, None
     # v2e keeps single precision whatever the frames have
     dtype = frames.dtype if sensor.timing == "v2e" else state.level.dtype

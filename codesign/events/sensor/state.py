@@ -128,6 +128,16 @@ def begin(state, sensor, frame, level, time_s, generator):
         state.shots = torch.zeros(pixels, dtype=torch.int32, device=level.device)
 
 
+def leak_before(state, sensor, generator):
+    """Let a state that has begun have leaked for some time, drawn evenly up to the event of each
+    pixel: else all leaks would come together, and none in a short run."""
+    if sensor.leaks:
+        come = torch.rand(state.level.shape, generator=generator, device=generator.device)
+        state.reference = state.reference - come.to(state.level) * state.theta_on * (
+            state.leak_hz > 0
+        )
+
+
 def change(state, sensor):
     """Give the pixels of a state the values of a sensor, which may be another than before: its
     thresholds and leaks by the numbers drawn at first, and no noise where it has none.

@@ -102,6 +102,10 @@ def from_stream(
     check_dtype(dtype, fractions=True)
     check_room(2 * bins * stream.height_px * stream.width_px, "the volume")
     duration_us = int(t1_us) - int(t0_us)
+    if duration_us * bins >= 2**63:
+        raise DomainError(
+            f"the interval of {duration_us:.3g} us is too long for {bins} bins; times are in microseconds."
+        )
     first, last = torch.searchsorted(
         stream.t_us, torch.tensor([int(t0_us), int(t1_us) + 1], device=stream.t_us.device)
     ).tolist()
@@ -122,6 +126,10 @@ def from_stream(
     if bins > 1:
         counts.index_add_(0, cell + height * width, share)
     counts = counts[: 2 * bins * height * width]
+    if float(counts.max()) > torch.finfo(dtype).max:
+        raise DomainError(
+            f"a bin holds {float(counts.max()):.3g} events, more than {dtype} can; take torch.float32."
+        )
     node_s = torch.arange(bins, dtype=torch.float64, device=cell.device) / max(bins - 1, 1)
     third = 1 / (3 * max(bins - 1, 1))
     node_s[0], node_s[-1] = (third, 1 - third) if bins > 1 else (0.5, 0.5)

@@ -38,10 +38,13 @@ def lateral_colour_mm(
     at_m: Distances = PARALLEL,
 ) -> Tensor:
     """Chief ray heights minus that at the reference wavelength, [F, W] mm, [D, F, W] for D
-    distances ``at_m`` of the object (see ``trace_field``). Gradient: to every lens tensor."""
+    distances ``at_m`` of the object (see ``trace_field``), computed in float64 and given in the
+    lens's precision. Gradient: to every lens tensor."""
+    dtype = lens.dtype
+    lens = in_float64(lens)
     reference = chief_height_mm(lens, fields_rad, reference_um, at_m)
     heights = [chief_height_mm(lens, fields_rad, float(w), at_m) for w in wavelengths_um]
-    return torch.stack([height - reference for height in heights], -1)
+    return torch.stack([height - reference for height in heights], -1).to(dtype)
 
 
 def chromatic_focus_shift_mm(
@@ -51,12 +54,15 @@ def chromatic_focus_shift_mm(
     at_m: Distances = PARALLEL,
 ) -> Tensor:
     """Place of the paraxial image of an axial point minus that at the reference wavelength, [W] mm,
-    [D, W] for D distances ``at_m``. Gradient: to every lens tensor and to at_m."""
+    [D, W] for D distances ``at_m``, computed in float64 and given in the lens's precision.
+    Gradient: to every lens tensor and to at_m."""
+    dtype = lens.dtype
+    lens = in_float64(lens)
     vergence = vergence_per_mm(lens, at_m)
     reference, *places = (
         image_place_mm(lens, vergence, float(w)) for w in (reference_um, *wavelengths_um)
     )
-    return torch.stack([place - reference for place in places], -1)
+    return torch.stack([place - reference for place in places], -1).to(dtype)
 
 
 REACH = 1e-3  # share of the pupil radius, of the rays of a thin bundle
@@ -187,20 +193,23 @@ def ray_fan(
       count: rays per diameter, odd to hold the chief ray. reference_mm: [2] image point to which
         both aberrations refer; None is the chief ray of this wavelength. Give that of a middle
         wavelength to see lateral colour. vignetting, at_m (one distance): see ``trace_field``.
+    Returns: RayFan, in the lens's precision; paths of many wavelengths are computed in float64.
     Gradient: aberrations to every lens tensor and to at_m. Raises: DomainError when no ray, or not
       the chief ray, arrives.
     """
     like = lens.curvature_per_mm
-    line = torch.linspace(-1, 1, count, dtype=like.dtype, device=like.device)
-    zero = torch.zeros(count, dtype=like.dtype, device=like.device)
+    lens = in_float64(lens)
+    line = torch.linspace(-1, 1, count, dtype=torch.float64, device=like.device)
+    zero = torch.zeros_like(line)
     pupil = torch.cat([torch.stack([zero, line], 1), torch.stack([line, zero], 1)])
+    reference_mm = None if reference_mm is None else reference_mm.double()
     rays, chief = trace_with_chief(lens, field_rad, pupil, wavelength_um, vignetting, at_m)
     centre = chief.position_mm[0] if reference_mm is None else reference_mm
     away = rays.position_mm - centre
     waves = path_difference_mm(lens, rays, chief, wavelength_um, reference_mm) / (
         wavelength_um * 1e-3
     )
-    return RayFan(
+    fans = (
         line,
         away[:count, 1],
         away[count:, 0],
@@ -209,6 +218,7 @@ def ray_fan(
         rays.weight[:count],
         rays.weight[count:],
     )
+    return RayFan(*(fan.to(like.dtype) for fan in fans))
 
 
 METHODS = {"diffraction": diffraction_mtf, "geometric": geometric_mtf}

@@ -86,6 +86,10 @@ def _surroundings(keyword, words):
         )
 
 
+def _words(keyword, words):
+    return words
+
+
 def _one_lens(keyword, words):
     if words and whole(words[0], keyword) > 1:
         raise FileFormatError(
@@ -114,6 +118,7 @@ HEADER = {
     "WAVM": Rule("waves", _waves),
     "ENVD": Rule("surroundings", _surroundings, 0),
     "PWAV": Rule("primary", one_whole),
+    "GCAT": Rule("catalogues", _words, 0),
 }
 
 
@@ -188,7 +193,7 @@ def _lens(header, entries, name):
     for entry in entries[1:-1]:
         with at(f"surface {entry.label}"):
             if entry.kind != "COORDBRK":
-                found.surfaces.append(entry.surface())
+                found.surfaces.append(entry.surface(header.get("catalogues", ())))
                 frames.append(frame)
             else:
                 frame = frame @ entry.coordinate_break()

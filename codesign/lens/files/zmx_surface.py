@@ -1,6 +1,7 @@
 """One surface of a .zmx file: a table of its keywords, and what of them can be traced."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -191,8 +192,8 @@ class Entry:
             )
         return coordinate_break(self.get("parameters", {}))
 
-    def surface(self) -> FileSurface:
-        """FileSurface of this entry."""
+    def surface(self, catalogues: Sequence[str] = ()) -> FileSurface:
+        """FileSurface of this entry, in a file that names these catalogues of glass."""
         self._check_lines()
         kind = self.kind
         if kind not in TYPES:
@@ -221,7 +222,7 @@ class Entry:
             self.label,
             self.values["curvature"],
             self.values["thickness"],
-            None if mirror else _medium(glass),
+            None if mirror else _medium(glass, catalogues),
             self.get("semi_diameter") if outer is None else outer,
             outer is not None or inner > 0,
             self.get("conic", 0.0),
@@ -233,11 +234,11 @@ class Entry:
         )
 
 
-def _medium(words):
+def _medium(words, catalogues):
     if words[0].upper() == "AIR":
         return None
     if words[0] != "___BLANK":
-        return Glass.named(words[0])
+        return Glass.named(words[0], catalogues)
     if len(words) < 5:
         raise FileFormatError(
             "its model glass has no index and Abbe number; write GLAS ___BLANK 1 0 nd Vd."
