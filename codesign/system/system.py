@@ -26,10 +26,7 @@ OTHER_NAMES = {
     "poses": "trajectory",
     "losses": "objectives",
 }
-_ALSO = (
-    *("lens", "objectives", "named_objectives", "gradient", "scene", "training"),
-    *("bins", "asked_bins"),
-)
+_ALSO = ("lens", "objectives", "named_objectives", "gradient", "scene", "bins", "training")
 
 
 Init = TypeVar("Init", bound=Callable[..., None])
@@ -126,7 +123,8 @@ class System(nn.Module):
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Parts can be exchanged; a camera brings its lens, objectives their Modules."""
-        if type(self) is System and name not in (*PARTS, *_ALSO) and not name.startswith("_"):
+        known = (*PARTS, *_ALSO, "asked_bins")
+        if type(self) is System and name not in known and not name.startswith("_"):
             raise _unknown(name, (*PARTS, *_ALSO))
         if name == "objectives":
             self.named_objectives = self._checked(value)
