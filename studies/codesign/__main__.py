@@ -16,7 +16,6 @@ from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-import torch
 from torch import Tensor
 
 from codesign import lens
@@ -48,6 +47,7 @@ from studies.placement.race import check_same, fingerprints
 from studies.placement.searches import SEARCHES, available
 
 THIN = "thin"
+SHORTLIST = 8  # answers that are looked at once more for the one that is handed over
 LEAST_STEPS = 16  # of which an eighth is left to each block of eight sweeps
 
 
@@ -154,6 +154,8 @@ def study(run: Run[Config]) -> None:
     judge = Judge(space, size.judged_worlds, size.judged_drives)
     rows = raced(run, judge, setting) if size.seeds else []
     said = page.lead(run, space, rows, judge)
+    if rows:
+        said += page.hand_over(run, space, judge, best_answer(drawn, rows))
     answer = best_joint(drawn, rows) if rows and (size.couplings or size.slopes) else gates.best
     if rows and size.couplings:
         around(run, drawn, rows, answer, setting["near"])
@@ -179,10 +181,14 @@ def same_robot(run: Run[Config], pair: RobotPair) -> None:
 
 def best_joint(drawn: Drawn, rows: Sequence[Row]) -> Tensor:
     """The joint answer [V] of which least is expected."""
-    shares = [
-        torch.tensor(row["share"], dtype=torch.float64) for row in rows if row["arm"] == "joint"
-    ]
-    return couplings.best_of(drawn, shares)
+    return couplings.share(couplings.best_of(drawn, [row for row in rows if row["arm"] == "joint"]))
+
+
+def best_answer(drawn: Drawn, rows: Sequence[Row]) -> Row:
+    """The answer of any arm of which least is expected in drives of the training worlds, among those
+    that expected least on their own way there."""
+    told = [row for row in rows if row["expected"] is not None]
+    return couplings.best_of(drawn, sorted(told, key=lambda row: row["expected"])[:SHORTLIST])
 
 
 def around(

@@ -116,8 +116,8 @@ def pulls_of(
 
 def _pulled(regime, draw):
     drawn = training(regime["setting"])
-    shares = [torch.tensor(share, dtype=torch.float64) for share in regime["shares"]]
-    at = couplings.best_of(drawn, shares).clamp(couplings.STEP, 1 - couplings.STEP)
+    best = couplings.best_of(drawn, [{"share": share} for share in regime["shares"]])
+    at = couplings.share(best).clamp(couplings.STEP, 1 - couplings.STEP)
     return [{**row, "at": at.tolist()} for row in couplings.curvatures(drawn, at, draw)]
 
 

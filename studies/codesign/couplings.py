@@ -25,13 +25,18 @@ FLATTEST = 0.02  # of the largest curvature, below which none is taken
 DESCENTS = [name for name in ARMS if " > " in name or name.split()[0] in ("alternating", "nested")]
 
 
-def best_of(drawn: Drawn, shares: Sequence[Tensor]) -> Tensor:
-    """Of shares [V] those of which least error is expected on one fresh draw."""
+def best_of(drawn: Drawn, rows: Sequence[Row]) -> Row:
+    """The answer of which least error is expected on one fresh draw."""
     fresh = drawn.draw(FIRST - 1)
     return min(
-        shares,
-        key=lambda share: float(drawn.looked(drawn.space.made(share), fresh).expected.mean()),
+        rows,
+        key=lambda row: float(drawn.looked(drawn.space.made(share(row)), fresh).expected.mean()),
     )
+
+
+def share(row: Row) -> Tensor:
+    """Of an answer [V]."""
+    return torch.tensor(row["share"], dtype=torch.float64)
 
 
 def curvatures(drawn: Drawn, at: Tensor, draw: int) -> list[Row]:

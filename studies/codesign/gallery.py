@@ -48,9 +48,9 @@ def side_by_side(judge: Judge, designs: Mapping[str, Whole]) -> Figure:
     return figure
 
 
-def handed(run: Run[Any], judge: Judge, whole: Whole, error: float) -> None:
+def handed(run: Run[Any], judge: Judge, whole: Whole, error: float, said: str) -> None:
     """Write a design as design.yaml with its lens beside it, read it back, and see that it has the
-    same score."""
+    same score. said: whose it is."""
     path = run.path("design.yaml")
     save(path, whole, error)
     back = loaded(path, whole)
@@ -58,7 +58,8 @@ def handed(run: Run[Any], judge: Judge, whole: Whole, error: float) -> None:
     run.record(hand_over_score=error, hand_over_score_again=sum(again) / len(again))
     run.section(
         "Hand-over",
-        f"`design.yaml` has the transform, camera and sensor, and the estimator's prior among its notes; the lens stands beside "
+        f"Of all answers that keep what is required, {said} is the one of which least is expected in drives of the training "
+        f"worlds. `design.yaml` has its transform, camera and sensor, and the estimator's prior among its notes; the lens stands beside "
         f"it, a traced one as `design.zmx` too (`codesign.lens.load` reads both). Read back it scores "
         f"{sum(again) / len(again):.4f} where the answer had {error:.4f}.",
     )

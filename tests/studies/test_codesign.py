@@ -340,9 +340,31 @@ def test_a_small_race_says_that_it_decides_nothing(here):
     assert found["race_joint_median_with_head"] != found["race_joint_median"]
     assert 0 <= found["parts_lens_and_mount_coupling"] < 1
     assert found["hand_over_score_again"] == pytest.approx(found["hand_over_score"], abs=1e-6)
+    assert "design.yaml is the answer of" in page(folder)
     before = (folder / "race.jsonl").read_bytes()
     assert ran(codesign, "--resume", folder) == 0
     assert (folder / "race.jsonl").read_bytes() == before
+
+
+def test_the_best_answer_of_any_arm_is_handed_over():
+    """On drives of its own: what expected least on its way there need not be the best."""
+
+    class Known:
+        space = Space.of("outdoors", None)
+
+        def draw(self, number):
+            return number
+
+        def looked(self, whole, samples):
+            return SimpleNamespace(expected=torch.tensor([whole.numbers["fno"]]))
+
+    def answer(arm, place, expected):
+        return {"arm": arm, "share": [place] * 9, "expected": expected}
+
+    rows = [answer("joint", 0.5, 0.2), answer("nested", 0.3, 0.3), answer("default", 0.0, None)]
+    rows += [answer("book", 0.1, 0.9 + k) for k in range(codesign.SHORTLIST)]
+    assert codesign.best_answer(Known(), rows)["arm"] == "book"
+    assert codesign.best_answer(Known(), rows[:3])["arm"] == "nested"
 
 
 def test_a_traced_design_is_handed_over_with_its_lens(tmp_path):
