@@ -27,7 +27,7 @@ BUDGETS = {
     "setup": 6_700,  # tables of races, answers raced again
     "studies": 7_840,  # heads by an interval
     "studies/chain_picture": 1_630,  # each stage alone, for the gallery
-    "studies/codesign": 15_560,  # where answers lie, the best of all answers, what blur does by experiment
+    "studies/codesign": 15_580,  # where answers lie, the best of all answers, what blur does by experiment
     "studies/flow_quality": 5_560,  # names of recordings, no truth of rotation alone
     "studies/flow_recording": 3_360,  # windows that are not judged
     "studies/frame": 8_790,  # titles of columns, options without effect
@@ -56,7 +56,7 @@ BUDGETS = {
     "tests/optimise": 3_850,  # a state is a copy; schedules, weights that nothing reaches
     "tests/render": 28_980,  # outlines from the real pupil
     "tests/scenes": 20_650,  # polygons from every corner, colours of materials and vertices
-    "tests/studies": 34_150,  # blur that is drawn, first lines that are true, the best of all answers
+    "tests/studies": 34_210,  # blur that is drawn, first lines that are true, the best of all answers
     "tests/system": 7_250,  # estimates of their own kind
     "tests/train": 5_200,  # bins of windows, ends of sources
 }

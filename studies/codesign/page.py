@@ -33,11 +33,18 @@ def lead(run: Run[Any], space: Space, rows: Sequence[Row], judge: Judge) -> str:
     return answer(run, space.pair.name, found, rows)
 
 
-def best_order(found: Mapping[str, tuple[Interval, float]]) -> str:
-    """The order of blocks that joint design beats least; of all arms where none is an order."""
-    orders = {arm: value for arm, value in found.items() if arm.count(">") == 2}
-    rivals = orders or found
-    return max(rivals, key=lambda arm: rivals[arm][0].value)
+def best_order(rows: Sequence[Row]) -> str:
+    """The order of blocks whose own errors are least (median over starts of the mean log over
+    worlds); of all rivals of joint design where none is an order."""
+    arms = dict.fromkeys(row["arm"] for row in rows if row["arm"] != "joint")
+    orders = [arm for arm in arms if arm.count(">") == 2]
+
+    def error(arm: str) -> float:
+        return statistics.median(
+            statistics.fmean(map(math.log, row["errors"])) for row in rows if row["arm"] == arm
+        )
+
+    return min(orders or arms, key=error)
 
 
 def answer(
@@ -51,7 +58,7 @@ def answer(
     where += "".join(f", {each}" for each in size.hold) + ", near starts" * size.near
     if size.seeds < ENOUGH:
         return f"{counted(size.seeds, 'start')} shows that everything works, and decides nothing ({where})."
-    name = best_order(found)
+    name = best_order(rows)
     rival = f"the best order of single blocks ({name})" if ">" in name else f"'{name}'"
     said = [f"In {where}, against {rival}:"]
     ways = {"joint": "One descent along all numbers"}
@@ -109,7 +116,7 @@ def race(
     tabulate(run, "Errors in unseen worlds", lines, "arm", prefix="race")
     if found:
         every = every_ratio(rows)
-        best = best_order(found)
+        best = best_order(rows)
         named = {plain(arm, "over", other): told for (arm, other), told in every.items()}
         for arm in ("joint", "nested"):
             if (arm, best) in every and ">" in best:
@@ -197,7 +204,7 @@ def shown(
     mean = {(row["seed"], row["arm"]): sum(row["errors"]) / len(row["errors"]) for row in rows}
     ours = sorted((row["expected"], row["seed"]) for row in rows if row["arm"] == "joint")
     seed = ours[(len(ours) - 1) // 2][1]
-    others = [best_order(found), "book", "default"] if found else []
+    others = [best_order(rows), "book", "default"] if found else []
     arms = [arm for arm in dict.fromkeys(["joint", *others]) if (seed, arm) in mean][:3]
     designs = {}
     for row in rows:

@@ -20,7 +20,7 @@ from studies.codesign import race as codesign_race
 from studies.codesign.arms import Task, Way, chosen_by_the_book, read_out
 from studies.codesign.design import Space
 from studies.codesign.objective import Objective
-from studies.codesign.page import every_ratio
+from studies.codesign.page import best_order, every_ratio
 from studies.codesign.problem import Drawn
 from studies.codesign.race import NEAR, Judge, compared, kept, start
 from studies.frame.config import StudyConfig
@@ -235,6 +235,13 @@ def test_the_comparison_is_of_pairs():
         ends = [1 / each for each in (ratio.value, ratio.high, ratio.low)]
         back, _ = every[other, arm]
         assert [back.value, back.low, back.high] == pytest.approx(ends, rel=1e-9)
+
+
+def test_the_best_order_is_the_one_that_errs_least_whatever_joint_does():
+    given = {"joint": [0.9, 0.1], "a > b > c": [0.3, 0.3], "b > a > c": [0.2, 0.5], "book": [0.1]}
+    rows = [{"arm": arm, "errors": [each]} for arm, errors in given.items() for each in errors]
+    assert best_order(rows) == "a > b > c"
+    assert best_order([row for row in rows if ">" not in row["arm"]]) == "book"
 
 
 @refusals.table(__file__, "codesign")
