@@ -136,6 +136,6 @@ def test_the_best_answer_of_a_cell_is_that_of_which_least_is_expected():
         def looked(self, share, samples):
             return type("L", (), {"expected": (share - 0.3).square().sum()[None]})
 
-    shares = [torch.full((2,), value, dtype=F) for value in (0.9, 0.35, 0.0)]
-    assert couplings.best_of(Known(), shares) is shares[1]
+    rows = [{"share": [value] * 2} for value in (0.9, 0.35, 0.0)]
+    assert couplings.best_of(Known(), rows) is rows[1]
     assert cells.setting(joint_map.Config())["calibration"] == []
