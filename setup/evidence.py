@@ -3,15 +3,19 @@
     make evidence                              parts whose code has changed since (all: an hour on two cores)
     make evidence ARGS="lens-motion hero"      named parts
     make evidence ARGS="--write"               runs nothing: writes the kept figures into the pages
+    make evidence ARGS="--again joint-flight"  races two answers of a raw table again: are they the same?
 
 A page names a figure as <!--fig:NAME-->text<!--/-->; the text is what this writes. A part that was
 cut is taken up where it stopped (runs/evidence/PART); one that was finished begins anew.
 
 Some parts draw what was run once from a raw table (--raw FILE): their figures are of the code of
-the commit that brought the table, and they are drawn again where they are named.
+the commit that brought the table, and they are drawn again where they are named. --again races the
+first start of joint and nested by the present code: where both answers are the table's to six
+digits, its figures are of this code too; else they stay old, and it says by how much they differ.
 
 evidence.json: {"schema": 1, "parts": {PART: {"command", "commit", "seconds", "machine", "measured":
-{folder: its tree in git}, "figures": {NAME: text}, "pictures": [FILE in docs]}}}.
+{folder: its tree in git}, "figures": {NAME: text}, "pictures": [FILE in docs],
+"again": commit whose answers were the same, where it was asked}}}.
 """
 
 import argparse
@@ -36,18 +40,21 @@ from codesign.atomic import write_atomic  # noqa: E402
 KEPT = ROOT / "docs" / "evidence.json"
 RUNS = ROOT / "runs" / "evidence"
 MARK = re.compile(r"(<!--fig:([\w.-]+)-->)(.*?)(<!--/-->)", re.S)
+SAME = 1e-6  # of answers that are raced again
 Metrics = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Part:
     """command: of a study, without --out. measured: folders whose code its figures are of.
-    figures: name -> its text from metrics.json. pictures: file in docs -> file of the run."""
+    figures: name -> its text from metrics.json. pictures: file in docs -> file of the run.
+    sample: command that races some answers of the raw table again."""
 
     command: str
     measured: tuple[str, ...]
     figures: Mapping[str, Callable[[Metrics], str]] = field(default_factory=dict)
     pictures: Mapping[str, str] = field(default_factory=dict)
+    sample: str = ""
 
 
 def interval(*names: str) -> Callable[[Metrics], str]:
@@ -97,14 +104,40 @@ def control(name: str) -> Callable[[Metrics], str]:
     )
 
 
+ARMS = {
+    "joint": "joint",
+    "nested": "nested",
+    "lens_mount_read_out": "lens > mount > read-out",
+    "mount_lens_read_out": "mount > lens > read-out",
+    "alternating_4": "alternating, 4 sweeps",
+    "cma_es": "CMA-ES",
+    "book": "book",
+    "default": "default",
+}
+# number of a design -> title and form in a page
+ENDS = {
+    "efl_mm": ("focal length, mm", "{:.1f}"),
+    "fno": ("f-number", "{:.1f}"),
+    "focus_per_m": ("focus, per m", "{:.1f}"),
+    "x_m": ("forward, m", "{:.2f}"),
+    "z_m": ("height, m", "{:.2f}"),
+    "pitch_rad": ("pitch, degrees", "{:.0f}"),
+    "theta": ("θ", "{:.2f}"),
+    "cutoff_hz": ("bandwidth, Hz", "{:.0f}"),
+}
 RACED = ("codesign", "scenes", "studies/codesign", "studies/placement", "studies/frame")
 
 
-def joint(pair: str, more: str) -> Part:
+def joint(pair: str, sizes: str, arms: str, seeds: str = "--seeds 20 ") -> Part:
     """The race of whole designs on a robot, from its committed answers."""
+    race = f"codesign --pair {pair} --grid 2 --slopes 0 --processes 2 {sizes}"
+    tables = {f"joint.{pair}.table": raced(pair), f"joint.{pair}.ends": ends} | {
+        f"joint.{pair}.{blocks.replace('_', '-')}": coupled(blocks)
+        for blocks in ("lens_and_read_out", "mount_and_read_out", "lens_and_mount")
+    }
     return Part(
         f"codesign --pair {pair} --grid 2 --slopes 0 --couplings 3 --processes 2 "
-        f"--raw docs/joint_race_{pair}.jsonl {more}",
+        f"--raw docs/joint_race_{pair}.jsonl {seeds}{sizes} --arms joint {arms}",
         RACED,
         {
             f"joint.{pair}.{name}": ratio(stem, pair)
@@ -121,9 +154,76 @@ def joint(pair: str, more: str) -> Part:
             f"joint.{pair}.foretold-lens-first": foretold("lens_mount_read_out"),
             f"joint.{pair}.foretold-mount-first": foretold("mount_lens_read_out"),
             f"joint.{pair}.foretold-nested": foretold("nested"),
-        },
+        }
+        | (tables if seeds else {}),
         {f"joint_race_{pair}.png": "ratios.png", f"joint_designs_{pair}.png": "designs.png"},
+        f"{race} --couplings 0 --seeds 1 --arms joint nested",
     )
+
+
+def coupled(blocks: str) -> Callable[[Metrics], str]:
+    """The coupling of two blocks, and what noise alone would give."""
+
+    def text(metrics: Metrics) -> str:
+        found, noise = (metrics[f"parts_{blocks}_{name}"] for name in ("coupling", "by_noise"))
+        return f"{found:.2f} ({noise:.2f})" + (": none is shown" if found <= noise else "")
+
+    return text
+
+
+def raced(pair: str) -> Callable[[Metrics], str]:
+    """Errors of all arms of a race, the best first, and what nested and joint make of each."""
+
+    def over(metrics: Metrics, ours: str, arm: str) -> str:
+        stem = f"{ours}_over_{arm}"
+        if ours == arm:
+            return ""
+        return f"{ratio(stem, pair)(metrics)}, p = {metrics[f'{stem}_p_{pair}']:.2g}"
+
+    def text(metrics: Metrics) -> str:
+        arms = sorted(arms_of(metrics), key=lambda arm: metrics[f"race_{arm}_median"])
+        return table(
+            ("arm", "error", "best, worst start", "with the head")
+            + ("nested over it", "joint over it", "CPU-s"),
+            [
+                (
+                    ARMS[arm],
+                    f"{metrics[f'race_{arm}_median']:.3f}",
+                    f"{metrics[f'race_{arm}_best']:.2f}, {metrics[f'race_{arm}_worst']:.2f}",
+                    f"{metrics[f'race_{arm}_median_with_head']:.3f}",
+                    over(metrics, "nested", arm),
+                    over(metrics, "joint", arm),
+                    f"{metrics[f'race_{arm}_cpu_s']:.0f}",
+                )
+                for arm in arms
+            ],
+        )
+
+    return text
+
+
+def ends(metrics: Metrics) -> str:
+    """Where in their bounds the arms of a race end."""
+
+    def line(arm: str) -> tuple[str, ...]:
+        of = {name: metrics[f"ends_{arm}_{name}"] for name in ENDS}
+        of["pitch_rad"] = math.degrees(of["pitch_rad"])
+        return ARMS[arm], *(form.format(of[name]) for name, (_, form) in ENDS.items())
+
+    return table(
+        ("arm", *(title for title, _ in ENDS.values())), [line(arm) for arm in arms_of(metrics)]
+    )
+
+
+def arms_of(metrics: Metrics) -> list[str]:
+    """Arms of a race, as metrics name them."""
+    return [arm for arm in ARMS if f"race_{arm}_median" in metrics]
+
+
+def table(titles: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    """As pages write it, on lines of its own."""
+    lines = [titles, ("---",) * len(titles), *rows]
+    return "\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n\n"
 
 
 def times(name: str) -> Callable[[Metrics], str]:
@@ -225,13 +325,11 @@ PARTS = {
         {"lens_motion.png": "lens_motion.png"},
     ),
     "joint-outdoors": joint(
-        "outdoors",
-        f'--designs 2 --arms joint {ORDERS} book "alternating 4" CMA-ES default nested',
+        "outdoors", "--designs 2", f'{ORDERS} book "alternating 4" CMA-ES default nested'
     ),
-    "joint-corridor": joint(
-        "corridor", f"--seeds 20 --designs 64 --arms joint {ORDERS} book nested default"
-    ),
-    "joint-flight": joint("flight", f"--designs 64 --arms joint {ORDERS} book nested default"),
+    "joint-corridor": joint("corridor", "--designs 64", f"{ORDERS} book nested default"),
+    # twelve starts so far
+    "joint-flight": joint("flight", "--designs 64", f"{ORDERS} book nested default", seeds=""),
     "joint-levers": Part(
         "joint_levers --processes 2",
         (*RACED, "studies/joint_levers.py"),
@@ -286,18 +384,43 @@ def stale(part: Mapping[str, Any]) -> list[str]:
     return [folder for folder, tree in part["measured"].items() if now[folder] != tree]
 
 
-def measured(name: str) -> dict[str, Any]:
-    """Run a part, or go on with it, and give what is kept of it."""
-    part, folder = PARTS[name], RUNS / name
-    words = shlex.split(part.command)
-    command = [sys.executable, "-m", f"studies.{words[0]}"]
+def run(command: str, folder: Path) -> None:
+    """Run a study into a folder, or go on with it."""
+    words = shlex.split(command)
     if (folder / "report.html").exists():
         shutil.rmtree(folder)
     begun = (folder / "config.json").exists()
     # what a run was begun with and what is asked now have to be the same
-    command += [*words[1:], "--resume" if begun else "--out", str(folder)]
+    more = [*words[1:], "--resume" if begun else "--out", str(folder)]
+    subprocess.run([sys.executable, "-m", f"studies.{words[0]}", *more], cwd=ROOT, check=True)
+
+
+def raced_again(name: str, part: dict[str, Any]) -> dict[str, Any]:
+    """What is kept of a part, of this code too where it races the same answers."""
+    folder = RUNS / f"{name}-again"
+    run(PARTS[name].sample, folder)
+    words = shlex.split(PARTS[name].command)
+    known = answers_of(ROOT / words[words.index("--raw") + 1])
+    now = answers_of(folder / "answers.jsonl")
+    apart = max(abs(a - b) for row in now for a, b in zip(now[row], known[row], strict=True))
+    print(f"{name}: {len(now)} answers raced again, at most {apart:.1g} apart")
+    if apart > SAME:
+        return part
+    at = trees(tuple(part["measured"]))
+    return {**part, "measured": at, "again": _git("rev-parse", "HEAD")}
+
+
+def answers_of(table: Path) -> dict[tuple[int, str], list[float]]:
+    """Design and errors in unseen worlds of every answer of a table, by start and arm."""
+    rows = [json.loads(line) for line in table.read_text(encoding="utf-8").splitlines()]
+    return {(at["seed"], at["arm"]): [*row["share"], *row["errors"]] for at, (row, *_) in rows}
+
+
+def measured(name: str) -> dict[str, Any]:
+    """Run a part, or go on with it, and give what is kept of it."""
+    part, folder = PARTS[name], RUNS / name
     since = time.monotonic()
-    subprocess.run(command, cwd=ROOT, check=True)
+    run(part.command, folder)
     for picture, made in part.pictures.items():
         (ROOT / "docs" / picture).parent.mkdir(exist_ok=True)
         write_atomic(ROOT / "docs" / picture, (folder / made).read_bytes())
@@ -338,10 +461,12 @@ def main(arguments: list[str] | None = None) -> int:
         "parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}; else those that are old"
     )
     parser.add_argument("--write", action="store_true", help="run nothing")
+    parser.add_argument("--again", action="store_true", help="race two answers of each again")
     asked = parser.parse_args(arguments)
-    unknown = [name for name in asked.parts if name not in PARTS]
+    choice = [name for name, part in PARTS.items() if part.sample or not asked.again]
+    unknown = [name for name in asked.parts if name not in choice]
     if unknown:
-        print(f"error: {unknown[0]} is no part; choose from {', '.join(PARTS)}.", file=sys.stderr)
+        print(f"error: {unknown[0]} is no part; choose from {', '.join(choice)}.", file=sys.stderr)
         return 2
     known = kept()
     old = [
@@ -349,8 +474,8 @@ def main(arguments: list[str] | None = None) -> int:
         for name, part in PARTS.items()
         if name not in known or (stale(known[name]) and "--raw" not in part.command)
     ]
-    for name in [] if asked.write else asked.parts or old:
-        known[name] = measured(name)
+    for name in [] if asked.write else asked.parts or (choice if asked.again else old):
+        known[name] = raced_again(name, known[name]) if asked.again else measured(name)
         text = json.dumps({"schema": 1, "parts": known}, indent=1, ensure_ascii=False)
         write_atomic(KEPT, f"{text}\n".encode())
     figures = {name: text for part in known.values() for name, text in part["figures"].items()}

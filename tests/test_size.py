@@ -24,7 +24,7 @@ BUDGETS = {
     "scenes/robots": 9_490,  # held joints, directions of axes, colours by name
     "scenes/trajectories": 3_080,  # numbers that are finite, directions that lead somewhere
     "scenes/windows": 8_710,  # what estimators are judged on, told twice in studies before
-    "setup": 6_700,  # tables of races, answers raced again
+    "setup": 6_790,  # tables of races, answers raced again
     "studies": 7_840,  # heads by an interval
     "studies/chain_picture": 1_630,  # each stage alone, for the gallery
     "studies/codesign": 15_580,  # where answers lie, the best of all answers, what blur does by experiment
