@@ -234,9 +234,7 @@ def _parts(path, scene, told, cut, axes, surfaces, materials) -> Iterator[Part]:
         elif faces.min() < 0 or faces.max() >= len(vertices):
             wrong = f"a face asks for vertex {faces.max()} of {len(vertices)}"
         elif cut and _folded(vertices, faces):
-            wrong = (
-                "a face of several corners has one that points inwards; give triangles"
-            )
+            wrong = "a face of several corners has one that points inwards; give triangles"
         elif materials and path.suffix.lower() == ".ply" and _brightest(mesh) > 1:
             wrong = f"colours of its vertices reach {_brightest(mesh):g}, where 1 is the most"
         if wrong:
