@@ -235,8 +235,8 @@ def _parts(path, scene, told, cut, axes, surfaces, materials) -> Iterator[Part]:
             wrong = f"a face asks for vertex {faces.max()} of {len(vertices)}"
         elif cut and _folded(vertices, faces):
             wrong = "a face of several corners has one that points inwards; give triangles"
-        elif materials and path.suffix.lower() == ".ply" and _brightest(mesh) > 1:
-            wrong = f"colours of its vertices reach {_brightest(mesh):g}, where 1 is the most"
+        elif materials and (most := _brightest(mesh)) > 1:
+            wrong = f"colours of its vertices reach {most:g}, where 1 is the most"
         if wrong:
             raise FileFormatError(f"{where}: {wrong}; export it anew.")
         turn = axes @ frame[:3, :3]

@@ -130,14 +130,13 @@ RACED = ("codesign", "scenes", "studies/codesign", "studies/placement", "studies
 
 def joint(pair: str, sizes: str, arms: str, seeds: str = "--seeds 20 ") -> Part:
     """The race of whole designs on a robot, from its committed answers."""
-    race = f"codesign --pair {pair} --grid 2 --slopes 0 --processes 2 {sizes}"
+    race = f"codesign --pair {pair} --grid 2 --slopes 0 --couplings {{}} --processes 2"
     tables = {f"joint.{pair}.table": raced(pair), f"joint.{pair}.ends": ends} | {
         f"joint.{pair}.{blocks.replace('_', '-')}": coupled(blocks)
         for blocks in ("lens_and_read_out", "mount_and_read_out", "lens_and_mount")
     }
     return Part(
-        f"codesign --pair {pair} --grid 2 --slopes 0 --couplings 3 --processes 2 "
-        f"--raw docs/joint_race_{pair}.jsonl {seeds}{sizes} --arms joint {arms}",
+        f"{race.format(3)} --raw docs/joint_race_{pair}.jsonl {seeds}{sizes} --arms joint {arms}",
         RACED,
         {
             f"joint.{pair}.{name}": ratio(stem, pair)
@@ -157,7 +156,7 @@ def joint(pair: str, sizes: str, arms: str, seeds: str = "--seeds 20 ") -> Part:
         }
         | (tables if seeds else {}),
         {f"joint_race_{pair}.png": "ratios.png", f"joint_designs_{pair}.png": "designs.png"},
-        f"{race} --couplings 0 --seeds 1 --arms joint nested",
+        f"{race.format(0)} --seeds 1 {sizes} --arms joint nested",
     )
 
 

@@ -1,7 +1,8 @@
 """Gradients of samples, one by one: clipped before they are averaged, because a few are tens of
 times too long."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -77,6 +78,20 @@ def assign(parameters: Sequence[Tensor], gradient: Tensor, felt: Sequence[bool])
     sizes = [p.numel() for p in parameters]
     for parameter, part, known in zip(parameters, gradient.split(sizes), felt, strict=True):
         parameter.grad = part.reshape(parameter.shape).to(parameter) if known else None
+
+
+@contextmanager
+def scaled_rates(optimiser: torch.optim.Optimizer, factor: float) -> Iterator[None]:
+    """Within it, learning rates are as many times what a schedule or the user has set."""
+    groups = optimiser.param_groups
+    told = [group["lr"] for group in groups]
+    try:
+        for group, rate in zip(groups, told, strict=True):
+            group["lr"] = rate * factor
+        yield
+    finally:
+        for group, rate in zip(groups, told, strict=True):
+            group["lr"] = rate
 
 
 def _flat(gradient: Tensor | None, parameter: Tensor) -> Tensor:

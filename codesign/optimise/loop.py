@@ -12,7 +12,7 @@ from torch import Tensor
 
 from codesign.checks import check_positive, check_whole
 from codesign.errors import DomainError, GradientError, NonFiniteError, ShapeError
-from codesign.optimise.gradients import assign, clipped_mean, sample_gradients
+from codesign.optimise.gradients import assign, clipped_mean, sample_gradients, scaled_rates
 
 SHRINK = 0.5  # of the step sizes, after a judgement that is worse than the best
 
@@ -132,15 +132,8 @@ class Loop:
         if not bool(values.isfinite().all() and gradients.isfinite().all()):
             raise NonFiniteError("a sample's loss or its gradient is infinite or NaN.")
         assign(self.parameters, self._clipped(gradients), felt)
-        groups = self.optimiser.param_groups
-        told = [group["lr"] for group in groups]  # by a schedule, or the user
-        try:
-            for group in groups:
-                group["lr"] = group["lr"] * self._shrunk
+        with scaled_rates(self.optimiser, self._shrunk):
             self.optimiser.step()
-        finally:
-            for group, lr in zip(groups, told, strict=True):
-                group["lr"] = lr
         self.record.loss.append(float(values.mean()))
         self.record.gradient.append(float(gradients.norm(dim=1).mean()))
 

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from codesign.errors import DomainError, FileFormatError, NonFiniteError, ShapeError
 from codesign.flow import checkpoint
 from codesign.flow.entry import modes_kept
+from codesign.optimise.gradients import scaled_rates
 from codesign.train.batches import to_device
 from codesign.train.objectives import flow_predictions
 from codesign.train.parallel import ALONE, Ranks
@@ -137,14 +138,10 @@ class Learner:
                 f"step {self.steps}: loss {mean:.4g}, gradient norm {norm:.4g}; lower the learning rate, or "
                 "look for the window that causes it."
             )
-        groups = self.optimiser.param_groups
-        rates = [group["lr"] for group in groups]
-        for group, rate in zip(groups, rates, strict=True):
-            group["lr"] = rate * factor
-        made = Step(mean, norm, norm > self.clip, float(groups[0]["lr"]))
-        self.optimiser.step()
-        for group, rate in zip(groups, rates, strict=True):
-            group["lr"] = rate
+        with scaled_rates(self.optimiser, factor):
+            rate = float(self.optimiser.param_groups[0]["lr"])
+            made = Step(mean, norm, norm > self.clip, rate)
+            self.optimiser.step()
         self._follow()
         self.steps += 1
         return made

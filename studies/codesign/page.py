@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from codesign.report.prose import counted
+from studies.codesign import couplings
 from studies.codesign.design import Space
 from studies.codesign.gallery import handed, side_by_side
 from studies.codesign.landscape import Landscape
@@ -209,7 +210,7 @@ def shown(
     designs = {}
     for row in rows:
         if row["seed"] == seed and row["arm"] in arms:
-            whole = space.made(torch.tensor(row["share"], dtype=torch.float64))
+            whole = space.made(couplings.share(row))
             title = f"{row['arm']}: {mean[seed, row['arm']]:.3f}, {whole}"
             designs[row["arm"]] = title, whole
     run.section(
@@ -226,7 +227,7 @@ def shown(
 def hand_over(run: Run[Any], space: Space, judge: Judge, best: Row) -> str:
     """An answer as files; returns the sentence that says which."""
     said = f"the answer of '{best['arm']}' from start {best['seed']}"
-    whole = space.made(torch.tensor(best["share"], dtype=torch.float64))
+    whole = space.made(couplings.share(best))
     handed(run, judge, whole, sum(best["errors"]) / len(best["errors"]), said)
     return f" design.yaml is {said}, of which least is expected: {whole}."
 

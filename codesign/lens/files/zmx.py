@@ -12,6 +12,7 @@ from codesign.lens.files.text import (
     MOST_SURFACES,
     Rule,
     all_numbers,
+    all_words,
     at,
     lines,
     number,
@@ -86,10 +87,6 @@ def _surroundings(keyword, words):
         )
 
 
-def _words(keyword, words):
-    return words
-
-
 def _one_lens(keyword, words):
     if words and whole(words[0], keyword) > 1:
         raise FileFormatError(
@@ -118,7 +115,7 @@ HEADER = {
     "WAVM": Rule("waves", _waves),
     "ENVD": Rule("surroundings", _surroundings, 0),
     "PWAV": Rule("primary", one_whole),
-    "GCAT": Rule("catalogues", _words, 0),
+    "GCAT": Rule("catalogues", all_words, 0),
 }
 
 
