@@ -380,24 +380,27 @@ def draw_shot_counts(
             "times."
         )
     shape = (len(interval_s), 2, *pixels)
-    if sensor.shot_rate_hz == 0:
+    if sensor.shot_rate_hz == 0 or not math.prod(shape):
         return torch.zeros(shape, dtype=dtype)
     size = 2 * math.prod(pixels)
-    means = (sensor.shot_rate_hz / 2 * interval_s.double()).tolist()
-    counts = [
-        exactly(_poisson(mean, size, generator).cpu(), dtype, "noise events") for mean in means
-    ]
-    return torch.stack(counts).reshape(shape) if counts else torch.zeros(shape, dtype=dtype)
-
-
-def _poisson(mean, size, generator):
-    """[size] Poisson numbers of one mean: their sum is one too, and falls on them evenly."""
+    means = sensor.shot_rate_hz / 2 * interval_s.double().to(generator.device)
     place: dict[str, Any] = {"generator": generator, "device": generator.device}
-    one = torch.ones((), dtype=torch.float64, device=generator.device)
-    if mean > 1:  # more places than pixels
-        return torch.poisson(one.new_full((size,), mean), generator=generator)
-    events = int(torch.poisson(size * mean * one, generator=generator))
-    return torch.bincount(torch.randint(size, (events,), **place), minlength=size)
+    many, places = {}, {}
+    for k, (mean, total) in enumerate(zip(means.tolist(), size * means, strict=True)):
+        if mean > 1:  # more places than pixels
+            many[k] = torch.poisson(total.new_full((size,), mean), generator=generator)
+        else:  # the sum of Poisson numbers is one too, and falls on them evenly
+            events = int(torch.poisson(total, generator=generator))
+            places[k] = k * size, torch.randint(size, (events,), **place)
+    counts = torch.zeros(len(means), size, dtype=torch.int64, device=generator.device)
+    if places:
+        starts, within = zip(*places.values(), strict=True)
+        lengths = counts.new_tensor([len(one) for one in within])
+        at = torch.cat(within) + counts.new_tensor(starts).repeat_interleave(lengths)
+        counts = torch.bincount(at, minlength=counts.numel()).reshape_as(counts)
+    for k, row in many.items():
+        counts[k] = row
+    return exactly(counts.reshape(shape).cpu(), dtype, "noise events")
 
 
 def _shape(pixels):
