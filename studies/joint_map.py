@@ -22,6 +22,7 @@ from torch import Tensor
 from studies.codesign import couplings
 from studies.codesign.cells import CellsConfig, answers, pulls_of, setting, space_of
 from studies.codesign.landscape import ranked
+from studies.codesign.page import best_order
 from studies.codesign.race import compared, start
 from studies.frame.compare import Interval, bootstrap
 from studies.frame.run import Run, main
@@ -67,9 +68,8 @@ def study(run: Run[Config]) -> None:
     lines, ratios = [], {}
     for cell, given in cells.items():
         mine = select(rows, regime=cell)
-        found = compared(mine)
-        order = max(ORDERS, key=lambda arm: found[arm][0].value)
-        over = found[order][0].ratio()
+        order = best_order(mine)
+        over = compared(mine)[order][0].ratio()
         ratios[cell] = over
         line = {
             "cell": cell,
