@@ -128,7 +128,7 @@ ENDS = {
 RACED = ("codesign", "scenes", "studies/codesign", "studies/placement", "studies/frame")
 
 
-def joint(pair: str, sizes: str, arms: str, seeds: str = "--seeds 20 ") -> Part:
+def joint(pair: str, sizes: str, arms: str) -> Part:
     """The race of whole designs on a robot, from its committed answers."""
     race = f"codesign --pair {pair} --grid 2 --slopes 0 --couplings {{}} --processes 2"
     tables = {f"joint.{pair}.table": raced(pair), f"joint.{pair}.ends": ends} | {
@@ -136,7 +136,7 @@ def joint(pair: str, sizes: str, arms: str, seeds: str = "--seeds 20 ") -> Part:
         for blocks in ("lens_and_read_out", "mount_and_read_out", "lens_and_mount")
     }
     return Part(
-        f"{race.format(3)} --raw docs/joint_race_{pair}.jsonl {seeds}{sizes} --arms joint {arms}",
+        f"{race.format(3)} --raw docs/joint_race_{pair}.jsonl --seeds 20 {sizes} --arms joint {arms}",
         RACED,
         {
             f"joint.{pair}.{name}": ratio(stem, pair)
@@ -154,7 +154,7 @@ def joint(pair: str, sizes: str, arms: str, seeds: str = "--seeds 20 ") -> Part:
             f"joint.{pair}.foretold-mount-first": foretold("mount_lens_read_out"),
             f"joint.{pair}.foretold-nested": foretold("nested"),
         }
-        | (tables if seeds else {}),
+        | tables,
         {f"joint_race_{pair}.png": "ratios.png", f"joint_designs_{pair}.png": "designs.png"},
         f"{race.format(0)} --seeds 1 {sizes} --arms joint nested",
     )
@@ -327,8 +327,7 @@ PARTS = {
         "outdoors", "--designs 2", f'{ORDERS} book "alternating 4" CMA-ES default nested'
     ),
     "joint-corridor": joint("corridor", "--designs 64", f"{ORDERS} book nested default"),
-    # twelve starts so far
-    "joint-flight": joint("flight", "--designs 64", f"{ORDERS} book nested default", seeds=""),
+    "joint-flight": joint("flight", "--designs 64", f"{ORDERS} book nested default"),
     "joint-levers": Part(
         "joint_levers --processes 2",
         (*RACED, "studies/joint_levers.py"),
