@@ -18,6 +18,7 @@ from torch import Tensor
 
 from studies.codesign.cells import CellsConfig, answers, judged_errors, setting, space_of
 from studies.codesign.design import BLOCKS
+from studies.codesign.race import ENOUGH
 from studies.frame.compare import crossed
 from studies.frame.run import Run, main
 from studies.frame.show import bars, tabulate
@@ -25,7 +26,6 @@ from studies.frame.sweep import column
 
 NAMES = {"lens": "lens", "mount": "mount", "sensor": "sensor", "network": "estimator"}
 SUBSETS = [frozenset(parts) for size in range(1, 5) for parts in combinations(BLOCKS, size)]
-ENOUGH = 6  # starts, below which nothing is decided
 
 
 @dataclass(frozen=True)

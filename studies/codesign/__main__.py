@@ -40,10 +40,11 @@ from studies.codesign.race import (
     training,
 )
 from studies.frame.config import check_least
+from studies.frame.files import check_same
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.sweep import Row, sweep
 from studies.placement.look import size_in_words
-from studies.placement.race import check_same, fingerprints
+from studies.placement.race import fingerprints
 from studies.placement.searches import SEARCHES, available
 
 THIN = "thin"
@@ -141,6 +142,9 @@ def study(run: Run[Config]) -> None:
         taken_up(size.raw, setting)  # before hours of the rest
     if size.robot:
         run.say(size_in_words(space.pair))
+        at = space.pair.design
+        turned = (f"{math.degrees(getattr(at, name)):.3g}" for name in ("yaw_rad", "roll_rad"))
+        run.say("held: {:.3g} m to the side, yaw {} and roll {} degrees".format(at.y_m, *turned))
         check_pair(space.pair, space.made(space.start).camera, (0, robot_pair.UNSEEN_FROM))
     for seed in range(size.seed, size.seed + size.seeds):
         start(space, seed)
@@ -185,10 +189,12 @@ def best_joint(drawn: Drawn, rows: Sequence[Row]) -> Tensor:
 
 
 def best_answer(drawn: Drawn, rows: Sequence[Row]) -> Row:
-    """The answer of any arm of which least is expected in drives of the training worlds, among those
-    that expected least on their own way there."""
-    told = [row for row in rows if row["expected"] is not None]
-    return couplings.best_of(drawn, sorted(told, key=lambda row: row["expected"])[:SHORTLIST])
+    """The answer of which least is expected in drives of the training worlds: among the SHORTLIST of
+    any arm and start that expected least on their own way there, and the default."""
+    ways = [row for row in rows if row["expected"] is not None]
+    still = [row for row in rows if row["expected"] is None]
+    listed = sorted(ways, key=lambda row: row["expected"])[:SHORTLIST]
+    return couplings.best_of(drawn, [*listed, *still[:1]])
 
 
 def around(

@@ -368,10 +368,12 @@ def test_the_best_answer_of_any_arm_is_handed_over():
     def answer(arm, place, expected):
         return {"arm": arm, "share": [place] * 9, "expected": expected}
 
-    rows = [answer("joint", 0.5, 0.2), answer("nested", 0.3, 0.3), answer("default", 0.0, None)]
+    rows = [answer("joint", 0.5, 0.2), answer("nested", 0.3, 0.3), answer("default", 0.4, None)]
     rows += [answer("book", 0.1, 0.9 + k) for k in range(codesign.SHORTLIST)]
     assert codesign.best_answer(Known(), rows)["arm"] == "book"
     assert codesign.best_answer(Known(), rows[:3])["arm"] == "nested"
+    rows[2]["share"] = [0.0] * 9
+    assert codesign.best_answer(Known(), rows)["arm"] == "default"
 
 
 def test_a_traced_design_is_handed_over_with_its_lens(tmp_path):
@@ -379,7 +381,7 @@ def test_a_traced_design_is_handed_over_with_its_lens(tmp_path):
     whole = space.made(start(space, 0))
     judge = Judge(space, 1, 1)
     (error,) = judge.of(whole)["errors"]
-    gallery.save(tmp_path / "design.yaml", whole, error)
+    gallery.save(tmp_path / "design.yaml", whole, {"error_unseen": error})
     again = judge.of(gallery.loaded(tmp_path / "design.yaml", whole))["errors"]
     assert again == [pytest.approx(error, rel=1e-9)]
     drawn = lens.load(tmp_path / "design.zmx").freeze().first_order()

@@ -81,6 +81,8 @@ def test_a_map_says_which_cells_are_won_and_what_their_valleys_foretell(tmp_path
     assert -1 <= figures["rank_of_foretold_low"] <= figures["rank_of_foretold_high"] <= 1.0 + 1e-9
     assert "in 3, loses in 3, and is undecided in 0" in page(tmp_path / "map")
     check_page("joint_map", tmp_path / "map")
+    assert ran(joint_map, "--fnos 0 --speeds 1 0.5 0.3 --seeds 2 --out", tmp_path / "few") == 0
+    assert "So few cells or starts decide nothing" in page(tmp_path / "few")
 
 
 def test_parts_that_act_by_themselves_have_their_own_factors(tmp_path, monkeypatch):

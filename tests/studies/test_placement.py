@@ -15,12 +15,13 @@ from codesign.errors import DomainError
 from codesign.system import load_hand_over
 from scenes.robots import pair as robot_pair
 from scenes.robots.pairs import PAIRS
+from studies.frame.files import check_same
 from studies.placement import __main__ as placement
 from studies.placement import outcome
 from studies.placement.controls import controls, looking_back
 from studies.placement.page import answer
 from studies.placement.problem import Problem, traced_camera
-from studies.placement.race import FINAL_DRAWS, Race, check_same, feasible, fingerprints, kept
+from studies.placement.race import FINAL_DRAWS, Race, feasible, fingerprints, kept
 from studies.placement.searches import descend
 from tests import refusals
 from tests.studies.browser import check_page
