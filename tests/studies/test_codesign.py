@@ -17,7 +17,7 @@ from scenes.robots.pairs import PAIRS
 from studies.codesign import __main__ as codesign
 from studies.codesign import couplings, gallery, slopes
 from studies.codesign import race as codesign_race
-from studies.codesign.arms import Task, Way, chosen_by_the_book, read_out
+from studies.codesign.arms import ARMS, Task, Way, chosen_by_the_book, read_out
 from studies.codesign.design import Space
 from studies.codesign.objective import Objective
 from studies.codesign.page import best_order, every_ratio
@@ -374,6 +374,11 @@ def test_the_best_answer_of_any_arm_is_handed_over():
     assert codesign.best_answer(Known(), rows[:3])["arm"] == "nested"
     rows[2]["share"] = [0.0] * 9
     assert codesign.best_answer(Known(), rows)["arm"] == "default"
+
+
+def test_a_search_expects_the_least_that_it_has_seen(drawn, space):
+    _, way = ARMS["random"](Task(Objective(drawn), space.start, 4, 0, 1, 5))
+    assert way.expected == min(way.errors) < way.errors[-1]
 
 
 def test_a_traced_design_is_handed_over_with_its_lens(tmp_path):
