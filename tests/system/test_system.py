@@ -14,10 +14,11 @@ from codesign.system import Batch, System, check
 from codesign.types import EventVolume, FlowField, Rays
 from tests import refusals
 from tests.hostile.stages import Stage, held
+from tests.numbers import D, f64, seeded
 
 ONE = torch.ones(1)
-T_S = torch.tensor([0.0, 1.0], dtype=torch.float64)
-BATCH = Batch(torch.eye(4, dtype=torch.float64).expand(2, 4, 4), T_S, scene="wall")
+T_S = f64([0.0, 1.0])
+BATCH = Batch(torch.eye(4, dtype=D).expand(2, 4, 4), T_S, scene="wall")
 
 
 class Glass(nn.Module):
@@ -186,9 +187,7 @@ def test_a_stage_gets_what_its_signature_names():
     assert seen["t_s"] is T_S
     assert seen["camera"].seed == 5
     assert seen["theta"] == 0.2
-    torch.testing.assert_close(
-        seen["draw"], torch.rand(3, generator=torch.Generator().manual_seed(5))
-    )
+    torch.testing.assert_close(seen["draw"], torch.rand(3, generator=seeded(5)))
 
 
 def test_parameters_of_every_part_are_the_systems():
@@ -224,7 +223,7 @@ def test_batches_that_do_not_fit_are_refused(row):
 
 
 def test_scenes_each_see_their_own_poses():
-    poses = torch.eye(4, dtype=torch.float64).expand(2, 1, 2, 4, 4)
+    poses = torch.eye(4, dtype=D).expand(2, 1, 2, 4, 4)
 
     def render(scene, T_world_cam):
         return float(scene) * T_world_cam[..., 0, 0, None, None]
@@ -237,7 +236,7 @@ def test_scenes_each_see_their_own_poses():
 def test_windows_of_a_film_become_samples():
     camera = ToyCamera(Glass())
     camera.film = SimpleNamespace(shape=(3, 1, 1))
-    poses = torch.eye(4, dtype=torch.float64).expand(2, 2, 4, 4)
+    poses = torch.eye(4, dtype=D).expand(2, 2, 4, 4)
 
     # [trajectory 2, T 2, window 3, 1, 1]: 100 trajectory + 10 time + window
     def render(T_world_cam):
