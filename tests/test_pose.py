@@ -8,6 +8,7 @@ import torch
 from codesign.errors import DomainError, ShapeError
 from codesign.pose import apply, check_pose, check_poses, inverse, look_at, se3_exp
 from codesign.render import Camera, project
+from tests import refusals
 from tests.numbers import D, close, f64, randn64
 
 
@@ -78,8 +79,6 @@ def test_the_gradient_of_the_inverse_is_that_of_differences_and_of_the_group(gen
 def test_constant_twists_give_constant_transforms():
     assert not se3_exp(torch.zeros(3, 6, dtype=D)).requires_grad
     assert se3_exp(torch.zeros(6)).dtype == torch.float32
-    with pytest.raises(ShapeError, match="6 components"):
-        se3_exp(torch.zeros(2, 3))
 
 
 def test_look_at_makes_a_rigid_camera_with_right_down_forward(thin_camera):
@@ -107,13 +106,12 @@ def thin_camera():
     return Camera(Pinhole(8.0), 64, 48, 0.05, 1)
 
 
-def test_look_at_along_down_and_at_itself_are_refused():
-    with pytest.raises(DomainError, match="parallel"):
-        look_at((0, 0, 2), (0, 0, 0))
-    with pytest.raises(DomainError, match="same point"):
-        look_at((1, 0, 2), (1, 0, 2))
-    with pytest.raises(DomainError, match="look_at"):
-        look_at((math.nan, 0, 2), (1, 0, 2))
+@refusals.table(__file__, "poses")
+def test_what_is_no_pose_is_refused(row):
+    row.holds(globals())
+
+
+def test_a_camera_may_look_straight_down():
     straight_down = look_at((0, 0, 2), (0, 0, 0), down=(0, -1, 0))
     close(straight_down[:3, :3], f64([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), atol=1e-15)
 
@@ -155,7 +153,3 @@ def test_one_bad_pose_among_good_ones_is_refused(change, sentence, place, genera
 def test_a_single_pose_is_one_matrix(generator):
     pose = se3_exp(randn64(generator, 6))
     assert torch.equal(check_pose(pose), pose)
-    with pytest.raises(ShapeError, match=r"a pose must be \[4, 4\], got \(1, 4, 4\)"):
-        check_pose(pose[None])
-    with pytest.raises(DomainError, match="not rigid"):
-        check_pose(2 * pose)

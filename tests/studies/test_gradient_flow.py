@@ -11,7 +11,6 @@ from codesign.system import check
 from studies.gradient_flow import __main__ as study
 from studies.gradient_flow import chain, silhouettes
 from studies.gradient_flow.topic import Row
-from tests import refusals
 from tests.numbers import randn64
 from tests.studies.browser import check_page
 from tests.studies.runs import page, ran
@@ -43,11 +42,6 @@ def test_the_study_goes_on_where_it_was_cut(tmp_path, monkeypatch):
     assert f"{len(jobs)} of {len(jobs)} gradients (silhouettes) are judged" in first
     assert f"are judged, and {len(jobs) - short} of" in first
     check_page("gradient_flow", out)
-
-
-@refusals.table(__file__, "gradient_flow")
-def test_wrong_options_are_refused(row, refuses):
-    refuses(study, row)
 
 
 def test_a_silhouette_makes_a_row_that_is_judged():

@@ -31,7 +31,6 @@ from scenes.tum import read_tum
 from studies.make_dataset import __main__ as study
 from studies.make_dataset import store
 from studies.make_dataset.segments import Segments
-from tests import refusals
 from tests.numbers import D, close, f64, seeded
 from tests.processes import ROOT
 from tests.rounding_case import RoundsByPlace
@@ -292,11 +291,6 @@ def test_folders_with_other_things_and_damaged_parts_are_refused_in_one_sentence
     part.write_bytes(b"not HDF5")
     with pytest.raises(ValueError, match="go on again with --resume"):
         store.read_state(part)
-
-
-@refusals.table(__file__, "make_dataset")
-def test_impossible_options_end_with_one_sentence(row, refuses):
-    refuses(study, row)
 
 
 def test_paths_that_cannot_keep_clear_are_refused():
