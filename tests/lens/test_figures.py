@@ -30,11 +30,6 @@ FIELDS = (0.0, 0.15)
 PICTURE = torch.linspace(1, 2, 64, dtype=torch.float64).reshape(8, 8)
 
 
-@pytest.fixture
-def triplet():
-    return lens.load("cooke-triplet").freeze()
-
-
 def pictured(spread, grid, geo, at_m):
     return (spread(geo, 0.02, 0.004, 8, LINES, grid=grid, at_m=at_m).energy * PICTURE).sum()
 
