@@ -10,9 +10,9 @@ import pytest
 import scipy.optimize
 import torch
 
-from codesign.errors import DomainError, ShapeError
 from codesign.grad.jacobian import by_autograd, by_differences, column_scales, principal_modes
 from codesign.optimise.least_squares import DampedLeastSquares, StopRules
+from tests import refusals
 from tests.numbers import D, close, f64, randn64
 
 FREE = (-math.inf, math.inf)
@@ -197,35 +197,9 @@ def carried(state, route):
     return torch.load(buffer, weights_only=True)
 
 
-@pytest.mark.parametrize(
-    ("call", "error", "sentence"),
-    [
-        (
-            lambda: DampedLeastSquares(rosenbrock, torch.zeros(2, 2, dtype=D)),
-            ShapeError,
-            r"start must be \[V\]",
-        ),
-        (lambda: DampedLeastSquares(rosenbrock, vector(math.nan, 0)), DomainError, "start"),
-        (
-            lambda: DampedLeastSquares(rosenbrock, vector(0, 0), lower=vector(1, 1)),
-            DomainError,
-            "outside",
-        ),
-        (
-            lambda: DampedLeastSquares(torch.log, vector(-1.0)),
-            DomainError,
-            "residuals at the start",
-        ),
-        (
-            lambda: DampedLeastSquares(rosenbrock, vector(0, 0)).resume({"variables": [1.0] * 4}),
-            ShapeError,
-            "state has 4",
-        ),
-    ],
-)
-def test_wrong_input_is_refused(call, error, sentence):
-    with pytest.raises(error, match=sentence):
-        call()
+@refusals.table(__file__, "least squares")
+def test_wrong_input_is_refused(row):
+    row.holds(globals())
 
 
 @torch.no_grad()
