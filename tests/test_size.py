@@ -44,7 +44,7 @@ BUDGETS = {
     "studies/train_flow": 5_130,  # steps of a race, options without effect
     "studies/viewer": 3_450,  # says what a fail may be
     "studies/video_to_events": 4_290,
-    "tests": 15_370,  # words of numbers for all rooms, pictures of poses
+    "tests": 15_270,  # words of numbers for all rooms, pictures of poses
     "tests/data": 1_000,
     "tests/events": 31_530,  # rates of leaks in short runs, sums over wide spreads
     "tests/flow": 28_610,  # chunks that may come again
@@ -53,7 +53,7 @@ BUDGETS = {
     "tests/hostile": 19_090,
     "tests/lens": 36_620,  # stops of their own axes, dense transforms, makers of glass
     "tests/mount": 13_900,  # blur of a wide lens
-    "tests/optimise": 3_780,  # a state is a copy; schedules, weights that nothing reaches
+    "tests/optimise": 3_410,  # a state is a copy; schedules, weights that nothing reaches
     "tests/render": 28_880,  # outlines from the real pupil
     "tests/scenes": 20_530,  # polygons from every corner, colours of materials and vertices
     "tests/studies": 34_040,  # blur that is drawn, first lines that are true, the best of all answers
