@@ -11,7 +11,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -30,13 +29,7 @@ SUBSETS = [frozenset(parts) for size in range(1, 5) for parts in combinations(BL
 
 @dataclass(frozen=True)
 class Config(CellsConfig):
-    QUICK: ClassVar = {
-        "seeds": 1,
-        "worlds": 2,
-        "per_draw": 2,
-        "judged_worlds": 2,
-        "settling": 6,
-    }
+    """Subsets of the parts are its settings."""
 
 
 def study(run: Run[Config]) -> None:

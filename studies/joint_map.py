@@ -35,16 +35,7 @@ CELLS = 6  # below which nothing is said of the prediction
 
 @dataclass(frozen=True)
 class Config(CellsConfig):
-    QUICK: ClassVar = {
-        "lights": (1.0,),
-        "fnos": (4.0,),
-        "seeds": 1,
-        "worlds": 2,
-        "per_draw": 2,
-        "judged_worlds": 2,
-        "settling": 6,
-        "couplings": 0,
-    }
+    QUICK: ClassVar = {**CellsConfig.QUICK, "lights": (1.0,), "fnos": (4.0,), "couplings": 0}
     lights: tuple[float, ...] = (1.0, 0.1)
     """Shares of daylight."""
     fnos: tuple[float, ...] = (0.0, 2.0, 8.0)

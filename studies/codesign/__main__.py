@@ -27,6 +27,7 @@ from scenes.robots.pair import RobotPair
 from scenes.robots.pairs import PAIRS
 from studies.codesign import couplings, page, slopes
 from studies.codesign.arms import ARMS
+from studies.codesign.cells import CellsConfig
 from studies.codesign.landscape import landscape
 from studies.codesign.problem import Drawn
 from studies.codesign.race import (
@@ -41,7 +42,7 @@ from studies.codesign.race import (
 )
 from studies.frame.config import check_least
 from studies.frame.files import check_same
-from studies.frame.run import Run, StudyConfig, main
+from studies.frame.run import Run, main
 from studies.frame.sweep import Row, sweep
 from studies.placement.look import size_in_words
 from studies.placement.race import fingerprints
@@ -53,22 +54,15 @@ LEAST_STEPS = 16  # of which an eighth is left to each block of eight sweeps
 
 
 @dataclass(frozen=True)
-class Config(StudyConfig):
+class Config(CellsConfig):
     QUICK: ClassVar = {
-        "seeds": 1,
-        "worlds": 2,
-        "per_draw": 2,
-        "judged_worlds": 2,
+        **CellsConfig.QUICK,
         "arms": ("joint", "lens > mount > read-out", "default"),
         "designs": 2,
         "grid": 2,
-        "settling": 6,
         "slopes": 0,
         "couplings": 0,
     }
-    ANEW: ClassVar = ("processes", "cluster")
-    pair: str = "outdoors"
-    """Robot and worlds: outdoors, corridor or flight."""
     robot: Path | None = None
     """A robot of your own instead, described in a .yaml file (docs/robots_and_worlds.md)."""
     family: str = "retrofocus-4"
@@ -89,14 +83,6 @@ class Config(StudyConfig):
     """Start within a tenth of the bounds of the best design looked at, instead of all over them."""
     steps: int = 16
     """Steps of every descent, looks of every search: the budget, a multiple of 16."""
-    worlds: int = 12
-    """Training worlds."""
-    per_draw: int = 12
-    """Drives rendered in a step."""
-    judged_worlds: int = 24
-    """Unseen worlds."""
-    judged_drives: int = 2
-    """Drives in each."""
     designs: int = 64
     """Designs all over the bounds, and as many near the best, looked at before the race; 64 and
     more calibrate it."""
@@ -107,14 +93,6 @@ class Config(StudyConfig):
     couplings: int = 4
     """Draws by which the couplings of the parts are measured around the best joint answer; 0: they
     are not."""
-    settling: int = 24
-    """Designs of sensor and estimator tried on recorded frames, wherever they are settled."""
-    processes: int = 0
-    """Arms that race side by side, each in a process of its own; 0: one after the other in this
-    one."""
-    cluster: str = ""
-    """Address of a Ray cluster on whose cores arms race instead: "auto" for that of this machine,
-    "here" for one of its own."""
     raw: Path | None = None
     """Answers of earlier runs (answers.jsonl of their folder, or race.jsonl of one that was cut):
     not raced again."""

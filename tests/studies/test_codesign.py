@@ -244,11 +244,6 @@ def test_the_best_order_is_the_one_that_errs_least_whatever_joint_does():
     assert best_order([row for row in rows if ">" not in row["arm"]]) == "book"
 
 
-@refusals.table(__file__, "codesign")
-def test_wrong_command_lines_end_with_a_sentence(row, refuses):
-    refuses(codesign, row)
-
-
 def test_a_way_keeps_the_last_rounds_that_were_recorded():
     way = Way()
     for k in range(8):

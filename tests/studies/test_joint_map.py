@@ -11,7 +11,6 @@ from studies import joint_levers, joint_map
 from studies.codesign import cells, couplings
 from studies.codesign.design import BLOCKS
 from studies.codesign.race import start
-from tests import refusals
 from tests.studies.browser import check_page
 from tests.studies.runs import lines, numbers, page, ran
 
@@ -121,11 +120,6 @@ def test_cells_are_raced_judged_and_taken_up_again(tmp_path):
     before = table.read_bytes()
     assert ran(joint_map, "--resume", tmp_path / "map") == 0
     assert table.read_bytes() == before
-
-
-@refusals.table(__file__, "joint_map")
-def test_a_cell_that_cannot_be_is_refused(row, refuses):
-    refuses(joint_map, row)
 
 
 def test_the_best_answer_of_a_cell_is_that_of_which_least_is_expected():

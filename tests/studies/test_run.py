@@ -13,6 +13,7 @@ from codesign.errors import DomainError, FileFormatError, ShapeError
 from codesign.state import write_state
 from studies.frame.run import StudyConfig, open_run
 from tests import refusals
+from tests.numbers import f64
 from tests.studies.runs import module_of, numbers, ran
 from tests.studies.smallest_study import Config
 
@@ -20,9 +21,7 @@ from tests.studies.smallest_study import Config
 def test_state_returns_every_bit(run, generator):
     tensors = {
         "float32": torch.randn(3, 4, generator=generator).T,
-        "float64/odd name": torch.tensor(
-            [0.1, torch.nan, -0.0, torch.inf, 5e-324], dtype=torch.float64
-        ),
+        "float64/odd name": f64([0.1, torch.nan, -0.0, torch.inf, 5e-324]),
         "int64": torch.tensor([2**62 + 1, -1]),
         "bool": torch.tensor([True, False]),
         "scalar": torch.tensor(1 / 3),
