@@ -383,14 +383,15 @@ _FIRST_ONLY = "drjit kernels give first derivatives only; a second derivative wa
 def first_only(
     found: Sequence[Tensor | None],
     sources: Iterable[Tensor | None],
+    sentence: str = _FIRST_ONLY,
 ) -> Sequence[Tensor | None]:
     """Gradients that a kernel found, as they are; differentiating them to their sources raises
-    GradientError."""
+    GradientError with the sentence."""
     if not torch.is_grad_enabled():
         return found
     live = [g for g in found if g is not None]
     given = [source for source in sources if source is not None]
-    sealed = iter(NoSecondDerivative.apply(_FIRST_ONLY, len(live), *live, *given))  # pyright: ignore[reportArgumentType]
+    sealed = iter(NoSecondDerivative.apply(sentence, len(live), *live, *given))  # pyright: ignore[reportArgumentType]
     return [None if g is None else next(sealed) for g in found]
 
 

@@ -53,6 +53,13 @@ def inverse(transform: Tensor) -> Tensor:
     return torch.cat([top, transform[..., 3:, :]], -2)
 
 
+def rigid(rotation: Tensor, position: Tensor) -> Tensor:
+    """Transforms [..., 4, 4] of rotations [..., 3, 3] and positions [..., 3]."""
+    top = torch.cat([rotation, position[..., None]], -1)
+    last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=top.dtype, device=top.device)
+    return torch.cat([top, last.expand(*top.shape[:-2], 1, 4)], -2)
+
+
 def apply(transform: Tensor, points: Tensor) -> Tensor:
     """Transform points [..., N, 3] by [..., 4, 4]."""
     return points @ transform[..., :3, :3].mT + transform[..., None, :3, 3]

@@ -24,7 +24,8 @@ from scenes.robots import pair as robot_pair
 from studies.codesign.cells import space_of
 from studies.codesign.design import BLOCKS, Whole
 from studies.codesign.problem import Drawn, Looked
-from studies.codesign.race import JUDGED, answers, compared
+from studies.codesign.race import ENOUGH, JUDGED, answers, compared
+from studies.frame.config import check_least
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.show import tabulate
 from studies.frame.sweep import plain, select, sweep
@@ -55,14 +56,15 @@ class Config(StudyConfig):
 
 def study(run: Run[Config]) -> None:
     config = run.config
+    check_least(config, 1, "starts", "judged_worlds")
     setting, rows = answers(config.raw)
     found = {(row["seed"], row["arm"]): row["share"] for row in rows}
     seeds = sorted({seed for seed, _ in found})[: config.starts]
     lacking = [arm for arm in config.arms if any((seed, arm) not in found for seed in seeds)]
-    if lacking or len(config.arms) < 2 or not seeds:
+    if lacking or len(set(config.arms)) < max(2, len(config.arms)):
         raise DomainError(
-            f"--arms {' '.join(lacking) or 'names fewer than two'}: choose from "
-            f"{', '.join(dict.fromkeys(arm for _, arm in found))}, and give one start or more."
+            f"--arms {' '.join(lacking) or 'names fewer than two, or one twice'}: choose from "
+            f"{', '.join(dict.fromkeys(arm for _, arm in found))}."
         )
     space = space_of(setting)
     drawn = Drawn(space, robot_pair.unseen(config.judged_worlds), config.judged_worlds, 2)
@@ -99,7 +101,7 @@ def study(run: Run[Config]) -> None:
         f"Made and mounted with errors, '{space.pair.name}' by {ours} has {made[ours]:.2f} where it has {plainly[ours]:.2f} as "
         f"designed; over {arm} {made[f'over {arm}']} where it was {plainly[f'over {arm}']}. What is left when events tell nothing "
         f"of motion: {blind[ours]:.2f} ({blind['control']})."
-        + (" So few starts decide nothing." if config.quick else ""),
+        + (" So few starts decide nothing." if len(seeds) < ENOUGH else ""),
     )
 
 

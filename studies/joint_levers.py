@@ -11,13 +11,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from studies.codesign.cells import CellsConfig, answers, judged_errors, setting, space_of
 from studies.codesign.design import BLOCKS
+from studies.codesign.race import ENOUGH
 from studies.frame.compare import crossed
 from studies.frame.run import Run, main
 from studies.frame.show import bars, tabulate
@@ -25,18 +25,11 @@ from studies.frame.sweep import column
 
 NAMES = {"lens": "lens", "mount": "mount", "sensor": "sensor", "network": "estimator"}
 SUBSETS = [frozenset(parts) for size in range(1, 5) for parts in combinations(BLOCKS, size)]
-ENOUGH = 6  # starts, below which nothing is decided
 
 
 @dataclass(frozen=True)
 class Config(CellsConfig):
-    QUICK: ClassVar = {
-        "seeds": 1,
-        "worlds": 2,
-        "per_draw": 2,
-        "judged_worlds": 2,
-        "settling": 6,
-    }
+    """Subsets of the parts are its settings."""
 
 
 def study(run: Run[Config]) -> None:

@@ -23,28 +23,19 @@ from studies.codesign import couplings
 from studies.codesign.cells import CellsConfig, answers, pulls_of, setting, space_of
 from studies.codesign.landscape import ranked
 from studies.codesign.page import best_order
-from studies.codesign.race import compared, start
+from studies.codesign.race import ENOUGH, compared, start
 from studies.frame.compare import Interval, bootstrap
 from studies.frame.run import Run, main
 from studies.frame.show import tabulate
 from studies.frame.sweep import Row, column, select, typical
 
 ORDERS = ("lens > mount > read-out", "mount > lens > read-out")
-ENOUGH = 6  # cells, below which nothing is said of the prediction
+CELLS = 6  # below which nothing is said of the prediction
 
 
 @dataclass(frozen=True)
 class Config(CellsConfig):
-    QUICK: ClassVar = {
-        "lights": (1.0,),
-        "fnos": (4.0,),
-        "seeds": 1,
-        "worlds": 2,
-        "per_draw": 2,
-        "judged_worlds": 2,
-        "settling": 6,
-        "couplings": 0,
-    }
+    QUICK: ClassVar = {**CellsConfig.QUICK, "lights": (1.0,), "fnos": (4.0,), "couplings": 0}
     lights: tuple[float, ...] = (1.0, 0.1)
     """Shares of daylight."""
     fnos: tuple[float, ...] = (0.0, 2.0, 8.0)
@@ -135,9 +126,9 @@ def _answer(run: Run[Config], ratios: Mapping[str, Interval], foretold: Mapping[
         f"Of {len(ratios)} cells one joint descent beats the better order of single blocks in {won}, loses in {lost}, and is "
         f"undecided in {len(ratios) - won - lost}."
     )
-    if len(ratios) < ENOUGH or run.config.quick:
+    if len(ratios) < CELLS or run.config.quick or run.config.seeds < ENOUGH:
         return f"{said} So few cells or starts decide nothing."
-    if len(foretold) < ENOUGH:
+    if len(foretold) < CELLS:
         return f"{said} Couplings foretell {len(foretold)} of them, too few to rank."
 
     def rank(measured: Tensor, told: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from studies.codesign.cells import CellsConfig, setting, space_of
-from studies.codesign.race import compared
+from studies.codesign.race import ENOUGH, compared
 from studies.codesign.refined import AFTERWARDS, JOINT, raced
 from studies.frame.config import check_least
 from studies.frame.run import Run, main
@@ -19,7 +19,6 @@ from studies.frame.show import tabulate
 from studies.frame.sweep import plain, select, sweep, typical
 
 OWN = ("judged_worlds", "judged_drives", "rate", "updates")
-ENOUGH = 6  # starts, below which nothing is decided
 
 
 @dataclass(frozen=True)
@@ -36,6 +35,7 @@ class Config(CellsConfig):
 def study(run: Run[Config]) -> None:
     config = run.config
     check_least(config, 1, "updates")
+    check_least(config, 0, "rate")
     free = space_of(setting(config)).free
     # the closed form's prior is nothing to a refiner
     cell = setting(config, free=[name for name in free if name != "prior_px"])

@@ -21,8 +21,8 @@ torch.set_num_threads(int(os.environ.get("CODESIGN_TEST_THREADS", "1")))
 drjit.set_thread_count(torch.get_num_threads())
 # modules that extras of pyproject.toml bring
 EXTRAS = {
-    *("h5py", "hdf5plugin", "lz4", "zstandard", "imageio", "imageio_ffmpeg", "tifffile", "trimesh"),
-    *("collada"),
+    *("h5py", "hdf5plugin", "lz4", "zstandard", "imageio", "imageio_ffmpeg", "tifffile"),
+    *("trimesh", "collada"),
     *("yourdfpy", "lxml", "tensorboard", "cma", "optuna", "onnx", "onnxscript", "viser"),
 }
 ABSENT = {name for name in EXTRAS if importlib.util.find_spec(name) is None}

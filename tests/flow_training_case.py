@@ -20,6 +20,7 @@ from scenes.windows import sets
 from studies.frame.run import main
 from studies.train_flow import __main__ as train_flow
 from studies.train_flow import watch
+from tests.numbers import f64, seeded
 
 ROOT = Path(__file__).resolve().parents[1]
 BINS = 2
@@ -60,16 +61,13 @@ class Made:
 
     def batch(self, indices):
         self.before(indices)
-        draws = [torch.Generator().manual_seed(1000 * self.seed + index) for index in indices]
+        draws = [seeded(1000 * self.seed + index) for index in indices]
         counts = torch.stack(
             [torch.randn(2, BINS, SIDE, SIDE, generator=draw).square() for draw in draws]
         )
         flow = torch.einsum("fc,bchw->bfhw", TRUE_WEIGHTS, counts.flatten(1, 2))
         valid = torch.full((len(counts), SIDE, SIDE), not self.blind)
-        times = (
-            torch.tensor([0.25, 0.75], dtype=torch.float64),
-            torch.tensor([0.5, 0.5], dtype=torch.float64),
-        )
+        times = (f64([0.25, 0.75]), f64([0.5, 0.5]))
         return FlowWindows(
             EventVolume(counts, *times),
             FlowField(flow, valid, 1.0),

@@ -6,6 +6,7 @@ import torch
 
 from codesign import backend
 from codesign.errors import BackendError, DomainError, GradientError
+from tests.numbers import D, close, randn64
 
 N = 5
 
@@ -26,7 +27,7 @@ def same_in_torch(x, y, a):
     return torch.sin(x * a) + y * y, (torch.exp(a * y) * x)[:, None], torch.round(x).to(torch.int32)
 
 
-@pytest.fixture(params=[torch.float32, torch.float64], ids=str)
+@pytest.fixture(params=[torch.float32, D], ids=str)
 def inputs(request, generator):
     x, y = (
         torch.randn(N, dtype=request.param, generator=generator).requires_grad_() for _ in range(2)
@@ -41,7 +42,7 @@ def test_values_and_dtype_follow_the_inputs(inputs):
     assert [o.shape for o in outputs] == [e.shape for e in expected]
     # drjit's sin and exp are within 2 units in the last place; values here stay below 8
     for got, want in zip(outputs, expected, strict=True):
-        torch.testing.assert_close(
+        close(
             got,
             want,
             rtol=4 * torch.finfo(inputs[0].dtype).eps,
@@ -50,10 +51,8 @@ def test_values_and_dtype_follow_the_inputs(inputs):
 
 
 def test_gradcheck_in_double(generator):
-    x, y = (
-        torch.randn(N, dtype=torch.float64, generator=generator).requires_grad_() for _ in range(2)
-    )
-    a = torch.tensor([0.7], dtype=torch.float64, requires_grad=True)
+    x, y = (randn64(generator, N).requires_grad_() for _ in range(2))
+    a = torch.tensor([0.7], dtype=D, requires_grad=True)
     assert torch.autograd.gradcheck(lambda *v: call(*v)[:2], (x, y, a))
 
 
@@ -66,9 +65,7 @@ def test_gradient_equals_torch(inputs):
     want = torch.autograd.grad(same_in_torch(*inputs)[:2], inputs, seeds)
     for g, w in zip(got, want, strict=True):
         # sums of ten terms of order one
-        torch.testing.assert_close(
-            g, w, rtol=20 * torch.finfo(w.dtype).eps, atol=20 * torch.finfo(w.dtype).eps
-        )
+        close(g, w, rtol=20 * torch.finfo(w.dtype).eps, atol=20 * torch.finfo(w.dtype).eps)
 
 
 @pytest.mark.bits
@@ -86,7 +83,7 @@ def test_second_backward_gives_the_same_numbers(inputs):
 def test_gradient_of_one_input_alone(inputs):
     x, y, a = inputs
     (only,) = torch.autograd.grad(call(x.detach(), y, a.detach())[1].sum(), [y])
-    torch.testing.assert_close(only, (a * torch.exp(a * y) * x).detach(), rtol=2e-6, atol=1e-6)
+    close(only, (a * torch.exp(a * y) * x).detach(), rtol=2e-6, atol=1e-6)
 
 
 def test_an_output_owns_its_memory(inputs):
@@ -153,9 +150,7 @@ def test_integer_outputs_carry_no_gradient(inputs):
 def test_mixed_dtypes_are_refused():
     with pytest.raises(GradientError, match=r"float32.*float64"):
         backend.run_kernel(
-            lambda arr, x, y: (x + y,),
-            (torch.zeros(2), torch.zeros(2, dtype=torch.float64)),
-            [(2,)],
+            lambda arr, x, y: (x + y,), (torch.zeros(2), torch.zeros(2, dtype=D)), [(2,)]
         )
     with pytest.raises(GradientError, match="float16"):
         backend.run_kernel(lambda arr, x: (x,), (torch.zeros(2, dtype=torch.float16),), [(2,)])

@@ -8,8 +8,8 @@ import torch
 from codesign.errors import DomainError, ShapeError
 from codesign.pose import apply, check_pose, check_poses, inverse, look_at, se3_exp
 from codesign.render import Camera, project
-
-D = torch.float64
+from tests import refusals
+from tests.numbers import D, close, f64, randn64
 
 
 def wedge(twist):
@@ -27,52 +27,45 @@ def wedge(twist):
 )
 def test_exponential_is_that_of_the_matrix(angle, generator):
     for _ in range(3):
-        axis = torch.nn.functional.normalize(torch.randn(3, dtype=D, generator=generator), dim=0)
-        twist = torch.cat([torch.randn(3, dtype=D, generator=generator), angle * axis])
+        axis = torch.nn.functional.normalize(randn64(generator, 3), dim=0)
+        twist = torch.cat([randn64(generator, 3), angle * axis])
         # torch's Pade form is good to some 1e-15 of a norm of at most 5
-        torch.testing.assert_close(
-            se3_exp(twist), torch.linalg.matrix_exp(wedge(twist)), rtol=0, atol=2e-14
-        )
+        close(se3_exp(twist), torch.linalg.matrix_exp(wedge(twist)), atol=2e-14)
 
 
 def test_a_quarter_turn_about_z_with_translation_by_hand():
     # left Jacobian of a quarter turn: (2/pi) [[1, -1], [1, 1]]
-    found = se3_exp(torch.tensor([1.0, 0, 0.5, 0, 0, math.pi / 2], dtype=D))
-    truth = torch.tensor(
-        [[0, -1, 0, 2 / math.pi], [1, 0, 0, 2 / math.pi], [0, 0, 1, 0.5], [0, 0, 0, 1]], dtype=D
-    )
-    torch.testing.assert_close(found, truth, rtol=0, atol=1e-15)
+    found = se3_exp(f64([1.0, 0, 0.5, 0, 0, math.pi / 2]))
+    truth = f64([[0, -1, 0, 2 / math.pi], [1, 0, 0, 2 / math.pi], [0, 0, 1, 0.5], [0, 0, 0, 1]])
+    close(found, truth, atol=1e-15)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-9, 1e-5, 0.5, 2.0])
 def test_gradcheck(scale, generator):
-    twist = (scale * torch.randn(2, 6, dtype=D, generator=generator)).requires_grad_()
+    twist = (scale * randn64(generator, 2, 6)).requires_grad_()
     # steps of 1e-6: differences are good to 1e-9
     assert torch.autograd.gradcheck(se3_exp, twist, atol=1e-8)
 
 
 def test_inverse_and_apply(generator):
-    transform = se3_exp(torch.randn(4, 2, 6, dtype=D, generator=generator))
-    points = torch.randn(4, 2, 7, 3, dtype=D, generator=generator)
-    torch.testing.assert_close(
-        inverse(transform) @ transform, torch.eye(4, dtype=D).expand(4, 2, 4, 4), rtol=0, atol=1e-14
-    )
+    transform = se3_exp(randn64(generator, 4, 2, 6))
+    points = randn64(generator, 4, 2, 7, 3)
+    close(inverse(transform) @ transform, torch.eye(4, dtype=D).expand(4, 2, 4, 4), atol=1e-14)
     homogeneous = torch.cat([points, torch.ones_like(points[..., :1])], -1)
-    torch.testing.assert_close(
+    close(
         apply(transform, points),
         torch.einsum("...ij,...nj->...ni", transform, homogeneous)[..., :3],
-        rtol=0,
         atol=1e-14,
     )
 
 
 def test_the_gradient_of_the_inverse_is_that_of_differences_and_of_the_group(generator):
-    transform = se3_exp(torch.randn(2, 3, 6, dtype=D, generator=generator))
+    transform = se3_exp(randn64(generator, 2, 3, 6))
     # any change of the entries, as differences see it: the formula is quadratic, so central ones
     # are exact
     entries = transform.clone().requires_grad_()
     assert torch.autograd.gradcheck(inverse, entries, eps=1e-2, rtol=0, atol=1e-12)
-    weights = torch.randn(transform.shape, dtype=D, generator=generator)
+    weights = randn64(generator, transform.shape)
     # a rigid change T exp(w): the inverse becomes exp(-w) T^-1, whose derivative is -[w] T^-1
     twist = torch.zeros(2, 3, 6, dtype=D, requires_grad=True)
     (found,) = torch.autograd.grad((inverse(transform @ se3_exp(twist)) * weights).sum(), twist)
@@ -80,14 +73,12 @@ def test_the_gradient_of_the_inverse_is_that_of_differences_and_of_the_group(gen
         truth = (-wedge(torch.eye(6, dtype=D)[k]) @ torch.linalg.inv(transform) * weights).sum(
             (-2, -1)
         )
-        torch.testing.assert_close(found[..., k], truth, rtol=0, atol=1e-12)
+        close(found[..., k], truth, atol=1e-12)
 
 
 def test_constant_twists_give_constant_transforms():
     assert not se3_exp(torch.zeros(3, 6, dtype=D)).requires_grad
     assert se3_exp(torch.zeros(6)).dtype == torch.float32
-    with pytest.raises(ShapeError, match="6 components"):
-        se3_exp(torch.zeros(2, 3))
 
 
 def test_look_at_makes_a_rigid_camera_with_right_down_forward(thin_camera):
@@ -96,14 +87,14 @@ def test_look_at_makes_a_rigid_camera_with_right_down_forward(thin_camera):
     pose = look_at(origin, target)
     check_poses(pose[None])
     assert float(torch.linalg.det(pose[:3, :3])) == pytest.approx(1, abs=1e-14)
-    forward = torch.tensor(target, dtype=D) - torch.tensor(origin, dtype=D)
-    torch.testing.assert_close(pose[:3, 2], forward / forward.norm(), rtol=0, atol=1e-15)
+    forward = f64(target) - f64(origin)
+    close(pose[:3, 2], forward / forward.norm(), atol=1e-15)
     assert abs(float(pose[2, 0])) <= 1e-15  # the image's rows are level
     assert float(pose[2, 1]) < 0  # down in the image is down in the world
     # seen from y = -4 towards +y, world +x is to the right and world +z up
-    world = torch.tensor([target, (0.7, 1.0, 1.0), (0.5, 1.0, 1.2)], dtype=D)
+    world = f64([target, (0.7, 1.0, 1.0), (0.5, 1.0, 1.2)])
     pixels = project(thin_camera, apply(inverse(pose), world))
-    torch.testing.assert_close(pixels[0], thin_camera.film.middle_px, rtol=0, atol=1e-9)
+    close(pixels[0], thin_camera.film.middle_px, atol=1e-9)
     assert float(pixels[1, 0]) > float(pixels[0, 0]) + 1
     assert float(pixels[2, 1]) < float(pixels[0, 1]) - 1
 
@@ -115,20 +106,14 @@ def thin_camera():
     return Camera(Pinhole(8.0), 64, 48, 0.05, 1)
 
 
-def test_look_at_along_down_and_at_itself_are_refused():
-    with pytest.raises(DomainError, match="parallel"):
-        look_at((0, 0, 2), (0, 0, 0))
-    with pytest.raises(DomainError, match="same point"):
-        look_at((1, 0, 2), (1, 0, 2))
-    with pytest.raises(DomainError, match="look_at"):
-        look_at((math.nan, 0, 2), (1, 0, 2))
+@refusals.table(__file__, "poses")
+def test_what_is_no_pose_is_refused(row):
+    row.holds(globals())
+
+
+def test_a_camera_may_look_straight_down():
     straight_down = look_at((0, 0, 2), (0, 0, 0), down=(0, -1, 0))
-    torch.testing.assert_close(
-        straight_down[:3, :3],
-        torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]], dtype=D),
-        rtol=0,
-        atol=1e-15,
-    )
+    close(straight_down[:3, :3], f64([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), atol=1e-15)
 
 
 @pytest.mark.parametrize("part", [(slice(None), slice(3)), slice(0)])
@@ -140,8 +125,8 @@ def test_poses_of_another_shape_are_refused(part):
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (lambda p: p @ torch.diag(torch.tensor([1.0, -1, 1, 1], dtype=D)), "mirrors"),
-        (lambda p: p @ torch.diag(torch.tensor([1.0, 1.01, 1, 1], dtype=D)), "not rigid: R R"),
+        (lambda p: p @ torch.diag(f64([1.0, -1, 1, 1])), "mirrors"),
+        (lambda p: p @ torch.diag(f64([1.0, 1.01, 1, 1])), "not rigid: R R"),
         (lambda p: torch.cat([p[:3], p[3:] + 0.1]), "last row"),
         (
             lambda p: torch.where(torch.eye(4, dtype=torch.bool).roll(1, 1), torch.nan, p),
@@ -155,7 +140,7 @@ def test_poses_of_another_shape_are_refused(part):
 )
 @pytest.mark.parametrize("place", [(0, 0), (1, 2)])
 def test_one_bad_pose_among_good_ones_is_refused(change, sentence, place, generator):
-    good = se3_exp(torch.randn(2, 3, 6, dtype=D, generator=generator))
+    good = se3_exp(randn64(generator, 2, 3, 6))
     assert check_poses(good) is good
     bad = good.clone()
     bad[place] = change(good[place])
@@ -166,9 +151,5 @@ def test_one_bad_pose_among_good_ones_is_refused(change, sentence, place, genera
 
 
 def test_a_single_pose_is_one_matrix(generator):
-    pose = se3_exp(torch.randn(6, dtype=D, generator=generator))
+    pose = se3_exp(randn64(generator, 6))
     assert torch.equal(check_pose(pose), pose)
-    with pytest.raises(ShapeError, match=r"a pose must be \[4, 4\], got \(1, 4, 4\)"):
-        check_pose(pose[None])
-    with pytest.raises(DomainError, match="not rigid"):
-        check_pose(2 * pose)

@@ -9,9 +9,10 @@ import torch
 
 import codesign
 from codesign import lens, render
-from codesign.errors import DomainError, ShapeError
+from codesign.errors import DomainError
 from codesign.system.result import Result
 from codesign.types import EventStream, EventVolume, FlowField
+from tests import refusals
 
 
 def picture(axis):
@@ -126,26 +127,9 @@ def test_light_through_a_thin_lens_meets_where_geometry_has_it():
         assert before[1] / before[0] == pytest.approx(behind[1] / behind[0])
 
 
-@pytest.mark.parametrize(
-    ("given", "error", "sentence"),
-    [
-        (np.array(["a"]), DomainError, "nothing is known of how to draw ndarray"),
-        (3, DomainError, "nothing is known of how to draw int"),
-        (torch.tensor(1.0), ShapeError, "frames are torch.float32 \\[\\]"),
-        (np.zeros((0, 4, 4)), ShapeError, "with a pixel is needed"),
-        (np.zeros((8, 9, 3)), ShapeError, "look like colour"),
-        (torch.full((2, 8, 9), -1.0), ShapeError, "look like flow"),
-        (
-            FlowField(torch.zeros(0, 2, 4, 4), torch.zeros(0, 4, 4, dtype=torch.bool), 0.1),
-            ShapeError,
-            "no sample",
-        ),
-        (codesign.mount.Mount((0, 0, 0.4), (0.1, 0.1, 0.1)), DomainError, "give camera= and body="),
-    ],
-)
-def test_what_cannot_be_drawn_is_refused_in_a_sentence(given, error, sentence):
-    with pytest.raises(error, match=sentence):
-        codesign.show(given)
+@refusals.table(__file__, "drawings")
+def test_what_cannot_be_drawn_is_refused_in_a_sentence(row):
+    row.holds(globals())
 
 
 def test_results_are_printed_in_a_line_each():

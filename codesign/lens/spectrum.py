@@ -31,7 +31,6 @@ LINE_UM = {
 }
 MOST_WAVELENGTHS = 1000
 ROUNDING = 4 * np.finfo(float).eps  # to which the ends of strata are found
-SECOND_RADIATION_UM_K = 14387.768775  # h c / k, exact in the SI of 2019
 
 # CIE standard illuminant D65, 300 to 830 nm in steps of 10 nm, linear between them by definition.
 # Source: CIE S 014-2 / ISO 11664-2
@@ -217,25 +216,6 @@ def _curve(curve, name):
     if not (value >= 0).all() or not 0 < value.max() < math.inf:
         raise DomainError(f"{name}: values must be finite, at least 0 and not all 0.")
     return wavelength_um, value
-
-
-def blackbody(temperature_k: float) -> Curve:
-    """Planck's radiance per wavelength, 0.30 to 1.20 um in steps of 5 nm, largest value 1:
-    (wavelength_um, value).
-
-    Args: temperature_k from 500 to 100000.
-    Raises: DomainError.
-    """
-    check_number(
-        temperature_k,
-        "temperature_k",
-        500,
-        100_000,
-        remedy="daylight has about 6500 K, a tungsten lamp 2856 K",
-    )
-    wavelength_um = np.linspace(0.30, 1.20, 181)
-    value = wavelength_um**-5 / np.expm1(SECOND_RADIATION_UM_K / (wavelength_um * temperature_k))
-    return wavelength_um, value / value.max()
 
 
 def daylight_d65() -> Curve:

@@ -225,7 +225,7 @@ class EgoVelocity:
             pixel_lines(camera, middle),
             mounts,
             field.interval_s,
-            _windows(camera),
+            camera.film.shape[0] if len(camera.film.shape) == 3 else 1,
         )
 
     def _read(self, looked, known, depth_m):
@@ -347,10 +347,6 @@ def _middle(frames: int, t_s: Tensor | None, interval_s: float) -> tuple[int, fl
     since_s = t_s - (t_s[-1] - interval_s)
     frame = int((since_s - interval_s / 2).abs().argmin())
     return frame, float(since_s[frame]) / interval_s
-
-
-def _windows(camera):
-    return camera.film.shape[0] if len(camera.film.shape) == 3 else 1
 
 
 def _solved(read, kept, prior):

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from codesign.checks import check_finite, check_number, check_positive
 from codesign.errors import DomainError, ShapeError
 from codesign.mount.observability import chief_lines, flow_of_points
-from codesign.pose import check_poses, se3_exp
+from codesign.pose import check_poses, rigid, se3_exp
 from codesign.render.film import some_pixels
 from codesign.types import ChiefRayCamera
 
@@ -129,7 +129,7 @@ class Mount(nn.Module):
         turn = se3_exp(torch.cat([torch.zeros_like(numbers[..., 3:]), numbers[..., 3:]], -1))[
             ..., :3, :3
         ]
-        return _pose(self.start_attitude @ turn, position)
+        return rigid(self.start_attitude @ turn, position)
 
     def numbers_at(self, T_body_cam: Tensor) -> Tensor:
         """Numbers [..., 6] that give poses [..., 4, 4], the inverse of ``forward``; no gradient.
@@ -313,7 +313,7 @@ class MountRanges:
         """T_body_cam [..., 4, 4] float64 of shares [..., 6], as ``numbers``; gradient and errors
         too."""
         numbers = self.numbers(share)
-        return _pose(attitude(*numbers[..., 3:].unbind(-1)), numbers[..., :3])
+        return rigid(attitude(*numbers[..., 3:].unbind(-1)), numbers[..., :3])
 
     def share_at(self, T_body_cam: Tensor) -> Tensor:
         """Shares [..., 6] of mounts [..., 4, 4], the inverse of ``pose``; no gradient.
@@ -345,13 +345,6 @@ class MountRanges:
         Raises: ShapeError; DomainError for shares that are not finite.
         """
         return torch.where(self.held, 0.5, _shares(share).clamp(0, 1))
-
-
-def _pose(turn, position):
-    """[..., 4, 4] of rotations [..., 3, 3] and positions [..., 3]."""
-    top = torch.cat([turn, position[..., None]], -1)
-    last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=top.dtype, device=top.device)
-    return torch.cat([top, last.expand(*top.shape[:-2], 1, 4)], -2)
 
 
 def _numbers(values, name, names, unit):

@@ -68,23 +68,6 @@ class FramesTruth(FlowTruth):
     object_id: Tensor
 
 
-def world_points(
-    rays: Rays, scene: Scene | MovingScene, T_world_cam: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """World points under rays given in camera space, from one pose.
-
-    Args:
-      rays: Rays [N] (chief rays).
-      scene: anything with ``hit``, or a MovingScene of one frame.
-      T_world_cam: [4, 4].
-    Returns: points [N, 3] metres, depth [N] along the camera's z axis, valid [N].
-    Gradient: to rays and poses, the surface taken as its tangent plane at the hit.
-    """
-    views = views_of(scene, T_world_cam[None])
-    hits = hits_of(rays, views.scene, views.cameras)
-    return carried(hits, views.T_world_part)[0], _depth(rays, hits)[0], hits.part[0] >= 0
-
-
 def view(camera: Camera, scene: Scene | MovingScene, T_world_cam: Poses, frame: int) -> View:
     """View of one frame of a sequence, or of several: T_world_cam [..., T, 4, 4], frame a number.
 

@@ -9,6 +9,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 from codesign import pose
 from codesign.render import Camera
+from codesign.render.camera import lines
 
 MOST_DRAWN = 6000  # triangles: of more, the largest
 # of the robot's size: longer edges are cut in half, since drawing sorts whole triangles by depth
@@ -67,8 +68,11 @@ def view_lines(camera: Camera, T_robot_cam: torch.Tensor, length_m: float) -> np
     corners_px = (
         film.middle_px + half * torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]]).double()
     )
-    rays = camera.chief_rays(corners_px)
-    direction = rays.direction.double().reshape(-1, 3)
-    ends = pose.apply(T_robot_cam, length_m * direction / direction[:, 2:]).detach().numpy()
+    rays = camera.rays_through(corners_px, torch.zeros_like(corners_px))
+    straight = (corners_px - film.middle_px) * camera.slope_per_px()
+    # where the lens passes no light, a corner is where a pinhole would see it
+    slope = torch.where(rays.weight[:, None] > 0, lines(rays)[1].double(), straight)
+    ends = pose.apply(T_robot_cam, length_m * torch.nn.functional.pad(slope, (0, 1), value=1.0))
+    ends = ends.detach().numpy()
     eye = np.broadcast_to(T_robot_cam[:3, 3].detach().numpy(), ends.shape)
     return np.concatenate([np.stack([eye, ends], 1), np.stack([ends, np.roll(ends, -1, 0)], 1)])

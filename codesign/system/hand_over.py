@@ -72,11 +72,13 @@ def save_hand_over(path: str | Path, handed: HandOver) -> None:
         **{name: value for name in FILM if (value := getattr(camera.film, name)) is not None},
         **{name: getattr(camera, name) for name in ("samples_per_pixel", "seed", "falloff", "aim")},
     }
-    if camera.spectrum is not None:
-        page["camera"]["wavelengths_um"] = [
-            float(value) for value in camera.spectrum.wavelengths_um
-        ]
-        page["camera"]["weights"] = [float(value) for value in camera.spectrum.weights]
+    spectrum = camera.spectrum
+    line, _ = camera.colours[0]
+    if line and spectrum is None:  # ``in_one_colour``
+        spectrum = lenses.Spectrum((line["wavelength_um"],), (1.0,))
+    if spectrum is not None:
+        for name in ("wavelengths_um", "weights"):
+            page["camera"][name] = [float(value) for value in getattr(spectrum, name)]
     if handed.sensor is not None:
         page["sensor"] = asdict(handed.sensor)
     if handed.notes:
@@ -88,7 +90,8 @@ def save_hand_over(path: str | Path, handed: HandOver) -> None:
 
 
 def load_hand_over(path: str | Path) -> HandOver:
-    """Read what ``save_hand_over`` wrote: the same mount, lens, camera and sensor, to the last bit.
+    """Read what ``save_hand_over`` wrote: the same mount, camera and sensor to the last bit,
+    and the lens; one with variables, or scaled as those of a family are, to rounding.
 
     A file without the section mount holds the pose of its transform. The file is data: nothing in
     it is run, and it names no file outside its own folder.

@@ -69,7 +69,9 @@ class Pass(Mapping[str, Any]):
 
     def result(self, objectives: dict[str, Tensor]) -> Result:
         pose = self.made.get("T_world_cam")
-        kept = None if self.junctions is None else dict(sorted(self.junctions.items(), key=_order))
+        kept = self.junctions
+        if kept is not None:
+            kept = {name: kept[name] for name in JUNCTIONS if name in kept}
         return Result(
             objectives,
             self.made.get("field"),
@@ -348,7 +350,3 @@ def built_bins(flow: Any) -> int | None:
         if isinstance(built, dict) and built.get("bins") is not None:
             return built["bins"]
     return None
-
-
-def _order(item: tuple[str, Any]) -> int:
-    return JUNCTIONS.index(item[0])

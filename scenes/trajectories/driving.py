@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
-from scenes.trajectories.trajectory import Trajectory, positive, rigid
+from codesign.pose import rigid
+from scenes.trajectories.trajectory import Trajectory, positive
 
 STEP_S = 0.02  # between points of the table of positions
 NODES = 8  # of Gauss and Legendre on such a step: exact to rounding for the slow waves below

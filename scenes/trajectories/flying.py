@@ -18,7 +18,8 @@ from torch import Tensor
 
 from codesign.checks import check_finite
 from codesign.errors import DomainError, ShapeError
-from scenes.trajectories.trajectory import Trajectory, rigid
+from codesign.pose import rigid
+from scenes.trajectories.trajectory import Trajectory
 
 TERMS = 8
 MOST_POINTS = 200

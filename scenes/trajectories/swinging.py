@@ -6,8 +6,8 @@ import math
 import torch
 
 from codesign.checks import check, check_number, check_positive
-from codesign.pose import check_pose
-from scenes.trajectories.trajectory import Trajectory, positive, rigid
+from codesign.pose import check_pose, rigid
+from scenes.trajectories.trajectory import Trajectory, positive
 
 
 class Orbital(Trajectory):

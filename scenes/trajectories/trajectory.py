@@ -115,12 +115,6 @@ def body_at(origin_m, target_m, up=(0.0, 0.0, 1.0)):
     return pose
 
 
-def rigid(rotation, position_m):
-    """Poses [n, 4, 4] of rotations [n, 3, 3] and positions [n, 3]."""
-    last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=rotation.dtype).expand(rotation.shape[0], 1, 4)
-    return torch.cat([torch.cat([rotation, position_m[:, :, None]], 2), last], 1)
-
-
 def positive(name, value, least=0.0, most=float("inf"), inclusive=False):
     """Raise DomainError unless ``least`` < value < ``most`` (or ``least`` <= value); returns it as
     a float."""

@@ -27,6 +27,7 @@ from scenes.robots.pair import RobotPair
 from scenes.robots.pairs import PAIRS
 from studies.codesign import couplings, page, slopes
 from studies.codesign.arms import ARMS
+from studies.codesign.cells import CellsConfig
 from studies.codesign.landscape import landscape
 from studies.codesign.problem import Drawn
 from studies.codesign.race import (
@@ -40,10 +41,11 @@ from studies.codesign.race import (
     training,
 )
 from studies.frame.config import check_least
-from studies.frame.run import Run, StudyConfig, main
+from studies.frame.files import check_same
+from studies.frame.run import Run, main
 from studies.frame.sweep import Row, sweep
 from studies.placement.look import size_in_words
-from studies.placement.race import check_same, fingerprints
+from studies.placement.race import fingerprints
 from studies.placement.searches import SEARCHES, available
 
 THIN = "thin"
@@ -52,22 +54,15 @@ LEAST_STEPS = 16  # of which an eighth is left to each block of eight sweeps
 
 
 @dataclass(frozen=True)
-class Config(StudyConfig):
+class Config(CellsConfig):
     QUICK: ClassVar = {
-        "seeds": 1,
-        "worlds": 2,
-        "per_draw": 2,
-        "judged_worlds": 2,
+        **CellsConfig.QUICK,
         "arms": ("joint", "lens > mount > read-out", "default"),
         "designs": 2,
         "grid": 2,
-        "settling": 6,
         "slopes": 0,
         "couplings": 0,
     }
-    ANEW: ClassVar = ("processes", "cluster")
-    pair: str = "outdoors"
-    """Robot and worlds: outdoors, corridor or flight."""
     robot: Path | None = None
     """A robot of your own instead, described in a .yaml file (docs/robots_and_worlds.md)."""
     family: str = "retrofocus-4"
@@ -88,14 +83,6 @@ class Config(StudyConfig):
     """Start within a tenth of the bounds of the best design looked at, instead of all over them."""
     steps: int = 16
     """Steps of every descent, looks of every search: the budget, a multiple of 16."""
-    worlds: int = 12
-    """Training worlds."""
-    per_draw: int = 12
-    """Drives rendered in a step."""
-    judged_worlds: int = 24
-    """Unseen worlds."""
-    judged_drives: int = 2
-    """Drives in each."""
     designs: int = 64
     """Designs all over the bounds, and as many near the best, looked at before the race; 64 and
     more calibrate it."""
@@ -106,14 +93,6 @@ class Config(StudyConfig):
     couplings: int = 4
     """Draws by which the couplings of the parts are measured around the best joint answer; 0: they
     are not."""
-    settling: int = 24
-    """Designs of sensor and estimator tried on recorded frames, wherever they are settled."""
-    processes: int = 0
-    """Arms that race side by side, each in a process of its own; 0: one after the other in this
-    one."""
-    cluster: str = ""
-    """Address of a Ray cluster on whose cores arms race instead: "auto" for that of this machine,
-    "here" for one of its own."""
     raw: Path | None = None
     """Answers of earlier runs (answers.jsonl of their folder, or race.jsonl of one that was cut):
     not raced again."""
@@ -141,6 +120,9 @@ def study(run: Run[Config]) -> None:
         taken_up(size.raw, setting)  # before hours of the rest
     if size.robot:
         run.say(size_in_words(space.pair))
+        at = space.pair.design
+        turned = (f"{math.degrees(getattr(at, name)):.3g}" for name in ("yaw_rad", "roll_rad"))
+        run.say("held: {:.3g} m to the side, yaw {} and roll {} degrees".format(at.y_m, *turned))
         check_pair(space.pair, space.made(space.start).camera, (0, robot_pair.UNSEEN_FROM))
     for seed in range(size.seed, size.seed + size.seeds):
         start(space, seed)
@@ -185,10 +167,12 @@ def best_joint(drawn: Drawn, rows: Sequence[Row]) -> Tensor:
 
 
 def best_answer(drawn: Drawn, rows: Sequence[Row]) -> Row:
-    """The answer of any arm of which least is expected in drives of the training worlds, among those
-    that expected least on their own way there."""
-    told = [row for row in rows if row["expected"] is not None]
-    return couplings.best_of(drawn, sorted(told, key=lambda row: row["expected"])[:SHORTLIST])
+    """The answer of which least is expected in drives of the training worlds: among the SHORTLIST of
+    any arm and start that expected least on their own way there, and the default."""
+    ways = [row for row in rows if row["expected"] is not None]
+    still = [row for row in rows if row["expected"] is None]
+    listed = sorted(ways, key=lambda row: row["expected"])[:SHORTLIST]
+    return couplings.best_of(drawn, [*listed, *still[:1]])
 
 
 def around(

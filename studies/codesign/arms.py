@@ -29,16 +29,18 @@ GEOMETRY = ("lens", "mount")
 @dataclass
 class Way:
     """shares: looked at, with the error to be expected at each; recorded: the last drives that were
-    rendered."""
+    rendered; expected: the error at what the way ends with, a search with the best it has seen."""
 
     shares: list[Tensor] = field(default_factory=list)
     errors: list[float] = field(default_factory=list)
     recorded: list[Looked] = field(default_factory=list)
+    expected: float | None = None
 
     def add(self, share: Tensor, error: float, looked: Looked) -> None:
         """One step."""
         self.shares.append(share)
         self.errors.append(error)
+        self.expected = error
         self.recorded = [*self.recorded, looked][-RECORDED:]
 
 
@@ -223,6 +225,7 @@ def searched(name: str) -> Callable[[Task], tuple[Tensor, Way]]:
             best = min(way.errors, default=math.inf)
             recorded = [looked] if error < best else way.recorded
             way.add(share, error, looked)
+            way.expected = min(error, best)
             way.recorded = recorded  # the read-out is settled on what the best design saw
             return error
 

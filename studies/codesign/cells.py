@@ -21,13 +21,20 @@ from studies.frame.sweep import Row, select, sweep
 
 @dataclass(frozen=True)
 class CellsConfig(StudyConfig):
-    """Sizes that every cell shares; as of studies.codesign."""
+    """Sizes of a race, of one setting or of many."""
 
+    QUICK: ClassVar = {
+        "seeds": 1,
+        "worlds": 2,
+        "per_draw": 2,
+        "judged_worlds": 2,
+        "settling": 6,
+    }
     ANEW: ClassVar = ("processes", "cluster")
     pair: str = "outdoors"
     """Robot and worlds: outdoors, corridor or flight."""
     seeds: int = 6
-    """Paired starting designs of every cell."""
+    """Paired starting designs of every setting."""
     steps: int = 16
     """Steps of every descent: the budget."""
     worlds: int = 12
@@ -41,9 +48,10 @@ class CellsConfig(StudyConfig):
     settling: int = 24
     """Designs of sensor and estimator tried on recorded frames, wherever they are settled."""
     processes: int = 0
-    """Cells that race side by side, each in a process of its own; 0: one after the other here."""
+    """Races side by side, each in a process of its own; 0: one after the other in this one."""
     cluster: str = ""
-    """Address of a Ray cluster on whose cores they race instead ("auto", "here")."""
+    """Address of a Ray cluster on whose cores they run instead: "auto" for that of this machine,
+    "here" for one of its own."""
 
 
 def setting(

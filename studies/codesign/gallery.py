@@ -52,24 +52,28 @@ def handed(run: Run[Any], judge: Judge, whole: Whole, error: float, said: str) -
     """Write a design as design.yaml with its lens beside it, read it back, and see that it has the
     same score. said: whose it is."""
     path = run.path("design.yaml")
-    save(path, whole, error)
+    size = run.config
+    told = ("light", "speed", "judged_worlds", "judged_drives")
+    asked = {name: getattr(size, name) for name in told} | {"pair": str(size.robot or size.pair)}
+    save(path, whole, {**asked, "error_unseen": error})
     back = loaded(path, whole)
     again = judge.of(back)["errors"]
     run.record(hand_over_score=error, hand_over_score_again=sum(again) / len(again))
     run.section(
         "Hand-over",
-        f"Of all answers that keep what is required, {said} is the one of which least is expected in drives of the training "
-        f"worlds. `design.yaml` has its transform, camera and sensor, and the estimator's prior among its notes; the lens stands beside "
+        f"Of the answers that expected least on their own way, and the default where it raced, {said} is the one of which "
+        f"least is expected in drives of the training worlds. `design.yaml` has its transform, camera and sensor, and the estimator's prior among its notes; the lens stands beside "
         f"it, a traced one as `design.zmx` too (`codesign.lens.load` reads both). Read back it scores "
         f"{sum(again) / len(again):.4f} where the answer had {error:.4f}.",
     )
 
 
-def save(path: Path, whole: Whole, error: float) -> None:
-    """A design with its error in unseen worlds, for those who build it."""
+def save(path: Path, whole: Whole, told: Mapping[str, Any]) -> None:
+    """A design for those who build it, with what is told of it (its error in unseen worlds, and
+    their light and speed) and its numbers as notes."""
     pair = whole.space.pair
     mount = robot_pair.mount_at(pair.ranges, whole.T_body_cam)
-    notes = {"pair": pair.name, "error_unseen": error, **whole.numbers}
+    notes = {**told, **whole.numbers}
     save_hand_over(
         path, HandOver(mount, whole.camera, whole.sensor, pair.frame, "camera_optical_frame", notes)
     )

@@ -15,6 +15,7 @@ from codesign.atomic import write_atomic
 from codesign.errors import DomainError
 from codesign.flow import checkpoint
 from codesign.mount import FlowErrors, Readings
+from studies.codesign import couplings
 from studies.codesign.calibration import Calibration, Conditions, fitted
 from studies.codesign.design import Space
 from studies.codesign.problem import Drawn, Seen
@@ -78,7 +79,7 @@ class Landscape:
             ("near", self.near[1::2]),
         ):
             for row in rows:
-                numbers = space.numbers(torch.tensor(row["share"], dtype=torch.float64))
+                numbers = space.numbers(couplings.share(row))
                 values = [numbers[name] for name in space.free] + [row["hard"], row["expected"]]
                 lines.append(f'"{kind}",' + ",".join(f"{value:.5g}" for value in values))
         return "\n".join(lines) + "\n"
@@ -202,8 +203,7 @@ def landscape(run: Run[Any], space: Space, count: int) -> Landscape:
         number=range(count),
     )
     order = sorted(designs, key=lambda row: row["hard"])
-    best = [torch.tensor(row["share"], dtype=torch.float64) for row in order]
-    others = near_by(space, best[:BEST], count)
+    others = near_by(space, list(map(couplings.share, order[:BEST])), count)
     near = sweep(
         run, lambda number: looks.row(f"near_{number}", others[number]), "near", number=range(count)
     )
@@ -223,7 +223,7 @@ def landscape(run: Run[Any], space: Space, count: int) -> Landscape:
 
 def best_of(rows: list[Row]) -> Tensor:
     """Shares [V] of the row with the least hard error."""
-    return torch.tensor(min(rows, key=lambda row: row["hard"])["share"], dtype=torch.float64)
+    return couplings.share(min(rows, key=lambda row: row["hard"]))
 
 
 def _fit(looks, names, rows):

@@ -13,13 +13,12 @@ from studies.codesign import couplings
 from studies.codesign.design import Space
 from studies.codesign.gallery import handed, side_by_side
 from studies.codesign.landscape import Landscape
-from studies.codesign.race import Judge, compared
+from studies.codesign.race import ENOUGH, Judge, compared
 from studies.frame.compare import Interval
 from studies.frame.run import Run
 from studies.frame.show import Panel, bars, panels, table, tabulate
 from studies.frame.sweep import Row, plain
 
-ENOUGH = 6  # seeds, below which nothing is decided
 SPREAD = 1.5  # of the landscape, below which there is nothing to design
 
 
@@ -81,7 +80,7 @@ def race(
     """The arms beside one another."""
     run.section(
         "The race",
-        "Every arm began at the same designs and rendered as many drives. Errors are means of q / "
+        "Every search began at the same designs and rendered as many drives. Errors are means of q / "
         "(1 + q), q the squared error of the velocities that count in units of 0.05 m/s plus a "
         "tenth of the speed, and 0.15 rad/s, by single events in worlds that no arm saw. Sensor "
         "and estimator on recorded frames cost nothing. Velocities are by least squares, with "

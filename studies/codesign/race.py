@@ -35,6 +35,7 @@ SPACE = ("pair", "family", "light", "speed", "free", "held")  # of a setting (``
 PER_SEED = 10_000  # draws of one start
 MOST_SEEDS = 500  # then come draws that measure slopes, and the judge's
 MOST_WORLDS = 200  # from 500 on are those of the landscape
+ENOUGH = 6  # starts, below which nothing is decided
 JUDGED = 7_700_000  # number of the judge's draw
 
 
@@ -111,7 +112,7 @@ def run_arm(
     return {
         "share": chosen.tolist(),
         "kept": keeps,
-        "expected": way.errors[-1] if way.errors else None,
+        "expected": way.expected,
         "trail": [round(error, 5) for error in way.errors],
         "drives": drawn.rendered - rendered,
         "cpu_s": time.process_time() - begun,

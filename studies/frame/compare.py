@@ -156,14 +156,18 @@ def _percentiles(value, drawn, count, level=LEVEL) -> Interval:
     return Interval(float(value), *torch.quantile(drawn.double(), ends).tolist(), count)
 
 
-def crossed(logs: Any) -> Interval:
-    """Median over seeds of the mean over worlds of paired log ratios [seeds, worlds], and its
-    interval when seeds and worlds are redrawn, each by itself."""
-    logs = _units(logs)
+def crossed(*tables: Any) -> Interval:
+    """Median over seeds of the mean over worlds of paired log ratios [seeds, worlds], of several
+    tables the mean of theirs, and its interval when seeds and worlds are redrawn, each by itself."""
     generator = torch.Generator().manual_seed(0)
-    rows, columns = (torch.randint(n, (DRAWS, n), generator=generator) for n in logs.shape)
-    drawn = logs[rows[:, :, None], columns[:, None, :]].mean(2).quantile(0.5, dim=1)
-    return _percentiles(logs.mean(1).quantile(0.5), drawn, len(logs))
+    value, drawn, count = torch.zeros(()), torch.zeros(DRAWS), 0
+    for logs in map(_units, tables):
+        rows, columns = (torch.randint(n, (DRAWS, n), generator=generator) for n in logs.shape)
+        again = logs[rows[:, :, None], columns[:, None, :]].mean(2).quantile(0.5, dim=1)
+        value = value + logs.mean(1).quantile(0.5) / len(tables)
+        drawn = drawn + again / len(tables)
+        count += len(logs)
+    return _percentiles(value, drawn, count)
 
 
 def grouped(values: Any, groups: Sequence[Any]) -> Interval:

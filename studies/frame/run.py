@@ -41,8 +41,8 @@ from codesign.errors import CodesignError, DomainError, FileFormatError, NonFini
 from codesign.interrupt import Interruption, written_out
 from codesign.reading import read_json
 from codesign.report import page, prose
+from studies.frame import files, machine
 from studies.frame import folder as folders
-from studies.frame import machine
 from studies.frame.config import (
     Config,
     StudyConfig,
@@ -276,7 +276,8 @@ def open_run(
 ) -> Run[Config]:
     """Make the folder of a new run and write its config.json, or find the run that
     ``config.resume`` names, which goes on with its stored configuration; what a killed session left
-    half written is removed there. No other process may work in the folder until ``held`` ends.
+    half written is removed there. Files that its options name have to be those it was begun with. No
+    other process may work in the folder until ``held`` ends.
 
     Raises: CodesignError with one sentence when the folder, the stored configuration or the device
       is unfit.
@@ -288,6 +289,9 @@ def open_run(
         )
         _hold(config.resume, held)
         remove_unfinished(config.resume)
+        begun = config.resume / "files.json"
+        if begun.exists():
+            files.check_same(read_json(begun), files.digests(files.given(stored)))
         # earlier versions stored what "auto" found, whether the study used it or not
         device = _device(stored) if stored.GPU else torch.device("cpu")
         return Run(study, stored, config.resume, device, True, interruption)
@@ -298,6 +302,8 @@ def open_run(
     folder = folders.fresh(study, config.out)
     _hold(folder, held)
     write_atomic(folder / "config.json", text.encode())
+    if begun := files.digests(files.given(config)):
+        write_atomic(folder / "files.json", json.dumps(begun, indent=2).encode())
     return Run(study, config, folder, device, False, interruption)
 
 

@@ -58,6 +58,10 @@ def sweep(
       when the table in the folder is of other axes or damaged, or an earlier version kept another
       kind of progress there.
     """
+    if processes < 0:
+        raise DomainError(
+            f"processes is {processes}; give 0 for none beside this one, or a number."
+        )
     path = run.path(f"{name}.jsonl")
     if run.state_unread and not path.exists():
         raise FileFormatError(
@@ -66,7 +70,7 @@ def sweep(
         )
     known = _read(path, {*axes, "turn"} if turns > 1 else set(axes))
     cells = [
-        dict(zip(axes, point, strict=True))
+        dict(zip(axes, map(_plain, point), strict=True))
         for point in itertools.product(*map(list, axes.values()))
     ]
     asked = (
@@ -82,6 +86,8 @@ def sweep(
     ):
         for point, found in measured:
             rows = [found] if isinstance(found, Mapping) else found
+            if rows is None:
+                raise DomainError(f"the cell {point} returned nothing; return a row of figures.")
             known[_key(point)] = _append(path, point, [dict(row) for row in rows])
             progress.advance()
     # those of one cell are as many cells apart as there are
@@ -91,6 +97,11 @@ def sweep(
         for point, found in zip(cells, of_turns, strict=True)
         for rows in zip(*found, strict=True)
     ]
+
+
+def _plain(value: Any) -> Any:
+    """A number of numpy or torch as Python's own, which a table keeps."""
+    return value.item() if hasattr(value, "item") else value
 
 
 def _median(rows: Sequence[Row]) -> Row:

@@ -28,6 +28,7 @@ from studies.lens_opt.task import (
 )
 
 SPEED_PX = 2.0  # over the interval
+STILL_PX = 0.1  # median flow of a file of poses, below which there is nothing to see
 SPREAD = 0.4  # standard deviation of the logarithm of the speed
 STRAY = 0.1  # of the other components, relative to the speed
 WIDE_PX, TALL_PX = 32, 64  # of a window: within it the focus of an uncorrected lens hardly changes
@@ -135,6 +136,11 @@ class Motion:
         twists = torch.stack([self.twist(generator) for _ in range(draws)])
         at = self.points_px() if at_px is None else at_px
         moved = flow_px(at, twists, self.efl_mm)
+        if moved.norm(dim=-1).median() < STILL_PX:
+            raise DomainError(
+                f"--motion {self.name} moves the picture by less than {STILL_PX} px over {DURATION_S:g} s; give poses "
+                "in metres that move, with times in seconds."
+            )
         radius = torch.atan2(at[:, 1], at[:, 0])
         return torch.atan2(moved[..., 1], moved[..., 0]) - radius[:, None]
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from codesign.mount.pose import NAMES
 from studies.frame.compare import median_ratio, ratio_of_means
+from studies.frame.sweep import plain
 from studies.placement.problem import Problem
 from studies.placement.race import DEFAULT, GRADIENT, Race
 
@@ -156,9 +157,9 @@ class Outcome:
         if self.groups >= LEAST_UNITS:
             found |= {"over_default_low90": low, "over_default_high90": high}
         for name, values in self.errors.items():
-            found[f"{_label(name)}_median_error"] = values.quantile(0.5)
+            found[f"{plain(name)}_median_error"] = values.quantile(0.5)
         for name, beside in self.rivals.items():
-            over = f"over_{_label(name)}"
+            over = f"over_{plain(name)}"
             found |= {f"{over}_median": beside.median, f"{over}_ahead": beside.ahead}
             if beside.count >= LEAST_UNITS:
                 found |= {f"{over}_low90": beside.low, f"{over}_high90": beside.high}
@@ -182,7 +183,3 @@ class Outcome:
             said = (f"{figure:.5f}" for figure in told)
             writer.writerow([problem.pair.name, seed, name, *numbers, samples, *said])
         return text.getvalue()
-
-
-def _label(name):
-    return name.lower().replace("-", "_").replace(" ", "_")

@@ -164,7 +164,10 @@ def handed(run: Run[Any], outcome: Outcome) -> VelocityErrors:
         mount, unseen.camera, robot_pair.SENSOR, unseen.pair.frame, "camera_optical_frame", notes
     )
     save_hand_over(path, handed_over)
-    found = unseen.judged(load_hand_over(path).mount().detach(), unseen.draw(0), "sensor")
+    back = load_hand_over(path)
+    unseen.camera = back.camera
+    found = unseen.judged(back.mount().detach(), unseen.draw(0), "sensor")
+    unseen.camera = unseen.real
     again = found.bounded().mean()
     run.record(hand_over_score_again=again, hand_over_score=outcome.error)
     run.section(

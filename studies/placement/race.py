@@ -1,7 +1,6 @@
 """The searches for a mount from the same starts at equal renders, what each ends with, and its
 error in worlds that none saw; all of it kept in the run's state."""
 
-import hashlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,6 +11,7 @@ from codesign.errors import DomainError
 from codesign.mount import PrecisionTrend, starts
 from codesign.mount.requirements import first_missed
 from scenes.robots.pair import RobotPair
+from studies.frame.files import check_same, digest, digests
 from studies.frame.run import Run
 from studies.placement.problem import Problem
 from studies.placement.searches import SEARCHES, Trail, descend
@@ -48,21 +48,11 @@ def kept(problem: Problem, share: Tensor) -> bool:
 def fingerprints(pair: RobotPair) -> dict[str, str]:
     """What a user may have changed since a run was begun: the robot's page, and the files of which
     it was made."""
-    contents = {"the robot's page": pair.page.encode()} | {
-        f"'{path}'": path.read_bytes() for path in pair.files
-    }
-    return {name: hashlib.sha256(content).hexdigest()[:12] for name, content in contents.items()}
-
-
-def check_same(stored: dict[str, Any], now: dict[str, Any]) -> None:
-    """Raise DomainError where a run that goes on is not the one that was begun."""
-    for name in (*stored, *now):
-        if stored.get(name) != now.get(name):
-            was, is_now = stored.get(name, "not there"), now.get(name, "not there")
-            raise DomainError(
-                f"{name} changed since this run was begun ({was}, now {is_now}); what it has found holds no more: "
-                "change it back, or start a new run."
-            )
+    found = {"the robot's page": digest(pair.page.encode())} | digests(pair.files)
+    if pair.page:  # a robot's file may name others
+        corners = [body.vertices_m for body in pair.bodies.values()]
+        found["the robot's shapes"] = digest(b"".join(each.tobytes() for each in corners))
+    return found
 
 
 class Race:

@@ -4,7 +4,6 @@ one sentence that names what was given. Plain types and signs of single argument
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -15,6 +14,7 @@ from codesign.events import SensorModel, layer
 from codesign.events.stream import check_stream, ordered
 from codesign.events.views import figures
 from codesign.types import EventStream
+from tests import refusals
 from tests.numbers import seeded
 
 FRAMES = torch.rand(5, 4, 6, generator=seeded()) * 200 + 10
@@ -172,15 +172,10 @@ NETWORK = events.TwoBranchSpikes(1)
 UNSTABLE = {"cutoff_hz": 300.0, "shot_rate_hz": 5.0, "photoreceptor_noise": True, "timing": "v2e"}
 
 
-TEXT = Path(__file__).with_name("refusals.txt").read_text()
-ROWS = [row.split(" | ", 1) for row in TEXT.splitlines() if " | " in row]
-
-
-@pytest.mark.parametrize(("call", "words"), ROWS, ids=[call[:60] for call, _ in ROWS])
-def test_one_wrong_value(call, words, tmp_path, monkeypatch):
+@refusals.table(__file__)
+def test_one_wrong_value(row, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(CodesignError, match=words):
-        eval(call, vars(figures) | globals())
+    row.holds(vars(figures) | globals())
     assert not list(tmp_path.iterdir())
 
 

@@ -5,16 +5,15 @@ sentences of refusals.txt. None leaves a file behind."""
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
-import pytest
 import torch
 
-from codesign import errors, flow
+from codesign import flow
 from codesign.flow import contrast, losses, metrics
 from codesign.flow.export import evenly_timed, export
 from codesign.flow.files import write_flow
 from studies.train_flow.peers import ECN, IDNet
+from tests import refusals
 from tests.event_streams import stream_of
 from tests.flow import test_tracker
 from tests.flow.test_contrast import moving_dots, uniform, window
@@ -44,13 +43,8 @@ def at_times(*t_us):
     return test_tracker.stream_of(t_us)
 
 
-TEXT = Path(__file__).with_name("refusals.txt").read_text()
-ROWS = [row.split(" | ", 2) for row in TEXT.splitlines() if "Error |" in row]
-
-
-@pytest.mark.parametrize(("call", "error", "words"), ROWS, ids=[call[:60] for call, *_ in ROWS])
-def test_one_wrong_value(call, error, words, tmp_path, monkeypatch):
+@refusals.table(__file__)
+def test_one_wrong_value(row, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(getattr(errors, error), match=words):
-        eval(call, globals())
+    row.holds(globals())
     assert not list(tmp_path.iterdir())

@@ -11,8 +11,7 @@ from codesign.grad import certify
 from codesign.grad.differences import Ladder, rounding_noise
 from codesign.grad.row import verdict
 from tests.gradients.wrong_case import certified, grad_of
-
-D = torch.float64
+from tests.numbers import D, seeded
 
 
 def test_right_gradient_passes_with_the_plateau_between_bending_and_rounding():
@@ -51,7 +50,7 @@ def test_scales_set_the_unit_of_every_number():
 def on_a_thousand(seed, longer):
     """A mean of squares on top of 1,000 in single precision, whose gradient is longer by a
     share."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     weight = torch.rand(12, 12, generator=generator)
     x = 2 * torch.rand(12, 12, generator=generator) - 1
 
@@ -64,7 +63,7 @@ def on_a_thousand(seed, longer):
 def test_the_weights_of_a_network_with_kinks():
     verdicts = {"right": [], "wrong": []}
     for seed in range(4):
-        generator = torch.Generator().manual_seed(seed)
+        generator = seeded(seed)
         image = torch.rand(2, 1, 12, 12, generator=generator)
         weights = torch.randn(4 * 9 + 2 * 4 * 9, generator=generator) / 3
 

@@ -11,6 +11,7 @@ from codesign.lens import GeoLens, Glass, Status, Surface
 from codesign.lens.surface import Phase
 from codesign.lens.trace import trace
 from tests.lens.systems import close, f64
+from tests.numbers import D, rand64
 
 INF = float("inf")
 GLASS = Glass.from_indices(1.5, 1.5, 1.5)
@@ -152,7 +153,7 @@ BAD_RAYS = [
 ]
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("dtype", [torch.float32, D])
 @pytest.mark.parametrize("kind", ["spheres", "asphere", "special"])
 def test_bad_rays_have_finite_values_gradients_and_positive_deficits(kind, dtype):
     geo = mixed_lenses()[kind].to(dtype)
@@ -173,13 +174,7 @@ def test_bad_rays_have_finite_values_gradients_and_positive_deficits(kind, dtype
 @pytest.mark.parametrize("kind", ["spheres", "asphere", "special"])
 def test_bad_rays_leave_the_gradients_of_good_ones_alone(kind, generator):
     geo = mixed_lenses()[kind]
-    good = torch.cat(
-        [
-            4 * torch.rand(40, 2, generator=generator, dtype=torch.float64) - 2,
-            torch.full((40, 1), -5.0, dtype=torch.float64),
-        ],
-        1,
-    )
+    good = torch.cat([4 * rand64(generator, 40, 2) - 2, torch.full((40, 1), -5.0, dtype=D)], 1)
     ahead = unit([(0.0, 0.1, 1.0)] * 40)
 
     def weighted(origin, direction):
@@ -305,7 +300,7 @@ def test_steep_aspheres_are_met_far_from_their_vertex_plane(fourth):
     close(out.optical_path_mm, low, atol=1e-12)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("dtype", [torch.float32, D])
 def test_when_all_rays_are_blocked_the_loss_is_zero_and_so_are_its_gradients(dtype):
     """Weights of blocked rays are exactly 0, the hard mask says so, and the merit of what arrives
     has the gradient 0, not NaN."""

@@ -20,6 +20,7 @@ from tests.hostile.judge import (
     judge,
     optics_of,
 )
+from tests.numbers import f64
 
 WIDTH_PX = 28
 HALF_SLOPE = 4 / 11
@@ -74,9 +75,7 @@ def auto_after_wall(effort: Effort = USUAL) -> Judged:
     but its wall."""
     scene = silhouettes.build("cubes")
     boxes = pose.look_at((0.05, -1.2, 1.0), (0.0, 1.0, 0.7))
-    wall = pose.look_at((0.0, 0.0, 2.4), (0.0, 2.5, 2.4)) @ pose.se3_exp(
-        torch.tensor([0, 0, 0, 0, 0, 0.2], dtype=torch.float64)
-    )
+    wall = pose.look_at((0.0, 0.0, 2.4), (0.0, 2.5, 2.4)) @ pose.se3_exp(f64([0, 0, 0, 0, 0, 0.2]))
     optics = optics_of("pinhole")
     pitch_mm = 2 * 11.0 * HALF_SLOPE / WIDTH_PX
     before = Case(scene, optics, wall, pitch_mm, WIDTH_PX, 3.0)

@@ -3,6 +3,7 @@ differences, parallel light as the limit, several distances as each alone, singl
 depth of field."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -29,21 +30,8 @@ FIELDS = (0.0, 0.15)
 PICTURE = torch.linspace(1, 2, 64, dtype=torch.float64).reshape(8, 8)
 
 
-@pytest.fixture
-def triplet():
-    return lens.load("cooke-triplet").freeze()
-
-
-def point_spread(geo, at_m):
-    return (
-        analysis.psf_on_pixels(geo, 0.02, 0.004, 8, LINES, grid=128, at_m=at_m).energy * PICTURE
-    ).sum()
-
-
-def geometric_spread(geo, at_m):
-    return (
-        analysis.geometric_psf(geo, 0.02, 0.004, 8, LINES, grid=32, at_m=at_m).energy * PICTURE
-    ).sum()
+def pictured(spread, grid, geo, at_m):
+    return (spread(geo, 0.02, 0.004, 8, LINES, grid=grid, at_m=at_m).energy * PICTURE).sum()
 
 
 def polychromatic_spot(geo, at_m):
@@ -52,8 +40,8 @@ def polychromatic_spot(geo, at_m):
 
 # figures that light in focus alone has a use for
 FOCUSED = {
-    "point spread": point_spread,
-    "geometric spread": geometric_spread,
+    "point spread": partial(pictured, analysis.psf_on_pixels, 128),
+    "geometric spread": partial(pictured, analysis.geometric_psf, 32),
     "MTF": lambda geo, at_m: analysis.diffraction_mtf(
         geo, 0.2, [10.0, 40.0], LINES, grid=64, at_m=at_m
     ),

@@ -30,11 +30,6 @@ FLINT = Glass.named("F2")
 
 
 @pytest.fixture(scope="module")
-def triplet():
-    return lens.load("cooke-triplet").freeze()
-
-
-@pytest.fixture(scope="module")
 def gauss():
     return lens.load("double-gauss").freeze()
 

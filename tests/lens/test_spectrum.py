@@ -4,7 +4,7 @@ of D65, absorption of silicon."""
 import numpy as np
 import pytest
 
-from codesign.lens.spectrum import LINE_UM, Spectrum, blackbody, daylight_d65, silicon_response
+from codesign.lens.spectrum import LINE_UM, Spectrum, daylight_d65, silicon_response
 from tests.lens.systems import close
 
 FLAT = (np.array([0.4, 0.7]), np.array([1.0, 1.0]))
@@ -75,26 +75,6 @@ def test_strata_skip_a_gap():
     tiny = (gap[0], gap[1] * 1e-300)
     huge = (FLAT[0], FLAT[1] * 1e300)
     assert Spectrum.from_curves(tiny, huge, 2) == Spectrum.from_curves(gap, FLAT, 2)
-
-
-@pytest.mark.parametrize("temperature_k", [3000, 4000, 5778, 8000])
-def test_the_peak_of_a_black_body_follows_wien(temperature_k):
-    wavelength_um, value = blackbody(temperature_k)
-    top = int(value.argmax())
-    # vertex of the parabola through the three highest points: third-order terms leave less than a
-    # tenth of the 5 nm step
-    left, peak, right = value[top - 1 : top + 2]
-    vertex = wavelength_um[top] + 0.005 * (left - right) / (left - 2 * peak + right) / 2
-    close(vertex, 2897.771955 / temperature_k, atol=5e-4)
-
-
-def test_a_hot_black_body_is_that_of_rayleigh_and_jeans():
-    wavelength_um, value = blackbody(100_000)
-    # 1/(e^x - 1) = 1/x - 1/2 + x/12 with x <= 0.48; the next term, x^3/720, is largest beside the
-    # others (0.77/x) at the first point
-    x = 14387.768775 / (wavelength_um * 1e5)
-    jeans = wavelength_um**-5 * (1 / x - 0.5 + x / 12)
-    close(value / value[0], jeans / jeans[0], 1.05 * 0.48**4 / 720 / 0.77)
 
 
 def test_d65_is_white():

@@ -42,11 +42,6 @@ ALL = Tolerances(
 )
 
 
-@pytest.fixture(scope="module")
-def triplet():
-    return lens.load("cooke-triplet").freeze()
-
-
 def singlet():
     return GeoLens(
         [Surface(60.0, 5.0, glass(1.5), 8.0, is_stop=True), Surface(-90.0, 70.0, None, 8.0)], 10.0

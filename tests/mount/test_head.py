@@ -53,14 +53,9 @@ def noisy(count, windows=3, seed=3):
 def of_windows(field, pick, flow=None):
     """The field with each of its tensors [N windows, ...] picked from; ``flow`` instead of its
     flow."""
-    flow = field.flow_px if flow is None else flow
-    return FlowField(
-        pick(flow),
-        pick(field.valid),
-        INTERVAL_S,
-        pick(field.confidence),
-        pick(field.covariance_px2),
-    )
+    given = {**vars(field), "flow_px": field.flow_px if flow is None else flow}
+    picked = {name: pick(part) for name, part in given.items() if torch.is_tensor(part)}
+    return replace(field, **picked)
 
 
 def moved(count, mount, seed=4):

@@ -10,7 +10,6 @@ import torch
 from codesign import lens, pose, render
 from codesign.mount import Mount, body_flow
 from codesign.render.film import some_pixels
-from codesign.render.truth import world_points
 from scenes import worlds
 from tests.numbers import D, close, f64, rand64, randn64
 
@@ -36,10 +35,9 @@ def mount_of(yaw, pitch, roll, position):
 def ground(camera, T_body_cam):
     """World points on z = 0 under the pixels, depth (NaN where there is none) and a mask: by the
     renderer's ground truth."""
-    points, depth, valid = world_points(
-        camera.chief_rays(camera.film.pixels()), worlds.smooth_plane(), T_body_cam
-    )
-    return points, torch.where(valid, depth, torch.nan), valid
+    seen = render.view(camera, worlds.smooth_plane(), T_body_cam[None], 0)
+    depth = torch.where(seen.valid, seen.depth_m, torch.nan)
+    return seen.points_world_m.flatten(0, 1), depth.flatten(), seen.valid.flatten()
 
 
 def exact_flow(camera, T_body_cam, twist, dt_s=1e-3):

@@ -3,6 +3,7 @@ bounds."""
 
 import math
 
+import pytest
 import torch
 
 from codesign.mount import Mount, MountRanges
@@ -35,17 +36,14 @@ def test_directions_of_known_angles(generator):
         close(poses[..., :3, column], expected, atol=1e-14)
 
 
-def test_shares_are_read_back(generator):
-    ranges = MountRanges(LOW, HIGH)
+# the second looks backwards: yaw around pi, where its arc tangent changes sign
+@pytest.mark.parametrize(
+    "ends", [(LOW, HIGH), (changed(LOW, 3, math.pi - 1), changed(HIGH, 3, math.pi + 1))]
+)
+def test_shares_are_read_back(ends, generator):
+    ranges = MountRanges(*ends)
     share = rand64(generator, 50, 6)
     # angles near the pole (1.5 of pi / 2) lose 1 / cos 1.5 = 14 times eps
-    close(ranges.share_at(ranges.pose(share)), share, atol=1e-13)
-
-
-def test_angles_are_read_back_where_they_lie_beyond_half_a_turn(generator):
-    """A mount that looks backwards: yaw around pi, where its arc tangent changes sign."""
-    ranges = MountRanges(changed(LOW, 3, math.pi - 1), changed(HIGH, 3, math.pi + 1))
-    share = rand64(generator, 50, 6)
     close(ranges.share_at(ranges.pose(share)), share, atol=1e-13)
 
 

@@ -1,8 +1,6 @@
 """Re-optimised moves against the closed form of the thin achromat, and against what the moves are
 for."""
 
-import math
-
 import pytest
 import torch
 
@@ -11,6 +9,7 @@ from codesign.errors import DomainError
 from codesign.lens import WAVELENGTH_UM, GeoLens, Glass, Surface
 from codesign.lens.design import elements, neighbour_glasses, with_glass
 from codesign.optimise.lens_moves import exchange_glasses, remove_element, reoptimise
+from tests import refusals
 
 FIELDS = (0.0, 0.1)
 EFL = 100.0
@@ -135,24 +134,6 @@ def test_a_ray_that_fails_is_a_failed_step(triplet):
     assert found.after <= found.before
 
 
-@pytest.mark.parametrize(
-    ("call", "sentence"),
-    [
-        (
-            lambda geo: reoptimise(geo, lambda g: spot_errors(g) * math.nan, steps=1),
-            "residuals at the start",
-        ),
-        (
-            lambda geo: reoptimise(geo, spot_errors, held=range(6)),
-            "no surface is left to hold the focal length",
-        ),
-        (
-            lambda geo: reoptimise(geo, spot_errors, held=(99,)),
-            "there is no surface 99 to hold; it has 0 to 5",
-        ),
-        (lambda geo: remove_element(geo, 4, spot_errors), "no element 4"),
-    ],
-)
-def test_what_cannot_be_re_optimised_is_refused(call, sentence, triplet):
-    with pytest.raises(DomainError, match=sentence):
-        call(triplet)
+@refusals.table(__file__, "moves")
+def test_what_cannot_be_re_optimised_is_refused(row, triplet):
+    row.holds(globals() | {"triplet": triplet})

@@ -7,9 +7,10 @@ import pytest
 import torch
 from torch import nn
 
-from codesign.errors import CodesignError, DomainError, GradientError, NonFiniteError, ShapeError
+from codesign.errors import NonFiniteError
 from codesign.optimise import Descent, Loop
 from codesign.optimise.gradients import clipped_mean, sample_gradients
+from tests import refusals
 
 GOAL = torch.tensor([2.0, -1.0], dtype=torch.float64)
 
@@ -162,57 +163,9 @@ def loop_of(*samples, optimiser=None, **options):
     return Loop(optimiser or torch.optim.SGD([x], lr=1.0), lambda step: list(samples), **options)
 
 
-@pytest.mark.parametrize(
-    ("call", "error", "said"),
-    [
-        (
-            lambda: loop_of(optimiser=torch.optim.SGD([still])),
-            GradientError,
-            r"parameter 0 of the optimiser, of shape \(3,\), is frozen",
-        ),
-        (lambda: loop_of(parameter(1.0).sum()).run(1), GradientError, "depend on any parameter"),
-        (lambda: loop_of(x.detach().sum()).run(1), GradientError, "the graph is cut"),
-        (lambda: loop_of(clip=0), DomainError, "clip must be .* got 0"),
-        (
-            lambda: loop_of(optimiser=torch.optim.LBFGS([x])),
-            DomainError,
-            "LBFGS asks for the loss several",
-        ),
-        (lambda: Descent([x], lr=0.1, momentum=1.0), DomainError, r"momentum must be .* got 1\.0"),
-        (
-            lambda: loop_of(optimiser=torch.optim.SGD([parameter(0.0)])).resume(
-                *noisy_loop().state()
-            ),
-            ShapeError,
-            "the state of the same problem",
-        ),
-        (
-            lambda: loop_of(optimiser=torch.optim.NAdam([x])).resume(*noisy_loop().state()),
-            DomainError,
-            "of the optimiser Descent, this loop has NAdam",
-        ),
-        (
-            lambda: Loop(torch.optim.SGD([x]), [1.0]),
-            DomainError,
-            "samples is a list; give a function",
-        ),
-        (lambda: loop_of().run(1), DomainError, "no samples in this step"),
-        (
-            lambda: Loop(torch.optim.SGD([x]), lambda step: x.sum()).run(1),
-            CodesignError,
-            "are one Tensor",
-        ),
-        (lambda: loop_of(2 * x).run(1), ShapeError, r"a sample's loss is \(2,\)"),
-        (
-            lambda: (lambda y: loop_of(y.sum(), y.sum()).run(1))(x.exp()),
-            GradientError,
-            "share a graph",
-        ),
-    ],
-)
-def test_what_cannot_be_optimised_is_refused_with_a_sentence(call, error, said):
-    with pytest.raises(error, match=said):
-        call()
+@refusals.table(__file__, "loops")
+def test_what_cannot_be_optimised_is_refused_with_a_sentence(row):
+    row.holds(globals())
 
 
 def test_a_state_is_of_its_moment_and_loops_resumed_from_it_go_apart():

@@ -10,17 +10,17 @@ import pytest
 import scipy.optimize
 import torch
 
-from codesign.errors import DomainError, ShapeError
 from codesign.grad.jacobian import by_autograd, by_differences, column_scales, principal_modes
 from codesign.optimise.least_squares import DampedLeastSquares, StopRules
+from tests import refusals
+from tests.numbers import D, close, f64, randn64
 
-D = torch.float64
 FREE = (-math.inf, math.inf)
 TIMES = torch.linspace(0.1, 4, 40, dtype=D)
 
 
 def vector(*values):
-    return torch.tensor(values, dtype=D)
+    return f64(values)
 
 
 def rosenbrock(x):
@@ -55,7 +55,7 @@ def decay(x):
 def test_rosenbrock_reaches_its_zero(jacobian):
     found = DampedLeastSquares(rosenbrock, vector(-1.2, 1.0), jacobian).run(200)
     # a zero of the residuals: what the Jacobian lacks only slows the way there
-    torch.testing.assert_close(found, vector(1, 1), rtol=0, atol=1e-9)
+    close(found, vector(1, 1), atol=1e-9)
 
 
 def test_a_singular_minimum_is_reached_linearly():
@@ -67,13 +67,13 @@ def test_a_singular_minimum_is_reached_linearly():
 
 
 def test_a_linear_problem_takes_one_step(generator):
-    A = torch.randn(9, 4, dtype=D, generator=generator)
-    b = torch.randn(9, dtype=D, generator=generator)
+    A = randn64(generator, 9, 4)
+    b = randn64(generator, 9)
     solver = DampedLeastSquares(lambda x: A @ x - b, torch.zeros(4, dtype=D), damping=1e-15)
     solver.step()
     truth = torch.linalg.lstsq(A, b).solution
     # condition of A some 10, damping 1e-15
-    torch.testing.assert_close(solver.variables, truth, rtol=1e-12, atol=1e-12)
+    close(solver.variables, truth, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_a_linear_problem_takes_one_step(generator):
     ],
 )
 def test_minima_agree_with_scipy(problem, start, lower, upper):
-    low, high = (torch.tensor(side, dtype=D).expand(len(start)) for side in (lower, upper))
+    low, high = (f64(side).expand(len(start)) for side in (lower, upper))
     solver = DampedLeastSquares(problem, vector(*start), lower=low, upper=high)
     found = solver.run(1000)
     assert bool(((low <= found) & (found <= high)).all())
@@ -103,9 +103,7 @@ def test_minima_agree_with_scipy(problem, start, lower, upper):
     # a minimum with a residual is known to the root of rounding by its loss, 1e-8; scipy's interior
     # steps stop just short of a bound
     assert solver.loss == pytest.approx(truth.cost, rel=1e-12 if free else 1e-6, abs=1e-12)
-    torch.testing.assert_close(
-        found, torch.from_numpy(truth.x), rtol=1e-5 if free else 1e-4, atol=1e-5
-    )
+    close(found, torch.from_numpy(truth.x), rtol=1e-5 if free else 1e-4, atol=1e-5)
 
 
 def test_residuals_that_are_not_finite_are_failed_steps():
@@ -150,7 +148,7 @@ def test_steps_do_not_depend_on_the_units_of_the_variables(problem, start):
         plain.step()
         other.step()
         # the same in exact arithmetic
-        torch.testing.assert_close(units * other.variables, plain.variables, rtol=1e-9, atol=1e-12)
+        close(units * other.variables, plain.variables, rtol=1e-9, atol=1e-12)
     plain.run(200)
     other.run(200)
     assert other.floor == 0
@@ -168,7 +166,7 @@ def test_a_null_mode_does_not_hold_the_others():
 
     solver = DampedLeastSquares(residuals, vector(3, 3, 0))
     found = solver.run(40)
-    torch.testing.assert_close(found, vector(1, 2, -5e-7), rtol=0, atol=3e-5)
+    close(found, vector(1, 2, -5e-7), atol=3e-5)
     # x - 1 within (2e-9 / 2)^0.5; 0.509 without the floor
     assert solver.loss == pytest.approx(0.5, rel=1e-9)
 
@@ -199,41 +197,15 @@ def carried(state, route):
     return torch.load(buffer, weights_only=True)
 
 
-@pytest.mark.parametrize(
-    ("call", "error", "sentence"),
-    [
-        (
-            lambda: DampedLeastSquares(rosenbrock, torch.zeros(2, 2, dtype=D)),
-            ShapeError,
-            r"start must be \[V\]",
-        ),
-        (lambda: DampedLeastSquares(rosenbrock, vector(math.nan, 0)), DomainError, "start"),
-        (
-            lambda: DampedLeastSquares(rosenbrock, vector(0, 0), lower=vector(1, 1)),
-            DomainError,
-            "outside",
-        ),
-        (
-            lambda: DampedLeastSquares(torch.log, vector(-1.0)),
-            DomainError,
-            "residuals at the start",
-        ),
-        (
-            lambda: DampedLeastSquares(rosenbrock, vector(0, 0)).resume({"variables": [1.0] * 4}),
-            ShapeError,
-            "state has 4",
-        ),
-    ],
-)
-def test_wrong_input_is_refused(call, error, sentence):
-    with pytest.raises(error, match=sentence):
-        call()
+@refusals.table(__file__, "least squares")
+def test_wrong_input_is_refused(row):
+    row.holds(globals())
 
 
 @torch.no_grad()
 def test_jacobians_against_derivatives_by_hand():
     x = vector(-1.2, 1.0)
-    truth = torch.tensor([[-20 * -1.2, 10.0], [-1.0, 0.0]], dtype=D)
+    truth = f64([[-20 * -1.2, 10.0], [-1.0, 0.0]])
     # forward: half the second derivative (20) times the step, and rounding 1e-15 over it; central:
     # exact on a quadratic but for rounding
     for jacobian, atol in (
@@ -241,7 +213,7 @@ def test_jacobians_against_derivatives_by_hand():
         (by_differences(1e-6), 1.1e-5),
         (by_differences(1e-4, central=True), 1e-10),
     ):
-        torch.testing.assert_close(jacobian(rosenbrock, x, rosenbrock(x)), truth, rtol=0, atol=atol)
+        close(jacobian(rosenbrock, x, rosenbrock(x)), truth, atol=atol)
 
 
 def test_differences_use_the_side_where_the_residuals_exist():
@@ -251,16 +223,14 @@ def test_differences_use_the_side_where_the_residuals_exist():
     at = vector(1 - 1e-7)
     slope = by_differences(1e-5)(near_edge, at, near_edge(at))
     truth = (near_edge(at) - near_edge(at - 1e-5)) / 1e-5
-    torch.testing.assert_close(slope[:, 0], truth, rtol=1e-6, atol=0)
+    close(slope[:, 0], truth, rtol=1e-6)
     alone = by_differences(1e-5)(lambda x: torch.where(x == at, x, math.nan), at, at)
     assert not bool(alone.isfinite().all())
 
 
 def test_principal_modes_have_effects_at_right_angles_of_size_one(generator):
-    J = torch.randn(20, 5, dtype=D, generator=generator) * vector(1, 3, 0.1, 10, 1)
+    J = randn64(generator, 20, 5) * vector(1, 3, 0.1, 10, 1)
     modes = J @ principal_modes(J)
-    torch.testing.assert_close(modes.T @ modes, torch.eye(5, dtype=D), rtol=0, atol=1e-11)
+    close(modes.T @ modes, torch.eye(5, dtype=D), atol=1e-11)
     assert float(principal_modes(J, limit=0.05).abs().max()) <= 0.05 * (1 + 1e-12)
-    torch.testing.assert_close(
-        J @ torch.diag(column_scales(J)), J / J.norm(dim=0), rtol=1e-12, atol=0
-    )
+    close(J @ torch.diag(column_scales(J)), J / J.norm(dim=0), rtol=1e-12)

@@ -4,20 +4,20 @@ import contextlib
 import dataclasses
 import functools
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from codesign import backend, errors, lens, render
+from codesign import backend, lens, render
 from codesign.errors import BackendError, CodesignError, DomainError, FileFormatError
 from codesign.pose import as_poses, look_at, se3_exp
 from codesign.render import Camera, Film, MitsubaScene, MovingScene, TexturedPlane, light
 from codesign.render.charts import emissive_mesh
 from codesign.types import Rays
 from scenes import textures, worlds
+from tests import refusals
 from tests.numbers import D, f64
 from tests.render import test_own_lens
 from tests.render.solids import area
@@ -321,11 +321,6 @@ def test_light_that_is_traced_has_no_gradient():
         frames.sum().backward()
 
 
-TEXT = Path(__file__).with_name("refusals.txt").read_text()
-ROWS = [row.split(" | ", 2) for row in TEXT.splitlines() if "Error | " in row]
-
-
-@pytest.mark.parametrize(("call", "kind", "sentence"), ROWS, ids=[call[:60] for call, *_ in ROWS])
-def test_what_cannot_be_gets_a_sentence(call, kind, sentence):
-    with pytest.raises(getattr(errors, kind), match=sentence):
-        eval(call, vars(test_own_lens) | globals())
+@refusals.table(__file__)
+def test_what_cannot_be_gets_a_sentence(row):
+    row.holds(vars(test_own_lens) | globals())

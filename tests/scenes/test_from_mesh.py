@@ -16,7 +16,7 @@ from codesign.errors import FileFormatError
 from codesign.pose import look_at, se3_exp
 from scenes import build, mesh_files, textures, worlds
 from tests import refusals
-from tests.numbers import f64
+from tests.numbers import D, f64
 from tests.scenes.solids import volume_m3
 
 PICTURE = np.array([[0, 64], [128, 255]], dtype=np.uint8)  # first row at the top; no two alike
@@ -431,16 +431,14 @@ def test_the_boundary_gradient_of_a_loaded_mesh_is_that_of_differences(tmp_path,
         scene = worlds.from_mesh(cube(tmp_path, "obj"), background=30.0)
         pose = look_at((0.6, -1.4, 0.7), (0.25, 0.25, 0.25))
     camera = render.Camera(lens.Pinhole(4.0 if inside else 8.0), 24, 24, 0.3, samples_per_pixel=256)
-    weight = torch.linspace(0.2, 1.4, 24, dtype=torch.float64)[:, None] * torch.linspace(
-        1.3, 0.1, 24
-    )
+    weight = torch.linspace(0.2, 1.4, 24, dtype=D)[:, None] * torch.linspace(1.3, 0.1, 24)
 
     def loss(twist, gradient: Any = "interior"):
         image = render.frames(camera, scene, (pose @ se3_exp(twist))[None], gradient=gradient)[0]
         return (image * weight).mean()
 
     def gradient(kind):
-        twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+        twist = torch.zeros(6, dtype=D, requires_grad=True)
         [found] = torch.autograd.grad(loss(twist, kind), twist)
         return found
 

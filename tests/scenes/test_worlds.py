@@ -141,11 +141,10 @@ def test_a_robot_stands_on_the_ground(shared):
     assert (size > 0.1).all()
     assert (size < 1.0).all()  # a robot of half a metre, in metres
     scene = worlds.outdoor(clutter=0, meshes=[(path, 0.0, 0.0, 30.0)])
-    points, depth, valid = render.truth.world_points(
-        CAMERA.chief_rays(CAMERA.film.pixels()), scene, look_at((0.0, -1.2, 0.6), (0, 0, 0.1))
-    )
-    assert 0.05 < points[valid][:, 2].max() < 0.5
-    assert (points[valid][:, 2] > 0.01).double().mean() > 0.05
+    seen = render.view(CAMERA, scene, look_at((0.0, -1.2, 0.6), (0, 0, 0.1))[None], 0)
+    height_m = seen.points_world_m[seen.valid][:, 2]
+    assert 0.05 < height_m.max() < 0.5
+    assert (height_m > 0.01).double().mean() > 0.05
 
 
 def test_things_outdoors_keep_clear_of_a_body_of_any_size(tmp_path):

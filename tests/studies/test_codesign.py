@@ -17,7 +17,7 @@ from scenes.robots.pairs import PAIRS
 from studies.codesign import __main__ as codesign
 from studies.codesign import couplings, gallery, slopes
 from studies.codesign import race as codesign_race
-from studies.codesign.arms import Task, Way, chosen_by_the_book, read_out
+from studies.codesign.arms import ARMS, Task, Way, chosen_by_the_book, read_out
 from studies.codesign.design import Space
 from studies.codesign.objective import Objective
 from studies.codesign.page import best_order, every_ratio
@@ -244,11 +244,6 @@ def test_the_best_order_is_the_one_that_errs_least_whatever_joint_does():
     assert best_order([row for row in rows if ">" not in row["arm"]]) == "book"
 
 
-@refusals.table(__file__, "codesign")
-def test_wrong_command_lines_end_with_a_sentence(row, refuses):
-    refuses(codesign, row)
-
-
 def test_a_way_keeps_the_last_rounds_that_were_recorded():
     way = Way()
     for k in range(8):
@@ -368,10 +363,17 @@ def test_the_best_answer_of_any_arm_is_handed_over():
     def answer(arm, place, expected):
         return {"arm": arm, "share": [place] * 9, "expected": expected}
 
-    rows = [answer("joint", 0.5, 0.2), answer("nested", 0.3, 0.3), answer("default", 0.0, None)]
+    rows = [answer("joint", 0.5, 0.2), answer("nested", 0.3, 0.3), answer("default", 0.4, None)]
     rows += [answer("book", 0.1, 0.9 + k) for k in range(codesign.SHORTLIST)]
     assert codesign.best_answer(Known(), rows)["arm"] == "book"
     assert codesign.best_answer(Known(), rows[:3])["arm"] == "nested"
+    rows[2]["share"] = [0.0] * 9
+    assert codesign.best_answer(Known(), rows)["arm"] == "default"
+
+
+def test_a_search_expects_the_least_that_it_has_seen(drawn, space):
+    _, way = ARMS["random"](Task(Objective(drawn), space.start, 4, 0, 1, 5))
+    assert way.expected == min(way.errors) < way.errors[-1]
 
 
 def test_a_traced_design_is_handed_over_with_its_lens(tmp_path):
@@ -379,7 +381,7 @@ def test_a_traced_design_is_handed_over_with_its_lens(tmp_path):
     whole = space.made(start(space, 0))
     judge = Judge(space, 1, 1)
     (error,) = judge.of(whole)["errors"]
-    gallery.save(tmp_path / "design.yaml", whole, error)
+    gallery.save(tmp_path / "design.yaml", whole, {"error_unseen": error})
     again = judge.of(gallery.loaded(tmp_path / "design.yaml", whole))["errors"]
     assert again == [pytest.approx(error, rel=1e-9)]
     drawn = lens.load(tmp_path / "design.zmx").freeze().first_order()

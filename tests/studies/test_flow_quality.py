@@ -23,7 +23,6 @@ from studies.flow_quality.measures import (
     spearman,
     warp_loss,
 )
-from tests import refusals
 from tests.studies.browser import check_page
 from tests.studies.runs import numbers, ran
 
@@ -136,11 +135,6 @@ def test_quick_form(tmp_path, monkeypatch):
     cell = "mixed_theta_0.2_noise_0.002"
     assert found[f"{cell}_closed_form_affine_ratio"] < 0.5 * found[f"{cell}_plain_ratio"]
     check_page("flow_quality", tmp_path)
-
-
-@refusals.table(__file__, "flow_quality")
-def test_unfit_options_are_refused(row, refuses):
-    refuses(flow_quality, row)
 
 
 def test_cells_of_single_planes_are_sets():

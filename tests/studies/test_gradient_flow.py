@@ -11,11 +11,9 @@ from codesign.system import check
 from studies.gradient_flow import __main__ as study
 from studies.gradient_flow import chain, silhouettes
 from studies.gradient_flow.topic import Row
-from tests import refusals
+from tests.numbers import randn64
 from tests.studies.browser import check_page
 from tests.studies.runs import page, ran
-
-D = torch.float64
 
 
 def test_the_study_goes_on_where_it_was_cut(tmp_path, monkeypatch):
@@ -44,11 +42,6 @@ def test_the_study_goes_on_where_it_was_cut(tmp_path, monkeypatch):
     assert f"{len(jobs)} of {len(jobs)} gradients (silhouettes) are judged" in first
     assert f"are judged, and {len(jobs) - short} of" in first
     check_page("gradient_flow", out)
-
-
-@refusals.table(__file__, "gradient_flow")
-def test_wrong_options_are_refused(row, refuses):
-    refuses(study, row)
 
 
 def test_a_silhouette_makes_a_row_that_is_judged():
@@ -80,8 +73,8 @@ def test_the_first_line_counts_what_is_judged_and_what_is_right_of_it():
 
 
 def test_the_judge_finds_the_error_noise_and_cosine_that_were_put_in(generator):
-    truth = torch.randn(18, generator=generator, dtype=D)
-    noise = torch.randn(400, 18, generator=generator, dtype=D)
+    truth = randn64(generator, 18)
+    noise = randn64(generator, 400, 18)
     values = torch.stack(
         [truth + 0.5 * noise, 0 * noise - truth, 1.25 * truth + 0 * noise, 0 * noise], 1
     )

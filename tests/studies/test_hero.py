@@ -11,7 +11,6 @@ from codesign.errors import DomainError
 from studies import hero
 from studies.codesign.design import Space
 from studies.codesign.race import answers
-from tests import refusals
 
 
 def test_the_robot_drives_a_circle_of_the_speed_and_turn_asked_for():
@@ -53,8 +52,3 @@ def test_published_answers_are_found_from_another_folder(tmp_path, monkeypatch):
     setting, rows = answers(hero.Config().answers)
     assert setting["pair"] == "outdoors"
     assert {"default", "nested"} <= {row["arm"] for row in rows}
-
-
-@refusals.table(__file__, "hero")
-def test_options_without_a_picture_are_refused(row, refuses):
-    refuses(hero, row)

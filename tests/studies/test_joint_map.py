@@ -11,7 +11,6 @@ from studies import joint_levers, joint_map
 from studies.codesign import cells, couplings
 from studies.codesign.design import BLOCKS
 from studies.codesign.race import start
-from tests import refusals
 from tests.studies.browser import check_page
 from tests.studies.runs import lines, numbers, page, ran
 
@@ -81,6 +80,8 @@ def test_a_map_says_which_cells_are_won_and_what_their_valleys_foretell(tmp_path
     assert -1 <= figures["rank_of_foretold_low"] <= figures["rank_of_foretold_high"] <= 1.0 + 1e-9
     assert "in 3, loses in 3, and is undecided in 0" in page(tmp_path / "map")
     check_page("joint_map", tmp_path / "map")
+    assert ran(joint_map, "--fnos 0 --speeds 1 0.5 0.3 --seeds 2 --out", tmp_path / "few") == 0
+    assert "So few cells or starts decide nothing" in page(tmp_path / "few")
 
 
 def test_parts_that_act_by_themselves_have_their_own_factors(tmp_path, monkeypatch):
@@ -119,11 +120,6 @@ def test_cells_are_raced_judged_and_taken_up_again(tmp_path):
     before = table.read_bytes()
     assert ran(joint_map, "--resume", tmp_path / "map") == 0
     assert table.read_bytes() == before
-
-
-@refusals.table(__file__, "joint_map")
-def test_a_cell_that_cannot_be_is_refused(row, refuses):
-    refuses(joint_map, row)
 
 
 def test_the_best_answer_of_a_cell_is_that_of_which_least_is_expected():

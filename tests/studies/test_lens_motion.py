@@ -170,6 +170,11 @@ def test_what_has_no_direction_cannot_be_turned_and_a_bad_file_is_named(tmp_path
     path.write_text("not a pose\n")
     with pytest.raises(FileFormatError, match=r"poses\.txt"):
         Motion(str(path), 9.0).directions_rad()
+    write_tum(
+        path, torch.linspace(0, 1, 5, dtype=torch.float64), se3_exp(torch.zeros(5, 6).double())
+    )
+    with pytest.raises(DomainError, match=r"moves the picture by less than 0\.1 px"):
+        Motion(str(path), 9.0).directions_rad()
 
 
 def test_a_verdict_is_that_of_textures_where_cases_of_one_are_alike():

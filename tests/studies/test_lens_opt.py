@@ -189,8 +189,3 @@ def test_a_run_killed_while_it_judges_goes_on_there_and_ends_with_the_same_figur
         *("seconds_per_step", "log_ratio_edge", "log_ratio_after_spots_over_spots_high"),
     ):
         assert again[name] == pytest.approx(first[name], rel=1e-6), name
-
-
-@refusals.table(__file__, "lens_opt")
-def test_sizes_that_cannot_be_are_refused(row, refuses):
-    refuses(lens_opt, row)

@@ -15,14 +15,14 @@ from codesign.errors import DomainError
 from codesign.system import load_hand_over
 from scenes.robots import pair as robot_pair
 from scenes.robots.pairs import PAIRS
+from studies.frame.files import check_same
 from studies.placement import __main__ as placement
 from studies.placement import outcome
 from studies.placement.controls import controls, looking_back
 from studies.placement.page import answer
 from studies.placement.problem import Problem, traced_camera
-from studies.placement.race import FINAL_DRAWS, Race, check_same, feasible, fingerprints, kept
+from studies.placement.race import FINAL_DRAWS, Race, feasible, fingerprints, kept
 from studies.placement.searches import descend
-from tests import refusals
 from tests.studies.browser import check_page
 from tests.studies.runs import numbers, page, ran
 
@@ -133,11 +133,6 @@ def test_controls_see_nothing(problem):
     assert torch.linalg.det(back[:3, :3]) == pytest.approx(1.0)
     # view not upwards
     assert all(looking_back(Problem(each(), range(1)))[2, 2] < 0.5 for each in PAIRS.values())
-
-
-@refusals.table(__file__, "placement")
-def test_wrong_input_is_one_sentence_before_the_first_frame(row, refuses):
-    refuses(placement, row)
 
 
 def test_ratios_are_of_paired_starts_and_worlds():

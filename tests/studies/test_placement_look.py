@@ -41,6 +41,13 @@ def test_the_drawn_view_is_that_of_the_camera():
     assert not lines[:4, 0].any()
 
 
+def test_corners_without_light_are_where_a_pinhole_sees_them():
+    camera = render.Camera(lens.load("cooke-triplet"), 40, 30, 1.5, 1)  # 60 x 45 mm behind 50 mm
+    drawn = robot_figures.view_lines(camera, torch.eye(4, dtype=torch.float64), 1.0)
+    expected = np.array([-1, -1]) * [20, 15] * camera.slope_per_px()
+    np.testing.assert_allclose(drawn[0, 1, :2], expected)
+
+
 def test_cut_triangles_cover_what_they_were_cut_from():
     generator = torch.Generator().manual_seed(0)
     triangles = torch.rand(5, 3, 3, generator=generator, dtype=torch.float64).numpy()

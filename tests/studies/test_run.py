@@ -1,16 +1,19 @@
 """What a run keeps and shows: exact state, metrics, a page that loads nothing."""
 
 import re
+from dataclasses import dataclass
+from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
 
-from codesign.errors import FileFormatError, ShapeError
+from codesign.errors import DomainError, FileFormatError, ShapeError
 from codesign.state import write_state
-from studies.frame.run import open_run
+from studies.frame.run import StudyConfig, open_run
 from tests import refusals
+from tests.numbers import f64
 from tests.studies.runs import module_of, numbers, ran
 from tests.studies.smallest_study import Config
 
@@ -18,9 +21,7 @@ from tests.studies.smallest_study import Config
 def test_state_returns_every_bit(run, generator):
     tensors = {
         "float32": torch.randn(3, 4, generator=generator).T,
-        "float64/odd name": torch.tensor(
-            [0.1, torch.nan, -0.0, torch.inf, 5e-324], dtype=torch.float64
-        ),
+        "float64/odd name": f64([0.1, torch.nan, -0.0, torch.inf, 5e-324]),
         "int64": torch.tensor([2**62 + 1, -1]),
         "bool": torch.tensor([True, False]),
         "scalar": torch.tensor(1 / 3),
@@ -75,6 +76,30 @@ def test_the_state_of_another_run_is_refused(tmp_path):
     write_state(mine / "state.npz", {}, {"numbers": {}, "times": {"seconds": 0.0, "loops": {}}})
     with pytest.raises(FileFormatError, match=r"another version .*start a new run"):
         resumed()
+
+
+def test_a_file_that_an_option_names_is_the_same_when_a_run_goes_on(tmp_path):
+    given, other = tmp_path / "lens.json", tmp_path / "other.json"
+    given.write_text("one")
+    begun = Reading(out=tmp_path / "run", files=(given, other), lens="triplet")
+    open_run("reading", begun)
+    resumed = Reading(resume=tmp_path / "run")
+    assert open_run("reading", resumed).config.files == (given, other)
+    for change in (lambda: given.write_text("two"), given.unlink):
+        change()
+        with pytest.raises(DomainError, match=r"lens\.json' changed since this run was begun"):
+            open_run("reading", resumed)
+    given.write_text("one")
+    open_run("reading", resumed)
+    other.write_text("was not there")
+    with pytest.raises(DomainError, match=r"other\.json' changed since"):
+        open_run("reading", resumed)
+
+
+@dataclass(frozen=True)
+class Reading(StudyConfig):
+    files: tuple[Path, ...] = ()
+    lens: str = ""
 
 
 @refusals.table(__file__, "empty paths")

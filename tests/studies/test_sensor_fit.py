@@ -14,10 +14,9 @@ from studies.sensor_fit import __main__ as study
 from studies.sensor_fit.recording import load
 from studies.sensor_fit.sensor import Fit, FittedSensor, match
 from tests import refusals
+from tests.numbers import D, seeded
 from tests.studies.browser import check_page
 from tests.studies.runs import numbers, page, ran
-
-D = torch.float64
 
 
 def test_the_loss_and_the_figures_equal_values_by_hand():
@@ -50,9 +49,7 @@ def test_the_fit_recovers_thresholds_that_are_known():
     )
     recorded = events.to_counts(stream, fine_s[::40])
     # 0.1 noise events per pixel and second
-    recorded += torch.poisson(
-        torch.full_like(recorded, 0.04 * 0.1), generator=torch.Generator().manual_seed(7)
-    )
+    recorded += torch.poisson(torch.full_like(recorded, 0.04 * 0.1), generator=seeded(7))
     # a recording that begins in mid-motion: memories are part of the way to an event
     recorded[0] *= 4
     seen = drifting(fine_s[::40]).float(), fine_s[::40]
@@ -80,7 +77,7 @@ def test_noise_fades_with_light_and_is_poisson():
     frames[:, :, 100:] = 10.0
     t_s = torch.arange(3, dtype=D) * 0.25
     sensor = FittedSensor(dark_offset=10.0, noise_on_hz=4.0, noise_off_hz=8.0)
-    counts = sensor.draw(frames, t_s, torch.Generator().manual_seed(1))
+    counts = sensor.draw(frames, t_s, seeded(1))
     for polarity, expected in ((0, 1.0), (1, 2.0)):
         # (10/(10 + 10))^2
         for part, share in ((slice(90), 1.0), (slice(110, None), 0.25)):

@@ -10,7 +10,6 @@ from codesign import events
 from codesign.events import SensorModel, SpikeEsim
 from studies.spike_esim import __main__ as study
 from studies.spike_esim import judge, train
-from tests import refusals
 
 D = torch.float64
 DT_S = 2e-3
@@ -143,8 +142,3 @@ def test_the_objective_is_zero_for_the_target_and_one_and_a_tenth_for_silence():
     target = noise(1)
     assert float(train.objective(target, target, DT_S)) == 0
     assert float(train.objective(torch.zeros_like(target), target, DT_S)) == pytest.approx(1.1)
-
-
-@refusals.table(__file__, "spike_esim")
-def test_too_small_a_study_is_refused(row, refuses):
-    refuses(study, row)

@@ -9,7 +9,6 @@ from codesign.mount import EgoVelocity, Evidence, VelocityHead
 from scenes.robots.pairs import PAIRS
 from studies import velocity_head
 from studies.velocity_head import designs
-from tests import refusals
 from tests.studies.browser import check_page
 from tests.studies.runs import numbers, page, ran
 
@@ -85,8 +84,3 @@ def test_a_little_training_lowers_the_error_on_worlds_kept_from_it_and_what_it_s
     )
     error = velocity_head.typical(velocity_head.errors(head, samples))
     assert error == pytest.approx(metrics["corridor_head_error"], rel=0.3)
-
-
-@refusals.table(__file__, "velocity_head")
-def test_sizes_and_names_are_checked(row, refuses):
-    refuses(velocity_head, row)

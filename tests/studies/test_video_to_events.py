@@ -22,6 +22,7 @@ from studies.video_to_events.input import Light, read_times
 from studies.video_to_events.options import chosen_sensor
 from studies.video_to_events.state import RECORD, EventLog, Progress
 from tests import refusals
+from tests.numbers import D, close, seeded
 from tests.studies.browser import check_page
 from tests.studies.runs import numbers, page, ran
 
@@ -116,7 +117,7 @@ def test_a_video_gives_the_events_of_its_frames_as_imageio_decodes_them(tmp_path
     used = (t_s >= 0.02) & (t_s <= 0.1 + 1e-9)
     sensor = events.SensorModel(theta_sigma=0.02)
     frames = torch.from_numpy(decoded[used]).float()
-    truth = events.simulate(frames, t_s[used], sensor, torch.Generator().manual_seed(3))
+    truth = events.simulate(frames, t_s[used], sensor, seeded(3))
     found = events.read(tmp_path / "run" / "e.npz")
     assert len(truth) > 1000
     order = [
@@ -203,9 +204,7 @@ def test_light_follows_the_published_curves():
         assert float(linear[value]) == pytest.approx(light, abs=5e-7)
     primaries = np.eye(3, dtype=np.uint8)[None] * 255
     seen = Light(255, False)([primaries], 0)
-    torch.testing.assert_close(
-        seen[0, 0] / 255, torch.tensor([0.2126, 0.7152, 0.0722]), rtol=1e-6, atol=0
-    )
+    close(seen[0, 0] / 255, torch.tensor([0.2126, 0.7152, 0.0722]), rtol=1e-6)
     assert float(Light(4095, False)([np.full((1, 1), 4095, np.uint16)], 0)) == 255
     assert float(Light(255, False)([np.full((1, 1), 300.5)], 0)) == 300.5
 
@@ -257,7 +256,7 @@ def test_presets_are_those_of_v2e_and_every_parameter_is_an_option():
 
 
 def test_the_log_finds_events_by_time_and_forgets_what_does_not_count(tmp_path):
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded()
     t_us, x, y, p = (torch.randint(0, high, (500,), generator=generator) for high in (300, 9, 7, 2))
     stream = ordered(t_us + 1_700_000_000_000_000, x, y, 2 * p - 1, 7, 9)
     log = EventLog(tmp_path / "log", 0, 7, 9)
@@ -306,7 +305,7 @@ def test_an_upsampled_grating_fires_when_its_closed_form_crosses_in_any_chunks(
 
     # the truth: 2000 steps per second of the same grating; pixels whose light of the last frame was
     # always inside the picture
-    t_s = torch.arange(0, 161, dtype=torch.float64) / 2000
+    t_s = torch.arange(0, 161, dtype=D) / 2000
     x = torch.arange(56) - 300 * t_s[:, None, None]
     level = 4.5 + 0.55 * torch.sin(2 * math.pi * x / 14)
     truth = events.simulate(level.exp().expand(-1, 24, -1).contiguous(), t_s, events.SensorModel())

@@ -13,13 +13,12 @@ from codesign.mount import Mount
 from codesign.plain_yaml import load
 from codesign.system import HandOver, load_hand_over, save_hand_over
 from tests import refusals
-
-D = torch.float64
+from tests.numbers import D, close, f64, randn64
 
 
 def found_mount(generator):
     mount = Mount((0.2, 0.0, 0.4), (0.1, 0.0, 0.2), yaw_rad=0.3, pitch_rad=1.0, roll_rad=-0.2)
-    mount.numbers.detach().copy_(torch.randn(6, generator=generator, dtype=D))
+    mount.numbers.detach().copy_(randn64(generator, 6))
     mount.variables(render.Camera(lens.Pinhole(3.4), 8, 8, 0.2, 1), 2.0)
     return mount
 
@@ -33,6 +32,14 @@ CAMERAS = {
     "float32": lambda: render.Camera(
         lens.load("cooke-triplet", torch.float32).scaled(0.3), 32, 24, 0.1, 4
     ),
+    "in one colour": lambda: render.Camera(
+        lens.load("cooke-triplet").scaled(0.3),
+        32,
+        24,
+        0.1,
+        4,
+        spectrum=lens.Spectrum((0.45, 0.5), (0.25, 0.75)),
+    ).in_one_colour(),
     "windows": lambda: render.Camera(
         lens.load("double-gauss").scaled(0.2),
         8,
@@ -70,11 +77,11 @@ def test_it_loads_back_bit_for_bit(tmp_path, generator, kind):
     assert torch.equal(back.mount(), handed.mount())
     for name, value in handed.mount.state_dict().items():
         assert torch.equal(back.mount.state_dict()[name], value), name
-    numbers = torch.randn(6, generator=generator, dtype=D)
+    numbers = randn64(generator, 6)
     assert torch.equal(back.mount(numbers), handed.mount(numbers))  # the map, not just the pose
     assert back.mount.numbers.requires_grad
     assert back.camera.film == camera.film
-    assert back.camera.spectrum == camera.spectrum
+    assert back.camera.colours == camera.colours
     mine, other = camera.rays(), back.camera.rays()
     for name in ("origin_m", "direction", "weight"):
         assert torch.equal(getattr(mine, name), getattr(other, name)), name
@@ -92,7 +99,7 @@ def test_it_loads_back_bit_for_bit(tmp_path, generator, kind):
 def rotated(quaternion, vector):
     """q v q* written out by Hamilton's products."""
     x, y, z, w = quaternion
-    u = torch.tensor([x, y, z], dtype=D)
+    u = f64([x, y, z])
     return 2 * (u @ vector) * u + (w * w - u @ u) * vector + 2 * w * torch.linalg.cross(u, vector)
 
 
@@ -102,11 +109,9 @@ def test_the_transform_is_the_mount_for_other_programs(tmp_path, generator):
     page = load((tmp_path / "mount.yaml").read_text())
     pose = handed.mount().detach()
     quaternion = [page["transform"]["rotation_quaternion"][axis] for axis in "xyzw"]
-    point = torch.randn(3, generator=generator, dtype=D)
-    there = rotated(quaternion, point) + torch.tensor(
-        list(page["transform"]["translation_m"].values()), dtype=D
-    )
-    torch.testing.assert_close(there, pose[:3, :3] @ point + pose[:3, 3], rtol=0, atol=1e-14)
+    point = randn64(generator, 3)
+    there = rotated(quaternion, point) + f64(list(page["transform"]["translation_m"].values()))
+    close(there, pose[:3, :3] @ point + pose[:3, 3], atol=1e-14)
     # URDF: fixed axes, roll about x first, then pitch about y, then yaw about z; then from link to
     # optical axes
     roll, pitch, yaw = page["urdf_origin"]["rpy_rad"]
@@ -119,10 +124,8 @@ def test_the_transform_is_the_mount_for_other_programs(tmp_path, generator):
         turn[j, i], turn[i, j] = math.sin(angle), -math.sin(angle)
         return turn
 
-    optical = torch.tensor([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]], dtype=D)
-    torch.testing.assert_close(
-        about(2, yaw) @ about(1, pitch) @ about(0, roll) @ optical, pose[:3, :3], rtol=0, atol=1e-14
-    )
+    optical = f64([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    close(about(2, yaw) @ about(1, pitch) @ about(0, roll) @ optical, pose[:3, :3], atol=1e-14)
 
 
 def test_a_transform_alone_is_a_held_mount(tmp_path, generator):
@@ -131,7 +134,7 @@ def test_a_transform_alone_is_a_held_mount(tmp_path, generator):
     save_hand_over(path, handed)
     path.write_text(path.read_text().split("mount:\n")[0])
     back = load_hand_over(path)
-    torch.testing.assert_close(back.mount(), handed.mount(), rtol=0, atol=1e-14)
+    close(back.mount(), handed.mount(), atol=1e-14)
     assert torch.equal(back.mount.half_range_m, torch.zeros(3, dtype=D))
 
 

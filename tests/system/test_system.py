@@ -2,7 +2,6 @@
 refusals."""
 
 import copy
-import math
 from types import SimpleNamespace
 
 import pytest
@@ -14,10 +13,11 @@ from codesign.system import Batch, System, check
 from codesign.types import EventVolume, FlowField, Rays
 from tests import refusals
 from tests.hostile.stages import Stage, held
+from tests.numbers import D, f64, seeded
 
 ONE = torch.ones(1)
-T_S = torch.tensor([0.0, 1.0], dtype=torch.float64)
-BATCH = Batch(torch.eye(4, dtype=torch.float64).expand(2, 4, 4), T_S, scene="wall")
+T_S = f64([0.0, 1.0])
+BATCH = Batch(torch.eye(4, dtype=D).expand(2, 4, 4), T_S, scene="wall")
 
 
 class Glass(nn.Module):
@@ -158,11 +158,6 @@ def test_recorded_junctions_replace_what_is_before_them(name, value, loss):
     assert toy(render=never)(BATCH, recorded={name: value}).loss.item() == pytest.approx(loss)
 
 
-def test_a_bad_value_is_named_by_its_junction():
-    with pytest.raises(NonFiniteError, match="junction 'frames'"):
-        toy(render=lambda rays: render_sum(rays) / 0)(BATCH, probe=True)
-
-
 def test_a_bad_gradient_is_named_by_its_junction():
     # sqrt(|x|) at 0 has a finite value and an infinite slope: the frames are the first junction
     # from the loss back to see it
@@ -186,9 +181,7 @@ def test_a_stage_gets_what_its_signature_names():
     assert seen["t_s"] is T_S
     assert seen["camera"].seed == 5
     assert seen["theta"] == 0.2
-    torch.testing.assert_close(
-        seen["draw"], torch.rand(3, generator=torch.Generator().manual_seed(5))
-    )
+    torch.testing.assert_close(seen["draw"], torch.rand(3, generator=seeded(5)))
 
 
 def test_parameters_of_every_part_are_the_systems():
@@ -215,8 +208,8 @@ def test_estimator_and_bins_must_fit():
         toy(flow=network, bins=9)
 
 
-@refusals.table(__file__, "batches")
-def test_batches_that_do_not_fit_are_refused(row):
+@refusals.table(__file__, "systems")
+def test_what_does_not_fit_is_refused(row):
     def run(*given):
         return toy(render=lambda rays, T_world_cam: render_sum(rays))(Batch(*given))
 
@@ -224,7 +217,7 @@ def test_batches_that_do_not_fit_are_refused(row):
 
 
 def test_scenes_each_see_their_own_poses():
-    poses = torch.eye(4, dtype=torch.float64).expand(2, 1, 2, 4, 4)
+    poses = torch.eye(4, dtype=D).expand(2, 1, 2, 4, 4)
 
     def render(scene, T_world_cam):
         return float(scene) * T_world_cam[..., 0, 0, None, None]
@@ -237,7 +230,7 @@ def test_scenes_each_see_their_own_poses():
 def test_windows_of_a_film_become_samples():
     camera = ToyCamera(Glass())
     camera.film = SimpleNamespace(shape=(3, 1, 1))
-    poses = torch.eye(4, dtype=torch.float64).expand(2, 2, 4, 4)
+    poses = torch.eye(4, dtype=D).expand(2, 2, 4, 4)
 
     # [trajectory 2, T 2, window 3, 1, 1]: 100 trajectory + 10 time + window
     def render(T_world_cam):
@@ -305,25 +298,9 @@ def test_parts_can_be_exchanged_in_place_and_are_looked_at():
     assert system(BATCH).loss.item() == pytest.approx(36.0)
     system.camera = lambda: ToyCamera(Glass(1.0))
     assert not list(system.parameters()), "the lens left with its camera"
-    with pytest.raises(DomainError, match="no part 'event', did you mean 'events'"):
-        system.replaced(event=doubled)
 
 
-def test_objectives_are_scalar_tensors():
-    with pytest.raises(DomainError, match="objective 'square' returned a float"):
-        toy(objectives={"square": lambda field: 1.0})(BATCH)
-    vector = toy(objectives={"each": lambda field: field.flow_px})(BATCH)
-    with pytest.raises(ShapeError, match=r"objective 'each' has shape \(1, 2, 1, 1\)"):
-        vector.backward()
-    with pytest.raises(DomainError, match="asks for 'estimate', but the system has no such stage"):
-        toy(objectives={"task": lambda estimate: estimate})
-
-
-def test_check_finds_nan_zero_gradients_and_a_lens_computed_once():
-    with pytest.raises(NonFiniteError, match="objective 'nan' is nan"):
-        check(toy(objectives={"nan": lambda field: field.flow_px.sum() * math.nan}), BATCH)
-    with pytest.raises(GradientError, match="exactly 0 for every variable"):
-        check(toy(flow=lambda volume: field_of(0 * volume.counts[:, :1, 0])), BATCH)
+def test_check_finds_a_lens_computed_once():
     once = toy()
     once.lens.register_buffer("made", 2 * once.lens.efl_mm)
     with pytest.raises(GradientError, match="computed once from other tensors"):

@@ -11,12 +11,11 @@ from codesign.train import Contrast, Photometric, Supervised
 from codesign.train.objectives import flow_predictions
 from codesign.types import FlowField
 from tests.flow_training_case import SIDE, Made
+from tests.numbers import seeded
 
 
 def field(seed, covariance=None):
-    flow = torch.randn(
-        4, 2, SIDE, SIDE, generator=torch.Generator().manual_seed(seed)
-    ).requires_grad_()
+    flow = torch.randn(4, 2, SIDE, SIDE, generator=seeded(seed)).requires_grad_()
     return FlowField(
         flow, torch.ones(4, SIDE, SIDE, dtype=torch.bool), 1.0, covariance_px2=covariance
     )

@@ -1,7 +1,7 @@
 """What the kernels of the closed form share: the samples of an image, numbers for lanes of them,
 recordings, how a kernel enters a graph of torch, and the switch to plain operations of torch."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -157,16 +157,8 @@ class _Kernel(Function):
             return (None,) * (3 + count)
         saved = ctx.saved_tensors
         found = adjoint(*settings, *saved, grads, ctx.needs_input_grad[3:])
-        return None, None, None, *first_only(found, *saved[:count], *live)
-
-
-def first_only(found: Sequence[Tensor | None], *sources: Tensor) -> Sequence[Tensor | None]:
-    """Gradients as they are, sealed where a graph of them is asked for."""
-    if not torch.is_grad_enabled():
-        return found
-    live = [grad for grad in found if grad is not None]
-    sealed = iter(backend.NoSecondDerivative.apply(_FIRST_ONLY, len(live), *live, *sources))
-    return [None if grad is None else next(sealed) for grad in found]
+        sources = (*saved[:count], *live)
+        return None, None, None, *backend.first_only(found, sources, _FIRST_ONLY)
 
 
 class Lanes:

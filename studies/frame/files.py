@@ -1,0 +1,41 @@
+"""Files that a run is given: one that goes on has to be of the same."""
+
+import dataclasses
+import hashlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from codesign.errors import DomainError
+from studies.frame.config import StudyConfig
+
+
+def digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:12]
+
+
+def digests(paths: Iterable[Path]) -> dict[str, str]:
+    """Name -> digest of the files among some paths."""
+    return {f"'{path}'": digest(path.read_bytes()) for path in paths if path.is_file()}
+
+
+def given(config: StudyConfig) -> list[Path]:
+    """The paths among a study's options, but for those that may change."""
+    found = []
+    for field in dataclasses.fields(config):
+        if field.name not in ("out", "resume", *config.ANEW):
+            value = getattr(config, field.name)
+            values = value if isinstance(value, tuple) else (value,)
+            found += [Path(each) for each in values if each and isinstance(each, str | Path)]
+    return found
+
+
+def check_same(stored: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Raise DomainError where a run that goes on is not the one that was begun."""
+    for name in (*stored, *now):
+        if stored.get(name) != now.get(name):
+            was, is_now = stored.get(name, "not there"), now.get(name, "not there")
+            raise DomainError(
+                f"{name} changed since this run was begun ({was}, now {is_now}); what it has found holds no more: "
+                "change it back, or start a new run."
+            )

@@ -1,0 +1,109 @@
+"""Does it pay to design lens, mount, sensor and estimator together, over all robots raced?
+
+Takes the judged answers of races (answers.jsonl of studies.codesign), and holds two ways of joint
+design, one descent along all numbers and nested, against the best order of single blocks, common
+practice and the default: on each robot, and over all of them. Races nothing.
+"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from codesign.errors import DomainError
+from studies.codesign.page import best_order
+from studies.codesign.race import ENOUGH, answers
+from studies.frame.compare import Interval, crossed, holm, sign_flip
+from studies.frame.run import Run, StudyConfig, main
+from studies.frame.show import bars, tabulate
+from studies.frame.sweep import Row, column, plain
+
+WAYS = {"nested": "nested", "joint": "one descent"}
+ORDER = "best order"
+RIVALS = (ORDER, "book", "default")
+
+
+@dataclass(frozen=True)
+class Config(StudyConfig):
+    raw: tuple[Path, ...] = (
+        Path("docs/joint_race_outdoors.jsonl"),
+        Path("docs/joint_race_corridor.jsonl"),
+        Path("docs/joint_race_flight.jsonl"),
+    )
+    """Tables of judged answers, one for each robot."""
+
+
+def study(run: Run[Config]) -> None:
+    robots = [read(path) for path in run.config.raw]
+    if not robots:
+        raise DomainError("--raw names no table; give answers.jsonl of one run or more.")
+    found: dict[tuple[str, str], Interval] = {}
+    lines = []
+    for way in WAYS:
+        logs = {rival: [over(rows, way, rival) for _, rows in robots] for rival in RIVALS}
+        p = holm([sign_flip(torch.cat([each.mean(1) for each in of])) for of in logs.values()])
+        for (rival, of), chance in zip(logs.items(), p, strict=True):
+            found[way, rival] = crossed(*of).ratio()
+            line: Row = {"over": f"{WAYS[way]} over {rival}"}
+            for (robot, _), each in zip(robots, of, strict=True):
+                line[robot] = f"{crossed(each).ratio():.2f}"
+            ahead = sum(int((each.mean(1) < 0).sum()) for each in of)
+            line |= {"all": f"{found[way, rival]:.2f}", "p": chance, "ahead": ahead}
+            lines.append(line)
+            run.record(**found[way, rival].metrics(plain(way, "over", rival)))
+    run.section(
+        "Over all robots",
+        "Errors over those of a rival from the same start, in the same unseen worlds: geometric mean over worlds, median over "
+        "starts; over all robots the mean of their logarithms. Intervals are 95 % of resampled starts and worlds, p by signs of "
+        "all starts after Holm over the rivals of a way. Best order: the one of the raced orders that errs least itself.",
+    )
+    starts = found["nested", ORDER].count
+    titles = {"over": "error of", **{robot: robot for robot, _ in robots}, "all": "all"}
+    titles |= {"p": "p", "ahead": f"ahead, of {starts}"}
+    tabulate(run, "Joint design over its rivals", lines, "over", prefix="all", **titles)
+    logs = {f"{WAYS[way]} over {rival}": of for (way, rival), of in found.items()}
+    run.figure(
+        bars(logs, "error over the rival's", log=True, level=1.0),
+        "all",
+        "Error over that of each rival, over all robots (95 % of resampled starts and worlds).",
+    )
+    said = " ".join(
+        f"{name.capitalize()} leaves {found[way, ORDER]:.2f} of the error of the best order of single parts."
+        for way, name in WAYS.items()
+    )
+    few = " So few starts decide nothing." if starts < ENOUGH * len(robots) else ""
+    where = ", ".join(robot for robot, _ in robots)
+    run.finish("Joint design, all robots", f"Over {starts} starts ({where}): {said}{few}")
+
+
+def read(path: Path) -> tuple[str, list[Row]]:
+    """The robot that answers are of, and their rows.
+
+    Raises: FileFormatError for what is no such table; DomainError where an arm is missing or was not
+      raced from every start.
+    """
+    setting, rows = answers(path)
+    seeds = {row["seed"] for row in rows}
+    best = best_order(rows)
+    for arm in (*WAYS, *RIVALS[1:], best if ">" in best else "lens > mount > read-out"):
+        if len(column(rows, "seed", arm=arm)) != len(seeds):
+            raise DomainError(
+                f"'{path}' has not raced '{arm}' from all of its {len(seeds)} starts."
+            )
+    return str(setting["pair"]), rows
+
+
+def over(rows: list[Row], way: str, rival: str) -> Tensor:
+    """Logs [starts, worlds] of a way's error over a rival's."""
+    other = best_order(rows) if rival == ORDER else rival
+    ours, theirs = (
+        torch.tensor(column(sorted(rows, key=lambda row: row["seed"]), "errors", arm=arm)).double()
+        for arm in (way, other)
+    )
+    return (ours / theirs).log()
+
+
+if __name__ == "__main__":
+    sys.exit(main(study, Config))
