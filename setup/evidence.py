@@ -214,6 +214,19 @@ def ends(metrics: Metrics) -> str:
     )
 
 
+def over_all(metrics: Metrics) -> str:
+    """What nested and one descent make of their rivals, on each robot and on all."""
+    rows = []
+    for way, title in (("nested", "nested"), ("joint", "one descent")):
+        for rival in ("best_order", "book", "default"):
+            stem = f"{way}_over_{rival}"
+            names = [*(f"{stem}_{robot}" for robot in ("outdoors", "corridor", "flight")), stem]
+            ratios = [interval(name, f"{name}_low", f"{name}_high")(metrics) for name in names]
+            told = f"{metrics[f'{stem}_p']:.2g}", f"{metrics[f'{stem}_ahead']} of 60"
+            rows.append((f"{title} over {rival.replace('_', ' ')}", *ratios, *told))
+    return table(("", "outdoors", "corridor", "flight", "all", "p", "starts ahead"), rows)
+
+
 def arms_of(metrics: Metrics) -> list[str]:
     """Arms of a race, as metrics name them."""
     return [arm for arm in ARMS if f"race_{arm}_median" in metrics]
@@ -328,6 +341,20 @@ PARTS = {
     ),
     "joint-corridor": joint("corridor", "--designs 64", f"{ORDERS} book nested default"),
     "joint-flight": joint("flight", "--designs 64", f"{ORDERS} book nested default"),
+    "joint-answer": Part(
+        "joint_answer",
+        ("studies/joint_answer.py", "studies/frame", "studies/codesign"),
+        {
+            "joint.all.table": over_all,
+            "joint.all.nested-order": interval(
+                *(f"nested_over_best_order{end}" for end in ("", "_low", "_high"))
+            ),
+            "joint.all.joint-order": interval(
+                *(f"joint_over_best_order{end}" for end in ("", "_low", "_high"))
+            ),
+        },
+        {"joint_answer.png": "all.png"},
+    ),
     "joint-levers": Part(
         "joint_levers --processes 2",
         (*RACED, "studies/joint_levers.py"),

@@ -17,7 +17,7 @@ from studies.codesign.page import best_order
 from studies.codesign.race import ENOUGH, answers
 from studies.frame.compare import Interval, crossed, holm, sign_flip
 from studies.frame.run import Run, StudyConfig, main
-from studies.frame.show import bars, tabulate
+from studies.frame.show import bars
 from studies.frame.sweep import Row, column, plain
 
 WAYS = {"nested": "nested", "joint": "one descent"}
@@ -48,11 +48,16 @@ def study(run: Run[Config]) -> None:
             found[way, rival] = crossed(*of).ratio()
             line: Row = {"over": f"{WAYS[way]} over {rival}"}
             for (robot, _), each in zip(robots, of, strict=True):
-                line[robot] = f"{crossed(each).ratio():.2f}"
+                alone = crossed(each).ratio()
+                line[robot] = f"{alone:.2f}"
+                run.record(**alone.metrics(plain(way, "over", rival, robot)))
             ahead = sum(int((each.mean(1) < 0).sum()) for each in of)
             line |= {"all": f"{found[way, rival]:.2f}", "p": chance, "ahead": ahead}
             lines.append(line)
-            run.record(**found[way, rival].metrics(plain(way, "over", rival)))
+            name = plain(way, "over", rival)
+            run.record(
+                **found[way, rival].metrics(name), **{f"{name}_p": chance, f"{name}_ahead": ahead}
+            )
     run.section(
         "Over all robots",
         "Errors over those of a rival from the same start, in the same unseen worlds: geometric mean over worlds, median over "
@@ -62,7 +67,11 @@ def study(run: Run[Config]) -> None:
     starts = found["nested", ORDER].count
     titles = {"over": "error of", **{robot: robot for robot, _ in robots}, "all": "all"}
     titles |= {"p": "p", "ahead": f"ahead, of {starts}"}
-    tabulate(run, "Joint design over its rivals", lines, "over", prefix="all", **titles)
+    run.table(
+        "Joint design over its rivals",
+        list(titles.values()),
+        [list(line.values()) for line in lines],
+    )
     logs = {f"{WAYS[way]} over {rival}": of for (way, rival), of in found.items()}
     run.figure(
         bars(logs, "error over the rival's", log=True, level=1.0),

@@ -33,10 +33,11 @@ def test_the_answer_is_the_mean_over_robots(tmp_path):
     found = numbers(tmp_path / "run")
     for name in ("", "_low", "_high"):  # every start has the same ratio
         assert found[f"nested_over_best_order{name}"] == pytest.approx(math.sqrt(0.5 * 0.8))
+    assert found["nested_over_best_order_corridor"] == pytest.approx(0.8)
     assert found["joint_over_book"] == pytest.approx(0.9 / 2)
-    assert found["all_nested_over_best_order_ahead"] == 12
+    assert found["nested_over_best_order_ahead"] == 12
     # two of 4096 signs are as far off, times three rivals
-    assert found["all_nested_over_best_order_p"] == pytest.approx(3 * 2 / 4096)
+    assert found["nested_over_best_order_p"] == pytest.approx(3 * 2 / 4096)
     assert "Over 12 starts (outdoors, corridor): Nested leaves 0.63" in page(tmp_path / "run")
     check_page("joint_answer", tmp_path / "run")
 
