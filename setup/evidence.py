@@ -346,12 +346,17 @@ PARTS = {
         ("studies/joint_answer.py", "studies/frame", "studies/codesign"),
         {
             "joint.all.table": over_all,
-            "joint.all.nested-order": interval(
-                *(f"nested_over_best_order{end}" for end in ("", "_low", "_high"))
-            ),
-            "joint.all.joint-order": interval(
-                *(f"joint_over_best_order{end}" for end in ("", "_low", "_high"))
-            ),
+            **{
+                f"joint.all.{way}-{rival}": interval(
+                    *(f"{way}_over_{name}{end}" for end in ("", "_low", "_high"))
+                )
+                for way in ("nested", "joint")
+                for rival, name in (
+                    ("order", "best_order"),
+                    ("book", "book"),
+                    ("default", "default"),
+                )
+            },
         },
         {"joint_answer.png": "all.png"},
     ),
