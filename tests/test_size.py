@@ -24,13 +24,13 @@ BUDGETS = {
     "scenes/robots": 9_490,  # held joints, directions of axes, colours by name
     "scenes/trajectories": 3_030,  # numbers that are finite, directions that lead somewhere
     "scenes/windows": 8_710,  # what estimators are judged on, told twice in studies before
-    "setup": 6_790,  # tables of races, answers raced again
-    "studies": 7_810,  # heads by an interval, names given twice
+    "setup": 6_960,  # tables of races, answers raced again, all robots together
+    "studies": 8_450,  # heads by an interval, names given twice, all robots together
     "studies/chain_picture": 1_630,  # each stage alone, for the gallery
     "studies/codesign": 15_610,  # where answers lie, the best of all answers, what blur does by experiment, what a design was judged in
     "studies/flow_quality": 5_560,  # names of recordings, no truth of rotation alone
     "studies/flow_recording": 3_360,  # windows that are not judged
-    "studies/frame": 9_080,  # titles of columns, options without effect, files that a run was given
+    "studies/frame": 9_110,  # titles of columns, options without effect, files that a run was given, tables put together
     "studies/gradient_flow": 6_300,  # a first line that answers
     "studies/lens_motion": 4_150,  # a table read case by case, poses that stand still
     "studies/lens_opt": 6_470,  # seeds that judge; where windows lie, designs that err alike
@@ -56,7 +56,7 @@ BUDGETS = {
     "tests/optimise": 3_410,  # a state is a copy; schedules, weights that nothing reaches
     "tests/render": 28_880,  # outlines from the real pupil
     "tests/scenes": 20_530,  # polygons from every corner, colours of materials and vertices
-    "tests/studies": 34_430,  # blur that is drawn, first lines that are true, the best of all answers, files that change, few starts
+    "tests/studies": 34_730,  # blur that is drawn, first lines that are true, the best of all answers, files that change, few starts, all robots together
     "tests/system": 7_050,  # estimates of their own kind, one colour handed over
     "tests/train": 5_200,  # bins of windows, ends of sources
 }
