@@ -84,6 +84,8 @@ def test_poses_are_a_path_from_above_with_headings():
         np.testing.assert_allclose(axis.lines[0].get_ydata(), -2, rtol=1e-6)
         (headings,) = axis.collections
         np.testing.assert_allclose((headings.U, headings.V), (np.ones(5), np.zeros(5)), atol=1e-6)
+    (one,) = codesign.show(start).axes[0].collections
+    np.testing.assert_allclose((one.X, one.Y, one.U), ([1], [-2], [1]), atol=1e-6)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float64])

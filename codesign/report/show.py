@@ -172,15 +172,15 @@ def _frame(axis, frame_and_films):
 
 
 def _are_poses(x):
-    """Whether it is [..., T, 4, 4] with the last row of rigid motions."""
-    if x.ndim < 3 or x.shape[-2:] != (4, 4) or not x.numel():
+    """Whether it is [4, 4] or [..., T, 4, 4] with the last row of rigid motions."""
+    if x.ndim < 2 or x.shape[-2:] != (4, 4) or not x.numel():
         return False
     return bool((x[..., 3, :] == x.new_tensor([0, 0, 0, 1])).all())
 
 
 def _paths(axis, T_world_cam):
     """Paths over the ground, and where the camera looks, at most TICKS times on each."""
-    for poses in T_world_cam.reshape(-1, *T_world_cam.shape[-3:]):
+    for poses in T_world_cam.reshape(-1, *(1, *T_world_cam.shape)[-3:]):
         x, y = poses[:, :2, 3].T.numpy()
         (line,) = axis.plot(x, y, linewidth=1)
         some = slice(None, None, math.ceil(len(poses) / TICKS))
