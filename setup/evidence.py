@@ -109,10 +109,18 @@ ARMS = {
     "nested": "nested",
     "lens_mount_read_out": "lens > mount > read-out",
     "mount_lens_read_out": "mount > lens > read-out",
+    "lens_read_out_mount": "lens > read-out > mount",
+    "mount_read_out_lens": "mount > read-out > lens",
+    "read_out_lens_mount": "read-out > lens > mount",
+    "read_out_mount_lens": "read-out > mount > lens",
     "alternating_4": "alternating, 4 sweeps",
+    "alternating_8": "alternating, 8 sweeps",
     "cma_es": "CMA-ES",
+    "tpe": "TPE",
+    "random": "random",
     "book": "book",
     "default": "default",
+    "default_settled": "default, settled",
 }
 # number of a design -> title and form in a page
 ENDS = {
@@ -341,6 +349,11 @@ PARTS = {
     ),
     "joint-corridor": joint("corridor", "--designs 64", f"{ORDERS} book nested default"),
     "joint-flight": joint("flight", "--designs 64", f"{ORDERS} book nested default"),
+    "joint-arms": Part(
+        "codesign --grid 2 --slopes 0 --couplings 0 --designs 2 --seeds 6 --raw docs/joint_race_arms.jsonl",
+        RACED,
+        {"joint.arms.table": raced("outdoors")},
+    ),
     "joint-answer": Part(
         "joint_answer",
         ("studies/joint_answer.py", "studies/frame", "studies/codesign"),
