@@ -9,22 +9,22 @@ ROOT = Path(__file__).resolve().parents[1]
 UNCOUNTED = (ast.expr_context, ast.operator, ast.unaryop, ast.cmpop, ast.boolop)
 BUDGETS = {
     "codesign": 9_990,  # a pose out of its rotation and its place, for mounts and paths alike
-    "codesign/events": 48_490,  # leaks that have begun before, counts that a type holds, kinds of TIFFs, noise events of all intervals at once
-    "codesign/fidelity": 2_960,  # stages without a level
+    "codesign/events": 48_620,  # leaks that have begun before, counts that a type holds, kinds of TIFFs, noise events of all intervals at once, times too coarse
+    "codesign/fidelity": 3_030,  # stages without a level, levels that are told wrong
     "codesign/flow": 43_050,  # truth that is unknown, windows that share no event, polarities told two ways
     "codesign/grad": 3_300,
     "codesign/lens": 48_010,  # makers of glass, fans of single precision, stops and apertures in their own axes
     "codesign/mount": 14_880,  # rays traced once for several depths, films looked at all over, angles in degrees, blur of the whole pupil
     "codesign/optimise": 3_900,
     "codesign/render": 43_780,  # chief rays of a spectrum, curves as the real pupil sees them
-    "codesign/report": 7_510,  # unknown flow, paths from above, wheels beside flow, corners without light
+    "codesign/report": 7_560,  # unknown flow, paths from above, wheels beside flow, corners without light, samples beside frames
     "codesign/system": 9_680,  # truth of what is read, a lens in its camera, bins that were asked for, one colour handed over
     "codesign/train": 5_700,  # bins of windows, ends of sources
     "scenes": 15_450,  # polygons with inward corners, colours of materials, mesh files that are read in part
     "scenes/robots": 9_490,  # held joints, directions of axes, colours by name
     "scenes/trajectories": 3_030,  # numbers that are finite, directions that lead somewhere
     "scenes/windows": 8_710,  # what estimators are judged on, told twice in studies before
-    "setup": 6_960,  # tables of races, answers raced again, all robots together
+    "setup": 7_000,  # tables of races, answers raced again, all robots together, every arm
     "studies": 8_450,  # heads by an interval, names given twice, all robots together
     "studies/chain_picture": 1_630,  # each stage alone, for the gallery
     "studies/codesign": 15_610,  # where answers lie, the best of all answers, what blur does by experiment, what a design was judged in
@@ -41,12 +41,12 @@ BUDGETS = {
     "studies/speed_error": 7_900,  # growth of the whole chain
     "studies/spike_esim": 2_940,
     "studies/stability": 8_220,
-    "studies/train_flow": 5_130,  # steps of a race, options without effect
+    "studies/train_flow": 5_140,  # steps of a race, options without effect, windows that reach into one another
     "studies/viewer": 3_450,  # says what a fail may be
     "studies/video_to_events": 4_290,
-    "tests": 15_270,  # words of numbers for all rooms, pictures of poses
+    "tests": 15_300,  # words of numbers for all rooms, pictures of poses, pycollada
     "tests/data": 1_000,
-    "tests/events": 31_530,  # rates of leaks in short runs, sums over wide spreads
+    "tests/events": 31_560,  # rates of leaks in short runs, sums over wide spreads, times with decimals
     "tests/flow": 28_610,  # chunks that may come again
     "tests/gradients": 3_260,
     "tests/hard_cases": 2_600,
@@ -57,7 +57,7 @@ BUDGETS = {
     "tests/render": 28_880,  # outlines from the real pupil
     "tests/scenes": 20_530,  # polygons from every corner, colours of materials and vertices
     "tests/studies": 34_730,  # blur that is drawn, first lines that are true, the best of all answers, files that change, few starts, all robots together
-    "tests/system": 7_050,  # estimates of their own kind, one colour handed over
+    "tests/system": 7_090,  # estimates of their own kind, one colour handed over, levels that are told wrong
     "tests/train": 5_200,  # bins of windows, ends of sources
 }
 

@@ -149,6 +149,14 @@ def check_times(t_s: Times, count: int | None = None) -> Tensor:
             f"t_s goes from {float(times_s[at])!r} to {float(times_s[at + 1])!r} s at index {at}; times "
             "must increase strictly."
         )
+    dtype = torch.as_tensor(t_s).dtype
+    if len(steps) and dtype in (torch.float32, torch.float16, torch.bfloat16):
+        grid_s = torch.finfo(dtype).eps * float(times_s.abs().max())
+        if grid_s > 1e-6 and float(steps.min()) < 256 * grid_s:
+            raise DomainError(
+                f"t_s tells times apart by {grid_s:.2g} s in {dtype}, too coarse for steps of {float(steps.min()):.2g} s; "
+                "give float64, or times from the first frame on."
+            )
     return times_s
 
 

@@ -83,13 +83,21 @@ def levels_of(task: Task, only: Mapping[str, Any] | None = None) -> Levels:
         "bins": BINS,
         "flow": tuple(FLOWS) if task.flow is None else (GIVEN,),
     }
-    for stage, levels in (only or {}).items():
+    for stage, levels in dict(only or {}).items():
+        if not isinstance(levels, tuple | list):
+            raise DomainError(f"levels of {stage} are {levels!r}; give a list, cheap to fine.")
         check_choice(stage, "the stage of levels", STAGES)
         if wrong := [level for level in levels if stage != "bins" and level not in known[stage]]:
             raise DomainError(
                 f"{stage} has no level {wrong[0]!r} here; it has {', '.join(map(str, known[stage]))}."
             )
         known[stage] = tuple(levels)
+        if stage in NUMBERS and not (
+            all(type(level) is int for level in levels) and list(levels) == sorted(set(levels))
+        ):
+            raise DomainError(
+                f"{stage} has the levels {known[stage]}; give whole numbers that rise."
+            )
     if empty := [stage for stage, found in pickable(task, known).items() if not found]:
         raise DomainError(f"{empty[0]} has no level to choose; give one ('hard' has no gradient).")
     return known

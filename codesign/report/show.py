@@ -18,7 +18,7 @@ from torch import Tensor
 
 from codesign.atomic import write_atomic
 from codesign.checks import check_choice, check_number
-from codesign.errors import CodesignError, DomainError, ShapeError
+from codesign.errors import CodesignError, DomainError, NonFiniteError, ShapeError
 from codesign.events import picture, to_counts
 from codesign.lens.pinhole import ThinLens
 from codesign.mount import Mount
@@ -69,7 +69,7 @@ def show(
     Args:
       x: lens (traced, thin or a pinhole) or camera: cross-section with rays to the middle, 0.7 and
         the corner of the field. Frames [..., H, W], tensor or array of numpy, linear light: at most
-        four of them over time, with the screen's gamma. Poses ``T_world_cam`` [..., T, 4, 4]: their
+        four of the first sample over time, with the screen's gamma. Poses ``T_world_cam`` [..., T, 4, 4]: their
         paths from above, with where the camera looks (+z). ``EventStream`` and ``EventVolume``: ON red, OFF blue, both purple.
         ``FlowField``: hue the direction, saturation the length, with a wheel that says how far.
         ``Mount``, with the camera that it carries and the meshes of its robot. What
@@ -116,13 +116,17 @@ def show(
             raise ShapeError(
                 f"frames {list(x.shape)} look like colour, [..., H, W, 3]; give their light, [..., H, W]."
             )
-        if x.ndim > 2 and x.shape[-3] == 2 and bool((x < 0).any()):
+        if x.ndim > 2 and x.shape[-3] == 2 and (x.ndim > 3 or bool((x < 0).any())):
             raise ShapeError(
-                f"frames {list(x.shape)} with values below 0 look like flow, [..., 2, H, W]; give a FlowField."
+                f"{list(x.shape)} may be counts or flow, [..., 2, H, W]: give an EventVolume, a FlowField, or frames [T, H, W]."
             )
-        films = x.detach().float().reshape(-1, *x.shape[-2:])
-        picked = np.unique(np.linspace(0, len(films) - 1, MOST).round().astype(int)).tolist()
-        figure = _row([(f"frame {k}", (films[k], films[picked]), _frame) for k in picked])
+        films = x.detach().float().reshape(-1, *(1, *x.shape)[-3:])
+        if not films.isfinite().all():
+            raise NonFiniteError("frames hold NaN, infinities or numbers beyond single precision.")
+        film, *others = films
+        of = f", sample 0 of {len(films)}" if others else ""
+        picked = np.unique(np.linspace(0, len(film) - 1, MOST).round().astype(int)).tolist()
+        figure = _row([(f"frame {k}{of}", (film[k], film[picked]), _frame) for k in picked])
     elif isinstance(x, Pass):
         figure = _chain(x)
     elif _has_section(x):

@@ -257,12 +257,13 @@ def sources(config, shape):
     )
     _warn_of_empty(config, whole)
     held = max(1, len(whole) // HELD_OUT)
-    if len(whole) <= held:
+    shared = config.window_frames - 1  # windows before the first held one that may reach into it
+    if len(whole) <= held + shared:
         raise DomainError(
-            f"'{config.data}' has {len(whole)} window(s); at least 2 are needed to train on some and judge "
+            f"'{config.data}' has {len(whole)} window(s); at least {2 + shared} are needed to train on some and judge "
             "on others."
         )
-    return [(1.0, Part(whole, 0, len(whole) - held))], {
+    return [(1.0, Part(whole, 0, len(whole) - held - shared))], {
         "held_out": Part(whole, len(whole) - held, len(whole))
     }
 

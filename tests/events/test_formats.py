@@ -134,6 +134,7 @@ def test_one_file_gives_the_same_numbers_through_both_doors(name, tmp_path):
         ("1 2 3 1\n", {"columns": "xytp"}, [3]),
         ("1 2 3 1\n2 3 4 1\n", {"columns": "xytp", "time_unit": "ms"}, [3000, 4000]),
         ("2 9 3 1\n5 9 1 1\n", {}, [2, 5]),
+        ("2.000 9 3 1\n5.000 9 1 1\n", {}, [2_000_000, 5_000_000]),
         # 256 ns from one number of double precision to the next
         (
             "1700000000000000499 1 1 1\n1700000000000001501 1 1 1\n",
@@ -246,6 +247,7 @@ DAMAGED = {
         (npz(t_us=None), "t_us"),
         (npz(t_us=T_US[::-1]), "event 1: .* us before"),
         (npz(t_us=np.full(3, 2**63 + 5, np.uint64)), "61 bits"),
+        (in_arrays(**NPZ | {"t": np.float32([1e9, 1e9, 2e9])}), "not told apart in float32"),
         (npz(x=np.zeros(2, int)), "equal length"),
         (npz(x=np.full(3, 10)), "x = 10; the sensor has 10"),
         (npz(t_us=np.array([None] * 3)), "t_us holds object"),

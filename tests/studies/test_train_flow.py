@@ -159,10 +159,10 @@ def test_the_last_tenth_of_a_data_set_is_judged_on_alone(tmp_path, monkeypatch):
     assert asked[:30] == [[k] for k in range(30)], "whether they hold events"
     del asked[:30]
     probe, *steps = asked[:15]
-    assert probe == [0, 13, 26]
+    assert probe == [0, 13, 25]
     seen = [index for batch in steps for index in batch]
-    assert sorted(seen[:27]) == list(range(27)), "each window once before any comes again"
-    assert max(seen) == 26
+    assert sorted(seen[:26]) == list(range(26)), "each window once before any comes again"
+    assert max(seen) == 25, "window 26 ends within the first that is held out"
     assert asked[15] == [27, 28, 29]
     assert metrics_of(tmp_path / "run")["held_out_windows"] == 3
 

@@ -66,6 +66,9 @@ def test_levels_share_the_ends_of_the_drive_and_colours_their_samples():
         levels_of(task(lens.Pinhole(8.0)), {"events": ("soft",)})
     with pytest.raises(DomainError, match="events has no level to choose"):
         levels_of(task(lens.Pinhole(8.0), gradient=True), {"events": ("hard",)})
+    for wrong in (6, "46", (4.5, 6), (6, 4)):
+        with pytest.raises(DomainError, match=r"give a list|whole numbers that rise"):
+            levels_of(task(lens.Pinhole(8.0)), {"bins": wrong})
 
 
 def made_up():

@@ -75,6 +75,10 @@ def settled_unit(t, unit, name=""):
     told = name.removeprefix("t_")
     if unit != "auto":
         return unit
+    if t.dtype == np.float32 and len(t) and np.abs(t).max() >= 2**24:
+        raise FileFormatError(
+            "times from 2^24 on are not told apart in float32; store float64 or whole numbers, or say time_unit=."
+        )
     return told if told in UNITS_US else "s" if bool((t % 1 != 0).any()) else "us"
 
 

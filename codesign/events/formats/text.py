@@ -59,6 +59,9 @@ def read_text(path, asked):
             if not arrival.count and len(table):
                 order = settled_order(path, table, order)
                 name = next((name for name in names if LETTERS[name] == "t"), "")
+                first = lines.split(b"\n", 1)[0].replace(b",", b" ").split()
+                if unit == "auto" and b"." in first[order.index("t")]:
+                    unit = "s"  # written with decimals, all of them 0 or not
                 unit = settled_unit(table[:, order.index("t")], unit, name)
             if len(table):
                 t, x, y, p = (table[:, order.index(letter)] for letter in "txyp")
