@@ -226,12 +226,18 @@ def over_all(metrics: Metrics) -> str:
     """What nested and one descent make of their rivals, on each robot and on all."""
     rows = []
     for way, title in (("nested", "nested"), ("joint", "one descent")):
-        for rival in ("best_order", "book", "default"):
+        for rival, name in {"best_order": "best order", **ARMS}.items():
             stem = f"{way}_over_{rival}"
-            names = [*(f"{stem}_{robot}" for robot in ("outdoors", "corridor", "flight")), stem]
-            ratios = [interval(name, f"{name}_low", f"{name}_high")(metrics) for name in names]
-            told = f"{metrics[f'{stem}_p']:.2g}", f"{metrics[f'{stem}_ahead']} of 60"
-            rows.append((f"{title} over {rival.replace('_', ' ')}", *ratios, *told))
+            if stem in metrics:
+                names = [*(f"{stem}_{robot}" for robot in ("outdoors", "corridor", "flight")), stem]
+                ratios = [
+                    interval(each, f"{each}_low", f"{each}_high")(metrics)
+                    if each in metrics
+                    else ""
+                    for each in names
+                ]
+                told = f"{metrics[f'{stem}_p']:.2g}", f"{metrics[f'{stem}_ahead']}"
+                rows.append((f"{title} over {name}", *ratios, *told))
     return table(("", "outdoors", "corridor", "flight", "all", "p", "starts ahead"), rows)
 
 

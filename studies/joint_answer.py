@@ -1,8 +1,8 @@
 """Does it pay to design lens, mount, sensor and estimator together, over all robots raced?
 
 Takes the judged answers of races (answers.jsonl of studies.codesign), and holds two ways of joint
-design, one descent along all numbers and nested, against the best order of single blocks, common
-practice and the default: on each robot, and over all of them. Races nothing.
+design, one descent along all numbers and nested, against the best order of single blocks and every
+other arm that was raced there: on each robot, and over all of them. Races nothing.
 """
 
 import sys
@@ -18,11 +18,10 @@ from studies.codesign.race import ENOUGH, answers
 from studies.frame.compare import Interval, crossed, holm, sign_flip
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.show import bars
-from studies.frame.sweep import Row, column, plain
+from studies.frame.sweep import Row, column, plain, select
 
 WAYS = {"nested": "nested", "joint": "one descent"}
 ORDER = "best order"
-RIVALS = (ORDER, "book", "default")
 
 
 @dataclass(frozen=True)
@@ -41,8 +40,10 @@ def study(run: Run[Config]) -> None:
         raise DomainError("--raw names no table; give answers.jsonl of one run or more.")
     found: dict[tuple[str, str], Interval] = {}
     lines = []
+    arms = [{row["arm"]: None for row in rows} for _, rows in robots]
+    others = [arm for arm in arms[0] if arm not in WAYS and all(arm in each for each in arms)]
     for way in WAYS:
-        logs = {rival: [over(rows, way, rival) for _, rows in robots] for rival in RIVALS}
+        logs = {each: [over(rows, way, each) for _, rows in robots] for each in (ORDER, *others)}
         p = holm([sign_flip(torch.cat([each.mean(1) for each in of])) for of in logs.values()])
         for (rival, of), chance in zip(logs.items(), p, strict=True):
             found[way, rival] = crossed(*of).ratio()
@@ -55,9 +56,8 @@ def study(run: Run[Config]) -> None:
             line |= {"all": f"{found[way, rival]:.2f}", "p": chance, "ahead": ahead}
             lines.append(line)
             name = plain(way, "over", rival)
-            run.record(
-                **found[way, rival].metrics(name), **{f"{name}_p": chance, f"{name}_ahead": ahead}
-            )
+            told = {f"{name}_p": chance, f"{name}_ahead": ahead}
+            run.record(**found[way, rival].metrics(name), **told)
     run.section(
         "Over all robots",
         "Errors over those of a rival from the same start, in the same unseen worlds: geometric mean over worlds, median over "
@@ -67,11 +67,8 @@ def study(run: Run[Config]) -> None:
     starts = found["nested", ORDER].count
     titles = {"over": "error of", **{robot: robot for robot, _ in robots}, "all": "all"}
     titles |= {"p": "p", "ahead": f"ahead, of {starts}"}
-    run.table(
-        "Joint design over its rivals",
-        list(titles.values()),
-        [list(line.values()) for line in lines],
-    )
+    cells = [list(line.values()) for line in lines]
+    run.table("Joint design over its rivals", list(titles.values()), cells)
     logs = {f"{WAYS[way]} over {rival}": of for (way, rival), of in found.items()}
     run.figure(
         bars(logs, "error over the rival's", log=True, level=1.0),
@@ -88,20 +85,18 @@ def study(run: Run[Config]) -> None:
 
 
 def read(path: Path) -> tuple[str, list[Row]]:
-    """The robot that answers are of, and their rows.
+    """The robot that answers are of, and the rows of the arms that were raced from every start.
 
-    Raises: FileFormatError for what is no such table; DomainError where an arm is missing or was not
-      raced from every start.
+    Raises: FileFormatError for what is no such table; DomainError where those are too few arms.
     """
     setting, rows = answers(path)
-    seeds = {row["seed"] for row in rows}
-    best = best_order(rows)
-    for arm in (*WAYS, *RIVALS[1:], best if ">" in best else "lens > mount > read-out"):
-        if len(column(rows, "seed", arm=arm)) != len(seeds):
-            raise DomainError(
-                f"'{path}' has not raced '{arm}' from all of its {len(seeds)} starts."
-            )
-    return str(setting["pair"]), rows
+    starts = len({row["seed"] for row in rows})
+    whole = [row for row in rows if len(select(rows, arm=row["arm"])) == starts]
+    if not {*WAYS} <= set(column(whole, "arm")) or ">" not in best_order(whole):
+        raise DomainError(
+            f"'{path}' has not raced {', '.join(WAYS)} and an order of single blocks from all of its {starts} starts."
+        )
+    return str(setting["pair"]), whole
 
 
 def over(rows: list[Row], way: str, rival: str) -> Tensor:

@@ -7,6 +7,7 @@ from itertools import product
 import pytest
 
 from studies import joint_answer
+from studies.frame.sweep import plain
 from tests import refusals
 from tests.studies.browser import check_page
 from tests.studies.runs import numbers, page, ran
@@ -36,8 +37,9 @@ def test_the_answer_is_the_mean_over_robots(tmp_path):
     assert found["nested_over_best_order_corridor"] == pytest.approx(0.8)
     assert found["joint_over_book"] == pytest.approx(0.9 / 2)
     assert found["nested_over_best_order_ahead"] == 12
-    # two of 4096 signs are as far off, times three rivals
-    assert found["nested_over_best_order_p"] == pytest.approx(3 * 2 / 4096)
+    # two of 4096 signs are as far off, times five rivals
+    assert found["nested_over_best_order_p"] == pytest.approx(5 * 2 / 4096)
+    assert found[f"nested_over_{plain(ORDERS[1])}"] == pytest.approx(math.sqrt(0.4) / 1.1)
     assert "Over 12 starts (outdoors, corridor): Nested leaves 0.63" in page(tmp_path / "run")
     check_page("joint_answer", tmp_path / "run")
 
@@ -46,5 +48,5 @@ def test_the_answer_is_the_mean_over_robots(tmp_path):
 def test_tables_that_cannot_answer_are_refused(row, refuses, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     table(tmp_path / "whole", "outdoors", 0.5)
-    table(tmp_path / "lacking", "outdoors", 0.5, "book")
+    table(tmp_path / "lacking", "outdoors", 0.5, "nested")
     refuses(joint_answer, row)
