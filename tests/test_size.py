@@ -24,7 +24,7 @@ BUDGETS = {
     "scenes/robots": 9_490,  # held joints, directions of axes, colours by name
     "scenes/trajectories": 3_030,  # numbers that are finite, directions that lead somewhere
     "scenes/windows": 8_710,  # what estimators are judged on, told twice in studies before
-    "setup": 7_000,  # tables of races, answers raced again, all robots together, every arm
+    "setup": 7_060,  # tables of races, answers raced again, all robots together, every arm
     "studies": 8_450,  # heads by an interval, names given twice, all robots together
     "studies/chain_picture": 1_630,  # each stage alone, for the gallery
     "studies/codesign": 15_610,  # where answers lie, the best of all answers, what blur does by experiment, what a design was judged in
