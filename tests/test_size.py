@@ -25,7 +25,7 @@ BUDGETS = {
     "scenes/trajectories": 3_030,  # numbers that are finite, directions that lead somewhere
     "scenes/windows": 8_710,  # what estimators are judged on, told twice in studies before
     "setup": 7_060,  # tables of races, answers raced again, all robots together, every arm
-    "studies": 8_450,  # heads by an interval, names given twice, all robots together
+    "studies": 8_490,  # heads by an interval, names given twice, all robots together
     "studies/chain_picture": 1_630,  # each stage alone, for the gallery
     "studies/codesign": 15_610,  # where answers lie, the best of all answers, what blur does by experiment, what a design was judged in
     "studies/flow_quality": 5_560,  # names of recordings, no truth of rotation alone
@@ -56,7 +56,7 @@ BUDGETS = {
     "tests/optimise": 3_410,  # a state is a copy; schedules, weights that nothing reaches
     "tests/render": 28_880,  # outlines from the real pupil
     "tests/scenes": 20_530,  # polygons from every corner, colours of materials and vertices
-    "tests/studies": 34_730,  # blur that is drawn, first lines that are true, the best of all answers, files that change, few starts, all robots together
+    "tests/studies": 34_760,  # blur that is drawn, first lines that are true, the best of all answers, files that change, few starts, all robots together
     "tests/system": 7_090,  # estimates of their own kind, one colour handed over, levels that are told wrong
     "tests/train": 5_200,  # bins of windows, ends of sources
 }
