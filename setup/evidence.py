@@ -224,21 +224,18 @@ def ends(metrics: Metrics) -> str:
 
 def over_all(metrics: Metrics) -> str:
     """What nested and one descent make of their rivals, on each robot and on all."""
+    stem, robots = "nested_over_best_order", ("outdoors", "corridor", "flight")
+    robots = [robot for robot in robots if f"{stem}_{robot}" in metrics]
     rows = []
     for way, title in (("nested", "nested"), ("joint", "one descent")):
         for rival, name in {"best_order": "best order", **ARMS}.items():
             stem = f"{way}_over_{rival}"
             if stem in metrics:
-                names = [*(f"{stem}_{robot}" for robot in ("outdoors", "corridor", "flight")), stem]
-                ratios = [
-                    interval(each, f"{each}_low", f"{each}_high")(metrics)
-                    if each in metrics
-                    else ""
-                    for each in names
-                ]
+                names = [*(f"{stem}_{robot}" for robot in robots), stem]
+                ratios = [interval(each, f"{each}_low", f"{each}_high")(metrics) for each in names]
                 told = f"{metrics[f'{stem}_p']:.2g}", f"{metrics[f'{stem}_ahead']}"
                 rows.append((f"{title} over {name}", *ratios, *told))
-    return table(("", "outdoors", "corridor", "flight", "all", "p", "starts ahead"), rows)
+    return table(("", *robots, "all", "p", "starts ahead"), rows)
 
 
 def arms_of(metrics: Metrics) -> list[str]:
@@ -378,6 +375,11 @@ PARTS = {
             },
         },
         {"joint_answer.png": "all.png"},
+    ),
+    "joint-orders": Part(
+        "joint_answer --raw docs/joint_race_arms.jsonl docs/joint_race_orders.jsonl",
+        ("studies/joint_answer.py", "studies/frame", "studies/codesign"),
+        {"joint.orders.table": over_all},
     ),
     "joint-levers": Part(
         "joint_levers --processes 2",
