@@ -379,7 +379,14 @@ PARTS = {
     "joint-orders": Part(
         "joint_answer --raw docs/joint_race_arms.jsonl docs/joint_race_orders.jsonl",
         ("studies/joint_answer.py", "studies/frame", "studies/codesign"),
-        {"joint.orders.table": over_all},
+        {"joint.orders.table": over_all}
+        | {
+            f"joint.orders.{way}-{robot}": interval(
+                *(f"{way}_over_best_order_{robot}{end}" for end in ("", "_low", "_high"))
+            )
+            for way in ("nested", "joint")
+            for robot in ("outdoors", "corridor")
+        },
     ),
     "joint-levers": Part(
         "joint_levers --processes 2",
