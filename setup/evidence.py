@@ -62,6 +62,11 @@ def interval(*names: str) -> Callable[[Metrics], str]:
     return lambda metrics: "{:.2f} ({:.2f} to {:.2f})".format(*(metrics[name] for name in names))
 
 
+def ends_of(name: str) -> list[str]:
+    """Names of a value and of the ends of its interval."""
+    return [name, f"{name}_low", f"{name}_high"]
+
+
 def ratio(stem: str, pair: str) -> Callable[[Metrics], str]:
     """A median ratio with its interval."""
     return interval(*(f"{stem}_{end}_{pair}" for end in ("median", "low95", "high95")))
@@ -232,7 +237,7 @@ def over_all(metrics: Metrics) -> str:
             stem = f"{way}_over_{rival}"
             if stem in metrics:
                 names = [*(f"{stem}_{robot}" for robot in robots), stem]
-                ratios = [interval(each, f"{each}_low", f"{each}_high")(metrics) for each in names]
+                ratios = [interval(*ends_of(each))(metrics) for each in names]
                 told = f"{metrics[f'{stem}_p']:.2g}", f"{metrics[f'{stem}_ahead']}"
                 rows.append((f"{title} over {name}", *ratios, *told))
     return table(("", *robots, "all", "p", "starts ahead"), rows)
@@ -360,19 +365,11 @@ PARTS = {
     "joint-answer": Part(
         "joint_answer",
         ("studies/joint_answer.py", "studies/frame", "studies/codesign"),
-        {
-            "joint.all.table": over_all,
-            **{
-                f"joint.all.{way}-{rival}": interval(
-                    *(f"{way}_over_{name}{end}" for end in ("", "_low", "_high"))
-                )
-                for way in ("nested", "joint")
-                for rival, name in (
-                    ("order", "best_order"),
-                    ("book", "book"),
-                    ("default", "default"),
-                )
-            },
+        {"joint.all.table": over_all}
+        | {
+            f"joint.all.{way}-{name}": interval(*ends_of(f"{way}_over_{rival}"))
+            for way in ("nested", "joint")
+            for name, rival in (("order", "best_order"), ("book", "book"), ("default", "default"))
         },
         {"joint_answer.png": "all.png"},
     ),
@@ -381,9 +378,7 @@ PARTS = {
         ("studies/joint_answer.py", "studies/frame", "studies/codesign"),
         {"joint.orders.table": over_all}
         | {
-            f"joint.orders.{way}-{robot}": interval(
-                *(f"{way}_over_best_order_{robot}{end}" for end in ("", "_low", "_high"))
-            )
+            f"joint.orders.{way}-{robot}": interval(*ends_of(f"{way}_over_best_order_{robot}"))
             for way in ("nested", "joint")
             for robot in ("outdoors", "corridor")
         },
@@ -392,9 +387,7 @@ PARTS = {
         "joint_levers --processes 2",
         (*RACED, "studies/joint_levers.py"),
         {
-            f"joint.levers.{part}": interval(
-                *(f"share_{part}{end}" for end in ("", "_low", "_high"))
-            )
+            f"joint.levers.{part}": interval(*ends_of(f"share_{part}"))
             for part in ("lens", "mount", "sensor", "estimator")
         },
         {"joint_levers.png": "shares.png"},
