@@ -76,7 +76,7 @@ def study(run: Run[Config]) -> None:
         "Error over that of each rival, over all robots (95 % of resampled starts and worlds).",
     )
     said = " ".join(
-        f"{name.capitalize()} leaves {found[way, ORDER]:.2f} of the error of the best order of single parts."
+        f"{name.capitalize()} leaves {found[way, ORDER]:.2f} of the error of the best order that was raced."
         for way, name in WAYS.items()
     )
     few = " So few starts decide nothing." if starts < ENOUGH * len(robots) else ""
