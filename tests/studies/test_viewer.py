@@ -118,7 +118,7 @@ def test_the_lens_that_is_certified_has_the_rays_of_the_setting(setting, monkeyp
 def test_designs_that_runs_handed_over_are_opened_as_they_are(tmp_path):
     space = Space.of("corridor", None, light=0.5)
     whole = space.made(space.share(z_m=0.5, fno=2.5, theta=0.3))
-    save(tmp_path / "design.yaml", whole, 0.1)
+    save(tmp_path / "design.yaml", whole, {"error_unseen": 0.1})
     config = {"pair": "corridor", "robot": None, "family": "thin", "light": 0.5, "speed": 1.0}
     (tmp_path / "config.json").write_text(json.dumps(config))
     back = opened(tmp_path)

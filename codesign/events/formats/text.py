@@ -60,8 +60,8 @@ def read_text(path, asked):
                 order = settled_order(path, table, order)
                 name = next((name for name in names if LETTERS[name] == "t"), "")
                 first = lines.split(b"\n", 1)[0].replace(b",", b" ").split()
-                if unit == "auto" and b"." in first[order.index("t")]:
-                    unit = "s"  # written with decimals, all of them 0 or not
+                if unit == "auto" and [b"." in word for word in first] == [c == "t" for c in order]:
+                    unit = "s"  # the times alone have decimals, all of them 0 or not
                 unit = settled_unit(table[:, order.index("t")], unit, name)
             if len(table):
                 t, x, y, p = (table[:, order.index(letter)] for letter in "txyp")
