@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from codesign.errors import DomainError
 from studies.codesign.page import best_order
-from studies.codesign.race import ENOUGH, answers
+from studies.codesign.race import ENOUGH, answers, paired
 from studies.frame.compare import Interval, crossed, holm, sign_flip
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.show import bars
@@ -40,15 +39,18 @@ def study(run: Run[Config]) -> None:
         raise DomainError("--raw names no table; give answers.jsonl of one run or more.")
     found: dict[tuple[str, str], Interval] = {}
     lines = []
-    arms = [{row["arm"]: None for row in rows} for _, rows in robots]
+    arms = [{row["arm"]: None for row in rows} for _, rows, _ in robots]
     others = [arm for arm in arms[0] if arm not in WAYS and all(arm in each for each in arms)]
     for way in WAYS:
-        logs = {each: [over(rows, way, each) for _, rows in robots] for each in (ORDER, *others)}
+        logs = {
+            each: [paired(rows, way, best if each == ORDER else each) for _, rows, best in robots]
+            for each in (ORDER, *others)
+        }
         p = holm([sign_flip(torch.cat([each.mean(1) for each in of])) for of in logs.values()])
         for (rival, of), chance in zip(logs.items(), p, strict=True):
             found[way, rival] = crossed(*of).ratio()
             line: Row = {"over": f"{WAYS[way]} over {rival}"}
-            for (robot, _), each in zip(robots, of, strict=True):
+            for (robot, *_), each in zip(robots, of, strict=True):
                 alone = crossed(each).ratio()
                 line[robot] = f"{alone:.2f}"
                 run.record(**alone.metrics(plain(way, "over", rival, robot)))
@@ -65,7 +67,7 @@ def study(run: Run[Config]) -> None:
         "all starts after Holm over the rivals of a way. Best order: the one of the raced orders that errs least itself.",
     )
     starts = found["nested", ORDER].count
-    titles = {"over": "error of", **{robot: robot for robot, _ in robots}, "all": "all"}
+    titles = {"over": "error of", **{robot: robot for robot, *_ in robots}, "all": "all"}
     titles |= {"p": "p", "ahead": f"ahead, of {starts}"}
     cells = [list(line.values()) for line in lines]
     run.table("Joint design over its rivals", list(titles.values()), cells)
@@ -80,33 +82,25 @@ def study(run: Run[Config]) -> None:
         for way, name in WAYS.items()
     )
     few = " So few starts decide nothing." if starts < ENOUGH * len(robots) else ""
-    where = ", ".join(robot for robot, _ in robots)
+    where = ", ".join(robot for robot, *_ in robots)
     run.finish("Joint design, all robots", f"Over {starts} starts ({where}): {said}{few}")
 
 
-def read(path: Path) -> tuple[str, list[Row]]:
-    """The robot that answers are of, and the rows of the arms that were raced from every start.
+def read(path: Path) -> tuple[str, list[Row], str]:
+    """The robot that answers are of, the rows of the arms that were raced from every start, and
+    the best order among them.
 
     Raises: FileFormatError for what is no such table; DomainError where those are too few arms.
     """
     setting, rows = answers(path)
     starts = len({row["seed"] for row in rows})
     whole = [row for row in rows if len(select(rows, arm=row["arm"])) == starts]
-    if not {*WAYS} <= set(column(whole, "arm")) or ">" not in best_order(whole):
+    best = best_order(whole)
+    if not {*WAYS} <= set(column(whole, "arm")) or ">" not in best:
         raise DomainError(
             f"'{path}' has not raced {', '.join(WAYS)} and an order of single blocks from all of its {starts} starts."
         )
-    return str(setting["pair"]), whole
-
-
-def over(rows: list[Row], way: str, rival: str) -> Tensor:
-    """Logs [starts, worlds] of a way's error over a rival's."""
-    other = best_order(rows) if rival == ORDER else rival
-    ours, theirs = (
-        torch.tensor(column(sorted(rows, key=lambda row: row["seed"]), "errors", arm=arm)).double()
-        for arm in (way, other)
-    )
-    return (ours / theirs).log()
+    return str(setting["pair"]), whole, best
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ BUDGETS = {
     "studies/codesign": 15_610,  # where answers lie, the best of all answers, what blur does by experiment, what a design was judged in
     "studies/flow_quality": 5_560,  # names of recordings, no truth of rotation alone
     "studies/flow_recording": 3_360,  # windows that are not judged
-    "studies/frame": 9_110,  # titles of columns, options without effect, files that a run was given, tables put together
+    "studies/frame": 9_140,  # titles of columns, options without effect, files that a run was given and read piece by piece, tables put together
     "studies/gradient_flow": 6_300,  # a first line that answers
     "studies/lens_motion": 4_150,  # a table read case by case, poses that stand still
     "studies/lens_opt": 6_470,  # seeds that judge; where windows lie, designs that err alike

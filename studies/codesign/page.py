@@ -66,10 +66,8 @@ def answer(
         ways["nested"] = "Lens and mount together, with sensor and estimator solved at every step,"
     for arm, way in ways.items():
         over, p = compared(rows, arm)[name]
-        ends = [math.exp(value) for value in (over.value, over.low, over.high)]
         said.append(
-            f"{way} {over.outcome}: {ends[0]:.2f} ({ends[1]:.2f} to {ends[2]:.2f}) times its error in "
-            f"unseen worlds (p = {p:.2g} after Holm)."
+            f"{way} {over.outcome}: {over.ratio():.2f} times its error in unseen worlds (p = {p:.2g} after Holm)."
         )
     return " ".join(said)
 
@@ -105,10 +103,11 @@ def race(
         }
         if arm in found:
             over, p = found[arm]
+            ratio = over.ratio()
             line |= {
-                "joint_over": math.exp(over.value),
-                "low": math.exp(over.low),
-                "high": math.exp(over.high),
+                "joint_over": ratio.value,
+                "low": ratio.low,
+                "high": ratio.high,
                 "p": p,
                 "head_joint_over": math.exp(by_head[arm][0].value),
             }
@@ -149,7 +148,7 @@ def every_ratio(rows: Sequence[Row]) -> dict[tuple[str, str], tuple[Interval, fl
     """(arm, other) -> the ratio of their errors over paired starts and worlds, and its p after
     Holm over the rivals of the arm."""
     return {
-        (arm, other): (Interval(*map(math.exp, (over.value, over.low, over.high)), over.count), p)
+        (arm, other): (over.ratio(), p)
         for arm in dict.fromkeys(row["arm"] for row in rows)
         for other, (over, p) in compared(rows, arm).items()
     }

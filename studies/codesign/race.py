@@ -26,6 +26,7 @@ from studies.codesign.problem import Drawn
 from studies.frame import workers
 from studies.frame.compare import Interval, crossed, holm, sign_flip
 from studies.frame.config import check_least
+from studies.frame.sweep import Row, column
 from studies.placement.problem import DRIVES, check_drives
 
 EDGE = 0.1  # of the cube, that starts keep from its walls
@@ -296,15 +297,21 @@ class Judge:
         ]
 
 
+def paired(rows: Sequence[Row], ours: str, theirs: str, of: str = "errors") -> Tensor:
+    """Logs [starts, worlds] of an arm's error over another's, from the same starts."""
+    by_start = sorted(rows, key=lambda row: row["seed"])
+    one, other = (
+        torch.tensor(column(by_start, of, arm=arm), dtype=torch.float64) for arm in (ours, theirs)
+    )
+    return (one / other).log()
+
+
 def compared(
-    rows: Sequence[Mapping[str, Any]], ours: str = "joint", of: str = "errors"
+    rows: Sequence[Row], ours: str = "joint", of: str = "errors"
 ) -> dict[str, tuple[Interval, float]]:
     """The log ratio of our error to each rival's over paired seeds and worlds, and its p after
     Holm."""
-    errors = {
-        arm: torch.tensor([row[of] for row in rows if row["arm"] == arm], dtype=torch.float64)
-        for arm in dict.fromkeys(row["arm"] for row in rows)
-    }
-    logs = {arm: (errors[ours] / theirs).log() for arm, theirs in errors.items() if arm != ours}
+    rivals = dict.fromkeys(row["arm"] for row in rows if row["arm"] != ours)
+    logs = {arm: paired(rows, ours, arm, of) for arm in rivals}
     adjusted = holm([sign_flip(each.mean(1)) for each in logs.values()])
     return {arm: (crossed(each), p) for (arm, each), p in zip(logs.items(), adjusted, strict=True)}

@@ -3,20 +3,27 @@
 import dataclasses
 import hashlib
 from collections.abc import Iterable, Mapping
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from codesign.errors import DomainError
 from studies.frame.config import StudyConfig
 
 
-def digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()[:12]
+def digest(content: bytes | BinaryIO) -> str:
+    """Of bytes, or of an open file, which is read piece by piece."""
+    content = BytesIO(content) if isinstance(content, bytes) else content
+    return hashlib.file_digest(content, "sha256").hexdigest()[:12]
 
 
 def digests(paths: Iterable[Path]) -> dict[str, str]:
     """Name -> digest of the files among some paths."""
-    return {f"'{path}'": digest(path.read_bytes()) for path in paths if path.is_file()}
+    found = {}
+    for path in filter(Path.is_file, paths):
+        with path.open("rb") as content:
+            found[f"'{path}'"] = digest(content)
+    return found
 
 
 def given(config: StudyConfig) -> list[Path]:
