@@ -8,6 +8,7 @@ import pytest
 
 from tests.processes import ROOT, script
 
+parts = script("evidence_parts")  # which the other takes its parts from
 evidence = script("evidence")
 
 
@@ -38,9 +39,9 @@ def test_what_is_kept_is_what_the_parts_make():
 
 def test_texts_of_metrics():
     metrics = {"a_median_p": 0.714, "a_low95_p": 0.5651, "a_high95_p": 0.92}
-    assert evidence.ratio("a", "p")(metrics) == "0.71 (0.57 to 0.92)"
+    assert parts.ratio("a", "p")(metrics) == "0.71 (0.57 to 0.92)"
     logs = {"x_as_it_is_b_c": math.log(0.84), "y_as_it_is_b_c": math.log(0.72), "y_turned_b_c": 1.0}
-    assert evidence.gains("b_c")(logs) == "16 to 28 %"
+    assert parts.gains("b_c")(logs) == "16 to 28 %"
     with pytest.raises(KeyError):
         evidence.written("<!--fig:nowhere--><!--/-->", {})
 

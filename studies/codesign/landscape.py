@@ -142,7 +142,7 @@ class Looks:
 
     def row(self, name: str, share: Tensor) -> Row:
         """Hard errors of single events and of the memory layer; the expected one without
-        calibration."""
+        calibration; by how much blur differs over the windows of a drive."""
         whole = self.space.made(share)
         looked = self.drawn.looked(whole, self.drawn.draw(LOOKED))
         single = looked.again(whole, "sensor")
@@ -154,7 +154,11 @@ class Looks:
         )
         hard = torch.cat([single.hard(), looked.hard()]).mean()
         plain = self.drawn.expected(looked.seen, looked.seen.read, FlowErrors()).mean()
-        return {"share": share.tolist(), "hard": float(hard), "plain": float(plain)}
+        # diameters of even discs of that root mean square radius
+        blur_px = 8**0.5 * looked.optics[..., 1].expm1()
+        span = (blur_px.amax(1) - blur_px.amin(1)).median()
+        row = {"share": share.tolist(), "hard": float(hard), "plain": float(plain)}
+        return {**row, "blur_span_px": float(span)}
 
     def stored(self, name: str) -> tuple[Seen, Conditions]:
         """What was seen of a design."""

@@ -19,6 +19,7 @@ from studies.codesign import couplings, gallery, slopes
 from studies.codesign import race as codesign_race
 from studies.codesign.arms import ARMS, Task, Way, chosen_by_the_book, read_out
 from studies.codesign.design import Space
+from studies.codesign.landscape import Looks
 from studies.codesign.objective import Objective
 from studies.codesign.page import best_order, every_ratio
 from studies.codesign.problem import Drawn
@@ -291,6 +292,17 @@ def test_a_held_lens_is_focused_by_the_book_as_what_it_is():
     assert found["focus_per_m"] == pytest.approx(
         1e3 * 4.0 * robot_pair.PITCH_MM / found["efl_mm"] ** 2
     )
+
+
+def test_blur_over_the_view_goes_with_the_aperture(space, tmp_path):
+    """By similar triangles, whatever the camera sees."""
+    size = SimpleNamespace(worlds=2, per_draw=2)
+    looks = Looks(SimpleNamespace(config=size, path=lambda name: tmp_path / name), space)
+    wide, stopped = (
+        looks.row(str(fno), space.share(fno=fno, focus_per_m=0.5))["blur_span_px"] for fno in (2, 8)
+    )
+    assert wide == pytest.approx(4 * stopped, rel=0.01)
+    assert wide > 1
 
 
 SMALL = (
