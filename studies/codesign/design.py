@@ -136,17 +136,29 @@ class Space:
 
     @cached_property
     def default(self) -> dict[str, float]:
-        """The pair's own design."""
-        return {**vars(self.pair.design), **DEFAULTS, **self.held}
+        """The pair's own design, as near as its family of lenses comes to it."""
+        own = {**vars(self.pair.design), **DEFAULTS}
+        for name, (low, high) in self._reach.items():
+            own[name] = min(max(own[name], low), high)
+        return {**own, **self.held}
+
+    @cached_property
+    def _reach(self):
+        if not self.pair.family:
+            return {}
+        family = lens.family(self.pair.family)
+        shortest, longest = family.efl_mm[[0, -1]].tolist()
+        return {"efl_mm": (shortest, longest), "fno": family.fno}
 
     def limits(self, name: str) -> tuple[float, float]:
-        """Bounds of a number."""
+        """Bounds of a number; of a lens no wider than its family's."""
         if name in self.bounds:
             return self.bounds[name]
-        if name == "fno" and self.pair.family:
-            return lens.family(self.pair.family).fno
         low, high = (getattr(each, name, None) for each in (self.pair.low, self.pair.high))
-        return BOUNDS[name] if name in BOUNDS and low == high else (low, high)
+        if name in BOUNDS and low == high:
+            low, high = BOUNDS[name]
+        reach = self._reach.get(name)
+        return (max(low, reach[0]), min(high, reach[1])) if reach else (low, high)
 
     def part(self, name: str) -> list[int]:
         """Places of a part's numbers (PARTS) among those that are free."""
