@@ -146,6 +146,10 @@ def test_a_larger_image_circle_scales_all_lengths(family):
         torch.testing.assert_close(getattr(large, name), 2.0**power * getattr(small, name))
 
 
+def test_families_are_named_those_of_most_elements_first():
+    assert NAMES == ("retrofocus-4", "retrofocus-3", "retrofocus-2")
+
+
 def test_a_family_lens_is_saved_copied_and_converted(tmp_path):
     import copy
 

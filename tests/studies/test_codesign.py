@@ -388,6 +388,13 @@ def test_a_search_expects_the_least_that_it_has_seen(drawn, space):
     assert way.expected == min(way.errors) < way.errors[-1]
 
 
+def test_a_design_begins_at_the_nearest_f_number_of_its_family():
+    for family in lens.family_names():
+        space = Space.of("outdoors", family)
+        found = space.numbers(space.start)["fno"]
+        assert found == pytest.approx(lens.family(family).fno[0])
+
+
 def test_a_traced_design_is_handed_over_with_its_lens(tmp_path):
     space = Space.of("outdoors", "retrofocus-4")
     whole = space.made(start(space, 0))
