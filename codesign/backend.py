@@ -395,6 +395,24 @@ def first_only(
     return [None if g is None else next(sealed) for g in found]
 
 
+def differentiable_once(found: Tensor, sentence: str) -> Tensor:
+    """What was found, with its gradient; differentiating that again raises GradientError with the
+    sentence."""
+    return _Once.apply(sentence, found) if found.requires_grad else found  # pyright: ignore[reportReturnType]
+
+
+class _Once(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, sentence: str, found: Tensor) -> Tensor:
+        ctx.sentence = sentence
+        ctx.save_for_backward(found)
+        return found.view_as(found)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return None, first_only([grad], ctx.saved_tensors, ctx.sentence)[0]
+
+
 class NoSecondDerivative(torch.autograd.Function):
     """Passes the first ``count`` tensors, gradients, on unchanged; differentiating them again
     raises GradientError with ``sentence``."""

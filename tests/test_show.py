@@ -84,6 +84,10 @@ def test_poses_are_a_path_from_above_with_headings():
         np.testing.assert_allclose(axis.lines[0].get_ydata(), -2, rtol=1e-6)
         (headings,) = axis.collections
         np.testing.assert_allclose((headings.U, headings.V), (np.ones(5), np.zeros(5)), atol=1e-6)
+    far = poses.double()
+    far[:, 1, 3] += 4_649_776.0  # metres north, as of UTM
+    north = codesign.show(far.numpy()).axes[0].lines[0].get_ydata()
+    np.testing.assert_allclose(north, 4_649_774.0, rtol=0, atol=1e-6)
     (one,) = codesign.show(start).axes[0].collections
     np.testing.assert_allclose((one.X, one.Y, one.U), ([1], [-2], [1]), atol=1e-6)
 

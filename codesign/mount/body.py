@@ -10,6 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from codesign.backend import differentiable_once
 from codesign.checks import check_finite, check_number, check_positive
 from codesign.errors import DomainError, ShapeError
 from codesign.mount.triangles import (
@@ -153,7 +154,10 @@ def _signed(points, triangles):
         sign = torch.where(inside, -1.0, 1.0).to(points)
         close = far <= ON_SURFACE_M
         slope = torch.where(close[:, None], normal, (sign / far.clamp_min(1e-300))[:, None] * away)
-    return sign * far + ((points - points.detach()) * slope).sum(-1)
+    return differentiable_once(
+        sign * far + ((points - points.detach()) * slope).sum(-1),
+        "the gradient of a distance to a body has none of its own; use differences of gradients.",
+    )
 
 
 def _of_segments(start, end, triangles):

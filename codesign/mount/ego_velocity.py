@@ -213,7 +213,7 @@ class EgoVelocity:
         for world in scene if isinstance(scene, tuple | list) else (scene,):
             if isinstance(world, MovingScene):
                 world.check_length(poses.shape[1])
-        middle = pixels + over * flow.detach()  # where the points are at that frame
+        middle = pixels + over * flow  # where the points are at that frame
         mounts = (
             T_body_cam.to(poses.device, torch.float64)
             .expand(*T_world_cam.shape[:-3], 4, 4)
@@ -236,7 +236,8 @@ class EgoVelocity:
             nearest = torch.where(on_surface, known.nearest_m, torch.inf)
             near, _ = self._rows(looked, nearest)
             parallax = (near - rows) / (1 / known.nearest_m - known.mean_per_m)
-        share = INDEPENDENT * looked.windows / flow.shape[1] * on_surface.to(flow)
+        independent = min(INDEPENDENT * looked.windows / flow.shape[1], 1.0)  # of the points
+        share = independent * on_surface.to(flow)
         return Readings(
             looked.places[1],
             flow,

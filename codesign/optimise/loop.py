@@ -182,6 +182,7 @@ class Loop:
             "shrunk": self._shrunk,
             "record": deepcopy(vars(self.record)),
             "optimiser": type(self.optimiser).__name__,
+            "rates": [float(group["lr"]) for group in self.optimiser.param_groups],
         }
         for i, parameter in enumerate(self.parameters):
             for name, value in self.optimiser.state.get(parameter, {}).items():
@@ -196,7 +197,8 @@ class Loop:
 
     @torch.no_grad()
     def resume(self, tensors: dict[str, Tensor], numbers: dict[str, Any]) -> "Loop":
-        """Go on from ``state()``; the same steps follow as without the break.
+        """Go on from ``state()``, learning rates included; the same steps follow as without the
+        break. A schedule's own state is the caller's.
 
         Raises: ShapeError when the state is of other parameters; DomainError when it is of another
           optimiser.
@@ -220,6 +222,8 @@ class Loop:
         self.best = [tensors[f"best_{i}"].to(p).clone() for i, p in enumerate(self.parameters)]
         self.best_score = math.inf if numbers["best_score"] is None else numbers["best_score"]
         self._shrunk = numbers["shrunk"]
+        for group, rate in zip(self.optimiser.param_groups, numbers.get("rates", ()), strict=False):
+            group["lr"] = rate
         self.record = Record(**deepcopy(numbers["record"]))
         self.optimiser.state.clear()
         for name, value in tensors.items():

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from codesign.backend import differentiable_once
 from codesign.checks import check_finite, check_kind, check_seed, check_whole
 from codesign.errors import DomainError, ShapeError
 from codesign.render.film import Film, check_memory, coarse_pixels, film_pupil_pattern
@@ -376,7 +377,10 @@ def project(camera: Camera, points_cam_m: Tensor, pupil: Tensor | None = None) -
         & (rays.direction.detach()[:, 2] > 1e-6)
         & (change.detach().abs() < 1e-3).all(1)
     )
-    return torch.where(found[:, None], rough.at_px - change, torch.nan).reshape(shape)
+    at_px = torch.where(found[:, None], rough.at_px - change, torch.nan).reshape(shape)
+    return differentiable_once(
+        at_px, "project: its gradient has none of its own; use differences of gradients."
+    )
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from codesign.backend import differentiable_once
 from codesign.checks import check_choice, check_kind, check_positive
 from codesign.errors import DomainError
 from codesign.pose import Poses, inverse, se3_exp
@@ -153,7 +154,9 @@ def by_differences(rays: Rays, camera: Camera, views: Views) -> Tensor:
             ahead, behind = (at(sign * size).reshape(found.shape) for sign in (1, -1))
             slope = (ahead - behind) / (2 * size)
         found = found + slope * number.to(found)
-    return found
+    return differentiable_once(
+        found, "frames: gradient 'difference' has none of its own; use differences of gradients."
+    )
 
 
 def _objects_ask(scene):

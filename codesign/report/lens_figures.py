@@ -168,11 +168,11 @@ def psf_pictures(psfs: Sequence[Psf], titles: Sequence[str]) -> Figure:
     figure, axes = _grid(1, len(psfs), 2.9, 3.0)
     for axis, psf, title in zip(axes[0], psfs, titles, strict=True):
         energy = psf.energy.detach().numpy()
-        x, y = (energy.shape[0] / 2 * float(p) * 1e3 for p in psf.pitch_mm.detach())
+        count = len(energy)  # the reference is in the middle of pixel count // 2
+        edges = np.array([-(count // 2), count - count // 2]) - 0.5
+        x, y = (edges * float(p) * 1e3 for p in psf.pitch_mm.detach())
         picture = np.maximum(energy / max(energy.max(), 1e-300), FLOOR)
-        axis.imshow(
-            picture, origin="lower", extent=(-x, x, -y, y), cmap="magma", norm=LogNorm(FLOOR, 1)
-        )
+        axis.imshow(picture, origin="lower", extent=(*x, *y), cmap="magma", norm=LogNorm(FLOOR, 1))
         axis.set(xlabel="x (µm)")
         axis.set_title(title, fontsize=9)
     axes[0, 0].set_ylabel("y (µm)")

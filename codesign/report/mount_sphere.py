@@ -6,10 +6,13 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+import torch
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from torch import Tensor
+
+from codesign.errors import DomainError
 
 COLOURS = ("#d62728", "#1f77b4", "#ff7f0e", "#e377c2", "#17becf", "#8c564b")
 
@@ -30,14 +33,16 @@ def mount_sphere(
       values: [rows, columns] > 0, on a logarithmic scale.
       label: of them.
       marked: name -> yaw and pitch of directions to mark.
+    Raises: DomainError for directions that are not those of a whole sphere, in whatever order.
     """
+    values = _in_order(yaw_rad, pitch_rad, values.detach())
     rows, columns = values.shape
     figure = plt.figure(figsize=(8.6, 4.8), layout="constrained")
     axes: Any = figure.add_subplot(projection="mollweide")
     across = np.linspace(-math.pi, math.pi, columns + 1)
     upwards = np.linspace(-math.pi / 2, math.pi / 2, rows + 1)
     # yaw grows to the left and pitch downwards
-    shown = values.detach().numpy()[::-1, ::-1]
+    shown = values.numpy()[::-1, ::-1]
     mesh = axes.pcolormesh(
         across,
         upwards,
@@ -71,3 +76,18 @@ def mount_sphere(
             frameon=False,
         )
     return figure
+
+
+def _in_order(yaw_rad, pitch_rad, values):
+    """Values [rows, columns], from yaw -pi and pitch -pi / 2 on."""
+    for at, whole, axis in ((yaw_rad, 2 * math.pi, 1), (pitch_rad, math.pi, 0)):
+        count = values.shape[axis]
+        at = (at.detach().double() + whole / 2) % whole
+        middles = whole / count * (torch.arange(count, dtype=torch.float64) + 0.5)
+        if at.shape != middles.shape or not torch.allclose(at.sort().values, middles, atol=1e-4):
+            raise DomainError(
+                "mount_sphere: directions are not the middles of equal cells over the whole sphere; give those of "
+                "mount.sight_map."
+            )
+        values = values.index_select(axis, at.argsort())
+    return values

@@ -87,12 +87,14 @@ def show(
     1
     """
     if isinstance(x, np.ndarray) and x.dtype.kind in "buif":
-        x = torch.from_numpy(x.astype(np.float32))
+        x = torch.from_numpy(x.astype(np.float64))
+        x = x if _are_poses(x) else x.float()  # paths may lie far from the origin
     if isinstance(x, Mount):
         figure = _mount(x, camera, list(body))
     elif isinstance(x, EventStream):
         first_us, last_us = x.t_us[[0, -1]].tolist() if len(x) else (0, 0)
-        counts = to_counts(x, [1e-6 * (first_us - 1), 1e-6 * last_us])
+        ends_us = torch.tensor([first_us - 1, last_us], dtype=torch.float64)
+        counts = to_counts(x, 1e-6 * ends_us)
         figure = _row([(f"{len(x):,} events", counts, _events)])
     elif isinstance(x, EventVolume):
         sums = x.counts.detach().sum(2)[:MOST]

@@ -21,8 +21,9 @@ from codesign.reading import building, read_bytes, read_text
 
 FORMAT = "codesign mount 1"
 MOST_BYTES = 50_000_000  # of a lens file
-# metres, and entries of the rotation, between the transform and the mount's own numbers
-AGREES = 1e-9
+# metres, and entries of the rotation, between the transform and the mount's own numbers, which may
+# be of single precision
+AGREES = 1e-6
 # what a film says of itself; where its coordinates are computed is not a part of it
 FILM = tuple(name for name in render.Film.__dataclass_fields__ if name != "device")
 COMMENT = """Pose of a camera on a robot, p_parent = R p_child + t: metres, unit quaternion (x, y, z, w).
@@ -67,7 +68,7 @@ def save_hand_over(path: str | Path, handed: HandOver) -> None:
     page: dict[str, Any] = {"format": FORMAT, "transform": _transform(pose, handed)}
     yaw, pitch, roll = yaw_pitch_roll_rad(pose).tolist()
     page["urdf_origin"] = {"xyz_m": pose[:3, 3].tolist(), "rpy_rad": [roll, pitch, yaw]}
-    page["lens"] = _lens_page(camera.lens, path)
+    page["lens"] = {}  # in this place
     page["camera"] = {
         **{name: value for name in FILM if (value := getattr(camera.film, name)) is not None},
         **{name: getattr(camera, name) for name in ("samples_per_pixel", "seed", "falloff", "aim")},
@@ -86,6 +87,8 @@ def save_hand_over(path: str | Path, handed: HandOver) -> None:
     page["mount"] = {
         name: value.detach().tolist() for name, value in handed.mount.state_dict().items()
     }
+    plain_yaml.dump(page)  # what it refuses is refused before a lens is replaced
+    page["lens"] = _lens_page(camera.lens, path)
     write_atomic(path, plain_yaml.dump(page, COMMENT).encode())
 
 
@@ -174,14 +177,14 @@ def _mount(page, pose: Tensor) -> Mount:
 def _lens_page(lens, path):
     lens = lens.replace() if hasattr(lens, "replace") else lens  # its values now, of variables too
     dtype = str(getattr(lens, "dtype", torch.float64)).removeprefix("torch.")
-    if isinstance(lens, lenses.ThinLens):
+    if type(lens) in (lenses.ThinLens, lenses.Pinhole):  # another class may map otherwise
         efl_mm, image_mm = (
             float(value.detach()) for value in (lens.efl_mm, lens.image_distance_mm)
         )
         page = {"kind": "thin", "dtype": dtype, "efl_mm": efl_mm}
         page["entrance_pupil_diameter_mm"] = lens.entrance_pupil_diameter_mm
         return page if image_mm == efl_mm else {**page, "image_distance_mm": image_mm}
-    if isinstance(lens, lenses.GeoLens):
+    if type(lens) is lenses.GeoLens:
         file = path.with_suffix(".lens.json")
         lenses.save(lens, file)
         return {"kind": "traced", "dtype": dtype, "file": file.name, "sha256": _digest(file)}

@@ -1,5 +1,6 @@
 """One pass of a system: each stage runs when what it makes is first asked for."""
 
+import math
 from collections import ChainMap
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -88,7 +89,22 @@ class Pass(Mapping[str, Any]):
             raise DomainError(
                 f"objective '{name}' returned a {type(value).__name__}; return a tensor."
             )
+        self._check_interval({"field", "volume", "truth"} & set(self.asked[f"objective {name}"]))
         return value
+
+    def _check_interval(self, asked: set[str]) -> None:
+        """Raise DomainError where the truth that an objective asks for is of another interval."""
+        lasts_s = {
+            each: float(value.collected_s.sum() if each == "volume" else value.interval_s)
+            for each in asked
+            if isinstance(value := self[each], EventVolume | FlowField)
+        }
+        for each, seconds in lasts_s.items():
+            if "truth" in asked and not math.isclose(seconds, lasts_s["truth"], rel_tol=1e-3):
+                raise DomainError(
+                    f"'{each}' is over {seconds:.6g} s and the truth over {lasts_s['truth']:.6g} s; give events and truth of "
+                    "one interval."
+                )
 
     def _call(self, name, part, *inputs, **instead):
         stage = self.system.stage(name, part)

@@ -10,6 +10,7 @@ from codesign import lens
 from codesign.errors import DomainError
 from codesign.lens import GeoLens, Surface, analysis
 from codesign.lens.analysis import (
+    Psf,
     diffraction_mtf,
     diffraction_psf,
     geometric_mtf,
@@ -19,6 +20,7 @@ from codesign.lens.analysis import (
     through_focus_mtf,
     through_focus_spot_mm,
 )
+from codesign.report.lens_figures import psf_pictures
 from tests.lens.systems import LINES, close, paraboloid
 from tests.numbers import D, f64
 
@@ -57,6 +59,18 @@ def test_the_two_transforms_agree(field, share, pitch):
     close(pixels.energy, fft.energy[40:88, 40:88], atol=share * float(fft.energy.max()))
     # w N / padding, N to (y / f)^2
     close(fft.pitch_mm[0], f64(0.5875618e-3 * 99.65 / 12 / 2), 5e-3)
+
+
+@pytest.mark.parametrize("count", [8, 9])
+def test_the_reference_of_a_picture_is_at_zero(count):
+    energy = torch.zeros(count, count)
+    energy[count // 2, count // 2] = 1.0
+    (drawn,) = psf_pictures([Psf(energy, f64([1e-3] * 2), f64([0.0] * 2))], ["one"]).axes[0].images
+    left, right, bottom, top = drawn.get_extent()
+    share = (count // 2 + 0.5) / count
+    assert left + share * (right - left) == pytest.approx(0, abs=1e-9)
+    assert bottom + share * (top - bottom) == pytest.approx(0, abs=1e-9)
+    assert right - left == pytest.approx(count)  # micrometres
 
 
 def test_the_geometric_spread_keeps_light_and_its_mean():

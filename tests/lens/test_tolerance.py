@@ -140,6 +140,8 @@ def test_linear_forecast_and_trials_agree(triplet):
     # errors of a thousandth bend their effect by about as much
     assert found.correlation.min() >= 0.9999
     assert found.bias.abs().max() <= 4 / 400**0.5
+    # a forecast of nothing has nothing to do with what trials change
+    assert compare(0 * slopes, trials).correlation.tolist() == [0.0] * 5
     median = trials.figures.quantile(0.5, dim=0)
     close(trials.quantiles((0.5,))[0], median, 1e-12)
 

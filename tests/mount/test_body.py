@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from codesign.errors import GradientError
 from codesign.mount import Body, Housing
 from codesign.mount.pose import attitude
 from codesign.mount.triangles import closest_points, first_crossings
@@ -125,6 +126,9 @@ def test_gradient_of_the_distance(generator):
     on_face = torch.tensor([[0.1, 0.05, 0.4]], dtype=D, requires_grad=True)
     (slope,) = torch.autograd.grad(Body([box_mesh(*BOX)]).distance_m(on_face).sum(), on_face)
     close(slope[0], f64([0.0, 0.0, 1.0]), atol=1e-12)
+    # beyond a corner distances bend, which the slope at the nearest point does not know
+    with pytest.raises(GradientError, match="has none of its own"):
+        torch.autograd.functional.hessian(lambda at: body.distances_m(at).square().sum(), points)
 
 
 def test_a_capsule_is_its_spheres(generator):

@@ -76,7 +76,11 @@ def test_readings_beside_the_truth_are_two_readings(camera, drive, depth):
     close(still.rows, true.rows)
 
 
-def test_least_squares_written_out_with_covariance_and_confidence(camera, drive):
+@pytest.mark.parametrize(("every_px", "independent"), [(8, 3 / 16), (32, 1.0)])
+def test_least_squares_written_out_with_covariance_and_confidence(
+    camera, drive, every_px, independent
+):
+    """Points of a window count as three, a lone one as itself."""
     mount, poses, _, flow = drive
     generator = seeded(5)
     noisy = flow + 0.1 * randn64(generator, flow.shape)
@@ -85,15 +89,15 @@ def test_least_squares_written_out_with_covariance_and_confidence(camera, drive)
     confidence = rand64(generator, flow[:, 0].shape)
     field = FlowField(noisy, confidence > 0, INTERVAL_S, confidence, torch.stack([xx, xy, yy], 1))
     prior = (1.0, 0.5, 2.0)
-    ours = EgoVelocity(PLANAR, prior, every_px=8, floor_px=0.05, outlier=None)
+    ours = EgoVelocity(PLANAR, prior, every_px=every_px, floor_px=0.05, outlier=None)
     found = ours(field, camera, None, mount, poses)
     body = 2
     normal = torch.diag(f64(prior) ** -2)
     right = torch.zeros(3, dtype=D)
     for window, (left, top) in enumerate(WINDOWS):
         sample = body * len(WINDOWS) + window
-        for row in range(4, 32, 8):
-            for column in range(4, 32, 8):
+        for row in range(every_px // 2, 32, every_px):
+            for column in range(every_px // 2, 32, every_px):
                 seen = noisy[sample, :, row, column]
                 at = f64([left + column, top + row]) + seen / 2
                 depth = ground_depth(camera, at[None, None], poses[body : body + 1, 1])
@@ -101,7 +105,7 @@ def test_least_squares_written_out_with_covariance_and_confidence(camera, drive)
                 j = rows[0][:, list(PLANAR)] * INTERVAL_S
                 here = sample, row, column
                 spread = torch.stack([xx[here], xy[here], xy[here], yy[here]]).reshape(2, 2)
-                precision = torch.linalg.inv(spread + 0.05**2 * torch.eye(2, dtype=D)) * 3 / 16
+                precision = independent * torch.linalg.inv(spread + 0.05**2 * torch.eye(2, dtype=D))
                 normal += confidence[here] * j.T @ precision @ j
                 right += j.T @ precision @ seen
     close(found.velocity[body], torch.linalg.solve(normal, right), rtol=1e-9, atol=1e-12)
@@ -154,16 +158,19 @@ def test_what_is_not_valid_means_nothing_and_nan_that_is_valid_is_refused(camera
         solved(torch.nan, field.valid)
 
 
-def test_gradient_to_the_mount(camera, drive):
+def test_gradient_to_the_mount_and_to_the_flow(camera, drive):
     mount, poses, _, flow = drive
     body = poses[:1] @ torch.linalg.inv(mount)
     ours = EgoVelocity(PLANAR, (1.0,) * 3, steps=2)
 
-    def velocity(shift):
-        turned = mount @ pose.se3_exp(shift)
-        return ours(field_of(flow[:3], INTERVAL_S), camera, None, turned, body @ turned).velocity[0]
+    noise = randn64(seeded(6), flow[:3].shape)
 
-    still = torch.zeros(6, dtype=D, requires_grad=True)
+    def velocity(shift, more):
+        turned = mount @ pose.se3_exp(shift)
+        field = field_of(flow[:3] + more * noise, INTERVAL_S)
+        return ours(field, camera, None, turned, body @ turned).velocity[0]
+
+    still = torch.zeros(6, dtype=D, requires_grad=True), f64(0.1).requires_grad_()
     # rounding 1e-12 over the step, truncation step^2
     assert torch.autograd.gradcheck(velocity, still, eps=1e-6, rtol=1e-5, atol=1e-6)
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from codesign import lens, render
+from codesign.errors import DomainError
 from codesign.mount import (
     ATTITUDES,
     PLANAR,
@@ -125,7 +126,12 @@ def test_the_picture_shows_the_map(camera, over_ground):
     assert sorted(shown.flatten().tolist()) == sorted(error.flatten().tolist())
     line = figure.axes[0].lines[-1]
     assert np.asarray(line.get_xydata()).tolist() == [[-0.3, -1.0]]
-    plt.close(figure)
+    # in whatever order directions come, whole turns aside
+    turned = mount_sphere((yaw + math.tau) % math.tau, pitch.flip(0), error.flip(0), "error")
+    assert np.array_equal(turned.axes[0].collections[0].get_array(), shown)
+    with pytest.raises(DomainError, match="middles of equal cells over the whole sphere"):
+        mount_sphere(yaw / 2, pitch, error, "error")
+    plt.close("all")
 
 
 def test_precision_is_the_inverse(generator):

@@ -199,6 +199,8 @@ def test_a_schedule_and_a_rate_set_between_runs_are_kept():
     # 0.1 (1 + 1/2 + 1/4 ...)
     assert way == pytest.approx([0.2 * (1 - 0.5**k) for k in range(1, 6)])
     optimiser.param_groups[0]["lr"] = 0.01
+    other = Loop(torch.optim.SGD([x], lr=0.1), loop.samples, clip=10.0).resume(*loop.state())
+    assert other.optimiser.param_groups[0]["lr"] == 0.01
     loop.run(7)
     assert x.item() == pytest.approx(way[-1] + 0.02)
     assert optimiser.param_groups[0]["lr"] == 0.01

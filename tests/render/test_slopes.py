@@ -4,11 +4,12 @@ rays visit what."""
 import pytest
 import torch
 
-from codesign import pose, render
+from codesign import lens, pose, render
 from codesign.errors import GradientError
 from codesign.render import pixel_means
 from codesign.render.wavefront import look, shade
 from codesign.types import Rays
+from scenes import worlds
 from tests.numbers import close, rand64, randn64
 
 FRAMES = 3
@@ -78,6 +79,32 @@ def test_second_derivatives_are_refused(rays, motion):
     (grad,) = torch.autograd.grad(pictures(*rays, *motion).sum(), motion[:1], create_graph=True)
     with pytest.raises(GradientError, match="first derivatives only"):
         grad.sum().backward()
+
+
+def by_difference(shift):
+    poses = pose.look_at((0.0, -2.0, 0.0), (0.0, 0.0, 0.0)).repeat(2, 1, 1)
+    poses = torch.cat([poses[:, :3, :3], poses[:, :3, 3:] + shift[:, None]], 2)
+    poses = torch.cat([poses, torch.tensor([0.0, 0, 0, 1]).double().expand(2, 1, 4)], 1)
+    behind = render.Camera(lens.Pinhole(8.0), 4, 4, 0.1, 2)
+    return render.frames(behind, worlds.smooth_plane(), poses, "difference")
+
+
+@pytest.mark.parametrize(
+    "found",
+    [
+        lambda shift: render.project(
+            render.Camera(lens.Pinhole(8.0), 4, 4, 0.1, 1), 1 + shift[None]
+        ),
+        by_difference,
+    ],
+    ids=["project", "difference"],
+)
+def test_gradients_at_a_point_that_is_held_have_none_of_their_own(found):
+    """Hessians of squares would lack what the point's own motion adds."""
+    with pytest.raises(GradientError, match="has none of its own"):
+        torch.autograd.functional.hessian(
+            lambda shift: found(shift).square().sum(), torch.zeros(3).double()
+        )
 
 
 @pytest.mark.parametrize("shape", ["sphere", "rectangle", "cube"])

@@ -4,6 +4,7 @@ file by sentence."""
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -158,6 +159,9 @@ def test_what_cannot_be_handed_over_gets_a_sentence(tmp_path, generator):
     mount = found_mount(generator)
     camera = CAMERAS["pinhole"]()
 
+    class Fisheye(lens.ThinLens):
+        pass
+
     class Own:
         def camera_rays(self, *args: Any, **kwargs: Any) -> Any:
             raise NotImplementedError
@@ -168,6 +172,18 @@ def test_what_cannot_be_handed_over_gets_a_sentence(tmp_path, generator):
         save_hand_over(tmp_path / "mount.yaml", HandOver(mount, camera, parent_frame=""))
     with pytest.raises(DomainError, match="kept by no file"):
         save_hand_over(tmp_path / "mount.yaml", HandOver(mount, camera.with_lens(Own())))
+    with pytest.raises(DomainError, match="a Fisheye is kept by no file"):
+        save_hand_over(
+            tmp_path / "mount.yaml", HandOver(mount, camera.with_lens(Fisheye(3.4, 0.5)))
+        )
     with pytest.raises(FileFormatError, match="no file lies at"):
         load_hand_over(tmp_path / "nothing.yaml")
     assert list(tmp_path.iterdir()) == []
+    # what is refused leaves what was handed over before
+    save_hand_over(tmp_path / "mount.yaml", HandOver(mount.float(), CAMERAS["windows"]()))
+    with pytest.raises(DomainError, match="float32 is not JSON"):
+        save_hand_over(
+            tmp_path / "mount.yaml",
+            HandOver(mount, CAMERAS["float32"](), notes={"error": np.float32(0.1)}),  # pyright: ignore[reportArgumentType]
+        )
+    load_hand_over(tmp_path / "mount.yaml")

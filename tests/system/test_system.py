@@ -2,6 +2,7 @@
 refusals."""
 
 import copy
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -88,6 +89,13 @@ def toy(**parts):
     """loss = (3 * 2 * a)^2 with a = 0.5."""
     usual = {"camera": ToyCamera(Glass()), "render": render_sum, "events": doubled, "flow": tripled}
     return System(**{**usual, "objectives": {"square": square}, **parts})
+
+
+def missed(interval_s):
+    """A pass judged by a truth of that interval; the flow's is 1 s."""
+    truth = replace(field_of(ONE.reshape(1, 1, 1, 1)), interval_s=interval_s)
+    judged = toy(objectives={"missed": lambda field, truth: (field.flow_px - truth.flow_px).sum()})
+    return judged(replace(BATCH, truth=truth)).objectives["missed"].item()
 
 
 def test_gradient_at_every_junction_is_that_of_the_algebra():

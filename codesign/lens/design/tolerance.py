@@ -338,7 +338,7 @@ class Comparison:
 
 def compare(slopes: Tensor, trials: Trials) -> Comparison:
     """Comparison of ``sensitivities`` [K, P] with trials of the same lens and tolerances. A figure
-    that nothing changes has correlation 1."""
+    that nothing changes has correlation 1, one that changes against the forecast of none 0."""
     good = trials.figures.isfinite().all(1)
     if int(good.sum()) < 3:
         raise DomainError(
@@ -349,8 +349,9 @@ def compare(slopes: Tensor, trials: Trials) -> Comparison:
     simulated = change.std(0)
     a = linear - linear.mean(0)
     b = change - change.mean(0)
-    size = torch.linalg.vector_norm(a, dim=0) * torch.linalg.vector_norm(b, dim=0)
-    correlation = torch.where(size > 0, (a * b).sum(0) / size.clamp_min(1e-300), 1.0)
+    told, seen = torch.linalg.vector_norm(a, dim=0), torch.linalg.vector_norm(b, dim=0)
+    still = (torch.maximum(told, seen) == 0).to(a)
+    correlation = still + (a * b).sum(0) / (told * seen).clamp_min(1e-300)
     return Comparison(
         torch.linalg.vector_norm(slopes, dim=1),
         simulated,
