@@ -23,21 +23,17 @@ def found_mount(generator):
     return mount
 
 
+def behind(optic, **options):
+    return render.Camera(optic, 32, 24, 0.1, 4, **options)
+
+
 CAMERAS = {
-    "pinhole": lambda: render.Camera(lens.Pinhole(3.4), 32, 24, 0.1, 4, seed=3),
-    "thin": lambda: render.Camera(
-        lens.ThinLens(8.0, 2.0).focus_at(1.3), 32, 24, 0.1, 4, falloff=True
-    ),
+    "pinhole": lambda: behind(lens.Pinhole(3.4), seed=3),
+    "thin": lambda: behind(lens.ThinLens(8.0, 2.0).focus_at(1.3), falloff=True),
     "variables": lambda: varied(lens.ThinLens(8.0, 2.0)),
-    "float32": lambda: render.Camera(
-        lens.load("cooke-triplet", torch.float32).scaled(0.3), 32, 24, 0.1, 4
-    ),
-    "in one colour": lambda: render.Camera(
+    "float32": lambda: behind(lens.load("cooke-triplet", torch.float32).scaled(0.3)),
+    "in one colour": lambda: behind(
         lens.load("cooke-triplet").scaled(0.3),
-        32,
-        24,
-        0.1,
-        4,
         spectrum=lens.Spectrum((0.45, 0.5), (0.25, 0.75)),
     ).in_one_colour(),
     "windows": lambda: render.Camera(
