@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from codesign.errors import FileFormatError
 from codesign.events.formats import text as text_events
-from codesign.flow import sources
 from codesign.flow.files import write_flow
-from codesign.flow.sources import PacketOptions, read_packets, read_recording
+from codesign.flow.sources import PacketOptions, camera, read_packets, read_recording
 from codesign.flow.sources.camera import (
     Calibration,
     read_calibration,
@@ -185,7 +184,7 @@ def test_damaged_side_files(row, tmp_path):
         (tmp_path / "side.txt").write_text(content)
         return tmp_path / "side.txt"
 
-    row.holds(vars(sources.camera) | {"side": side})
+    row.holds(vars(camera) | {"side": side})
 
 
 def test_the_camera_fit_projects_as_the_camera():

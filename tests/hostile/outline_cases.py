@@ -119,7 +119,7 @@ def far_pole(ratio: float) -> World:
 def facets() -> World:
     """A ball of 5,120 faces with one radiance per face, as bodies and baked meshes have."""
     vertices, faces = icosphere(4)
-    normal = across(vertices, faces)
+    normal = across(vertices[faces])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     light = 30 + 180 * np.maximum(normal @ np.array([0.5, -0.6, 0.6]), 0)
     ball = emissive_mesh(backend.mitsuba("cpu"), 0.3 * vertices + [0.05, 1.2, 0.02], faces, light)

@@ -405,7 +405,7 @@ def test_volume_and_area_of_a_cube_in_every_format(tmp_path, kind):
 def test_a_mirrored_node_keeps_its_outside_outside(tmp_path):
     nodes = [{"scale": [-1, 1, 1], "children": [1]}, {"mesh": 0}]
     [part] = mesh_files.read(write_gltf(tmp_path, "gltf", nodes=nodes))
-    normal = across(part.vertices_m, part.faces)
+    normal = across(part.vertices_m[part.faces])
     assert (normal[:, 1] < 0).all()  # towards the viewer, as before
 
 
