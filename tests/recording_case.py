@@ -72,3 +72,23 @@ def stores(path, name, values):
 
 def rewritten(path, old, new):
     path.write_text(path.read_text().replace(old, new))
+
+
+def put(path, content):
+    """A file of bytes, text, an array or arrays by name, or a picture; a folder of such files."""
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif isinstance(content, str):
+        path.write_text(content)
+    elif path.suffix == ".npy":
+        np.save(path, content)
+    elif path.suffix == ".npz":
+        np.savez(path, **content)
+    elif isinstance(content, dict):
+        path.mkdir()
+        for name, picture in content.items():
+            put(path / name, picture)
+    else:
+        import imageio.v3 as iio
+
+        iio.imwrite(path, content)

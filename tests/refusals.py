@@ -33,21 +33,21 @@ class Row:
         return str(told.value)
 
 
-def rows(file: str, section: str = "") -> list[Row]:
-    """The rows of a section, of all its errors; of all sections where none is named."""
+def rows(file: str, *sections: str) -> list[Row]:
+    """The rows of some sections, of all their errors; of all sections where none is named."""
     text = Path(file).with_name("refusals.txt").read_text(encoding="utf-8")
     found = []
     for name, error, lines in re.findall(
         r"^\[([^:\]]+): (\w+)\]\n(.*?)(?=^\[|\Z)", text, re.M | re.S
     ):
-        if section in ("", name):
+        if name in (sections or (name,)):
             calls = [line.rsplit(" | ", 1) for line in lines.splitlines() if " | " in line]
             found += [Row(call, getattr(errors, error), sentence) for call, sentence in calls]
-    assert found, f"no rows of {section}"
+    assert found, f"no rows of {sections}"
     return found
 
 
-def table(file: str, section: str = "") -> pytest.MarkDecorator:
-    """Runs a test with every ``row`` of a section, or of all."""
-    found = rows(file, section)
+def table(file: str, *sections: str) -> pytest.MarkDecorator:
+    """Runs a test with every ``row`` of some sections, or of all."""
+    found = rows(file, *sections)
     return pytest.mark.parametrize("row", found, ids=[row.sentence for row in found])

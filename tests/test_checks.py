@@ -22,7 +22,7 @@ from codesign.checks import (
     check_seed,
     check_whole,
 )
-from codesign.errors import DomainError, FileFormatError, ShapeError
+from codesign.errors import DomainError, ShapeError
 from tests import refusals
 
 FLOW = torch.ones(3, 2, 4, 5)
@@ -107,9 +107,3 @@ def test_what_is_not_allowed_is_one_sentence(row):
     whole = "$" if row.sentence.endswith(".") else ""
     told = replace(row, sentence=f"^{re.escape(row.sentence)}{whole}").holds(globals())
     assert told.endswith(".")
-
-
-@pytest.mark.parametrize("path", [3, None, "", "a\0b", b"a"])
-def test_what_is_no_path(path):
-    with pytest.raises(FileFormatError, match=r"^the file must be text or a pathlib\.Path, got "):
-        check_path(path, "the file")

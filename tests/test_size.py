@@ -8,17 +8,17 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 UNCOUNTED = (ast.expr_context, ast.operator, ast.unaryop, ast.cmpop, ast.boolop)
 BUDGETS = {
-    "codesign": 9_990,  # a pose out of its rotation and its place, for mounts and paths alike
+    "codesign": 10_050,  # a pose out of its rotation and its place, for mounts and paths alike, what is differentiable once
     "codesign/events": 48_620,  # leaks that have begun before, counts that a type holds, kinds of TIFFs, noise events of all intervals at once, times too coarse
     "codesign/fidelity": 3_030,  # stages without a level, levels that are told wrong
     "codesign/flow": 43_050,  # truth that is unknown, windows that share no event, polarities told two ways
     "codesign/grad": 3_300,
-    "codesign/lens": 48_010,  # makers of glass, fans of single precision, stops and apertures in their own axes
-    "codesign/mount": 14_880,  # rays traced once for several depths, films looked at all over, angles in degrees, blur of the whole pupil
-    "codesign/optimise": 3_900,
-    "codesign/render": 43_780,  # chief rays of a spectrum, curves as the real pupil sees them
-    "codesign/report": 7_560,  # unknown flow, paths from above, wheels beside flow, corners without light, samples beside frames
-    "codesign/system": 9_680,  # truth of what is read, a lens in its camera, bins that were asked for, one colour handed over
+    "codesign/lens": 48_020,  # makers of glass, fans of single precision, stops and apertures in their own axes, forecasts of nothing
+    "codesign/mount": 14_890,  # rays traced once for several depths, films looked at all over, angles in degrees, blur of the whole pupil, points that stand alone
+    "codesign/optimise": 3_940,  # rates in a state
+    "codesign/render": 43_790,  # chief rays of a spectrum, curves as the real pupil sees them, no second derivatives
+    "codesign/report": 7_680,  # unknown flow, paths from above, wheels beside flow, corners without light, samples beside frames, directions of a sphere in any order
+    "codesign/system": 9_800,  # truth of what is read, a lens in its camera, bins that were asked for, one colour handed over, truth of another interval, refusals that lose nothing
     "codesign/train": 5_700,  # bins of windows, ends of sources
     "scenes": 15_450,  # polygons with inward corners, colours of materials, mesh files that are read in part
     "scenes/robots": 9_490,  # held joints, directions of axes, colours by name
@@ -44,21 +44,21 @@ BUDGETS = {
     "studies/train_flow": 5_140,  # steps of a race, options without effect, windows that reach into one another
     "studies/viewer": 3_450,  # says what a fail may be
     "studies/video_to_events": 4_290,
-    "tests": 15_310,  # words of numbers for all rooms, pictures of poses, pycollada
+    "tests": 15_190,  # words of numbers for all rooms, pictures of poses, pycollada, arrays of far paths
     "tests/data": 1_000,
-    "tests/events": 31_560,  # rates of leaks in short runs, sums over wide spreads, times with decimals
-    "tests/flow": 28_610,  # chunks that may come again
+    "tests/events": 30_180,  # rates of leaks in short runs, sums over wide spreads, times with decimals
+    "tests/flow": 27_690,  # chunks that may come again
     "tests/gradients": 3_260,
-    "tests/hard_cases": 2_600,
-    "tests/hostile": 19_090,
-    "tests/lens": 36_620,  # stops of their own axes, dense transforms, makers of glass
-    "tests/mount": 13_900,  # blur of a wide lens
-    "tests/optimise": 3_410,  # a state is a copy; schedules, weights that nothing reaches
-    "tests/render": 28_880,  # outlines from the real pupil
-    "tests/scenes": 20_530,  # polygons from every corner, colours of materials and vertices
-    "tests/studies": 34_870,  # blur over the view, families that are slower, blur that is drawn, first lines that are true, the best of all answers, files that change, few starts, all robots together
-    "tests/system": 7_090,  # estimates of their own kind, one colour handed over, levels that are told wrong
-    "tests/train": 5_200,  # bins of windows, ends of sources
+    "tests/hard_cases": 2_540,
+    "tests/hostile": 19_030,
+    "tests/lens": 36_480,  # stops of their own axes, dense transforms, makers of glass, pictures of even sizes
+    "tests/mount": 14_020,  # blur of a wide lens, lone points, gradients to the flow
+    "tests/optimise": 3_440,  # a state is a copy; schedules, weights that nothing reaches, rates in a state
+    "tests/render": 28_980,  # outlines from the real pupil, no second derivatives
+    "tests/scenes": 20_350,  # polygons from every corner, colours of materials and vertices
+    "tests/studies": 34_830,  # blur over the view, families that are slower, blur that is drawn, first lines that are true, the best of all answers, files that change, few starts, all robots together
+    "tests/system": 6_600,  # estimates of their own kind, one colour handed over, levels that are told wrong, truth of another interval
+    "tests/train": 4_970,  # bins of windows, ends of sources
 }
 
 

@@ -1,6 +1,7 @@
 """Event files of every format: exact round trips, one file through both doors, damage and limits
 that end in a sentence. Bit layouts: test_formats_layouts.py; mutants of whole files:
 tests/hostile."""
+# ruff: noqa: F401 (names of the calls)
 
 import io
 import zipfile
@@ -18,6 +19,7 @@ from codesign.events import read, write
 from codesign.events.formats import text
 from codesign.events.formats.aedat import read_frames
 from codesign.flow.sources import read_recording
+from tests import refusals
 from tests.event_streams import (
     FIELDS,
     dat,
@@ -29,6 +31,7 @@ from tests.event_streams import (
     same,
     stream_of,
 )
+from tests.recording_case import put
 
 EPOCH_US = 1_643_243_628_737_093  # a clock that counts from 1970
 DAVIS = {"height_px": 260, "width_px": 346}
@@ -218,186 +221,47 @@ def claimed_npz():
 
 
 LINES = "".join(f"0.2{k:03d} 1 2 1\n" for k in range(299))
-TEXTS = [
-    ("t,x,y,p\n", "holds no event"),
-    ("a b c\n", "line 1"),
-    ("t,x,y\n1,2,3\n", "line 1.*header"),
-    ("1,2,3,1\n2,5,6,1\n", "give columns='txyp' or"),
-    ("5,2,3,1\n4,2,1,1\n", "give columns='txyp' or"),
-    ("t,x,y,p\n1,2,3,1\n2,2,3\n", "line 3"),
-    ("t,x,y,p\n1,2,nan,1\n", "line 2"),
-    ("t,x,y,p\n1_0,2,3,1\n", "line 2"),
-    ("t,x,y,p\n1,2,3,1x\n", "line 2.*four finite"),
-    ("t,x,y,p\n1,2,3,1\n9999999999999999999,2,3,1\n", "line 3.*61 bits"),
-    ("t,x,y,p\n5000,2,3,1\n3999,2,3,1\n", "line 3.*1001 us before an earlier"),
-    ("t,x,y,p\n5,-2,3,1\n", "line 2.*x = -2"),
-    ("t,x,y,p\n5,2,3,2\n", "line 2.*polarity is 2"),
-    ("t,x,y,p\n5,2,3,-1\n5,2,3,0\n", "line 3.*polarity is 0; 1 for ON, -1, as"),
-    (bytes(range(256)).decode("latin-1") * 90, "line"),
-    (LINES + "0.3 1 2 1 9\n0.3 1 2 1\n", "line 300.*four"),
-    (LINES + "0.3 1 two 1\n", "line 300.*four"),
-    (LINES + "0.1 1 2 1\n", "line 300.*before an earlier"),
-    (LINES + "\n0.3 1.5 2 1\n", "line 301.*whole numbers"),  # empty lines count as lines
-    (LINES + "0.3 1 2 7\n", "line 300.*polarity"),
-]
 EVT3 = evt3()
-DAMAGED = {
-    "e.csv": [(body.encode(), words) for body, words in TEXTS],
-    "e.npz": [
-        (npz(t_us=None), "t_us"),
-        (npz(t_us=T_US[::-1]), "event 1: .* us before"),
-        (npz(t_us=np.full(3, 2**63 + 5, np.uint64)), "61 bits"),
-        (in_arrays(**NPZ | {"t": np.float32([1e9, 1e9, 2e9])}), "not told apart in float32"),
-        (npz(x=np.zeros(2, int)), "equal length"),
-        (npz(x=np.full(3, 10)), "x = 10; the sensor has 10"),
-        (npz(t_us=np.array([None] * 3)), "t_us holds object"),
-        (npz(height_px=np.array([2])), "height_px"),
-        (claimed_npz(), "t_us claims"),
-    ],
-    "e.h5": [
-        (b"not HDF5", "no HDF5 file"),
-        (dsec(p=None), "events/p is absent"),
-        (dsec(t_offset=np.int64(2**62)), "61 bits"),
-        (dsec(t_offset=np.zeros(2, int)), "one whole number"),
-        (dsec(x=np.zeros(5, np.uint16)), r"\[5\], \[3\] is needed"),
-        (dsec(x=np.zeros(3)), "whole numbers"),
-        (dsec(p=np.full(3, 2, np.uint8)), "event 0: its polarity is 2"),
-        (dsec(t=T_US[::-1]), "before an earlier"),
-        (dsec(ms_to_idx=np.zeros(41, int)), "first event of each millisecond"),
-        (dsec(ms_to_idx=np.array([0, 2**40])), "no index of its 3 events"),
-        (in_hdf5({}, linked), "link to another"),
-        (in_hdf5(DSEC | {"events/x": None}, virtual), "other files"),
-        (in_hdf5(DSEC, compression="lzf"), "filters"),
-        (short_blocks({"compression": "gzip"}, five_bytes), "does not unpack"),
-        (short_blocks(dict(hdf5plugin.Blosc()), claims_64_bytes), "does not unpack"),
-        (in_hdf5({}, never_written), "out of proportion"),
-    ],
-    "e.raw": [
-        (b"", "encoding nowhere"),
-        (b"% evt 2.1\n% end\n", "2.1"),
-        (b"% evt 3.0\n% format EVT2\n% end\n", r"2\.0.*3\.0"),
-        (b"% evt 3.0\n% endianness big\n% end\n", "big"),
-        (b"% evt 3.0\n% geometry 640\n% end\n", "WIDTHxHEIGHT"),
-        (b"% evt 3.0\n% format EVT3;height=4;width=5\n% geometry 4x5\n% end\n", "two sensor sizes"),
-        (b"% evt 3.0\n% geometry 9000x5\n% end\n", "from 1 to 2048"),
-        (b"% evt 3.0\n% evt 2.0\n% end\n", "twice"),
-        (b"% evt \xff\n% end\n", "ASCII"),
-        (b"% evt 3.0", "does not end"),
-        (b"% evt 3.0\n% end\n", "no event"),
-        (b"% t0 1e6\n" + EVT3, r"start time \(t0\) as '1e6'"),
-        (b"% t0 5\n% T0 6\n" + EVT3, "5 and as 6"),
-        (EVT3 + b"\x00", "amid a word"),
-        (evt3((0x8, 0), (0x9, 0)), "word 1 has type 0x9"),
-        (evt2(0x80000000, 0x30000000), "word 1 has type 0x3"),
-        (evt3((0x8, 0), (0x0, 720), (0x2, 5)), "y = 720.*720 pixels"),
-        (evt3((0x8, 0), (0x0, 1), (0x3, 2047), (0x5, 2), geometry=False), "column 2048"),
-        # one wrong bit is no new loop
-        (evt3((0x8, 2048), (0x0, 1), (0x2, 5), (0x8, 0), (0x2, 5)), "before an earlier"),
-    ],
-    "e.dat": [
-        (b"", "version 'none'"),
-        (dat().replace(b"Version 2", b"Version 1"), "version '1'"),
-        (dat()[:-2] + b"\x0e\x08", "0e 08"),
-        (dat()[:-1], "type and size are 0c"),
-        (dat() + b"1234567", "amid an event"),
-        (dat((1, 2, 3, 2)), "polarity is 2"),
-        (dat((1, 640, 3, 1)), "x = 640"),
-        (dat((5000, 1, 1, 1), (3999, 2, 1, 1)), "event 1: it lies 1001 us before"),
-        (dat().replace(b"Width 640", b"Width -6"), "Width as '-6'"),
-    ],
-    "e.aedat4": [
-        (lambda data: data[1:] + b"x", "does not start with"),
-        (lambda data: data.replace(b'<dv version="2.0">', b"<!DOCTYPE dv     >"), "document type"),
-        (lambda data: data.replace(b"</dv>", b"</dw>"), "XML cannot be read"),
-        (lambda data: data.replace(b"EVTS</attr>", b"FRME</attr>"), "0 streams of kind EVTS"),
-        (lambda data: data.replace(b">346<", b">-46<"), "whole numbers"),
-        (lambda data: data[:-20], "damaged"),
-        (lambda data: data[: 14 + 32] + b"\x09" + data[14 + 33 :], "compression 9"),
-        (lambda data: data[: 14 + 45] + b"\x01" + data[14 + 46 :], "was cut"),
-        # blocks that unpack without end; ZSTD packs zeros 20000 to 1
-        (lambda data: packed_aedat4(data, 1, lz4.frame.compress(bytes(2**26))), "damaged"),
-        (lambda data: packed_aedat4(data, 3, zstandard.compress(bytes(2**26))), "damaged"),
-    ],
-    "e.aedat2": [(b"#!AER-DAT2.0\r\n", "written, not read")],
-    "e.log": [(b"", r"\.csv, \.dat, \.h5, \.hdf5, \.npy, \.npz, \.raw, \.txt")],
-}
-DAMAGES = [(name, *row) for name, rows in DAMAGED.items() for row in rows]
 
 
-@pytest.mark.parametrize(("name", "content", "words"), DAMAGES)
-def test_damaged_files_end_in_a_sentence(tmp_path, monkeypatch, name, content, words):
-    path = tmp_path / name
-    if callable(content):
-        write(path, stream_of((5, 1, 2, 1), (9, 3, 4, -1), **DAVIS))
-        content = content(path.read_bytes())
-    path.write_bytes(content)
+@refusals.table(__file__, "damaged files of events")
+def test_damaged_files_end_in_a_sentence(row, tmp_path, monkeypatch):
+    write(tmp_path / "e.aedat4", stream_of((5, 1, 2, 1), (9, 3, 4, -1), **DAVIS))
+
+    def damaged(name, content):
+        put(tmp_path / name, content)
+        return read(tmp_path / name)
+
+    names = globals() | {"damaged": damaged, "data": (tmp_path / "e.aedat4").read_bytes()}
     for chunk in (2**23, 640):
         monkeypatch.setattr(text, "CHUNK_BYTES", chunk)
-        with pytest.raises(FileFormatError, match=words):
-            read(path)
+        row.holds(names)
 
 
 ONE, LATE = stream_of((0, 1, 1, 1)), stream_of((2**32, 1, 1, 1))
 
 
-@pytest.mark.parametrize(
-    ("name", "stream", "options", "words"),
-    [
-        ("e.log", ONE, {}, r"\.csv, \.dat, \.h5, \.hdf5, \.npz, \.raw"),
-        ("none/e.csv", ONE, {}, "folder"),
-        ("e.csv", stream_of((2**61, 1, 1, 1)), {}, "CSV holds"),
-        ("e.h5", stream_of((0, 1, 1, 1), (2**32, 1, 1, 1)), {}, "32 bits"),
-        ("e.raw", stream_of((0, 1, 1, 1), width_px=2049), {}, "at most 2048 x 2048"),
-        ("e.raw", stream_of((-1, 1, 1, 1)), {"evt": 2}, "times span -1"),
-        ("e.raw", stream_of((2**44, 1, 1, 1)), {}, "0 to 17592186044415; pass .* t0_us"),
-        ("e.raw", stream_of((2**34, 1, 1, 1)), {"evt": 2}, "0 to 17179869183; pass .* t0_us"),
-        ("e.raw", ONE, {"evt": 4}, "evt=4"),
-        ("e.raw", ONE, {"t0_us": 1}, "times less t0_us 1 span -1"),
-        ("e.dat", ONE, {"evt": 3}, "evt=3"),
-        ("e.dat", LATE, {}, "times span 4294967296.*0 to 4294967295; pass .* t0_us"),
-        ("e.dat", stream_of((0, 1, 1, 1), width_px=2**14 + 1), {}, "16384 x 16384"),
-        ("e.dat", ONE, {"t0_us": 1.0}, "t0_us is 1.0"),
-        ("e.dat", ONE, {"t0_us": 2**63}, "t0_us is 9223372036854775808"),
-        ("e.npz", ONE, {"t0_us": 5}, r"t0_us=5 was given .* \.dat and \.raw files alone"),
-        ("e.aedat2", ONE, {}, "346 x 260 and 240 x 180 pixels, not 640 x 480"),
-        ("e.aedat2", stream_of((2**31, 1, 1, 1), **DAVIS), {}, "holds 0 to 2147483647"),
-    ],
-)
-def test_streams_a_format_cannot_hold_leave_the_earlier_file(
-    tmp_path, name, stream, options, words
-):
-    path = tmp_path / name
-    if path.parent.exists():
-        path.write_bytes(b"earlier")
-    with pytest.raises(FileFormatError, match=words):
+@refusals.table(__file__, "streams that a format cannot hold")
+def test_streams_a_format_cannot_hold_leave_the_earlier_file(row, tmp_path):
+    def write_to(name, stream, **options):
+        path = tmp_path / name
+        if path.parent.exists():
+            path.write_bytes(b"earlier")
         write(path, stream, **options)
-    assert [one.read_bytes() for one in tmp_path.iterdir()] == [b"earlier"] * path.parent.exists()
+
+    row.holds(globals() | {"write_to": write_to})
+    kept = [one.read_bytes() for one in tmp_path.iterdir()]
+    assert kept == [b"earlier"] * ("none/" not in row.call)
 
 
-@pytest.mark.parametrize(
-    ("name", "options", "words"),
-    [
-        (
-            "seconds.csv",
-            {"width_px": 9},
-            "line 3.*x = 9; the sensor has 9 pixels there by the options",
-        ),
-        ("seconds.csv", {"height_px": 5}, "line 2.*y = 5"),
-        ("own.npz", {"width_px": 3}, "width_px 10 by the file, but 3"),
-        ("mvsec.hdf5", {"width_px": 11}, "width_px 10 by its frames, but 11"),
-        ("seconds.csv", {"columns": "abcd"}, "four letters"),
-        ("seconds.csv", {"time_unit": "h"}, "time unit 'h'"),
-        ("e.raw", {"columns": "xytp"}, "has these by its format"),
-        ("dsec.hdf5", {"time_unit": "ns"}, "has these by its format"),
-        ("own.npz", {"columns": "yxtp"}, "leave columns away"),
-        ("none.csv", {}, "no file lies at"),
-    ],
-)
-def test_options_and_places_that_do_not_fit_are_refused(name, options, words, tmp_path):
-    if name != "none.csv":
-        (tmp_path / name).write_bytes(SAME.get(name, b""))
-    with pytest.raises(FileFormatError, match=words):
-        read(tmp_path / name, **options)
+@refusals.table(__file__, "options and places")
+def test_options_and_places_that_do_not_fit_are_refused(row, tmp_path):
+    def read_as(name, **options):
+        if name != "none.csv":
+            (tmp_path / name).write_bytes(SAME.get(name, b""))
+        return read(tmp_path / name, **options)
+
+    row.holds({"read_as": read_as})
 
 
 def test_a_file_of_events_has_no_frames(tmp_path):

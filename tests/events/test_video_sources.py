@@ -12,7 +12,9 @@ import torch
 from codesign.errors import FileFormatError
 from codesign.events.sources.folder import read_picture
 from codesign.events.sources.opening import open_frames
+from tests import refusals
 from tests.numbers import f64
+from tests.recording_case import put
 
 # imageio leaves FFmpeg's pipes to the garbage collector
 IMAGEIO_LEAKS = pytest.mark.filterwarnings(
@@ -188,52 +190,17 @@ def test_a_real_recording_is_what_is_known_of_it(shared):
 GRAY, COLOUR = np.zeros((4, 5), np.uint8), np.zeros((4, 5, 3), np.uint8)
 CLEAR = np.zeros((4, 5, 4), np.uint8)
 DEEP = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + b"\0\0\0\1" * 2 + bytes([16, 2, 0, 0, 0]) + b"\0" * 20
-# name of a file -> bytes, or an array; of a folder -> name -> bytes or picture
-NO_SOURCES = [
-    ("none", None, "no file or folder"),
-    ("text.mp4", b"this is no video", "as a video"),
-    ("empty", {}, "0 picture"),
-    ("one", {"a.png": GRAY}, "1 picture"),
-    ("sizes", {"a.png": COLOUR, "b.png": COLOUR[[0] * 5]}, "frame 1.*5 x 5 pixels.*5 x 4"),
-    ("kinds", {"a.png": COLOUR, "b.png": GRAY}, "frame 1"),
-    ("depths", {"a.png": GRAY, "b.png": GRAY.astype(np.uint16)}, "16 bits"),
-    ("torn", {"a.png": GRAY, "b.png": DEEP[:20]}, "cannot be read"),
-    ("deep", {"a.png": DEEP, "b.png": GRAY}, "16 bits"),
-    ("faint", {"a.png": DEEP[:25] + b"\4" + DEEP[26:], "b.png": GRAY}, "alpha at 16 bits"),
-    ("clear", {"a.png": CLEAR, "b.png": CLEAR}, "transparent"),
-    ("mixed", {"a.png": GRAY, "c.jpg": GRAY}, "several kinds"),
-    ("a.png", GRAY, "single picture"),
-    ("half.npy", b"\x93NUMPY\x01\x00", "whole .npy"),
-    ("flat.npy", np.zeros((5, 5)), "at least two"),
-    ("complex.npy", np.zeros((3, 5, 5), complex), "complex128"),
-    ("two.npz", {"a": np.zeros((3, 4, 5)), "b": np.zeros((3, 4, 5))}, "called frames"),
-    ("times.npz", {"frames": np.zeros((3, 4, 5)), "t_s": np.arange(4)}, "one time per frame"),
-]
 
 
-def put(path, content):
-    if isinstance(content, bytes):
-        path.write_bytes(content)
-    elif path.suffix == ".npy":
-        np.save(path, content)
-    elif path.suffix == ".npz":
-        np.savez(path, **content)
-    elif isinstance(content, dict):
-        path.mkdir()
-        for name, picture in content.items():
-            put(path / name, picture)
-    else:
-        iio.imwrite(path, content)
+@refusals.table(__file__, "no sources of frames")
+def test_what_is_no_source_is_refused_with_a_reason(row, tmp_path):
+    def frames(name, content):
+        """Content: bytes, or an array; of a folder, name -> bytes or picture."""
+        if content is not None:
+            put(tmp_path / name, content)
+        return list(open_frames(tmp_path / name).read(0))
 
-
-@pytest.mark.parametrize(
-    ("name", "content", "words"), NO_SOURCES, ids=[name for name, *_ in NO_SOURCES]
-)
-def test_what_is_no_source_is_refused_with_a_reason(tmp_path, name, content, words):
-    if content is not None:
-        put(tmp_path / name, content)
-    with pytest.raises(FileFormatError, match=words):
-        list(open_frames(tmp_path / name).read(0))
+    row.holds(globals() | {"frames": frames})
 
 
 def test_a_cut_video_and_sound_alone_are_refused(clip, tmp_path):

@@ -3,7 +3,6 @@ nothing where nothing is seen, gradients that differences confirm, and one sente
 volume of events."""
 # pyright: reportArgumentType=false, reportCallIssue=false
 
-import math
 from copy import deepcopy
 from dataclasses import replace
 from functools import partial
@@ -15,6 +14,7 @@ from codesign import flow
 from codesign.errors import CodesignError
 from codesign.flow.export import evenly_timed
 from studies.train_flow.peers import ECN, IDNet
+from tests import refusals
 from tests.flow.volumes import drawn
 from tests.numbers import D, close, f64, randn64
 
@@ -152,28 +152,6 @@ def counted(counts):
 
 
 @pytest.mark.parametrize("estimate", [flow.estimate_lk, NETWORKS["flownet"]], ids=["lk", "flownet"])
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        (COUNTS, "must be an EventVolume, got a Tensor"),
-        (counted([1.0]), r"must be a torch tensor, got \[1\.0\]"),
-        (counted(COUNTS.long()), "int64"),
-        (counted(COUNTS.to_sparse()), "sparse"),
-        (counted(COUNTS.to("meta")), "without values"),
-        (counted(COUNTS[0]), r"\[B, 2, .*, H, W\].*, got \[2, 4, 20, 24\]"),
-        (counted(COUNTS[:, :1]), "got"),
-        (counted(COUNTS[..., :0]), "empty"),
-        (counted(COUNTS[:, :, :1]), "bins|B, 2, 4, H, W"),
-        (counted(COUNTS - 0.5), "reach down to -0.5"),
-        (counted(COUNTS.index_fill(4, torch.tensor(3), math.nan)), "NaN"),
-        (replace(VOLUME, centroid_s=None), "centroid_s .* must be a torch tensor, got None"),
-        (
-            replace(VOLUME, centroid_s=torch.ones(3)),
-            r"centroid_s .* must be \[bins\] with bins = 4, got \[3\]",
-        ),
-        (replace(VOLUME, collected_s=torch.zeros(BINS)), "collected_s"),
-    ],
-)
-def test_volumes_that_are_none(estimate, given, words):
-    with pytest.raises(CodesignError, match=words):
-        estimate(given)
+@refusals.table(__file__, "volumes of events")
+def test_volumes_that_are_none(estimate, row):
+    row.holds(globals() | {"estimate": estimate})

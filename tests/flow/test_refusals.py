@@ -43,7 +43,9 @@ def at_times(*t_us):
     return test_tracker.stream_of(t_us)
 
 
-@refusals.table(__file__)
+@refusals.table(
+    __file__, "networks", "images of warped events", "losses", "measures", "files", "tracker"
+)
 def test_one_wrong_value(row, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     row.holds(globals())

@@ -11,18 +11,18 @@ from kornia.geometry.calibration import distort_points
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from codesign.errors import CodesignError, FileFormatError
+from codesign.errors import FileFormatError
 from codesign.events.formats import text as text_events
 from codesign.flow.files import write_flow
-from codesign.flow.sources import PacketOptions, read_packets, read_recording
+from codesign.flow.sources import PacketOptions, camera, read_packets, read_recording
 from codesign.flow.sources.camera import (
     Calibration,
     read_calibration,
     read_gyroscope,
     read_poses,
-    signed_axes,
 )
 from codesign.flow.sources.rendered import CameraFit
+from tests import refusals
 from tests.numbers import f64
 from tests.recording_case import DAVIS, ETH_CALIBRATION, eth_text, gyroscope, made, poses, recording
 
@@ -178,23 +178,13 @@ def test_a_rate_that_changes_linearly_is_integrated_exactly_about_a_fixed_axis(t
     np.testing.assert_allclose(found, right, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("read", "content", "reason"),
-    [
-        (read_gyroscope, "1 2 3\n", "rows of 3 numbers"),
-        (read_gyroscope, "a b c\n", "cannot be read"),
-        (read_gyroscope, "2 0 0 0 0 0 0\n1 0 0 0 0 0 0\n", "row 2 lies before"),
-        (read_poses, "0 0 0 0 0 0 0 2\n1 0 0 0 0 0 0 1\n", "length 2"),
-        (read_calibration, "1 2 3\n", "3 numbers"),
-        (read_calibration, "-1 2 3 4\n", "above 0"),
-        (read_calibration, "x\n", "in pixels is needed"),
-        (lambda path: signed_axes("xxz"), "", "name each of x, y, z once"),
-    ],
-)
-def test_damaged_side_files(read, content, reason, tmp_path):
-    (tmp_path / "side.txt").write_text(content)
-    with pytest.raises(CodesignError, match=reason):
-        read(tmp_path / "side.txt")
+@refusals.table(__file__, "side files")
+def test_damaged_side_files(row, tmp_path):
+    def side(content):
+        (tmp_path / "side.txt").write_text(content)
+        return tmp_path / "side.txt"
+
+    row.holds(vars(camera) | {"side": side})
 
 
 def test_the_camera_fit_projects_as_the_camera():

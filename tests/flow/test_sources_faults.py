@@ -21,10 +21,14 @@ def test_events_off_the_sensor_or_back_in_time(kind, tmp_path):
     y[60] = -1
     t_us[200] -= 20_000
     path = tmp_path / f"e.{kind}"
-    if kind == "txt":
-        path.write_text(eth_text((t_us, x, y, on)))
-    else:
-        np.save(path, np.column_stack([t_us * 1e-6, x, y, on]))
+
+    def save():
+        if kind == "txt":
+            path.write_text(eth_text((t_us, x, y, on)))
+        else:
+            np.save(path, np.column_stack([t_us * 1e-6, x, y, on]))
+
+    save()
     place = "line 61|line 201" if kind == "txt" else "event 60|event 200"
     with pytest.raises(FileFormatError, match=place):
         read_packets(path, options=PacketOptions(size_px=DAVIS))
@@ -32,10 +36,7 @@ def test_events_off_the_sensor_or_back_in_time(kind, tmp_path):
     assert packet.left_out == {"events_off_sensor": 2, "events_back_in_time": 1}
     # one that is off the sensor and a minute ahead makes no other late
     t_us[50] += 60_000_000
-    if kind == "npy":
-        np.save(path, np.column_stack([t_us * 1e-6, x, y, on]))
-    else:
-        path.write_text(eth_text((t_us, x, y, on)))
+    save()
     (again,) = read_packets(path, options=PacketOptions(size_px=DAVIS, skip=SKIP))
     assert (again.left_out, len(again.stream)) == (packet.left_out, len(packet.stream))
     kept = np.delete(np.arange(400), [50, 60, 200])

@@ -2,8 +2,6 @@
 training."""
 # pyright: reportArgumentType=false
 
-from pathlib import Path
-
 import hdf5plugin
 import numpy as np
 import pytest
@@ -15,9 +13,10 @@ from codesign.flow.files import write_flow
 from codesign.flow.sources import DsecWindows, MvsecWindows, open_windows
 from codesign.flow.sources.dsec import splatted
 from studies.make_dataset.store import h5
+from tests import recording_case, refusals
 from tests.event_streams import random_stream
 from tests.numbers import close
-from tests.recording_case import gone, halved, rewritten, stores
+from tests.recording_case import stores
 
 # DSEC
 
@@ -188,49 +187,21 @@ def mvsec(folder):
     return MvsecWindows
 
 
-def holds(path, arrays):
-    np.savez(path, **arrays)
-
-
 LEFT = "thun_00_a/events/left"
 FLOW = "thun_00_a/flow"
 TIMES = f"{FLOW}/forward_timestamps.txt"
 GREY = "indoor_flying1_data.hdf5"
 GT = "indoor_flying1_gt_flow_dist.npz"
-SMALL = np.zeros((9, 9, 2), np.float32)
-MAPS = {"x_flow_dist": np.ones((11, 26, 34)), "y_flow_dist": np.ones((11, 26, 34))}
-STILL = {"timestamps": np.zeros(11), **MAPS}
 
 
-# source, path, what happens to it and with what, words of the sentence
-@pytest.mark.parametrize(
-    ("source", "path", "damage", "given", "reason"),
-    [
-        (dsec, f"{LEFT}/rectify_map.h5", gone, (), "no file lies at .*rectify_map.h5"),
-        (dsec, f"{LEFT}/rectify_map.h5", stores, ("rectify_map", SMALL), "rectify_map has shape"),
-        (dsec, f"{LEFT}/events.h5", gone, (), "no file lies at .*events.h5"),
-        (dsec, f"{LEFT}/events.h5", halved, (), "cut or damaged"),
-        (dsec, TIMES, rewritten, ("1310000, 1410000", ""), "for 3 flow"),
-        (dsec, TIMES, rewritten, ("1310000, 14", "9310000, 94"), "the events of"),
-        (dsec, TIMES, rewritten, ("1310000, 141", "1310000, 142"), "all must last alike"),
-        (dsec, f"{FLOW}/forward/000004.png", Path.write_bytes, (b"no",), "is not a PNG file"),
-        (dsec, FLOW, gone, (), "holds no sequence of DSEC"),
-        (dsec, LEFT, gone, (), "is missing; download the events"),
-        (mvsec, GT, gone, (), f"has no {GT}"),
-        (mvsec, GT, halved, (), "use a whole .npz file"),
-        (mvsec, GT, holds, ({"timestamps": np.arange(3.0)},), "use a whole .npz file"),
-        (mvsec, GT, holds, (STILL,), "rising times"),
-        (mvsec, GREY, halved, (), "cut or damaged"),
-        (mvsec, GREY, stores, ("davis/left/events", np.zeros((9, 3))), r"\[9, 3\]"),
-        (mvsec, GREY, gone, (), "holds no"),
-    ],
-)
-def test_damage_is_refused_at_once(source, path, damage, given, reason, tmp_path):
-    folder = tmp_path / "set"
-    opened = source(folder)
-    damage(folder / path, *given)
-    with pytest.raises(CodesignError, match=reason):
-        opened(folder)
+@refusals.table(__file__, "damaged published sets")
+def test_damage_is_refused_at_once(row, tmp_path):
+    def spoiled(source, path, damage, *given):
+        opened = source(tmp_path / "set")
+        damage(tmp_path / "set" / path, *given)
+        return opened(tmp_path / "set")
+
+    row.holds(vars(recording_case) | globals() | {"spoiled": spoiled})
 
 
 def test_a_folder_is_opened_as_what_it_is(tmp_path):

@@ -6,11 +6,12 @@ import pytest
 import torch
 from scipy.io import savemat
 
-from codesign.errors import FileFormatError
 from codesign.flow.files import write_flow
 from codesign.flow.sources.truth import read_truth, size_of
 from codesign.flow.warp import chained
+from tests import refusals
 from tests.numbers import close, f64
+from tests.recording_case import put
 
 SIZE = (12, 17)
 
@@ -119,44 +120,16 @@ def test_a_folder_of_flows_and_its_list_of_times(tmp_path):
         np.testing.assert_array_equal(found[2].flow, field(2)[0] * VALID)
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "reason"),
-    [
-        ("a.npy", np.zeros((5, 4, 4)), r"\[2, H, W\]"),
-        ("a.npy", np.zeros((2, 4, 5)), "5 x 4 pixels, the recording 17 x 12"),
-        ("a.npz", {"other": np.zeros((2, 4, 5))}, "holds other"),
-        ("a.npz", {"flow": FLOW, "valid": np.zeros((3, 3))}, "mask has shape"),
-        ("a.npz", {"flow": FLOW, "t0": np.array([2.0]), "t1": np.array([1.0])}, "a later time"),
-        ("a.npz", {"u": np.zeros(SIZE), "v": np.zeros((2, 2))}, "two alike"),
-        ("a.txt", "1 2 3\n", "'x y u v'"),
-        ("a.txt", "90 2 3 4\n", "none of a sensor of 17 x 12"),
-        ("a.txt", "1 2\n3 4\n", "one for all pixels or 204"),
-        ("a.txt", "a, b\nc d", "no table"),
-        ("a.bmp", "", "ends in '.bmp'"),
-        ("a.npy", "text", "use a whole .npy file"),
-        ("a.mat", "text", "no MATLAB file"),
-        ("a.flo", "text", "not a .flo"),
-    ],
-)
-def test_truths_that_are_none(name, content, reason, tmp_path):
-    path = tmp_path / name
-    if isinstance(content, np.ndarray):
-        np.save(path, content)
-    elif isinstance(content, dict):
-        np.savez(path, **content)
-    else:
-        path.write_text(content)
-    with pytest.raises(FileFormatError, match=reason):
-        read_truth(path, SIZE)
+@refusals.table(__file__, "files of true flow")
+def test_truths_that_are_none(row, tmp_path):
+    def read(name, content):
+        put(tmp_path / name, content)
+        return read_truth(tmp_path / name, SIZE)
+
+    row.holds(globals() | {"read": read, "folder": tmp_path})
 
 
-def test_places_without_a_truth_and_a_line_for_all_pixels(tmp_path):
-    for path, reason in (
-        (tmp_path / "absent.flo", "no ground truth lies"),
-        (tmp_path, "holds no flow files"),
-    ):
-        with pytest.raises(FileFormatError, match=reason):
-            read_truth(path, SIZE)
+def test_a_line_is_the_flow_of_all_pixels(tmp_path):
     (tmp_path / "flow.txt").write_text("1.5 -2\n")
     (found,) = read_truth(tmp_path / "flow.txt", SIZE)
     np.testing.assert_array_equal(found.flow, np.full((*SIZE, 2), (1.5, -2.0)).transpose(2, 0, 1))

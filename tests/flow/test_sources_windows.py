@@ -19,8 +19,9 @@ from scenes import worlds
 from studies.frame.run import main
 from studies.make_dataset import __main__ as study
 from studies.make_dataset.store import h5
+from tests import recording_case, refusals
 from tests.numbers import close
-from tests.recording_case import eth_text, gone, halved, made, rewritten, stores
+from tests.recording_case import eth_text, made
 
 
 @pytest.fixture(scope="module")
@@ -110,19 +111,9 @@ def test_pieces_depend_on_seed_and_number_alone(dataset):
         DatasetWindows(dataset, crop_px=(16, 41))
 
 
-@pytest.mark.parametrize(
-    ("call", "reason"),
-    [
-        (lambda folder: DatasetWindows(folder).batch([24]), "the source has 24"),
-        (lambda folder: DatasetWindows(folder).batch([-1]), "the source has 24"),
-        (lambda folder: DatasetWindows(folder).batch([]), "no samples"),
-        (lambda folder: DatasetWindows(folder, window_frames=13), "no sequence"),
-        (lambda folder: DatasetWindows(folder, window_frames=0), "a whole number from 1"),
-    ],
-)
-def test_numbers_that_mean_nothing(call, reason, dataset):
-    with pytest.raises(CodesignError, match=reason):
-        call(dataset)
+@refusals.table(__file__, "numbers of windows")
+def test_numbers_that_mean_nothing(row, dataset):
+    row.holds({"DatasetWindows": DatasetWindows, "folder": dataset})
 
 
 def test_times_of_the_bins_are_those_of_from_stream():
@@ -156,34 +147,12 @@ def test_a_recording_is_a_source_of_windows(tmp_path):
         RecordingWindows(place, options=PacketOptions())
 
 
-RADIAL = "sequence_001_radial"
+@refusals.table(__file__, "damaged data sets")
+def test_damage_is_refused_at_once(row, dataset, tmp_path):
+    def spoiled(of, path, damage, *given):
+        """The set or one sequence, after what happens to one of its files."""
+        shutil.copytree(dataset / of, tmp_path / "set")
+        damage(tmp_path / "set" / path, *given)
+        return DatasetWindows(tmp_path / "set")
 
-
-NARROW = np.zeros((12, 2, 40, 39), np.float32)
-FAR = np.full(200, 10**9, np.uint64)
-
-
-# of the set or one sequence: path, what happens to it and with what, words of the sentence
-@pytest.mark.parametrize(
-    ("of", "path", "damage", "given", "reason"),
-    [
-        ("", f"{RADIAL}/events.h5", gone, (), "lacks events.h5"),
-        ("", f"{RADIAL}/frames.h5", halved, (), "by the manifest; it was cut"),
-        ("", "manifest.json", gone, (), "has no manifest.json"),
-        (
-            "",
-            "manifest.json",
-            rewritten,
-            ("-dataset/1", "-dataset/9"),
-            "format 'codesign-dataset/9'",
-        ),
-        (RADIAL, "frames.h5", stores, ("flow", NARROW), r"flow has shape \[12, 2, 40, 39\], \["),
-        (RADIAL, "frames.h5", stores, ("timestamps", np.zeros(13, np.int64)), "do not rise"),
-        (RADIAL, "events.h5", stores, ("ms_to_idx", FAR), "no index"),
-    ],
-)
-def test_damage_is_refused_at_once(of, path, damage, given, reason, dataset, tmp_path):
-    shutil.copytree(dataset / of, tmp_path / "set")
-    damage(tmp_path / "set" / path, *given)
-    with pytest.raises(CodesignError, match=reason):
-        DatasetWindows(tmp_path / "set")
+    row.holds(vars(recording_case) | {"spoiled": spoiled})

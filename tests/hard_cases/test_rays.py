@@ -49,40 +49,31 @@ def gradients(geo, loss):
     )
 
 
-# name -> (lens, a ray that fails, its status, the surface where, its deficit by hand)
+def faces(front, back, diameter=4.0):
+    return GeoLens([Surface(*front), Surface(*back)], diameter)
+
+
+BALL = faces((10.0, 5.0, GLASS, 9.0), (INF, 10.0, None, 9.0))
+AHEAD = f64([[0, 0, 1.0]])
+# name -> (lens, height of a ray along its axis that fails, its status, the surface where, its
+# deficit by hand)
 CASES = {
     # 20 mm off the axis of a sphere of 10 mm radius: radicand 1 - (20/10)^2
-    "miss": (
-        GeoLens([Surface(10.0, 5.0, GLASS, 9.0), Surface(INF, 10.0, None, 9.0)], 4.0),
-        (20.0, 0.0, -5.0),
-        (0, 0, 1.0),
-        Status.MISS,
-        0,
-        3.0,
-    ),
+    "miss": (BALL, 20.0, Status.MISS, 0, 3.0),
     # sin = 0.8 > 1/1.5 inside the glass: radicand 1 - 1.5^2 * 0.64
     "total reflection": (
-        GeoLens([Surface(INF, 5.0, GLASS, 99.0), Surface(-10.0, 10.0, None, 9.9)], 4.0),
-        (8.0, 0.0, -5.0),
-        (0, 0, 1.0),
+        faces((INF, 5.0, GLASS, 99.0), (-10.0, 10.0, None, 9.9)),
+        8.0,
         Status.TOTAL_REFLECTION,
         1,
         1.5**2 * 0.64 - 1,
     ),
     # exactly tangent to the sphere: radicand 0, counted as a miss
-    "grazing": (
-        GeoLens([Surface(10.0, 5.0, GLASS, 9.0), Surface(INF, 10.0, None, 9.0)], 4.0),
-        (10.0, 0.0, -5.0),
-        (0, 0, 1.0),
-        Status.MISS,
-        0,
-        1e-8,
-    ),
+    "grazing": (BALL, 10.0, Status.MISS, 0, 1e-8),
     # a conic that ends at 10 / sqrt(1 + 3) = 5 mm: 1 - (1 + k) c^2 r^2 at 8 mm
     "ellipsoid": (
-        GeoLens([Surface(10.0, 5.0, GLASS, 4.0, conic=3.0), Surface(INF, 10.0, None, 9.0)], 4.0),
-        (8.0, 0.0, -5.0),
-        (0, 0, 1.0),
+        faces((10.0, 5.0, GLASS, 4.0, 3.0), (INF, 10.0, None, 9.0)),
+        8.0,
         Status.MISS,
         0,
         4 * 0.64 - 1,
@@ -92,8 +83,8 @@ CASES = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_failed_ray_says_what_where_and_by_how_much(name):
-    geo, origin, direction, status, surface, deficit = CASES[name]
-    out = geo.trace(f64([origin]), f64([direction]))
+    geo, height, status, surface, deficit = CASES[name]
+    out = geo.trace(f64([[height, 0.0, -5.0]]), AHEAD)
     assert (out.status.item(), out.failed_surface.item(), out.weight.item()) == (
         status,
         surface,
@@ -105,12 +96,12 @@ def test_a_failed_ray_says_what_where_and_by_how_much(name):
 
 @pytest.mark.parametrize("name", ["miss", "total reflection", "ellipsoid"])
 def test_the_deficit_falls_when_its_gradient_is_followed(name):
-    geo, origin, direction, *_ = CASES[name]
-    x = f64([origin]).requires_grad_()
-    deficit = geo.trace(x, f64([direction])).deficit
+    geo, height, *_ = CASES[name]
+    x = f64([[height, 0.0, -5.0]]).requires_grad_()
+    deficit = geo.trace(x, AHEAD).deficit
     (slope,) = torch.autograd.grad(deficit.sum(), x)
     step = 1e-6
-    nearer = geo.trace((x - step * slope / slope.norm()).detach(), f64([direction])).deficit
+    nearer = geo.trace((x - step * slope / slope.norm()).detach(), AHEAD).deficit
     drop = step * float(slope.norm())
     # bends by the step over 10 mm; rounding 1e-16 over 1e-6
     assert abs(deficit.item() - nearer.item() - drop) <= 1e-5 * drop

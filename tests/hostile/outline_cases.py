@@ -16,6 +16,7 @@ from codesign.render import MitsubaScene, MovingScene
 from codesign.render.charts import emissive_mesh
 from scenes import silhouettes
 from tests.hostile.random_worlds import convex
+from tests.scenes.solids import across
 
 AHEAD = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 RADIUS_M = 0.01  # of the cylinders that are seen from afar
@@ -118,10 +119,9 @@ def far_pole(ratio: float) -> World:
 def facets() -> World:
     """A ball of 5,120 faces with one radiance per face, as bodies and baked meshes have."""
     vertices, faces = icosphere(4)
-    corners = vertices[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    light = 30 + 180 * np.maximum(across @ np.array([0.5, -0.6, 0.6]), 0)
+    normal = across(vertices[faces])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    light = 30 + 180 * np.maximum(normal @ np.array([0.5, -0.6, 0.6]), 0)
     ball = emissive_mesh(backend.mitsuba("cpu"), 0.3 * vertices + [0.05, 1.2, 0.02], faces, light)
     return World(MitsubaScene({"wall": _wall(2.5, 120), "ball": ball}), _ahead(), 0.9)
 

@@ -12,6 +12,7 @@ import torch
 from codesign import backend, lens, pose
 from codesign.render import MitsubaScene
 from tests.hostile import judge, listed, outline_cases, random_worlds, worlds
+from tests.scenes.solids import volume
 from tests.studies.runs import lines
 
 QUICK = judge.Effort(seeds=(4,))
@@ -20,10 +21,6 @@ QUICK = judge.Effort(seeds=(4,))
 def test_meshes_are_wound_outwards():
     """Volumes by the divergence theorem: of a ball below 4 pi / 3, of a ring below 2 pi^2 R r^2
     with R = 1 - r."""
-
-    def volume(vertices, faces):
-        a, b, c = (vertices[faces[:, k]] for k in range(3))
-        return float((np.cross(a, b) * c).sum()) / 6
 
     vertices, faces = outline_cases.icosphere(4)
     assert len(faces) == 5120

@@ -18,52 +18,13 @@ from tests.numbers import f64
 FOLDER = "data/lenses"
 EXTENSIONS = (".json", ".zmx", ".seq", ".txt")
 
-# files whose own header states the paraxial focal length
-HEADERS = [
-    f"deeplens/{name}.json"
-    for name in (
-        "camera/ef100mm_f2.8",
-        "camera/rf50mm_f1.8",
-        "camera/sigma70mm_f2.8",
-        "camera/yongnuo_50mm_f1.8",
-        "cooke",
-        "thorlabs/lb1471a",
-    )
-]
-# and files that claim none, or round what they claim, for the round trips
-OTHERS = [
-    *(
-        f"deeplens/{name}"
-        for name in (
-            "camera/ef35mm_f2.0.zmx",
-            "camera/ef85mm_f1.8.json",
-            "camera/rf16mm_f2.8.json",
-            "camera/rf24mm_f1.8.json",
-            "thorlabs/acl12708u.json",
-        )
-    ),
-    *(
-        f"rayoptics/{name}"
-        for name in (
-            "US05331467-1.zmx",
-            "US08427765-1.ZMX",
-            "HoO-V2C18Ex27.zmx",
-            "schmidt.seq",
-            "achroMangin_ok.seq",
-            "asp46.seq",
-            "rc_f16.seq",
-        )
-    ),
-]
-
-
 REAL = json.loads(Path(__file__).with_name("real_files.json").read_text())
 
 
-@pytest.mark.parametrize("name", [*HEADERS, *REAL["claimed"]])
+@pytest.mark.parametrize("name", [*REAL["headers"], *REAL["claimed"]])
 def test_focal_lengths_are_within_half_a_percent_of_what_is_claimed(name, shared):
     path = shared(f"{FOLDER}/{name}")
-    if name in HEADERS:
+    if name in REAL["headers"]:
         wavelength_um, claimed = 0.5875618, json.loads(path.read_text())["foclen"]
     else:
         wavelength_um, claimed, _ = REAL["claimed"][name]
@@ -155,7 +116,7 @@ def test_one_lens_in_two_formats(one, other, atol, shared):
     same_rays(a, b, atol)
 
 
-@pytest.mark.parametrize("name", [*HEADERS, *REAL["claimed"], *OTHERS])
+@pytest.mark.parametrize("name", [*REAL["headers"], *REAL["claimed"], *REAL["others"]])
 @pytest.mark.parametrize("extension", ["json", "zmx"])
 def test_real_lenses_survive_a_round_trip(name, extension, shared, tmp_path):
     before = lens.load(shared(f"{FOLDER}/{name}"))

@@ -71,6 +71,10 @@ def built(**part):
     return GeoLens([Surface(50.0, 5.0, None, 5.0, **part)], 4.0)
 
 
+def of_glass(glass):
+    return GeoLens([Surface(50.0, 4.0, glass, 5.0), Surface(60.0, 40.0, None, 5.0)], 5.0)
+
+
 def stopped(at, **options):
     faces = [Surface(50.0 - 130 * i, 5.0, None, 5.0, is_stop=i == at) for i in range(2)]
     return GeoLens(faces, 4.0, **options)
@@ -128,8 +132,12 @@ def triplet():
 
 
 @refusals.table(__file__)
-def test_what_cannot_be_gets_a_sentence(row, triplet):
+def test_what_cannot_be_gets_a_sentence(row, triplet, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder.json").mkdir()
+    (tmp_path / "lens.doc").write_text("{}")
     assert len(row.holds(NAMES | {"geo": triplet})) < 500
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["folder.json", "lens.doc"]
 
 
 def test_the_limit_that_a_sentence_names_is_the_limit(triplet):

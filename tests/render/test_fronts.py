@@ -15,6 +15,7 @@ from codesign.render.placed import Placement, SidedScene
 from codesign.render.silhouettes.shapes import read
 from scenes import worlds
 from tests.numbers import close
+from tests.scenes.solids import across
 
 CAMERA = Camera(lens.Pinhole(4.0), 24, 24, 0.1, 4)
 # axes of one length, as Mitsuba asks for
@@ -68,8 +69,8 @@ def test_what_glows_shows_the_side_that_mitsuba_shows(tmp_path, kind, seed):
     found = read(mi, mi.load_dict({"type": "scene", **glowing}).shapes()[0])
     if kind not in EQUAL:  # faces of the outline point to where the light goes
         corners = found.vertices[found.faces]
-        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        ahead = across / np.linalg.norm(across, axis=1, keepdims=True)
+        normal = across(corners)
+        ahead = normal / np.linalg.norm(normal, axis=1, keepdims=True)
         rays = [
             mi.Float(np.float32(v))
             for v in np.concatenate([corners.mean(1) + 0.01 * ahead, -ahead], 1).T

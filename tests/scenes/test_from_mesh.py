@@ -17,7 +17,7 @@ from codesign.pose import look_at, se3_exp
 from scenes import build, mesh_files, textures, worlds
 from tests import refusals
 from tests.numbers import D, f64
-from tests.scenes.solids import volume_m3
+from tests.scenes.solids import across, area_m2, volume_m3
 
 PICTURE = np.array([[0, 64], [128, 255]], dtype=np.uint8)  # first row at the top; no two alike
 CAMERA = render.Camera(lens.Pinhole(8.0), 32, 32, 0.2, samples_per_pixel=4)
@@ -289,10 +289,18 @@ def test_polygons_have_their_area_or_are_refused(tmp_path, name, kind):
                 mesh_files.read(path, 1.0, "z")
             refused += 1
             continue
-        corners = part.vertices_m[part.faces]
-        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        assert np.linalg.norm(across, axis=1).sum() / 2 == pytest.approx(area, rel=1e-6)
+        assert area_m2(part) == pytest.approx(area, rel=1e-6)
     assert 0 < refused < len(outline) if name != "house" else refused == 0
+
+
+def ply(lines, *names):
+    """Text of a file with one face over all vertices; lines: their numbers, by these names."""
+    numbers = "".join(f"property float {name}\n" for name in names)
+    face = " ".join(map(str, [len(lines), *range(len(lines))]))
+    return (
+        f"ply\nformat ascii 1.0\nelement vertex {len(lines)}\n{numbers}element face 1\n"
+        "property list uchar int vertex_indices\nend_header\n" + "\n".join([*lines, face, ""])
+    )
 
 
 def polygon(folder, outline, kind):
@@ -302,12 +310,7 @@ def polygon(folder, outline, kind):
         text = "".join(f"v {x} {y} 0\n" for x, y in outline)
         text += f"f {' '.join(str(i + 1) for i in range(count))}\n"
     elif kind == "ply":
-        text = (
-            f"ply\nformat ascii 1.0\nelement vertex {count}\nproperty float x\nproperty float y\n"
-            "property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
-            + "".join(f"{x} {y} 0\n" for x, y in outline)
-            + f"{count} {' '.join(map(str, range(count)))}\n"
-        )
+        text = ply([f"{x} {y} 0" for x, y in outline], "x", "y", "z")
     else:
         text = (
             '<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">'
@@ -363,15 +366,7 @@ def test_colours_of_vertices_are_read_or_refused(tmp_path, kind, colours, found)
     if kind == "obj":
         text = "".join(f"v {line}\n" for line in lines) + "f 1 2 3\n"
     else:
-        numbers = "".join(
-            f"property float {name}\n" for name in ("x", "y", "z", "red", "green", "blue")
-        )
-        text = f"ply\nformat ascii 1.0\nelement vertex 3\n{numbers}element face 1\n"
-        text += (
-            "property list uchar int vertex_indices\nend_header\n"
-            + "\n".join(lines)
-            + "\n3 0 1 2\n"
-        )
+        text = ply(lines, "x", "y", "z", "red", "green", "blue")
     (tmp_path / f"c.{kind}").write_text(text)
     if isinstance(found, str):
         with pytest.raises(FileFormatError, match=found):
@@ -404,16 +399,13 @@ def test_volume_and_area_of_a_cube_in_every_format(tmp_path, kind):
     up = "z" if kind in ("dae", "glb") else None
     [part] = mesh_files.read(cube(tmp_path, kind), 0.1, up)
     assert volume_m3(part) == pytest.approx(0.05**3, rel=1e-6)
-    corners = part.vertices_m[part.faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    assert np.linalg.norm(across, axis=1).sum() / 2 == pytest.approx(6 * 0.05**2, rel=1e-6)
+    assert area_m2(part) == pytest.approx(6 * 0.05**2, rel=1e-6)
 
 
 def test_a_mirrored_node_keeps_its_outside_outside(tmp_path):
     nodes = [{"scale": [-1, 1, 1], "children": [1]}, {"mesh": 0}]
     [part] = mesh_files.read(write_gltf(tmp_path, "gltf", nodes=nodes))
-    corners = part.vertices_m[part.faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = across(part.vertices_m[part.faces])
     assert (normal[:, 1] < 0).all()  # towards the viewer, as before
 
 

@@ -8,7 +8,7 @@ from tests.studies.runs import module_of
 
 STUDIES = (
     *("codesign", "flow_quality", "gradient_flow", "hero", "joint_map", "lens_opt"),
-    *("make_dataset", "placement", "spike_esim", "velocity_head"),
+    *("lens_report", "make_dataset", "placement", "spike_esim", "velocity_head"),
 )
 ROWS = [(name, row) for name in STUDIES for row in refusals.rows(__file__, name)]
 

@@ -11,19 +11,16 @@ from torch import nn
 
 from codesign import events
 from codesign.errors import CodesignError, DomainError, ShapeError
-from codesign.system import Batch, System
+from codesign.system import System
 from codesign.types import FlowField
+from tests import refusals
 from tests.hostile import stages as s
 from tests.hostile.stages import (
     BATCH,
     SIDE,
-    T_S,
-    counted,
     field_of,
-    flow_of,
     glass,
     held,
-    moved,
     of,
 )
 
@@ -44,92 +41,17 @@ def helper(volume):
 
 NET, GAIN = s.Convolution(), nn.Parameter(torch.ones(()))
 PX = torch.ones(2, 2, SIDE, SIDE)
-BAD = {
-    "hard sensor": ("events", of(events=s.HARD_SENSOR)),
-    "pose cut": (
-        "flow.*T_world_cam",
-        of(flow=lambda v, T_world_cam: flow_of(v, T_world_cam.detach().mean())),
-    ),
-    "objective cuts": (
-        "'a'.*'estimate'",
-        of(
-            objectives={
-                "a": lambda estimate, field: s.error(estimate.detach()) + field.flow_px.mean()
-            }
-        ),
-    ),
-    "flow of one drive": ("'flow' holds 1", of(flow=lambda v: field_of(moved(v)[:1]))),
-    "flow [N, 2, 1, 1]": (
-        "flow",
-        of(flow=lambda v: s.entry("flow_px", lambda t: t[..., :1, :1])(flow_of(v))),
-    ),
-    "confidence [N, 1, H, W]": (
-        "flow",
-        of(flow=lambda v: replace(flow_of(v), confidence=moved(v)[:, :1])),
-    ),
-    "covariance of two": ("flow", of(flow=lambda v: replace(flow_of(v), covariance_px2=moved(v)))),
-    "truth [N, 2, 1, 1]": ("truth", truth(PX[..., :1, :1])),
-    "truth [N, 1, H, W]": ("truth", truth(PX[:, :1])),
-    "truth [1, 2, H, W]": ("'truth' holds 1", truth(PX[:1])),
-    "truth valid of floats": ("truth", truth(PX, valid=False)),
-    "frames of one drive": ("'frames' holds 1", of(render=s.picture(after=lambda f: f[:1]))),
-    "frames on 0 to 1": (
-        "scale is 0 to 255",
-        of(render=s.picture(after=lambda f: (f - f.min()) / 255)),
-    ),
-    "counts below 0": ("0 or more", of(events=lambda f: counted(f) - 1)),
-    "rays as a tensor": ("camera", of(camera=s.Camera(glass(), lambda r: r.direction))),
-    "mounts of three drives": ("mount", of(mount=held(lambda T: T.expand(3, 4, 4)))),
-    "trajectory of T - 1": (
-        "trajectory",
-        of(trajectory=lambda: s.DRIVES[1:5], batch=Batch(None, T_S, "waves")),
-    ),
-    "times in ms": ("milliseconds", of(batch=replace(BATCH, t_s=1e3 * T_S))),
-    "times that stand still": ("increase strictly", of(batch=replace(BATCH, t_s=0 * T_S))),
-    "float64 network": (
-        "float64 on cpu.*float32 on cpu.*'events'",
-        of(flow=s.Convolution().double()),
-    ),
-    "weights without values": (
-        "'flow.0.weight' is on the device meta",
-        of(flow=s.Convolution().to("meta")),
-    ),
-    "hidden in a global": ("does not see", of(flow=lambda volume: helper(volume))),
-    "hidden parameter": ("does not see", of(events=lambda frames: counted(frames, GAIN))),
-    "hidden mount": ("does not see", of(mount=s.closed(held()))),
-    "hidden camera": ("does not see", of(camera=s.closed(functools.partial(s.Camera, glass())))),
-    "hidden in an objective": (
-        "does not see",
-        of(objectives={"a": lambda volume: NET(volume).flow_px.mean()}),
-    ),
-    "in place on the batch": (
-        "in place",
-        of(mount=None, render=s.picture(poses=lambda T: T.mul_(1.01))),
-    ),
-    "in place on times": (
-        "in place",
-        of(flow=lambda volume, t_s: (t_s.add_(1), flow_of(volume))[1]),
-    ),
-    "takes no input": ("flow.*takes no input", of(flow=lambda: None)),
-    "takes another first": ("names its first argument 't", of(flow=lambda truth, volume: None)),
-    "more by position": ("'t_s' by position alone", of(events=placed)),
-    "asks for what is not": ("asks for 'theta'", of(events=lambda frames, theta: frames)),
-    "asks for what comes after": ("in a circle: '", of(events=lambda frames, field: frames)),
-    "a class": ("is the class", of(flow=s.Convolution)),
-    "a string": ("is a str", of(flow="refiner")),
-    "no objective": ("at least one objective", of(objectives={})),
-    "a gradient of no kind": ("gradient must be .* got 'exact'", of(gradient="exact")),
-    "said to cut, of no stage": ("may_cut is", of(may_cut=("event",))),
-    "one variable of 0": (
-        "'estimate.gain' is exactly 0",
-        of(estimate=s.Stage(lambda f, gain: s.mean_flow(f) + 0 * gain)),
-    ),
-}
 
 
-@pytest.mark.parametrize("name", [*BAD, *s.BAD])
-def test_bad_stages_are_named(name):
-    said, parts = (BAD | s.BAD)[name]
+@refusals.table(__file__, "bad stages")
+def test_bad_stages_are_named(row):
+    parts = eval(row.call, vars(s) | globals())
+    assert s.outcome(parts, f"(?s){row.sentence}") is None
+
+
+@pytest.mark.parametrize("name", s.BAD)
+def test_stages_that_are_spoilt_at_a_place_are_named(name):
+    said, parts = s.BAD[name]
     assert s.outcome(parts, f"(?s){said}") is None
 
 

@@ -5,11 +5,11 @@ import math
 from typing import Any
 
 import numpy as np
+import numpy as np
 import pytest
 import torch
 
 from codesign import events, lens, render
-from codesign.errors import DomainError, FileFormatError
 from codesign.mount import Mount
 from codesign.plain_yaml import load
 from codesign.system import HandOver, load_hand_over, save_hand_over
@@ -24,21 +24,17 @@ def found_mount(generator):
     return mount
 
 
+def behind(optic, **options):
+    return render.Camera(optic, 32, 24, 0.1, 4, **options)
+
+
 CAMERAS = {
-    "pinhole": lambda: render.Camera(lens.Pinhole(3.4), 32, 24, 0.1, 4, seed=3),
-    "thin": lambda: render.Camera(
-        lens.ThinLens(8.0, 2.0).focus_at(1.3), 32, 24, 0.1, 4, falloff=True
-    ),
+    "pinhole": lambda: behind(lens.Pinhole(3.4), seed=3),
+    "thin": lambda: behind(lens.ThinLens(8.0, 2.0).focus_at(1.3), falloff=True),
     "variables": lambda: varied(lens.ThinLens(8.0, 2.0)),
-    "float32": lambda: render.Camera(
-        lens.load("cooke-triplet", torch.float32).scaled(0.3), 32, 24, 0.1, 4
-    ),
-    "in one colour": lambda: render.Camera(
+    "float32": lambda: behind(lens.load("cooke-triplet", torch.float32).scaled(0.3)),
+    "in one colour": lambda: behind(
         lens.load("cooke-triplet").scaled(0.3),
-        32,
-        24,
-        0.1,
-        4,
         spectrum=lens.Spectrum((0.45, 0.5), (0.25, 0.75)),
     ).in_one_colour(),
     "windows": lambda: render.Camera(
@@ -155,35 +151,27 @@ def test_faults_of_the_file_get_a_sentence(row, tmp_path, generator):
     row.holds({"changed": changed})
 
 
-def test_what_cannot_be_handed_over_gets_a_sentence(tmp_path, generator):
-    mount = found_mount(generator)
-    camera = CAMERAS["pinhole"]()
+class Own:
+    def camera_rays(self, *args: Any, **kwargs: Any) -> Any:
+        raise NotImplementedError
 
-    class Fisheye(lens.ThinLens):
-        pass
 
-    class Own:
-        def camera_rays(self, *args: Any, **kwargs: Any) -> Any:
-            raise NotImplementedError
+class Fisheye(lens.ThinLens):
+    pass
 
-    with pytest.raises(FileFormatError, match=r"extension '.json'"):
-        save_hand_over(tmp_path / "mount.json", HandOver(mount, camera))
-    with pytest.raises(DomainError, match="a frame is named ''"):
-        save_hand_over(tmp_path / "mount.yaml", HandOver(mount, camera, parent_frame=""))
-    with pytest.raises(DomainError, match="kept by no file"):
-        save_hand_over(tmp_path / "mount.yaml", HandOver(mount, camera.with_lens(Own())))
-    with pytest.raises(DomainError, match="a Fisheye is kept by no file"):
-        save_hand_over(
-            tmp_path / "mount.yaml", HandOver(mount, camera.with_lens(Fisheye(3.4, 0.5)))
-        )
-    with pytest.raises(FileFormatError, match="no file lies at"):
-        load_hand_over(tmp_path / "nothing.yaml")
+
+@refusals.table(__file__, "what is handed over")
+def test_what_cannot_be_handed_over_gets_a_sentence(row, tmp_path, monkeypatch, generator):
+    monkeypatch.chdir(tmp_path)
+    made = {"MOUNT": found_mount(generator), "CAMERA": CAMERAS["pinhole"]()}
+    row.holds(globals() | made)
     assert list(tmp_path.iterdir()) == []
-    # what is refused leaves what was handed over before
-    save_hand_over(tmp_path / "mount.yaml", HandOver(mount.float(), CAMERAS["windows"]()))
+
+
+def test_what_is_refused_leaves_what_was_handed_over_before(tmp_path, generator):
+    mount, path = found_mount(generator), tmp_path / "mount.yaml"
+    save_hand_over(path, HandOver(mount.float(), CAMERAS["windows"]()))
+    notes = {"error": np.float32(0.1)}
     with pytest.raises(DomainError, match="float32 is not JSON"):
-        save_hand_over(
-            tmp_path / "mount.yaml",
-            HandOver(mount, CAMERAS["float32"](), notes={"error": np.float32(0.1)}),  # pyright: ignore[reportArgumentType]
-        )
-    load_hand_over(tmp_path / "mount.yaml")
+        save_hand_over(path, HandOver(mount, CAMERAS["float32"](), notes=notes))  # pyright: ignore[reportArgumentType]
+    load_hand_over(path)

@@ -9,7 +9,8 @@ import torch
 from torch import nn
 
 from codesign import train
-from codesign.errors import DomainError, FileFormatError
+from codesign.errors import FileFormatError
+from tests import refusals
 from tests.flow_training_case import TRUE_WEIGHTS, Linear, Made, in_two_processes, state_of
 
 
@@ -157,26 +158,16 @@ def test_another_training_is_not_resumed(tmp_path, options, sentence):
     assert noisy_fit(tmp_path, Noisy(), **options, resume=False).step == options.get("steps", 8)
 
 
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        ({"steps": 0}, "steps must be .* got 0"),
-        ({"clip": 0.0}, "clip must be .* got 0.0"),
-        ({"average": 1.0}, "average must be .* got 1.0"),
-        (
-            {"batch": 3, "ranks": train.Ranks(0, 2, torch.device("cpu"))},
-            "batch 3 cannot be shared evenly by 2",
-        ),
-        ({"loss": train.Photometric()}, "needs frames, and these windows have none"),
-        ({"blind": True}, "needs true flow, and the windows looked at have none"),
-    ],
-)
-def test_what_is_unfit_is_refused_before_the_first_step(options, sentence):
+@refusals.table(__file__, "fits")
+def test_what_is_unfit_is_refused_before_the_first_step(row):
     asked = []
     network = linear()
-    windows = Made(frames=False, blind=options.pop("blind", False), before=asked.append)
-    with pytest.raises(DomainError, match=sentence):
+
+    def fit(blind=False, **options):
+        windows = Made(frames=False, blind=blind, before=asked.append)
         train.fit(network, windows, **{"steps": 2, **options})
+
+    row.holds(globals() | {"fit": fit})
     assert asked in ([], [[0]]), "one window may be looked at, no more"
     assert torch.equal(network.layer.weight, linear().layer.weight)
 
