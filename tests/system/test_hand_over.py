@@ -5,11 +5,11 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy as np
 import pytest
 import torch
 
 from codesign import events, lens, render
+from codesign.errors import DomainError
 from codesign.mount import Mount
 from codesign.plain_yaml import load
 from codesign.system import HandOver, load_hand_over, save_hand_over
