@@ -10,7 +10,6 @@ import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import PIL.Image
@@ -39,17 +38,20 @@ UNREAD = ("EXT_mesh_gpu_instancing", "KHR_texture_transform")
 
 @dataclass(frozen=True)
 class Surface:
-    """Base colour: linear luminance ``factor`` times ``picture`` [H, W] (first row at the top) or
-    1."""
+    """Base colour: linear ``factor`` [3], and the luminance of it times the picture [H, W] (first
+    row at the top) where there is one."""
 
-    factor: float
+    factor: np.ndarray
     picture: np.ndarray | None = None
     wrap: str = "repeat"
 
 
-def luminance(image: Any) -> np.ndarray:
-    """Linear luminance [H, W], 0..1, of a PIL picture coded in sRGB; transparency is left out."""
-    return textures.linear(textures.stored_values(image))
+def luminance(stored: np.ndarray, factor: np.ndarray) -> np.ndarray:
+    """Linear luminance [H, W] of a picture's values in sRGB [H, W] or [H, W, 3], each colour times
+    its linear factor [3]."""
+    if stored.ndim < 3 or np.ptp(factor) == 0:
+        return factor @ textures.LUMINANCE * textures.linear(stored)
+    return textures.linear(stored, factor * textures.LUMINANCE)
 
 
 def opened(path: Path, folder: Folder, materials: bool) -> tuple[bytes, dict[str, Surface]]:
@@ -153,7 +155,8 @@ def _surfaces(tree, folder):
         base = material.get("pbrMetallicRoughness") or {
             key.replace("diffuse", "baseColor"): value for key, value in older.items()
         }
-        factor = np.asarray(base.get("baseColorFactor", [1, 1, 1, 1]))[:3] @ textures.LUMINANCE
+        given = base.get("baseColorFactor", [1, 1, 1, 1])
+        factor = np.asarray(given, dtype=np.float64)[:3].reshape(3)
         texture = base.get("baseColorTexture")
         if texture is None:
             found[str(number)] = Surface(factor)
@@ -172,7 +175,9 @@ def _surfaces(tree, folder):
         wraps = {sampler.get(key, REPEAT) for key in ("wrapS", "wrapT")}
         if len(wraps) > 1:
             raise ValueError("a picture goes on in one way along u and in another along v")
-        found[str(number)] = Surface(factor, pictures[source], WRAPS[wraps.pop()])
+        found[str(number)] = Surface(
+            factor, luminance(pictures[source], factor), WRAPS[wraps.pop()]
+        )
     return found
 
 
@@ -184,7 +189,7 @@ def _picture(tree, image, folder):
     else:
         data = _bytes(image["uri"], folder)
     with PIL.Image.open(io.BytesIO(data)) as picture:
-        return luminance(picture)
+        return textures.stored_values(picture)
 
 
 def _bytes(uri, folder):

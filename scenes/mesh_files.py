@@ -297,11 +297,12 @@ def _coloured(where, name, vertices, faces, whole, visual, surfaces):
     tint = visual.vertex_attributes.get("color") if surfaces is not None else None
     if tint is not None:
         scale = np.iinfo(tint.dtype).max if tint.dtype.kind == "u" else 1.0
-        tint = tint[:, :3].astype(np.float64) / scale @ textures.LUMINANCE
+        tint = tint[:, :3].astype(np.float64) / scale
     if surface.picture is None:
         if tint is None:
-            return Part(name, vertices, faces, plain * 0 + surface.factor)
-        return Part(name, vertices, faces, surface.factor * tint, smooth=True)
+            return Part(name, vertices, faces, plain * 0 + surface.factor @ textures.LUMINANCE)
+        shade = (surface.factor * tint) @ textures.LUMINANCE
+        return Part(name, vertices, faces, shade, smooth=True)
     uv = visual.uv
     if uv is None or len(uv) != len(vertices) or not np.isfinite(uv).all():
         raise FileFormatError(
@@ -313,7 +314,7 @@ def _coloured(where, name, vertices, faces, whole, visual, surfaces):
             f"{where}: its picture is tinted by vertex colours, which is not read; bake them into the picture."
         )
     uv = np.asarray(uv, dtype=np.float64)
-    return Part(name, vertices, faces, surface.factor * surface.picture, uv, wrap=surface.wrap)
+    return Part(name, vertices, faces, surface.picture, uv, wrap=surface.wrap)
 
 
 def _from_srgb(colours):
@@ -331,10 +332,11 @@ def _surface(material: Any) -> gltf.Surface:
         said = None if rounded is None else np.asarray(rounded, dtype=np.float64)[:3] / 255
     elif np.size(said) != 3:
         said = np.full(3, np.ravel(said)[0])
-    factor = UNCOLOURED if picture is None else 1.0
-    if said is not None:
-        factor = float(np.asarray(said, dtype=np.float64) @ textures.LUMINANCE)
-    return gltf.Surface(factor, None if picture is None else gltf.luminance(picture))
+    if said is None:
+        said = np.full(3, UNCOLOURED if picture is None else 1.0)
+    factor = np.asarray(said, dtype=np.float64)
+    stored = None if picture is None else textures.stored_values(picture)
+    return gltf.Surface(factor, None if stored is None else gltf.luminance(stored, factor))
 
 
 def _merged(part):

@@ -110,9 +110,9 @@ def stored_values(image: PIL.Image.Image) -> np.ndarray:
     return np.asarray(image if gray else image.convert("RGB"))
 
 
-def linear(stored: np.ndarray) -> np.ndarray:
+def linear(stored: np.ndarray, shares: np.ndarray = LUMINANCE) -> np.ndarray:
     """Linear luminance 0..1, [H, W] float64, of values coded by the sRGB gamma: [H, W] or
-    [H, W, 3], whole numbers or 0..1."""
+    [H, W, 3], whole numbers or 0..1. shares: of red, green and blue in it, of whole numbers."""
     white = np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else 1.0
     if stored.dtype.kind != "u" or stored.dtype.itemsize > 2:
         return luminance(_light(np.asarray(stored, dtype=np.float64) / white))
@@ -120,7 +120,7 @@ def linear(stored: np.ndarray) -> np.ndarray:
     if stored.ndim < 3 or stored.shape[2] < 3:
         return luminance(level[stored])
     # colour by colour: a picture of 45 megapixels takes a gigabyte at once
-    return sum(share * level[stored[..., colour]] for colour, share in enumerate(LUMINANCE))
+    return sum(share * level[stored[..., colour]] for colour, share in enumerate(shares))
 
 
 def _light(values):

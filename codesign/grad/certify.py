@@ -11,7 +11,7 @@ import torch
 
 from codesign.checks import check_positive, check_whole
 from codesign.errors import DomainError
-from codesign.grad.differences import Ladder, rounding_noise
+from codesign.grad.differences import EPS, Ladder, rounding_noise, stair
 from codesign.grad.groups import Loss, check_groups, components, gradients, random_lines, repeated
 from codesign.grad.row import SIGMAS, Row, make_row
 
@@ -141,15 +141,21 @@ class _Group:
         decided = row.verdict == "pass" and SIGMAS * row.noise_floor <= self.tolerance
         return row if decided or not self.extend else self.tried(lines, MANY, MORE_STEPS)
 
-    def tried(self, lines, spacings, more):
+    def tried(self, lines, spacings, more, least=0.0):
+        seen = []
+
+        def fn(x):
+            seen.append(self.alone(x))
+            return seen[-1]
+
         step = NOISE_STEP * max(self.steps)
-        noise = max(self.jitter, rounding_noise(self.alone, self.value, self.probe, step, spacings))
+        noise = max(self.jitter, least, rounding_noise(fn, self.value, self.probe, step, spacings))
         slopes = []
         ladders = []
         for line in lines:
             step = line.to(self.unit) * self.unit
             slopes.append(float((self.grad.double() * step.double()).sum()))
-            ladders.append(Ladder(self.alone, self.value, step, noise, self.eps, self.grad))
+            ladders.append(Ladder(fn, self.value, step, noise, self.eps, self.grad))
             ladders[-1].take(self.steps)
         for ladder, step in product(ladders, more):
             try:
@@ -157,6 +163,9 @@ class _Group:
             # nobody asked for steps as large as these
             except (ArithmeticError, RuntimeError, ValueError):
                 ladder.left_out.append(step)
+        rounded = stair([float(value) for value in seen]) if self.eps == EPS else 0.0
+        if rounded > noise:
+            return self.tried(lines, spacings, more, rounded)
         return make_row(
             self.name, slopes, [ladder.difference() for ladder in ladders], self.tolerance
         )

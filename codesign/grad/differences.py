@@ -85,6 +85,19 @@ def _nine(fn, point, unit):
     return statistics.median(found)
 
 
+def stair(values: Sequence[float]) -> float:
+    """Half the spacing of stairs on which all these values stand, as those of coarser formats do in
+    double; 0 where they stand on none. Of one value alone, that of single precision."""
+    found = torch.tensor([v for v in values if math.isfinite(v)], dtype=torch.float64).unique()
+    gaps = found.diff()
+    largest = max(found.abs().tolist(), default=0.0)
+    gaps = gaps[gaps > 4 * EPS * largest]
+    if not len(gaps):
+        return _rounding(largest, torch.finfo(torch.float32).eps)
+    steps = (found - found[0]) / gaps.min()
+    return float(gaps.min()) / 2 if bool(((steps - steps.round()).abs() < 0.01).all()) else 0.0
+
+
 class Ladder:
     """Central differences along one direction, rung by rung, each with what rounding may do to
     it."""

@@ -58,7 +58,7 @@ _CODE = re.compile(r"([0-9]{3})([0-9]{3})(?:\.[0-9]{3})?|([0-9]{3,9})\.([0-9]{3,
 _PAIR = re.compile(r"([0-9]\.[0-9]{1,16}) ?[/:] ?([0-9]{1,3}(?:\.[0-9]{1,16})?)")
 
 
-def _maker(text):
+def maker_of(text: str) -> str | None:
     """The maker of glass that a text names; None where it names none, or a catalogue of several."""
     found = next((maker for maker in _MAKERS[:-3] if maker in text.upper()), None)
     return "HIKARI" if found == "NIKON" else found  # one catalogue
@@ -236,7 +236,8 @@ class Glass:
         (NBK7_SCHOTT) do not matter.
 
         catalogues: that a file takes its glasses from (GCAT of a .zmx: makers, SUMITA_AUG2011).
-          Where all of them are makers known here, a glass of that name by another maker is refused.
+          Where all of them are makers known here, a glass of that name by another maker is refused;
+          one that the catalogue keeps apart (SF15_HIKARI) is that of the first that made one.
 
         What looks like a code stands for nd and Vd, as in ``from_abbe``: 517642, 517.642,
         517642.251, 517000.642000, 1.5168/64.17.
@@ -255,7 +256,8 @@ class Glass:
         text = name.strip().upper()
         stem, _, maker = text.rpartition("_")
         known = _by_key()
-        glass = known.get(_key(text))
+        keys = (_key(f"{text}_{maker_of(catalogue)}") for catalogue in catalogues)
+        glass = next((known[key] for key in keys if key in known), known.get(_key(text)))
         if glass is None and maker in _MAKERS:
             found = known.get(_key(stem))
             # LAF20 of Hoya is not LAF20 of Schott
@@ -270,8 +272,8 @@ class Glass:
                 f"glass {_cut(name)} is not in the catalogue; the nearest names are {offers}; else give "
                 "Glass.from_indices or Glass.from_abbe, in a .zmx a line such as GLAS ___BLANK 1 0 nd Vd."
             )
-        told = [_maker(catalogue) for catalogue in catalogues]
-        maker = _maker(glass.source)
+        told = [maker_of(catalogue) for catalogue in catalogues]
+        maker = maker_of(glass.source)
         if told and maker and None not in told and maker not in told:
             raise DomainError(
                 f"glass {_cut(name)} is that of {maker.title()} in the catalogue, and the file takes its glasses from "

@@ -76,7 +76,7 @@ def spots_by_wavelength(
     lines = list(_lines(light))
     first_um = lines[0][0]
     figure, axes = _grid(1, len(fields_rad), 3.1, 3.4, sharex=True, sharey=True)
-    airy = 1.22 * first_um * float(lens.first_order(first_um).fno.abs())
+    airy = 1.22 * first_um * float(analysis.working_fno(lens, first_um, at_m))
     for axis, field in zip(axes[0], fields_rad, strict=True):
         points, weight = analysis.polychromatic_spot(
             lens, field, light, grid, vignetting, at_m=at_m

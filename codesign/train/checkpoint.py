@@ -71,6 +71,7 @@ def load(folder: Path, learner: Learner, facts: dict[str, Any]) -> Progress | No
             f"'{path}' has format version {version}, this codesign reads version {VERSION}; go on with the "
             "codesign that wrote it, or start a new run."
         )
+    stored.setdefault("functions", facts.get("functions"))  # runs begun earlier lack it
     _check_facts(path, stored, json.loads(json.dumps(facts)))
     if Path(file).name != file or len(file) > 100:
         raise FileFormatError(

@@ -1,9 +1,14 @@
 """Training in one call."""
 
 import dataclasses
+import dis
+import functools
+import hashlib
+import inspect
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import CodeType
 from typing import Any
 
 import torch
@@ -19,6 +24,8 @@ from codesign.train.learner import Learner
 from codesign.train.loop import Budget, Cosine, Progress
 from codesign.train.objectives import Supervised, flow_predictions
 from codesign.train.parallel import ALONE, Ranks
+
+PLAIN = (bool, int, float, complex, str, bytes, type(None))
 
 
 def fit(
@@ -183,6 +190,7 @@ def _facts(learner, steps, batch, schedule):
             "clip": str(learner.clip),
             "average": learner.average,
         },
+        "functions": _told((learner.loss, learner.predict, schedule)),
         "torch": torch.__version__,
     }
 
@@ -192,3 +200,24 @@ def _name(value):
     if dataclasses.is_dataclass(value):
         return repr(value)
     return getattr(value, "__qualname__", type(value).__qualname__)
+
+
+def _told(value):
+    """What an equal thing of another process says of itself too: partials by their parts, functions
+    by code, defaults and the plain values around them that they do not write; of others the name."""
+    if isinstance(value, functools.partial):
+        value = value.func, value.args, value.keywords
+    if isinstance(value, CodeType):
+        value = value.co_code, value.co_names, value.co_consts
+    if isinstance(value, (dict, set, frozenset)):
+        value = sorted(value.items() if isinstance(value, dict) else value, key=repr)
+    if isinstance(value, (list, tuple)):
+        return f"({', '.join(map(_told, value))})"
+    if isinstance(value, PLAIN) or not hasattr(value, "__code__"):
+        return repr(value) if isinstance(value, PLAIN) else _name(value)
+    around = inspect.getclosurevars(value)
+    plain = {n: v for n, v in (around.globals | around.nonlocals).items() if isinstance(v, PLAIN)}
+    written = {op.argval for op in dis.get_instructions(value) if op.opname.startswith("STORE")}
+    read = {n: v for n, v in plain.items() if n not in written}
+    inside = _told((value.__code__, value.__defaults__, value.__kwdefaults__, read))
+    return f"{_name(value)} {hashlib.sha256(inside.encode()).hexdigest()[:12]}"

@@ -294,7 +294,7 @@ def sharpness(run, geo, fields, light, quick, at_m):
         ("field", "RMS (waves)", "RMS without tilt", "peak to valley", "Strehl ratio without tilt"),
         rows,
     )
-    fno = float(geo.first_order(light[0]).fno.abs())
+    fno = float(analysis.working_fno(geo, light[0], at_m))
     airy = light[0] * 1e-3 * fno
     how = {"about_chief": True, "at_m": at_m}
     widest = max(
@@ -341,7 +341,7 @@ def sharpness(run, geo, fields, light, quick, at_m):
     run.figure(
         lens_figures.mtf_curves(frequency, curves, ideal),
         "mtf",
-        "MTF; dotted: a perfect lens of the same f-number on the axis.",
+        "MTF; dotted: a perfect lens with the same cone of light on the axis.",
     )
     depth = max(8 * airy * fno, 2 * widest * fno)
     shifts = torch.linspace(-depth, depth, 11 if quick else 31).tolist()

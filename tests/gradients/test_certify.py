@@ -60,6 +60,23 @@ def on_a_thousand(seed, longer):
     return certified(fn, x, longer * grad_of(fn, x), directions=4, generator=generator)
 
 
+@pytest.mark.parametrize("error", [0.0, 0.03, -0.07])
+@pytest.mark.parametrize("offset", [1.0, 1e2, 1e3, 1e4])
+def test_single_precision_returned_in_double_is_judged_as_single_precision(offset, error):
+    for seed in range(5):
+
+        def fn(p):
+            x = p["x"] + error * (p["x"] - p["x"].detach())
+            return 0.01 * x.float().square().sum() + offset
+
+        x = {"x": torch.randn(3, generator=seeded(seed)).double()}
+        (single,), (double,) = certify(fn, x), certify(lambda p, fn=fn: fn(p).double(), x)
+        assert double.verdict == single.verdict
+        assert offset > 1e2 or double.verdict == ("fail" if error else "pass")
+    (row,) = certify(lambda p: offset + 0 * p["x"].sum(), x)
+    assert row.verdict == "pass"
+
+
 def test_the_weights_of_a_network_with_kinks():
     verdicts = {"right": [], "wrong": []}
     for seed in range(4):

@@ -42,6 +42,12 @@ def test_a_lens_has_what_its_file_says(kind, exchanges, fact, tmp_path):
     assert eval(fact, NAMES | names)
 
 
+def test_the_name_counts_where_the_first_catalogue_is_its_makers(tmp_path):
+    line = r"MODE SEQ => MODE SEQ\nGCAT SCHOTT ;; N-BK7 0 0 1.5 40 => N-BK7 0 0 1.9 20"
+    with pytest.warns(UserWarning, match=r"nd 1.51680 .* says 1.9 and 20, .* the name counts"):
+        assert load_file(tmp_path, "zmx", line).to_surfaces() == SINGLET
+
+
 @pytest.mark.parametrize(("kind", "name"), [("zmx", "a singlet"), ("seq", "a; singlet!")])
 def test_a_singlet_is_what_the_lensmaker_says(kind, name, tmp_path):
     geo = load_file(tmp_path, kind)

@@ -18,8 +18,13 @@ from codesign.lens.analysis import (
     psf_on_pixels,
     through_focus_mtf,
     through_focus_spot_mm,
+    working_fno,
 )
+<<<<<<< HEAD
 from codesign.report.lens_figures import psf_pictures
+=======
+from codesign.report import lens_figures
+>>>>>>> wt-cure
 from tests.lens.systems import LINES, close, paraboloid
 from tests.numbers import D, f64
 
@@ -44,6 +49,25 @@ def test_the_airy_pattern():
     close((low + (a - c) / (2 * (a - 2 * b + c))) * pixel, 1.2197 * w * N, 2e-3)
     # peak: energy density pi / 4 (1 / w N)^2 of the whole
     close(float(energy[64, 64]) / pixel**2, math.pi / 4 / (w * N) ** 2, 1e-3)
+
+
+def test_the_cone_of_light_is_that_of_the_distance_and_of_the_medium():
+    # an ellipsoid of index 1.5 brings parallel light to its far focus, 150 mm behind its vertex
+    glass = lens.Glass.from_indices(1.5, 1.5, 1.5)
+    geo = GeoLens([Surface(50.0, 150.0, glass, 12.0, conic=-1 / 1.5**2, is_stop=True)], 20.0)
+    height, bend = 10.0, 1 - 1 / 1.5**2
+    sag = height**2 / 50 / (1 + math.sqrt(1 - bend * (height / 50) ** 2))
+    true = math.hypot(height, 150 - sag) / (2 * 1.5 * height)
+    close(working_fno(geo), true, 1e-12)
+    close(
+        diffraction_mtf(geo, 0.0, [50.0, 200.0])[0], ideal_mtf(f64([50.0, 200.0]), true), atol=3e-3
+    )
+    # a triplet at f/25 and 0.11 m: its own transform, and the circle that is drawn
+    near = lens.load("cooke-triplet").with_pupil(2.0).focus_at(0.11)
+    number, f = working_fno(near, at_m=0.11), f64([20.0, 30.0])
+    close(diffraction_mtf(near, 0.0, f, at_m=0.11)[0], ideal_mtf(f, number.detach()), atol=0.01)
+    axis = lens_figures.spots_by_wavelength(near, [0.0], 0.5875618, at_m=0.11).axes[0]
+    close(axis.patches[0].radius, 1.22 * 0.5875618 * number, 1e-12)
 
 
 # pitches of the two axes differ by 1e-3 off the axis: by 0.02 px at 24 px from the middle

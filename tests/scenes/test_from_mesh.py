@@ -233,17 +233,36 @@ def test_colours_of_faces_and_vertices_are_shown_in_the_light_of_a_plain_sky(tmp
 
 
 def test_colours_of_16_bits_are_read_to_their_last_bit(tmp_path):
-    levels = np.array([13107, 655, 65535, 40000], dtype="<u2")  # where texture coordinates were
-    colours = {"bufferView": 1, "componentType": 5123, "count": 3, "type": "VEC4"}
-    path = write_gltf(
-        tmp_path,
-        "gltf",
-        uv=levels.repeat(4).view("<f4").reshape(4, 2),
-        meshes=[{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}}]}],
-        accessors=[{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}, colours],
+    levels = np.array([13107, 655, 65535, 40000], dtype="<u2")
+    pure, truth = 65535 * np.eye(4, dtype="<u2"), [0.2126 / 2, 0.7152 / 4, 0.0722]
+    tint = [{"pbrMetallicRoughness": {"baseColorFactor": [0.5, 0.25, 1, 1]}}]
+    point, colour = (
+        {"bufferView": view, "componentType": kind, "count": 3, "type": shape}
+        for view, kind, shape in ((0, 5126, "VEC3"), (1, 5123, "VEC4"))
     )
-    [part] = mesh_files.read(path)
-    assert part.colour == pytest.approx(levels[:3] / 65535, rel=1e-12)
+    white = levels.repeat(4), {}, levels[:3] / 65535
+    for values, material, found in (white, (pure, {"material": 0}, truth)):
+        path = write_gltf(
+            tmp_path,
+            "gltf",
+            uv=values.view("<f4").reshape(4, 2),  # where texture coordinates were
+            meshes=[{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}, **material}]}],
+            materials=tint,
+            accessors=[point, colour],
+        )
+        [part] = mesh_files.read(path)
+        assert part.colour == pytest.approx(found, rel=1e-12)
+
+
+def test_a_picture_is_tinted_colour_by_colour(tmp_path):
+    base = {"baseColorFactor": [1, 0.05, 0.05, 1], "baseColorTexture": {"index": 0}}
+    obj = write_obj(tmp_path, UPRIGHT, SQUARE, kd="1 0.05 0.05")
+    other = write_gltf(tmp_path, "gltf", materials=[{"pbrMetallicRoughness": base}])
+    PIL.Image.new("RGB", (2, 2), (200, 30, 30)).save(tmp_path / "p.png")
+    # 200 and 30 of sRGB are 0.577580 and 0.012983 of light, by IEC 61966-2-1
+    truth = 0.2126 * 0.577580 + 0.05 * (0.7152 + 0.0722) * 0.012983
+    for path in (obj, other):
+        assert mesh_files.read(path)[0].colour == pytest.approx(np.full((2, 2), truth), rel=1e-5)
 
 
 def test_a_diffuse_colour_of_the_older_extension_is_the_base_colour(tmp_path):

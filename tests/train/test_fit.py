@@ -2,6 +2,7 @@
 
 import json
 import signal
+from functools import partial
 from typing import Any
 
 import pytest
@@ -95,6 +96,10 @@ class Noisy(nn.Module):
         return self.layers(x)
 
 
+def far(y, x, k=1.0):
+    return (y - k * x[:, :1]).square().mean()
+
+
 def noisy_fit(folder, network, **options):
     def batches(step):
         return torch.randn(16, 2, generator=torch.Generator().manual_seed(step))
@@ -102,9 +107,8 @@ def noisy_fit(folder, network, **options):
     return train.fit(
         network,
         batches,
-        **{"steps": 8, **options},
+        **{"steps": 8, "loss": far, **options},
         predict=lambda network, x: network(x),
-        loss=lambda y, x: (y - x[:, :1]).square().mean(),
         average=0.9,
         validate=lambda network: float((network(batches(1000)) - 1).square().mean()),
         validate_every=3,
@@ -156,6 +160,18 @@ def test_another_training_is_not_resumed(tmp_path, options, sentence):
     with pytest.raises(FileFormatError, match=sentence):
         noisy_fit(tmp_path, Noisy(), **options)
     assert noisy_fit(tmp_path, Noisy(), **options, resume=False).step == options.get("steps", 8)
+
+
+@pytest.mark.parametrize("of", [lambda k: partial(far, k=k), lambda k: lambda y, x: far(y, x, k)])
+def test_another_loss_is_not_resumed(tmp_path, of):
+    noisy_fit(tmp_path, Noisy(), loss=of(2.0))
+    assert noisy_fit(tmp_path, Noisy(), loss=of(2.0)).step == 8
+    with pytest.raises(FileFormatError, match=r"functions .*, this run has .*; start a new"):
+        noisy_fit(tmp_path, Noisy(), loss=of(3.0))
+    stored = json.loads((tmp_path / "checkpoint.json").read_text())
+    del stored["functions"]  # as of a run begun before it was written
+    (tmp_path / "checkpoint.json").write_text(json.dumps(stored))
+    assert noisy_fit(tmp_path, Noisy(), loss=of(3.0)).step == 8
 
 
 @refusals.table(__file__, "fits")

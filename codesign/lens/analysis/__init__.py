@@ -29,6 +29,7 @@ from codesign.lens.analysis.rays import (
     pupil_grid,
     spectral_lines,
     trace_field,
+    working_fno,
 )
 from codesign.lens.analysis.spots import (
     encircled_energy,
@@ -92,6 +93,7 @@ __all__ = [
     "trace_field",
     "traced_depth_of_field",
     "wavefront",
+    "working_fno",
 ]
 
 explain(globals())

@@ -249,6 +249,18 @@ def chief_ray(
     return trace_field(lens, field_rad, centre, wavelength_um, at_m=at_m)
 
 
+def working_fno(
+    lens: TracedLens, wavelength_um: float = D_UM, at_m: float | Tensor = PARALLEL
+) -> Tensor:
+    """f-number of the cone that makes the image of an axial point: 1 / (2 NA), NA the index there
+    times the sine of half its angle, through all of the pupil that arrives. at_m: of one point, see
+    ``trace_field``. Gradient: to every lens tensor. Raises: DomainError when no ray arrives."""
+    line = torch.linspace(-1, 1, 33, dtype=lens.dtype, device=lens.curvature_per_mm.device)
+    rays = trace_field(lens, 0.0, torch.stack([0 * line, line], 1), wavelength_um, at_m=at_m)
+    sine = rays.direction[rays.weight > 0][:, 1]
+    return 1 / (rays.index * (sine.max() - sine.min()))
+
+
 def spectral_lines(light: Light) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Wavelengths (um) and weights that sum to 1, from a wavelength, a list of them
     (equal weights), or anything with wavelengths_um and weights.

@@ -38,7 +38,8 @@ def load(source: str | Path, dtype: torch.dtype = torch.float64) -> GeoLens:
         .txt (DiffOptics).
       dtype: precision of the lens.
     Returns: GeoLens. Files are parsed, never executed; at most 2 MB and 500 surfaces are read.
-    Warns: when coordinate breaks of a .zmx file put the stop beside the axis.
+    Warns: when coordinate breaks of a .zmx file put the stop beside the axis, and when nd and Vd
+      beside a glass of its first catalogue are those of another.
     Raises: FileFormatError or DomainError, one sentence naming file, place, fault and remedy;
       nothing is half loaded or dropped.
 

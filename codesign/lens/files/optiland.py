@@ -237,7 +237,8 @@ def _medium(row, key):
     if kind == "AbbeMaterial":
         return Glass.from_abbe(p.number(material, "index"), p.number(material, "abbe"))
     if kind == "Material" and isinstance(material.get("name"), str):
-        return Glass.named(material["name"])
+        maker = material.get("reference")
+        return Glass.named(material["name"], [maker] if isinstance(maker, str) else ())
     raise FileFormatError(
         f"its material {shown(kind)} is not read; IdealMaterial, AbbeMaterial and Material are."
     )

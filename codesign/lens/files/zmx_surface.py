@@ -1,6 +1,7 @@
 """One surface of a .zmx file: a table of its keywords, and what of them can be traced."""
 
 import math
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -22,7 +23,7 @@ from codesign.lens.files.text import (
     whole,
     yes,
 )
-from codesign.lens.glass import Glass
+from codesign.lens.glass import Glass, maker_of
 from codesign.lens.surface import Phase
 
 TYPES = ("STANDARD", "EVENASPH", "BINARY_2")
@@ -40,6 +41,7 @@ IDLE_WORDS = """
 SLAB HIDE MIRR POPS FIMP COAT COMM PZUP PPAR VPAR VDSZ VCON PKUP MAZH MARG EDGE MEMA OEMA TCMM TCED CHZN
 SCOL SOPA DRAW NOTE RCMF
 """
+UNUSED = [1.5, 40.0], [0.0, 0.0]  # nd and Vd beside names where no model glass was
 APERTURES = {
     "rectangular": "SQAP SQOB",
     "elliptical": "ELAP ELOB",
@@ -238,12 +240,31 @@ def _medium(words, catalogues):
     if words[0].upper() == "AIR":
         return None
     if words[0] != "___BLANK":
-        return Glass.named(words[0], catalogues)
+        return _named(words, catalogues)
+    if any(number(word, "dPgF") for word in words[5:6]):
+        raise FileFormatError("its model glass has a dPgF, which is not read; write 0, or a name.")
     if len(words) < 5:
         raise FileFormatError(
             "its model glass has no index and Abbe number; write GLAS ___BLANK 1 0 nd Vd."
         )
     return Glass.from_abbe(number(words[3], "the index nd"), number(words[4], "the Abbe number"))
+
+
+def _named(words, catalogues):
+    """Glass by its name; where its line says the nd and Vd of another, its maker must come first."""
+    glass = Glass.named(words[0], catalogues)
+    said = [number(word, "nd or Vd of its glass") for word in words[3:5]]
+    nd, Vd = glass.index_d, glass.abbe_number
+    if len(said) < 2 or said in UNUSED or (abs(said[0] - nd) <= 1e-3 and abs(said[1] - Vd) <= 1):
+        return glass
+    has = f"glass '{shown(words[0])}' has nd {nd:.5f} and Vd {Vd:.2f} in the catalogue"
+    told = f"{has}, and its line says {said[0]:.6g} and {said[1]:.6g}"
+    if maker_of(glass.source) not in {maker_of(each) for each in catalogues[:1]} - {None}:
+        raise FileFormatError(
+            f"{told}; give GLAS ___BLANK 1 0 nd Vd, or 1.5 40 if the name counts."
+        )
+    warnings.warn(f"{told}, as a model glass leaves behind; the name counts.", stacklevel=2)
+    return glass
 
 
 def _phase(parameters, extra):

@@ -144,7 +144,7 @@ def _is_named(glass):
     return (
         same
         and known.name in names()
-        and bool(_catalogue(known))
+        and _catalogue(known) not in ("", glass.name.rpartition("_")[2])
         and not any(c.isspace() for c in glass.name)
     )
 
