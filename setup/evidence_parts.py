@@ -106,6 +106,10 @@ ENDS = {
     "cutoff_hz": ("bandwidth, Hz", "{:.0f}"),
 }
 ORDERS = tuple(arm for arm in ARMS.values() if arm.count(">") == 2)
+# in names of figures -> in those of metrics
+RIVALS = {"order": "best_order", "lens-first": "lens_mount_read_out"} | {
+    name: name for name in ("book", "default")
+}
 RACED = ("codesign", "scenes", "studies/codesign", "studies/placement", "studies/frame")
 
 
@@ -114,14 +118,13 @@ def joint(pair: str, sizes: str, more: str = "") -> dict[str, Part]:
     around the best of them."""
     race = f"codesign --pair {pair} --grid 2 --slopes 0 --couplings {{}} --processes 2"
     again = f"--raw docs/joint_race_{pair}.jsonl --seeds 20 {sizes} --arms joint"
-    rivals = {"order": "best_order", "book": "book", "default": "default"}
     drawn = Part(
         f"{race.format(0)} {again} {' '.join(map(shlex.quote, ORDERS))} book nested default {more}".strip(),
         RACED,
         {
             f"joint.{pair}.{way}-{name}": ratio(f"{way}_over_{rival}", pair)
             for way in ("nested", "joint")
-            for name, rival in rivals.items()
+            for name, rival in RIVALS.items()
         }
         | {f"joint.{pair}.table": raced(pair), f"joint.{pair}.ends": ends},
         {f"joint_race_{pair}.png": "ratios.png", f"joint_designs_{pair}.png": "designs.png"},
@@ -336,7 +339,7 @@ PARTS = {
         | {
             f"joint.all.{way}-{name}": interval(*ends_of(f"{way}_over_{rival}"))
             for way in ("nested", "joint")
-            for name, rival in (("order", "best_order"), ("book", "book"), ("default", "default"))
+            for name, rival in RIVALS.items()
         },
         {"joint_answer.png": "all.png"},
     ),

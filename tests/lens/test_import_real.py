@@ -18,50 +18,8 @@ from tests.numbers import f64
 FOLDER = "data/lenses"
 EXTENSIONS = (".json", ".zmx", ".seq", ".txt")
 
-<<<<<<< HEAD
-=======
-# files whose own header states the paraxial focal length
-HEADERS = [
-    f"deeplens/{name}.json"
-    for name in (
-        "camera/ef100mm_f2.8",
-        "camera/rf50mm_f1.8",
-        "camera/sigma70mm_f2.8",
-        "camera/yongnuo_50mm_f1.8",
-        "cooke",
-        "thorlabs/lb1471a",
-    )
-]
-# and files that claim none, or round what they claim, for the round trips
-OTHERS = [
-    *(
-        f"deeplens/{name}"
-        for name in (
-            "camera/ef35mm_f2.0.zmx",
-            "camera/ef85mm_f1.8.json",
-            "camera/rf16mm_f2.8.json",
-            "camera/rf24mm_f1.8.json",
-            "thorlabs/acl12708u.json",
-        )
-    ),
-    *(
-        f"rayoptics/{name}"
-        for name in (
-            "US05331467-1.zmx",
-            "US08427765-1.ZMX",
-            "HoO-V2C18Ex27.zmx",
-            "schmidt.seq",
-            "achroMangin_ok.seq",
-            "asp46.seq",
-            "rc_f16.seq",
-        )
-    ),
-]
-
-
 # the maker's 1.49 mm are those of the name, not of what its line says
 pytestmark = pytest.mark.filterwarnings("ignore:glass 'D-ZK3M' has nd 1.58642")
->>>>>>> wt-cure
 REAL = json.loads(Path(__file__).with_name("real_files.json").read_text())
 
 

@@ -20,11 +20,7 @@ from codesign.lens.analysis import (
     through_focus_spot_mm,
     working_fno,
 )
-<<<<<<< HEAD
-from codesign.report.lens_figures import psf_pictures
-=======
 from codesign.report import lens_figures
->>>>>>> wt-cure
 from tests.lens.systems import LINES, close, paraboloid
 from tests.numbers import D, f64
 
@@ -88,7 +84,11 @@ def test_the_two_transforms_agree(field, share, pitch):
 def test_the_reference_of_a_picture_is_at_zero(count):
     energy = torch.zeros(count, count)
     energy[count // 2, count // 2] = 1.0
-    (drawn,) = psf_pictures([Psf(energy, f64([1e-3] * 2), f64([0.0] * 2))], ["one"]).axes[0].images
+    (drawn,) = (
+        lens_figures.psf_pictures([Psf(energy, f64([1e-3] * 2), f64([0.0] * 2))], ["one"])
+        .axes[0]
+        .images
+    )
     left, right, bottom, top = drawn.get_extent()
     share = (count // 2 + 0.5) / count
     assert left + share * (right - left) == pytest.approx(0, abs=1e-9)
