@@ -2,7 +2,6 @@
 of its metrics.json."""
 
 import math
-import re
 import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -119,7 +118,7 @@ def joint(pair: str, sizes: str, more: str = "") -> dict[str, Part]:
     race = f"codesign --pair {pair} --grid 2 --slopes 0 --couplings {{}} --processes 2"
     again = f"--raw docs/joint_race_{pair}.jsonl --seeds 20 {sizes} --arms joint"
     drawn = Part(
-        f"{race.format(0)} {again} {' '.join(map(shlex.quote, ORDERS))} book nested default {more}".strip(),
+        f"{race.format(0)} {again} {shlex.join(ORDERS)} book nested default {more}".strip(),
         RACED,
         {
             f"joint.{pair}.{way}-{name}": ratio(f"{way}_over_{rival}", pair)
@@ -130,17 +129,17 @@ def joint(pair: str, sizes: str, more: str = "") -> dict[str, Part]:
         {f"joint_race_{pair}.png": "ratios.png", f"joint_designs_{pair}.png": "designs.png"},
         f"{race.format(0)} --seeds 1 {sizes} --arms joint nested",
     )
-    foretold_of = {"lens-first": ORDERS[0], "mount-first": ORDERS[1], "nested": "nested"}
     pulls = Part(
-        f"{race.format(3)} {again} {' '.join(map(shlex.quote, ORDERS[:2]))} nested",
+        f"{race.format(3)} {again} {shlex.join(ORDERS[:2])} nested",
         RACED,
         {
             f"joint.{pair}.{blocks.replace('_', '-')}": coupled(blocks)
             for blocks in ("lens_and_read_out", "mount_and_read_out", "lens_and_mount")
         }
         | {
-            f"joint.{pair}.foretold-{name}": foretold(re.sub(r"\W+", "_", arm))
-            for name, arm in foretold_of.items()
+            f"joint.{pair}.foretold-lens-first": foretold("lens_mount_read_out"),
+            f"joint.{pair}.foretold-mount-first": foretold("mount_lens_read_out"),
+            f"joint.{pair}.foretold-nested": foretold("nested"),
         },
     )
     return {f"joint-{pair}": drawn, f"couplings-{pair}": pulls}
