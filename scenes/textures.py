@@ -92,7 +92,11 @@ def decoded(data: bytes, what: str) -> np.ndarray:
     [H, W] or [H, W, 3]; FileFormatError, which begins with ``what``, for damaged, enormous and other ones."""
     with reading(what, "it is no whole picture; convert it to PNG"), warnings.catch_warnings():
         warnings.simplefilter("error", PIL.Image.DecompressionBombWarning)
-        with PIL.Image.open(io.BytesIO(data), formats=FORMATS) as image:
+        try:
+            opened = PIL.Image.open(io.BytesIO(data), formats=FORMATS)
+        except PIL.UnidentifiedImageError:
+            raise ValueError("it begins as none of " + ", ".join(FORMATS)) from None
+        with opened as image:
             if image.width * image.height > MOST_PIXELS:
                 raise FileFormatError(
                     f"{what} has {image.width} x {image.height} pixels; at most {MOST_PIXELS / 1e6:.0f} million are read, "

@@ -19,6 +19,7 @@ import numpy as np
 from torch import Tensor
 
 from codesign import backend
+from codesign.checks import check_choice
 from codesign.doors import explain
 from codesign.errors import DomainError
 from codesign.render import MitsubaScene, TexturedPlane
@@ -98,6 +99,7 @@ def ground(
 
 def _plane(name, texture, texel_m, half_width_m, towards, up, wrap, device):
     check_sizes(name, texel_m=texel_m, half_width_m=half_width_m)
+    check_choice(wrap, f"{name}: wrap", ("mirror", "repeat"))
     size = None
     if isinstance(texture, str | Path):
         # a damaged file gets the sentence of the picture

@@ -44,7 +44,7 @@ def vergence_per_mm(
             f"{lens.name}: the entrance pupil lies at infinity, so object distances and fields have no "
             "origin; move the stop off the focal plane."
         )
-    nearest = max(origin_mm, 0.0) * 1e-3
+    nearest = max(0.0, origin_mm) * 1e-3
     bad = [d for d in at.detach().reshape(-1).tolist() if not d > nearest]
     if bad:
         raise DomainError(

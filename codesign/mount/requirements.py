@@ -119,7 +119,7 @@ class CableSide:
 
 @dataclass(frozen=True)
 class LookAhead:
-    """A share of the picture sees farther than ``distance_m``.
+    """A share of the film (of its windows, where it has some) sees farther than ``distance_m``.
 
     A pixel sees beyond the distance when its chief ray goes ahead and meets the ground, if at all,
     beyond the line across at that distance.
@@ -268,7 +268,7 @@ def _direction(vector, name):
 
 @dataclass(frozen=True)
 class OwnBody:
-    """The body covers at most ``largest_share`` of the picture, one of the requirements of a mount
+    """The body covers at most ``largest_share`` of the film (of its windows, where it has some), one of the requirements of a mount
     (see codesign.mount).
 
     The slack's gradient is that of a rendered picture in which the body glows and nothing else
@@ -297,7 +297,7 @@ class OwnBody:
     step: float = 0.02
     per_px: float = 10.0
     name: str = "own body in view"
-    unit: str = "of the picture"
+    unit: str = "of the film"
 
     def __post_init__(self):
         check_number(self.largest_share, "own body: largest_share", 0.0, 1.0)
@@ -310,7 +310,7 @@ class OwnBody:
         return glowing(self.body.triangles)
 
     def slack(self, T_body_cam: Tensor, camera: Camera) -> Tensor:
-        """[..., 1] share of the picture that may still be covered. Gradient: mount and lens."""
+        """[..., 1] share of the film that may still be covered. Gradient: mount and lens."""
         return self.largest_share - self.covered(T_body_cam, camera).mean(-1, keepdim=True)
 
     def covered(self, T_body_cam: Tensor, camera: Camera) -> Tensor:

@@ -9,12 +9,14 @@ import torch
 from torch import Tensor
 
 from codesign.backend import memory_bytes
-from codesign.checks import check_number, check_positive, check_whole
+from codesign.checks import check_number, check_whole
 from codesign.errors import DomainError
 
 # origin, direction and weight of a ray in float64, and its film and pupil position; tracing takes
 # more
 BYTES_PER_RAY = 88
+# beyond them a pitch is in metres or micrometres by mistake
+LEAST_PITCH_MM, MOST_PITCH_MM = 1e-4, 1e2
 R2 = (0.7548776662466927, 0.5698402909980532)  # 1 / g, 1 / g^2 with g^3 = g + 1
 
 
@@ -40,7 +42,7 @@ class Film:
         the film."""
         for label in ("sensor_width_px", "sensor_height_px", "width_px", "height_px"):
             check_whole(getattr(self, label), f"camera: {label}")
-        check_positive(self.pixel_pitch_mm, "camera: pixel_pitch_mm")
+        check_number(self.pixel_pitch_mm, "camera: pixel_pitch_mm", LEAST_PITCH_MM, MOST_PITCH_MM)
         if self.windows_px is not None and len(self.windows_px) == 0:
             raise DomainError(
                 "camera: there is no window on the film; give at least one, or None for the whole sensor."

@@ -87,8 +87,8 @@ def show(
     1
     """
     if isinstance(x, np.ndarray) and x.dtype.kind in "buif":
-        x = torch.from_numpy(x.astype(np.float64))
-        x = x if _are_poses(x) else x.float()  # paths may lie far from the origin
+        paths = x.shape[-2:] == (4, 4)  # they may lie far from the origin
+        x = torch.from_numpy(x.astype(np.float64 if paths else np.float32))
     if isinstance(x, Mount):
         figure = _mount(x, camera, list(body))
     elif isinstance(x, EventStream):

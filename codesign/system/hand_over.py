@@ -16,6 +16,7 @@ from codesign import plain_yaml, render
 from codesign.atomic import write_atomic
 from codesign.errors import DomainError, FileFormatError
 from codesign.events import SensorModel
+from codesign.lens.files.load import text_of
 from codesign.mount import Mount, yaw_pitch_roll_rad
 from codesign.reading import building, read_bytes, read_text
 
@@ -68,7 +69,7 @@ def save_hand_over(path: str | Path, handed: HandOver) -> None:
     page: dict[str, Any] = {"format": FORMAT, "transform": _transform(pose, handed)}
     yaw, pitch, roll = yaw_pitch_roll_rad(pose).tolist()
     page["urdf_origin"] = {"xyz_m": pose[:3, 3].tolist(), "rpy_rad": [roll, pitch, yaw]}
-    page["lens"] = {}  # in this place
+    page["lens"], beside = _lens_page(camera.lens, path)
     page["camera"] = {
         **{name: value for name in FILM if (value := getattr(camera.film, name)) is not None},
         **{name: getattr(camera, name) for name in ("samples_per_pixel", "seed", "falloff", "aim")},
@@ -87,9 +88,9 @@ def save_hand_over(path: str | Path, handed: HandOver) -> None:
     page["mount"] = {
         name: value.detach().tolist() for name, value in handed.mount.state_dict().items()
     }
-    plain_yaml.dump(page)  # what it refuses is refused before a lens is replaced
-    page["lens"] = _lens_page(camera.lens, path)
-    write_atomic(path, plain_yaml.dump(page, COMMENT).encode())
+    files = {path: plain_yaml.dump(page, COMMENT)}  # refused, it replaces no lens
+    for file, text in (beside | files).items():
+        write_atomic(file, text.encode())
 
 
 def load_hand_over(path: str | Path) -> HandOver:
@@ -175,6 +176,7 @@ def _mount(page, pose: Tensor) -> Mount:
 
 
 def _lens_page(lens, path):
+    """The lens's part of a hand-over, and the files beside it: path -> text."""
     lens = lens.replace() if hasattr(lens, "replace") else lens  # its values now, of variables too
     dtype = str(getattr(lens, "dtype", torch.float64)).removeprefix("torch.")
     if type(lens) in (lenses.ThinLens, lenses.Pinhole):  # another class may map otherwise
@@ -183,11 +185,17 @@ def _lens_page(lens, path):
         )
         page = {"kind": "thin", "dtype": dtype, "efl_mm": efl_mm}
         page["entrance_pupil_diameter_mm"] = lens.entrance_pupil_diameter_mm
-        return page if image_mm == efl_mm else {**page, "image_distance_mm": image_mm}
+        return page if image_mm == efl_mm else {**page, "image_distance_mm": image_mm}, {}
     if type(lens) is lenses.GeoLens:
         file = path.with_suffix(".lens.json")
-        lenses.save(lens, file)
-        return {"kind": "traced", "dtype": dtype, "file": file.name, "sha256": _digest(file)}
+        text = text_of(lens, file)
+        page = {
+            "kind": "traced",
+            "dtype": dtype,
+            "file": file.name,
+            "sha256": _digest(text.encode()),
+        }
+        return page, {file: text}
     raise DomainError(
         f"hand-over: a {type(lens).__name__} is kept by no file; give a GeoLens, ThinLens or Pinhole."
     )
@@ -213,14 +221,14 @@ def _lens(page, path):
         raise DomainError(
             f"the lens {page['file']!r} is not beside it; give the name of a file in the same folder."
         )
-    if not file.is_file() or _digest(file) != page["sha256"]:
+    if not file.is_file() or _digest(read_bytes(file, MOST_BYTES)) != page["sha256"]:
         said = "is missing" if not file.is_file() else "is not the one that was handed over"
         raise DomainError(f"the lens '{file.name}' {said}; put the file back, or write both anew.")
     return lenses.load(file, dtype)
 
 
-def _digest(file):
-    return hashlib.sha256(read_bytes(file, MOST_BYTES)).hexdigest()
+def _digest(content):
+    return hashlib.sha256(content).hexdigest()
 
 
 def _camera(page, lens):

@@ -94,13 +94,15 @@ class Pass(Mapping[str, Any]):
 
     def _check_interval(self, asked: set[str]) -> None:
         """Raise DomainError where the truth that an objective asks for is of another interval."""
+        if "truth" not in asked:
+            return
         lasts_s = {
             each: float(value.collected_s.sum() if each == "volume" else value.interval_s)
             for each in asked
             if isinstance(value := self[each], EventVolume | FlowField)
         }
         for each, seconds in lasts_s.items():
-            if "truth" in asked and not math.isclose(seconds, lasts_s["truth"], rel_tol=1e-3):
+            if not math.isclose(seconds, lasts_s["truth"], rel_tol=1e-3):
                 raise DomainError(
                     f"'{each}' is over {seconds:.6g} s and the truth over {lasts_s['truth']:.6g} s; give events and truth of "
                     "one interval."

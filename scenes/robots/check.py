@@ -42,7 +42,7 @@ def check_pair(
     pair.check(pair.design)
     camera = pair.camera(pair.design) if camera is None else camera
     requirements = pair.requirements()
-    _check_width(pair, camera)
+    check_width(pair, camera)
     check_mount(robot_pair.mount_at(pair.ranges, pair.design.mount()), requirements, camera)
     if pair.depth == "ground" and pair.low.z_m - pair.housing_radius_m <= pair.ground_z_m:
         raise DomainError(
@@ -89,8 +89,8 @@ def check_pair(
             )
 
 
-def _check_width(pair, camera):
-    """Raise for a lens that does not fit into the camera's housing."""
+def check_width(pair: RobotPair, camera: render.Camera) -> None:
+    """Raise DomainError for a lens that does not fit into the camera's housing."""
     lens, housing_mm = camera.lens, 2e3 * pair.housing_radius_m
     widths = (
         2 * lens.semi_aperture_mm

@@ -3,7 +3,7 @@ all over the bounds, of others near the best of them, and along every number thr
 before any race."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -44,7 +44,12 @@ class Landscape:
     @property
     def best(self) -> Tensor:
         """Shares [V] of the least hard error."""
-        return best_of(self.designs + self.near)
+        return couplings.share(self.best_row)
+
+    @property
+    def best_row(self) -> Row:
+        """The row of the least hard error."""
+        return min(self.designs + self.near, key=lambda row: row["hard"])
 
     @property
     def spread(self) -> float:
@@ -219,15 +224,10 @@ def landscape(run: Run[Any], space: Space, count: int) -> Landscape:
     for name, rows in (("all", designs), ("near", near)):
         for number, row in enumerate(rows):
             row["expected"] = looks.expected(f"{name}_{number}", calibration)
-    grid = _along(run, looks, best_of(designs + near), calibration)
-    found = Landscape(designs, near, grid, calibration)
+    found = Landscape(designs, near, [], calibration)
+    found = replace(found, grid=_along(run, looks, found.best, calibration))
     write_atomic(run.path("landscape.csv"), found.csv(space).encode())
     return found
-
-
-def best_of(rows: list[Row]) -> Tensor:
-    """Shares [V] of the row with the least hard error."""
-    return couplings.share(min(rows, key=lambda row: row["hard"]))
 
 
 def _fit(looks, names, rows):

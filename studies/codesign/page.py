@@ -236,12 +236,11 @@ def looked(run: Run[Any], space: Space, gates: Landscape) -> None:
         "The landscape",
         "Hard errors of designs spread over the bounds, and along every number through the best.",
     )
-    best = min(gates.designs + gates.near, key=lambda row: row["hard"])
     run.record(
         landscape_spread=gates.spread,
         landscape_designs=len(gates.designs),
         blur_span_px_median=statistics.median(row["blur_span_px"] for row in gates.designs),
-        blur_span_px_best=best["blur_span_px"],
+        blur_span_px_best=gates.best_row["blur_span_px"],
         **{f"calibration_{name}": value for name, value in vars(gates.calibration).items()},
         **{
             f"inside_{plain(name)}": float(gates.inside(name))
@@ -271,7 +270,7 @@ def looked(run: Run[Any], space: Space, gates: Landscape) -> None:
         at_walls = ""
     run.text(
         f"The ninetieth percentile of {len(gates.designs)} designs is {gates.spread:.2f} times the "
-        f"tenth: {enough}.{at_walls}{told} Behind the best, blur differs by {best['blur_span_px']:.1f} px between the sharpest and "
+        f"tenth: {enough}.{at_walls}{told} Behind the best, blur differs by {gates.best_row['blur_span_px']:.1f} px between the sharpest and "
         "the softest window of a drive (diameters of even discs)."
     )
     if missed := sum(row["hard"] is None for row in gates.grid):

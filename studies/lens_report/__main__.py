@@ -65,6 +65,8 @@ def study(run: Run[Config]) -> None:
         )
     geo = lens.load(run.config.lens).requires_grad_(False)
     light = run.config.wavelengths_um
+    for line in light:
+        geo.first_order(line)  # says what is wrong with it
     quick = run.config.quick
     analysis.spectral_lines(light)
     distances = run.config.at_m or (math.inf,)

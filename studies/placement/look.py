@@ -30,6 +30,7 @@ from codesign.mount import (
 from codesign.mount.requirements import Verdict
 from codesign.report.mount_sphere import mount_sphere
 from scenes.robots import pair as robot_pair
+from scenes.robots.check import check_width
 from scenes.robots.pair import RobotPair
 from studies.frame.run import Run
 from studies.placement import figures
@@ -39,13 +40,16 @@ LEAST_HEIGHT_M = 0.05
 
 
 def look(run: Run[Any], pair: RobotPair, camera: render.Camera) -> None:
+    check_width(pair, camera)
     pose = pair.design.mount()
     drives = pair.batch((0,), 1, run.config.seed)
     meshes = pair.bodies.values()
     body = Body((mesh.vertices_m, mesh.faces) for mesh in meshes)
     own_share = 1 - float(OwnBody(body, 1.0).exact(pose, camera))
     run.record(faces=sum(len(mesh.faces) for mesh in meshes), own_body_share=own_share)
-    run.card("Own body in view", f"{own_share:.1%}", "of the pixels' chief rays")
+    run.card(
+        "Own body in view", f"{own_share:.1%}", "of the chief rays in the windows that are read"
+    )
     run.section("The robot and its view", size_in_words(pair))
     run.figure(
         figures.robot_and_frame(pair, drives, camera, pose),
@@ -98,7 +102,8 @@ def answer(
     missed = [each.name for each in verdicts if not each.kept]
     keeps = f"misses what is required: {', '.join(missed)}" if missed else "keeps all requirements"
     return (
-        f"From its default mount the camera of '{pair.name}' {blind}; its own body fills {own_share:.1%} of the view, and "
+        f"From its default mount the camera of '{pair.name}' {blind}; its own body fills {own_share:.1%} of the windows that are "
+        f"read, and "
         f"the mount {keeps}."
     )
 

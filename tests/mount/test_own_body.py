@@ -102,7 +102,7 @@ def test_it_is_a_requirement_like_any_other(rover):
     verdict = judge([required], poses[1], camera)[0]
     assert str(verdict).startswith("own body in view: missed by 0.")
     spare = judge([required], poses[0], camera)[0]
-    assert str(spare) == "own body in view: kept with 0.05 of the picture to spare"
+    assert str(spare) == "own body in view: kept with 0.05 of the film to spare"
     assert penalty([required], poses[0], camera) == 0
 
 

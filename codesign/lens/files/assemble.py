@@ -3,6 +3,7 @@ them to be computed."""
 
 import itertools
 import math
+import warnings
 from dataclasses import replace
 
 import torch
@@ -20,6 +21,8 @@ MARGIN = 1.05
 # share of the semi-aperture by which two faces of a glass may cross at the rim: files round
 # apertures up, and optimised designs cross where no ray passes
 EDGE = 5e-3
+# height of the paraxial marginal ray over an aperture, from which on the two contradict each other
+CUT = 1.25
 
 
 def assemble(lens: FileLens, dtype: torch.dtype = torch.float64) -> GeoLens:
@@ -193,6 +196,18 @@ def _open(rows, optics, diameter, half_field):
     marginal, _ = optics.trace(diameter / 2, 0.0)
     chief, _ = optics.trace(-slope * optics.entrance_pupil_mm() if slope else 0.0, slope)
     free = [row for row in rows if row.semi_aperture is None]
+    cut = {
+        r.label: abs(y) / r.semi_aperture
+        for r, y in zip(rows, marginal, strict=True)
+        if r not in free
+    }
+    worst = max(cut, key=lambda label: cut[label], default=None)
+    if worst is not None and cut[worst] > CUT:
+        warnings.warn(
+            f"surface {worst} cuts the beam: an entrance pupil of {diameter:.4g} mm needs {cut[worst]:.2g} times its "
+            "aperture, so pictures are darker than the f-number says; give a smaller pupil.",
+            stacklevel=5,
+        )
     for row, y, y_chief in zip(rows, marginal, chief, strict=True):
         if row in free:
             needed = abs(y) if row.is_stop else MARGIN * (abs(y) + abs(y_chief))

@@ -120,10 +120,15 @@ def save(lens: GeoLens, path: str | Path) -> None:
     25.0
     """
     path = Path(path)
+    text = text_of(lens, path)
+    with at(f"lens file {path}"), replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
+def text_of(lens: GeoLens, path: Path) -> str:
+    """What ``save`` writes to such a file."""
     if path.suffix.lower() not in WRITERS:
         raise FileFormatError(
             f"lens file {path}: extension '{path.suffix}' is not written; use {' or '.join(WRITERS)}."
         )
-    text = WRITERS[path.suffix.lower()](lens)
-    with at(f"lens file {path}"), replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
+    return WRITERS[path.suffix.lower()](lens)

@@ -170,7 +170,7 @@ def _lens(header, entries, name):
     stops = [entry.label for entry in entries if "is_stop" in entry.values]
     if len(stops) != 1 or not 0 < stops[0] < len(entries) - 1:
         raise FileFormatError(
-            f"surfaces {stops} are marked as the stop; mark one between object and image with STOP."
+            f"surfaces {stops or 'none'} are marked as the stop; mark one between object and image with STOP."
         )
     kind, count = header.get("field", (FIELDS[0], None))
     pairs = itertools.zip_longest(header.get("x", []), header.get("y", []), fillvalue=0.0)
