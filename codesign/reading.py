@@ -12,6 +12,7 @@ import re
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -62,6 +63,20 @@ def building(
         raise FileFormatError(said if said.startswith(str(what)) else f"{what}: {said}") from error
 
 
+_OPENED: ContextVar[dict[Path, None] | None] = ContextVar("opened", default=None)
+
+
+@contextmanager
+def noting() -> Iterator[dict[Path, None]]:
+    """The files that readers open within, each once, in order."""
+    found: dict[Path, None] = {}
+    token = _OPENED.set(found)
+    try:
+        yield found
+    finally:
+        _OPENED.reset(token)
+
+
 def open_regular(path: str | Path, most_bytes: int | None = None) -> BinaryIO:
     """Open a regular file for reading bytes.
 
@@ -79,6 +94,8 @@ def open_regular(path: str | Path, most_bytes: int | None = None) -> BinaryIO:
         raise FileFormatError(
             f"{path} cannot be read ({said}); give a file you may read."
         ) from error
+    if (opened := _OPENED.get()) is not None:
+        opened[Path(path)] = None
     length = os.fstat(file.fileno()).st_size
     if most_bytes is not None and length > most_bytes:
         file.close()

@@ -2,6 +2,7 @@
 windows to learn flow from."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 from torch import Tensor
@@ -41,6 +42,11 @@ class EventStream:
     p: Tensor
     height_px: int
     width_px: int
+
+    @cached_property
+    def in_order(self) -> bool:
+        """Whether times never go back; looked at once."""
+        return not bool((self.t_us[1:] < self.t_us[:-1]).any())
 
     def __len__(self):
         return int(self.t_us.numel())

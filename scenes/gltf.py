@@ -15,9 +15,9 @@ import numpy as np
 import PIL.Image
 
 from codesign.errors import FileFormatError
-from codesign.reading import reading
+from codesign.reading import read_bytes, reading
 from scenes import textures
-from scenes.mesh_folder import Folder
+from scenes.mesh_folder import MOST_BYTES, Folder
 from scenes.trees import unreached
 
 MAGIC = b"glTF"
@@ -60,7 +60,7 @@ def opened(path: Path, folder: Folder, materials: bool) -> tuple[bytes, dict[str
     damaged or not read."""
     try:
         with reading(f"mesh '{path}'", "it is no whole glTF 2.0; export it anew"):
-            tree = _tree(path.read_bytes(), folder)
+            tree = _tree(read_bytes(path, MOST_BYTES), folder)
             if str(tree["asset"]["version"]).split(".")[0] != "2":
                 raise ValueError(f"version {tree['asset']['version']}")
             _made_readable(path, tree)

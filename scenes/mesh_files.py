@@ -17,16 +17,15 @@ import numpy as np
 
 from codesign.errors import DomainError, FileFormatError
 from codesign.optional import optional
-from codesign.reading import open_regular, reading
+from codesign.reading import open_regular, read_bytes, reading
 from scenes import gltf, obj, textures
-from scenes.mesh_folder import Folder
+from scenes.mesh_folder import MOST_BYTES, Folder
 
 trimesh = optional("trimesh", "worlds", "reading meshes")
 collada = optional("collada", "worlds", "reading .dae")
 
 KINDS = (".obj", ".ply", ".stl", ".dae", ".gltf", ".glb")
 MOST_FACES = 4_000_000  # some 10 s to read; their silhouettes take minutes and GiB
-MOST_BYTES = 1 << 30
 UNCOLOURED = 0.5  # linear luminance of what says none
 FOLDED = 0.999  # cosine of what lies upon each other
 # what trimesh would read as something else
@@ -106,7 +105,7 @@ def read(
     if kind in (".gltf", ".glb"):
         data, surfaces = gltf.opened(path, folder, materials)
     else:
-        data = path.read_bytes()
+        data = read_bytes(path, MOST_BYTES)
     told = _faces_told(kind, data)
     _check_count(path, told)
     if kind in MISREAD:

@@ -7,8 +7,10 @@ from pathlib import Path
 import PIL.Image
 
 from codesign.errors import FileFormatError
+from codesign.reading import read_bytes
 
 DATA = (".mtl", ".bin", "")  # what is no picture
+MOST_BYTES = 1 << 30  # of a file
 
 
 class Folder:
@@ -35,7 +37,7 @@ class Folder:
         if name in self.given:
             return self.given[name]
         try:
-            data = self._found(name).read_bytes()
+            data = read_bytes(self._found(name), MOST_BYTES)
             if Path(name).suffix.lower() not in DATA:
                 _check_picture(data, name)
         except FileFormatError as error:

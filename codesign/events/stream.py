@@ -45,8 +45,8 @@ def ordered(
 
 
 def check_stream(stream: EventStream, part: slice = slice(None)) -> EventStream:
-    """Return ``stream`` when it is one: lists of int64 of equal length and, in ``part``, times that
-    do not go back, pixels of the sensor, polarities +1 and -1; DomainError, ShapeError
+    """Return ``stream`` when it is one: lists of int64 of equal length, times that do not go back
+    and, in ``part``, pixels of the sensor, polarities +1 and -1; DomainError, ShapeError
     otherwise."""
     check_kind(
         stream, EventStream, "the events", "events.read and events.simulate give an EventStream"
@@ -66,8 +66,7 @@ def check_stream(stream: EventStream, part: slice = slice(None)) -> EventStream:
             f"t_us, x, y, p of the stream are {given}; dense tensors of int64 are needed."
         )
     _check_columns(*columns, stream.height_px, stream.width_px, part)
-    t_us = stream.t_us[part]
-    if bool((t_us[1:] < t_us[:-1]).any()):
+    if not stream.in_order:
         raise DomainError(
             "the times of the stream go back; order it with codesign.events.stream.ordered."
         )

@@ -16,6 +16,7 @@ from codesign.doors import explain
 from codesign.errors import CodesignError, DomainError, FileFormatError
 from codesign.mount import FREE, PLANAR
 from codesign.pose import se3_exp
+from codesign.reading import noting
 from scenes import mesh_files, robots, worlds
 from scenes.bodies import Body
 from scenes.robots import pair as robot_pair
@@ -50,6 +51,11 @@ def own_pair(settings: OwnRobot | str | Path) -> RobotPair:
       the world, a trajectory that stands still or is shorter than three windows.
     """
     own = settings if isinstance(settings, OwnRobot) else read_own(settings)
+    with noting() as opened:
+        return _pair(own, opened)
+
+
+def _pair(own, opened):
     bodies, frame = _bodies(own)
     world, depth = _world(own)
     if own.motion is None or own.motion in PAIRS:
@@ -68,6 +74,7 @@ def own_pair(settings: OwnRobot | str | Path) -> RobotPair:
         )
     low, high, start = _designs(own)
     asked = own.require
+    named_files = [Path(n) for n in (own.robot, own.world, own.motion) if n and n not in PAIRS]
     ahead, cable = asked.look_ahead, asked.cable
     return RobotPair(
         Path(own.robot).stem,
@@ -88,9 +95,7 @@ def own_pair(settings: OwnRobot | str | Path) -> RobotPair:
         ground_z_m=-float(middle[:, 2, 3].mean()),
         frame=frame,
         one_world=own.world not in PAIRS,
-        files=tuple(
-            Path(name) for name in (own.robot, own.world, own.motion) if name and name not in PAIRS
-        ),
+        files=tuple(dict.fromkeys([*named_files, *opened])),
         page=repr(own),
     )
 

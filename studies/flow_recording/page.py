@@ -11,6 +11,7 @@ from codesign.report.flow_colours import flow_colours
 from codesign.report.prose import counted
 from studies.frame.show import pictures as show_pictures
 
+FEW = 100  # events of a packet
 SHARPER = 1.02  # times the truth's FWL: estimates are sharper than a truth that is right by less
 NAMED = 5  # packets that a sentence names
 UNITS = {
@@ -75,9 +76,10 @@ def show(run, packets, rows, names, film):
         run.section("Video", film.sentence)
         run.video(film.path.name, film.caption)
     source = "a synthetic recording" if synthetic else f"`{run.config.recording}`"
+    seen = sum(bool(len(packet.stream)) for packet in packets)
     run.finish(
         "Event flow on a recording",
-        f"{answer(best, main)} Means of {counted(len(packets), 'packet')} of {source}.",
+        f"{answer(best, main)} Means of {counted(seen, 'packet')} with events of {source}.",
     )
 
 
@@ -148,7 +150,13 @@ def doubts(packets, rows, name):
     sharper = _sharper(rows, name)
     mine = [(packet.name, figures) for packet, one, figures in rows if one == name]
     blurred = [packet for packet, figures in mine if figures.get("truth_fwl", 1) < 1]
+    few = statistics.median(len(packet.stream) for packet in packets)
     sentences = (
+        (
+            few < FEW,
+            f"**A packet holds {few:g} events** (median), too few to tell flow: is the unit of the times right "
+            "(`--time-unit`), and the window long enough?",
+        ),
         (
             empty or blind,
             f"{empty} packet(s) hold no event, {blind} have no true flow; they do not count in the "

@@ -10,6 +10,8 @@ from typing import Any, BinaryIO
 from codesign.errors import DomainError
 from studies.frame.config import StudyConfig
 
+BEGINNING = 1 << 16  # bytes that are read of each file of a folder
+
 
 def digest(content: bytes | BinaryIO) -> str:
     """Of bytes, or of an open file, which is read piece by piece."""
@@ -18,12 +20,24 @@ def digest(content: bytes | BinaryIO) -> str:
 
 
 def digests(paths: Iterable[Path]) -> dict[str, str]:
-    """Name -> digest of the files among some paths."""
+    """Name -> digest of the files among some paths, and of names, sizes and beginnings of what lies
+    in folders."""
     found = {}
-    for path in filter(Path.is_file, paths):
-        with path.open("rb") as content:
-            found[f"'{path}'"] = digest(content)
+    for path in paths:
+        if path.is_file():
+            with path.open("rb") as content:
+                found[f"'{path}'"] = digest(content)
+        elif path.is_dir():
+            inside = sorted(each for each in path.rglob("*") if each.is_file())
+            told = b"".join(map(_beginning, inside))
+            found[f"what lies in '{path}'"] = digest(told)
     return found
+
+
+def _beginning(path):
+    with path.open("rb") as content:
+        begins = content.read(BEGINNING)
+    return digest(f"{path.name} {path.stat().st_size} ".encode() + begins).encode()
 
 
 def given(config: StudyConfig) -> list[Path]:

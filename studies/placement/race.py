@@ -48,11 +48,7 @@ def kept(problem: Problem, share: Tensor) -> bool:
 def fingerprints(pair: RobotPair) -> dict[str, str]:
     """What a user may have changed since a run was begun: the robot's page, and the files of which
     it was made."""
-    found = {"the robot's page": digest(pair.page.encode())} | digests(pair.files)
-    if pair.page:  # a robot's file may name others
-        corners = [body.vertices_m for body in pair.bodies.values()]
-        found["the robot's shapes"] = digest(b"".join(each.tobytes() for each in corners))
-    return found
+    return {"the robot's page": digest(pair.page.encode())} | digests(pair.files)
 
 
 class Race:

@@ -15,6 +15,9 @@ CROWN = Glass.named("N-BK7")
 N = CROWN.index_d
 SINGLET = (Surface(50.0, 4.0, CROWN, 8.0, is_stop=True), Surface(-100.0, 60.0, None, 7.0))
 
+# many of these lenses are made up
+pytestmark = pytest.mark.filterwarnings("ignore:the stop, .* cuts the beam")
+
 
 def thick(c1, c2, t, n=N):
     """Focal length of a thick lens in air (Smith, Modern Optical Engineering, ch. 3)."""
@@ -99,6 +102,13 @@ def test_units_become_millimetres(kind, unit, shape, unit_mm, tmp_path):
         if not (kind == "seq" and name == "semi_aperture_mm"):
             found, true = (getattr(g, name)[..., :2] for g in (geo, same.scaled(unit_mm)))
             close(found, true, 1e-13)
+
+
+def test_a_pupil_that_the_stop_cuts_is_told(tmp_path):
+    with pytest.warns(
+        UserWarning, match="the stop, 16 mm wide, .* an entrance pupil of 40 mm needs 40 mm"
+    ):
+        load_file(tmp_path, "zmx", "ENPD 10 => ENPD 40")
 
 
 @pytest.mark.parametrize("spec", ["ENPD 10", "FNUM 5 0", "FNUM 5 1", "FLOA"])

@@ -242,14 +242,19 @@ def test_windows_of_uneven_motion_have_their_mean_velocity(page, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("write", "world"), [(textured_room, "room.obj"), (textured_floor, "floor.xml")]
+    ("write", "files"),
+    [
+        (textured_room, ("room.obj", "room.mtl", "brick.png")),
+        (textured_floor, ("floor.xml", "gravel.png")),
+    ],
 )
-def test_rendered_flow_of_a_world_of_ones_own_gives_the_twist_back(write, world, page, tmp_path):
+def test_rendered_flow_of_a_world_of_ones_own_gives_the_twist_back(write, files, page, tmp_path):
     write(tmp_path)
     low = PAGE.replace("pitch_deg: 30", "pitch_deg: 70")
-    found = own_pair(page(low + f"world: {world}\nmotion: screw.csv\n"))
+    found = own_pair(page(low + f"world: {files[0]}\nmotion: screw.csv\n"))
     check_pair(found)
     assert found.depth == "scene"
+    assert {path.name for path in found.files} == {"box.obj", "screw.csv", *files}
     drives = found.batch((0, UNSEEN), 2)
     system = found.system(found.design).replaced(
         flow=lambda volume, truth: truth, estimate=EgoVelocity(FREE, (1e3,) * 6, "scene")

@@ -91,6 +91,13 @@ def test_a_file_that_an_option_names_is_the_same_when_a_run_goes_on(tmp_path):
             open_run("reading", resumed)
     given.write_text("one")
     open_run("reading", resumed)
+    (inside := tmp_path / "frames").mkdir()
+    (inside / "0.png").write_text("one")
+    begun = Reading(out=tmp_path / "second", files=(inside,))
+    open_run("reading", begun)
+    (inside / "0.png").write_text("two")
+    with pytest.raises(DomainError, match=r"what lies in '.*frames' changed since"):
+        open_run("reading", Reading(resume=tmp_path / "second"))
     other.write_text("was not there")
     with pytest.raises(DomainError, match=r"other\.json' changed since"):
         open_run("reading", resumed)

@@ -47,8 +47,8 @@ class SensorModel:
     hot_pixel_share: share of pixels that fire by themselves. hot_pixel_rate_hz: their rate
       (ON, as a leak), events per second.
     Leaks and hot pixels have been at it for a while when the first frame begins, each pixel by a
-      drawn share of a threshold: n seconds have n events per Hz on average, however short (not with
-      timing "v2e", where all begin together).
+      drawn share of a threshold, so n seconds have n events per Hz on average, however short (not
+      with timing "v2e", where all begin together).
     timing: "interpolated": each event at the time its pixel crosses the threshold, log level linear
       in time between frames; events inside the dead time are lost (ESIM). "v2e": the frame-wide
       time slots of v2e, where events inside the dead time are deferred.

@@ -109,9 +109,12 @@ class Opened:
           left_out: see Packet.
         """
         empty = gaps(self.events.t_us)
+        t_us = self.events.t_us
+        lasts_s = max(1e-6 * float(t_us[-1] - t_us[0]), 1e-6) if len(t_us) else 1e-6
         notes = [
             *self.notes,
             f"sensor {self.events.width_px} x {self.events.height_px} px by {self.events.size_from}",
+            f"{len(t_us):,} events in {lasts_s:.4g} s, {len(t_us) / lasts_s:,.0f} a second",
         ]
         if len(empty):
             longest = float(np.diff(empty, axis=1).max()) * 1e-6

@@ -208,6 +208,21 @@ def _cut_by_flows(one, flows, start_us):
     whole = one.whole
     left_out = {}
     over = None
+    if not any(bool(flow.valid.any()) for flow in flows):
+        raise FileFormatError(
+            "none of the true flows has a number that is finite; is it the right file?"
+        )
+    if (
+        len(flows) == 1
+        and flows[0].span_s is None
+        and options.window_s
+        and options.truth_unit == "px"
+        and not options.truth_interval_s
+    ):
+        raise DomainError(
+            f"the true flow does not say over what time it is, and windows of {1e3 * options.window_s:g} ms are asked for: "
+            "give its time (truth_interval_s, --truth-interval-ms), or its unit as px/s."
+        )
     if all(flow.span_s is not None for flow in flows[:-1] or flows):
         ends = enumerate(flow.span_s for flow in flows)
         spans = [(k, (round(span[0] * 1e6), round(span[1] * 1e6))) for k, span in ends if span]

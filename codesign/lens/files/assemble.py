@@ -21,7 +21,7 @@ MARGIN = 1.05
 # share of the semi-aperture by which two faces of a glass may cross at the rim: files round
 # apertures up, and optimised designs cross where no ray passes
 EDGE = 5e-3
-# height of the paraxial marginal ray over an aperture, from which on the two contradict each other
+# height of the paraxial marginal ray over the stop, from which on the two contradict each other
 CUT = 1.25
 
 
@@ -196,16 +196,11 @@ def _open(rows, optics, diameter, half_field):
     marginal, _ = optics.trace(diameter / 2, 0.0)
     chief, _ = optics.trace(-slope * optics.entrance_pupil_mm() if slope else 0.0, slope)
     free = [row for row in rows if row.semi_aperture is None]
-    cut = {
-        r.label: abs(y) / r.semi_aperture
-        for r, y in zip(rows, marginal, strict=True)
-        if r not in free
-    }
-    worst = max(cut, key=lambda label: cut[label], default=None)
-    if worst is not None and cut[worst] > CUT:
+    needed = abs(marginal[optics.stop])
+    if (opening := rows[optics.stop].semi_aperture) and needed > CUT * opening:
         warnings.warn(
-            f"surface {worst} cuts the beam: an entrance pupil of {diameter:.4g} mm needs {cut[worst]:.2g} times its "
-            "aperture, so pictures are darker than the f-number says; give a smaller pupil.",
+            f"the stop, {2 * opening:.4g} mm wide, cuts the beam: an entrance pupil of {diameter:.4g} mm needs "
+            f"{2 * needed:.4g} mm there, so pictures are darker than the f-number says; give a smaller pupil.",
             stacklevel=5,
         )
     for row, y, y_chief in zip(rows, marginal, chief, strict=True):
