@@ -4,15 +4,15 @@ docs/evidence.json, and write them into the pages.
     make evidence                              parts whose code has changed since (all: an hour on two cores)
     make evidence ARGS="lens-motion hero"      named parts
     make evidence ARGS="--write"               runs nothing: writes the kept figures into the pages
-    make evidence ARGS="--again joint-flight"  races two answers of a raw table again: are they the same?
+    make evidence ARGS="--again joint-flight"  finds some answers of a raw table again: are they the same?
 
 A page names a figure as <!--fig:NAME-->text<!--/-->; the text is what this writes. A part that was
 cut is taken up where it stopped (runs/evidence/PART); one that was finished begins anew.
 
 Some parts draw what was run once from a raw table (--raw FILE): their figures are of the code of
-the commit that brought the table, and they are drawn again where they are named. --again races the
-first start of joint and nested by the present code: where both answers are the table's to six
-digits, its figures are of this code too; else they stay old, and it says by how much they differ.
+the commit that brought the table, and they are drawn again where they are named. --again finds the
+first start of each way by the present code: where these answers are the table's to six digits, its
+figures are of this code too; else they stay old, and it says by how much they differ.
 
 evidence.json: {"schema": 1, "parts": {PART: {"command", "commit", "seconds", "machine", "measured":
 {folder: its tree in git}, "figures": {NAME: text}, "pictures": [FILE in docs],
@@ -85,24 +85,24 @@ def run(command: str, folder: Path) -> None:
 
 
 def raced_again(name: str, part: dict[str, Any]) -> dict[str, Any]:
-    """What is kept of a part, of this code too where it races the same answers."""
+    """What is kept of a part, of this code too where it finds the same answers."""
     folder = RUNS / f"{name}-again"
     run(PARTS[name].sample, folder)
-    words = shlex.split(PARTS[name].command)
-    known = answers_of(ROOT / words[words.index("--raw") + 1])
+    known = answers_of(ROOT / "docs" / PARTS[name].table)
     now = answers_of(folder / "answers.jsonl")
     apart = max(abs(a - b) for row in now for a, b in zip(now[row], known[row], strict=True))
-    print(f"{name}: {len(now)} answers raced again, at most {apart:.1g} apart")
+    print(f"{name}: {len(now)} answers found again, at most {apart:.1g} apart")
     if apart > SAME:
         return part
     at = trees(tuple(part["measured"]))
     return {**part, "measured": at, "again": _git("rev-parse", "HEAD")}
 
 
-def answers_of(table: Path) -> dict[tuple[int, str], list[float]]:
-    """Design and errors in unseen worlds of every answer of a table, by start and arm."""
+def answers_of(table: Path) -> dict[str, list[float]]:
+    """Design and errors in unseen worlds of every answer of a table, by start, arm and what else it
+    is of."""
     rows = [json.loads(line) for line in table.read_text(encoding="utf-8").splitlines()]
-    return {(at["seed"], at["arm"]): [*row["share"], *row["errors"]] for at, (row, *_) in rows}
+    return {str(at): [*row.get("share", ()), *row["errors"]] for at, (row, *_) in rows}
 
 
 def measured(name: str) -> dict[str, Any]:
@@ -150,7 +150,7 @@ def main(arguments: list[str] | None = None) -> int:
         "parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}; else those that are old"
     )
     parser.add_argument("--write", action="store_true", help="run nothing")
-    parser.add_argument("--again", action="store_true", help="race two answers of each again")
+    parser.add_argument("--again", action="store_true", help="find some answers of each again")
     asked = parser.parse_args(arguments)
     choice = [name for name, part in PARTS.items() if part.sample or not asked.again]
     unknown = [name for name in asked.parts if name not in choice]

@@ -14,12 +14,13 @@ Metrics = Mapping[str, Any]
 class Part:
     """command: of a study, without --out. measured: folders whose code its figures are of.
     figures: name -> its text from metrics.json. pictures: file in docs -> file of the run.
-    sample: command that races some answers of the raw table again."""
+    table: file in docs that keeps its answers. sample: command that finds some of them again."""
 
     command: str
     measured: tuple[str, ...]
     figures: Mapping[str, Callable[[Metrics], str]] = field(default_factory=dict)
     pictures: Mapping[str, str] = field(default_factory=dict)
+    table: str = ""
     sample: str = ""
 
 
@@ -127,6 +128,7 @@ def joint(pair: str, sizes: str, more: str = "") -> dict[str, Part]:
         }
         | {f"joint.{pair}.table": raced(pair), f"joint.{pair}.ends": ends},
         {f"joint_race_{pair}.png": "ratios.png", f"joint_designs_{pair}.png": "designs.png"},
+        f"joint_race_{pair}.jsonl",
         f"{race.format(0)} --seeds 1 {sizes} --arms joint nested",
     )
     pulls = Part(
@@ -330,6 +332,8 @@ PARTS = {
         "codesign --grid 2 --slopes 0 --couplings 0 --designs 2 --seeds 6 --raw docs/joint_race_arms.jsonl",
         RACED,
         {"joint.arms.table": raced("outdoors")},
+        table="joint_race_arms.jsonl",
+        sample="codesign --grid 2 --slopes 0 --couplings 0 --designs 2 --seeds 1 --arms joint nested",
     ),
     "joint-answer": Part(
         "joint_answer",
@@ -349,7 +353,9 @@ PARTS = {
             f"joint.levers.{part}": interval(*ends_of(f"share_{part}"))
             for part in ("lens", "mount", "sensor", "estimator")
         },
-        {"joint_levers.png": "shares.png"},
+        {"joint_levers.png": "shares.png", "joint_levers.jsonl": "answers.jsonl"},
+        "joint_levers.jsonl",
+        "joint_levers --processes 2 --seeds 1",
     ),
     "joint-controls": Part(
         'joint_controls --arms nested "lens > mount > read-out"',
@@ -361,5 +367,8 @@ PARTS = {
                 *("without_blur", "order_of_events_lost", "no_contrast"),
             )
         },
+        {"joint_controls.jsonl": "answers.jsonl"},
+        "joint_controls.jsonl",
+        'joint_controls --arms nested "lens > mount > read-out" --starts 1',
     ),
 }

@@ -74,7 +74,7 @@ def study(run: Run[Config]) -> None:
         errors = CONTROLS[control](drawn, space.made(share), seed)
         return {"errors": errors.unflatten(0, (config.judged_worlds, -1)).mean(1).tolist()}
 
-    judged = sweep(run, cell, seed=seeds, arm=config.arms, control=list(CONTROLS))
+    judged = sweep(run, cell, "answers", seed=seeds, arm=config.arms, control=list(CONTROLS))
     ours, *others = config.arms
     lines = []
     for control in CONTROLS:
