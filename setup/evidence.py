@@ -114,13 +114,19 @@ def measured(name: str) -> dict[str, Any]:
         (ROOT / "docs" / picture).parent.mkdir(exist_ok=True)
         write_atomic(ROOT / "docs" / picture, (folder / made).read_bytes())
     metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    try:
+        figures = {figure: text(metrics) for figure, text in part.figures.items()}
+    except KeyError as missing:
+        sys.exit(
+            f"error: {name}: its run did not measure {missing}; are its peers installed (pip install -e '.[all,bench]')?"
+        )
     return {
         "command": f"python -m studies.{part.command}",
         "commit": metrics["versions"]["commit"],
         "seconds": round(time.monotonic() - since),
         "machine": f"{metrics['hardware']['cpu']}, {metrics['hardware']['cores']} cores",
         "measured": trees(part.measured, run_at(part.command)),
-        "figures": {figure: text(metrics) for figure, text in part.figures.items()},
+        "figures": figures,
         "pictures": list(part.pictures),
     }
 

@@ -258,7 +258,7 @@ class Arrival:
         def said(at):
             return (
                 f"it lies at {name} = {values[at]:.15g}; the sensor has {most} pixels there{by} (0 to "
-                f"{most - 1}, whole numbers); give its true size"
+                f"{most - 1}, whole numbers); give {'its true size' if values[at] % 1 == 0 else 'whole pixels'}"
             )
 
         return ~((values >= 0) & (values < most)) | (values % 1 != 0), said
