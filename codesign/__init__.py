@@ -5,9 +5,10 @@ imported when they are first asked for.
 """
 
 import importlib
-import os
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
+
+from codesign import waiting  # noqa: F401 - before torch, where nobody has imported it yet
 
 if TYPE_CHECKING:
     from codesign import (
@@ -33,10 +34,6 @@ if TYPE_CHECKING:
     from codesign.fidelity.search import select
     from codesign.report.show import show
     from codesign.system import System
-
-# Torch's OpenMP threads would busy-wait after each operation on the core that drjit's thread pool
-# needs (a render step took 2x the CPU).
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 __all__ = [
     "System",

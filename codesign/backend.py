@@ -21,6 +21,7 @@ from codesign.atomic import write_atomic
 from codesign.doors import explain
 from codesign.errors import BackendError, DomainError, FileFormatError, GradientError
 from codesign.exclusive import exclusive
+from codesign.waiting import threads_sleep
 
 # 15 and 16 abort the process while compiling Mitsuba 3.9 kernels; 14 is refused; 19 and 22 work
 MINIMUM_LLVM = 19
@@ -203,6 +204,7 @@ class Arrays:
 def arrays(device: str = "cpu", dtype: torch.dtype = torch.float32) -> Arrays:
     """drjit types that match a torch device and dtype (float32 or float64)."""
     check_version(device)
+    threads_sleep()
     if device_name(device) == "cuda":
         import drjit.cuda.ad as ad
     else:

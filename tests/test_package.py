@@ -16,7 +16,7 @@ from tests.processes import ROOT, python
 # for the toolkit itself
 PRIVATE = {
     *("arrays", "__init__", "__main__", "atomic", "checks", "doctor", "doors", "former"),
-    *("interrupt", "optional", "place", "plain_yaml", "reading", "task"),
+    *("interrupt", "optional", "place", "plain_yaml", "reading", "task", "waiting"),
 }
 
 

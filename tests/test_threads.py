@@ -23,6 +23,15 @@ print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
 
 
+FIRST = """
+import threading
+{}
+from codesign import lens
+lens.load("cooke-triplet", torch.float32).trace(torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]]))
+print([each.name for each in threading.enumerate()])
+"""
+
+
 WORKERS = """
 import sys, torch
 from torch.utils.data import DataLoader
@@ -55,6 +64,15 @@ def test_many_threads_with_gradients_equal_serial_ones():
 def test_a_process_forked_after_the_first_kernel_is_told_to_spawn():
     done = python("-c", FORKED)
     assert done.stdout.strip() == "7", done.stderr[-2000:]
+
+
+@pytest.mark.parametrize(
+    ("imports", "held"), [("import torch", True), ("import codesign, torch", False)]
+)
+def test_threads_of_a_torch_that_came_first_are_kept_from_spinning(imports, held, monkeypatch):
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    done = python("-c", FIRST.format(imports))
+    assert ("codesign-waiting" in done.stdout) == held, done.stderr[-2000:]
 
 
 @pytest.mark.parametrize("context", ["spawn", "fork"])

@@ -1,5 +1,7 @@
 """Stage "flow": what event flow costs."""
 
+import statistics
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -7,11 +9,11 @@ from typing import Any
 import drjit as dr
 import torch
 
-from codesign.flow import estimate_lk
+from codesign.flow import Tracker, estimate_lk, load
 from codesign.flow.baselines import FlowNetEvents, SpikeFlowNet
 from codesign.flow.baselines.parts import count_weights
 from codesign.flow.refiner import Refiner
-from codesign.types import EventVolume
+from codesign.types import EventStream, EventVolume
 from studies.frame.bench import cost
 from studies.frame.run import Run
 from studies.frame.show import Asked, tabulate
@@ -37,6 +39,10 @@ ASKED_FLOW = {
     (CLOSED, "forward_backward", *SMALL): 305 / 170 / 3,
 }
 ASKED_GROWTH = 0.2
+WINDOW_S = 1 / 30  # of a live stream
+WINDOWS, WARM_UP = 12, 3
+EVENTS = 20_000  # of a window: a DAVIS346 before things that move
+LIVE = {f"{width} x {height}": (height, width) for height, width in ((180, 240), (260, 346))}
 
 
 def stage(run: Run[Config]) -> list[Asked]:
@@ -72,6 +78,14 @@ def stage(run: Run[Config]) -> list[Asked]:
         first, last = (cpu_s[name, "forward", size, 1] / size**2 for size in (sizes[0], sizes[-1]))
         what = f"{name}, CPU per pixel at {sizes[-1]} px over {sizes[0]} px"
         figures.append(Asked(what, last / first, 1 - ASKED_GROWTH, 1 + ASKED_GROWTH))
+    estimators = [CLOSED, CELLS, REFINER]
+    rows = sweep(run, live, "live", 1, config.rounds, sensor=LIVE, estimator=estimators)
+    tabulate(
+        run, "A window of a live stream, all threads", rows, "sensor", "estimator", prefix="live"
+    )
+    for row in rows:
+        what = f"live, {row['sensor']} px, {row['estimator']}: clock over the window's time"
+        figures.append(Asked(what, row["wall_s"] / WINDOW_S, most=1.0))
     return figures
 
 
@@ -125,6 +139,28 @@ def flow(case: tuple[str, str, int, int], repeats: int, seed: int) -> dict[str, 
     work(scattered(64, bins, seed))
     volume = scattered(size, bins, seed, windows)
     return cost(lambda: work(volume), repeats) | {"weights": sum(p.numel() for p in learned)}
+
+
+def live(sensor: tuple[int, int], estimator: str) -> dict[str, float]:
+    """Medians over windows of a stream of scattered events, 30 a second."""
+    draw = torch.Generator().manual_seed(0)
+    count = WINDOWS * EVENTS
+    t_us = torch.randint(round(1e6 * WINDOW_S * WINDOWS), (count,), generator=draw).sort().values
+    y, x, on = (torch.randint(most, (count,), generator=draw) for most in (*sensor, 2))
+    estimate = load("refiner") if estimator == REFINER else ESTIMATORS[estimator](0)
+    tracker = Tracker(estimate, window_s=WINDOW_S)
+    clock, processor = [], []
+    for rows in zip(*(values.split(EVENTS) for values in (t_us, x, y, 2 * on - 1)), strict=True):
+        since = time.perf_counter(), time.process_time()
+        tracker.add(EventStream(*rows, *sensor))
+        clock.append(time.perf_counter() - since[0])
+        processor.append(time.process_time() - since[1])
+    wall_s = statistics.median(clock[WARM_UP:])
+    return {
+        "wall_s": wall_s,
+        "cpu_s": statistics.median(processor[WARM_UP:]),
+        "events_per_s": EVENTS / wall_s,
+    }
 
 
 def scattered(size_px: int, bins: int, seed: int, windows: int = 1) -> EventVolume:
