@@ -1,5 +1,6 @@
 """Stage "flow": what event flow costs."""
 
+import itertools
 import statistics
 import time
 from collections.abc import Callable
@@ -9,11 +10,14 @@ from typing import Any
 import drjit as dr
 import torch
 
+from codesign import events, lens, pose, render
 from codesign.flow import Tracker, estimate_lk, load
 from codesign.flow.baselines import FlowNetEvents, SpikeFlowNet
 from codesign.flow.baselines.parts import count_weights
+from codesign.flow.metrics import aee
 from codesign.flow.refiner import Refiner
 from codesign.types import EventStream, EventVolume
+from scenes import trajectories, worlds
 from studies.frame.bench import cost
 from studies.frame.run import Run
 from studies.frame.show import Asked, tabulate
@@ -24,6 +28,7 @@ from studies.train_flow.peers import ECN, IDNet
 CLOSED = "closed form"
 CELLS = "closed form with cells"
 REFINER = "refiner"
+TWO_LEVELS = ", two levels, no warm start"
 PUBLISHED = "Spike-FlowNet form"
 SIZE_PX = 256
 SIZES_PX = (128, 256, 512, 1024)
@@ -41,7 +46,8 @@ ASKED_FLOW = {
 ASKED_GROWTH = 0.2
 WINDOW_S = 1 / 30  # of a live stream
 WINDOWS, WARM_UP = 12, 3
-EVENTS = 20_000  # of a window: a DAVIS346 before things that move
+VIEW = ((0.1, -1.5, 0.9), (0.0, 1.0, 0.6))  # from, to, in a room
+TWIST = (0.4, 0.1, 0.5, 0.1, 0.3, 0.1)  # m/s, rad/s
 LIVE = {f"{width} x {height}": (height, width) for height, width in ((180, 240), (260, 346))}
 
 
@@ -78,8 +84,7 @@ def stage(run: Run[Config]) -> list[Asked]:
         first, last = (cpu_s[name, "forward", size, 1] / size**2 for size in (sizes[0], sizes[-1]))
         what = f"{name}, CPU per pixel at {sizes[-1]} px over {sizes[0]} px"
         figures.append(Asked(what, last / first, 1 - ASKED_GROWTH, 1 + ASKED_GROWTH))
-    estimators = [CLOSED, CELLS, REFINER]
-    rows = sweep(run, live, "live", 1, config.rounds, sensor=LIVE, estimator=estimators)
+    rows = sweep(run, live, "live", 1, config.rounds, sensor=LIVE, estimator=list(LIVE_ESTIMATORS))
     tabulate(
         run, "A window of a live stream, all threads", rows, "sensor", "estimator", prefix="live"
     )
@@ -109,6 +114,16 @@ ESTIMATORS: dict[str, Callable[[int], Any]] = {
     "IDNet, small": lambda seed: IDNet(seed=seed),
     PUBLISHED: lambda seed: SpikeFlowNet(seed=seed),
     f"{PUBLISHED}, 10 bins": lambda seed: SpikeFlowNet(bins=10, seed=seed),
+}
+
+
+FAST = {"levels_px": (4.0, 2.0), "steps": 2}
+LIVE_ESTIMATORS: dict[str, Callable[[], Any]] = {
+    CLOSED: lambda: estimate_lk,
+    f"{CLOSED}{TWO_LEVELS}": lambda: partial(estimate_lk, **FAST),
+    CELLS: lambda: partial(estimate_lk, model="local"),
+    f"{CELLS}{TWO_LEVELS}": lambda: partial(estimate_lk, model="local", **FAST),
+    REFINER: lambda: load("refiner"),
 }
 
 
@@ -142,24 +157,37 @@ def flow(case: tuple[str, str, int, int], repeats: int, seed: int) -> dict[str, 
 
 
 def live(sensor: tuple[int, int], estimator: str) -> dict[str, float]:
-    """Medians over windows of a stream of scattered events, 30 a second."""
-    draw = torch.Generator().manual_seed(0)
-    count = WINDOWS * EVENTS
-    t_us = torch.randint(round(1e6 * WINDOW_S * WINDOWS), (count,), generator=draw).sort().values
-    y, x, on = (torch.randint(most, (count,), generator=draw) for most in (*sensor, 2))
-    estimate = load("refiner") if estimator == REFINER else ESTIMATORS[estimator](0)
-    tracker = Tracker(estimate, window_s=WINDOW_S)
-    clock, processor = [], []
-    for rows in zip(*(values.split(EVENTS) for values in (t_us, x, y, 2 * on - 1)), strict=True):
+    """Windows of a stream of a camera that moves through a room, 30 a second: medians of their cost,
+    and the flow's error over that of zero flow."""
+    height, width = sensor
+    camera = render.Camera(lens.Pinhole(6.4), width, height, 0.0185, 1)
+    steps = 8  # frames to a window
+    t_s = torch.arange(WINDOWS * steps + 1, dtype=torch.float64) * (WINDOW_S / steps)
+    drive = trajectories.body_twist(pose.look_at(*VIEW), torch.tensor(TWIST), t_s)
+    room = worlds.room()
+    stream = events.simulate(render.frames(camera, room, drive), t_s, events.SensorModel(0.2, 0.2))
+    true, valid = render.true_flow(camera, room, drive[::steps].unfold(0, 2, 1).permute(0, 3, 1, 2))
+    edges = torch.searchsorted(stream.t_us, (t_s[::steps] * 1e6).round().long()).tolist()
+    estimate, warm = LIVE_ESTIMATORS[estimator](), TWO_LEVELS not in estimator
+    tracker = Tracker(estimate, window_s=WINDOW_S, size_px=sensor, warm_start=warm)
+    clock, processor, found = [], [], []
+    for part in itertools.starmap(slice, itertools.pairwise([*edges[:-1], len(stream)])):
+        columns = (values[part] for values in (stream.t_us, stream.x, stream.y, stream.p))
         since = time.perf_counter(), time.process_time()
-        tracker.add(EventStream(*rows, *sensor))
+        done = tracker.add(EventStream(*columns, height, width))
         clock.append(time.perf_counter() - since[0])
         processor.append(time.process_time() - since[1])
+        found += [window.field.flow_px[0] for window in done]
+    errors = [
+        aee(flow_px[None], *truth) / aee(0 * flow_px[None], *truth)
+        for flow_px, truth in zip(found, zip(true, valid, strict=True), strict=False)
+    ]
     wall_s = statistics.median(clock[WARM_UP:])
     return {
         "wall_s": wall_s,
         "cpu_s": statistics.median(processor[WARM_UP:]),
-        "events_per_s": EVENTS / wall_s,
+        "events_per_s": len(stream) / WINDOWS / wall_s,
+        "error_over_zero_flow": statistics.median(map(float, errors)),
     }
 
 
