@@ -94,7 +94,7 @@ def raced_again(name: str, part: dict[str, Any]) -> dict[str, Any]:
     print(f"{name}: {len(now)} answers found again, at most {apart:.1g} apart")
     if apart > SAME:
         return part
-    at = trees(tuple(part["measured"]))
+    at = trees(PARTS[name].measured)
     return {**part, "measured": at, "again": _git("rev-parse", "HEAD")}
 
 

@@ -5,6 +5,7 @@ import math
 import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 Metrics = Mapping[str, Any]
@@ -110,7 +111,14 @@ ORDERS = tuple(arm for arm in ARMS.values() if arm.count(">") == 2)
 RIVALS = {"order": "best_order", "lens-first": "lens_mount_read_out"} | {
     name: name for name in ("book", "default")
 }
-RACED = ("codesign", "scenes", "studies/codesign", "studies/placement", "studies/frame")
+# rooms that draw, choose levels, train networks or talk to the user: no figure of a race is of them
+BESIDE = ("__init__.py", "__main__.py", "__pycache__", "doctor.py", "fidelity", "report", "train")
+ROOMS = sorted(
+    f"codesign/{path.name}"
+    for path in (Path(__file__).resolve().parents[1] / "codesign").iterdir()
+    if path.name not in BESIDE
+)
+RACED = (*ROOMS, "scenes", "studies/codesign", "studies/placement", "studies/frame")
 
 
 def joint(pair: str, sizes: str, more: str = "") -> dict[str, Part]:
