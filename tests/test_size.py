@@ -14,7 +14,7 @@ BUDGETS = {
     "codesign/flow": 43_150,  # truth that is unknown, windows that share no event, polarities told two ways
     "codesign/grad": 3_370,  # stairs of single precision in double
     "codesign/lens": 48_420,  # makers of glass, fans of single precision, stops and apertures in their own axes, forecasts of nothing, what a line says beside a name, cones at a distance, a stop that cuts a pupil
-    "codesign/mount": 14_890,  # rays traced once for several depths, films looked at all over, angles in degrees, blur of the whole pupil, points that stand alone
+    "codesign/mount": 14_950,  # rays traced once for several depths, films looked at all over, angles in degrees, blur of the whole pupil, points that stand alone, a mount prints where it is
     "codesign/optimise": 3_940,  # rates in a state
     "codesign/render": 43_800,  # chief rays of a spectrum, curves as the real pupil sees them, no second derivatives
     "codesign/report": 7_690,  # unknown flow, paths from above, wheels beside flow, corners without light, samples beside frames, directions of a sphere in any order
@@ -24,7 +24,7 @@ BUDGETS = {
     "scenes/robots": 9_520,  # held joints, directions of axes, colours by name
     "scenes/trajectories": 3_030,  # numbers that are finite, directions that lead somewhere
     "scenes/windows": 8_710,  # what estimators are judged on, told twice in studies before
-    "setup": 7_110,  # couplings by themselves, tables of races, answers raced again, all robots together, every arm
+    "setup": 7_150,  # couplings by themselves, tables of races, answers raced again, all robots together, every arm
     "studies": 8_490,  # heads by an interval, names given twice, all robots together
     "studies/chain_picture": 1_630,  # each stage alone, for the gallery
     "studies/codesign": 15_770,  # blur over the view, what a family reaches, where answers lie, the best of all answers, what blur does by experiment, what a design was judged in

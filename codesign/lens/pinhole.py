@@ -67,6 +67,9 @@ class ThinLens(Replaceable):
             remedy="0 is a pinhole",
         )
 
+    def extra_repr(self) -> str:
+        return f"{float(self.efl_mm.detach()):.4g} mm, entrance pupil {self.entrance_pupil_diameter_mm:g} mm"
+
     def _hold(self, name, value):
         if value is None or isinstance(value, nn.Parameter):
             self.register_parameter(name, value)
