@@ -125,3 +125,9 @@ def test_depths_of_a_picture_count_where_there_is_a_surface():
     close(found.unit[1:3], same.unit[1:3], rtol=1e-9)
     # pixels per metre at 2 m: 11 mm / 0.5 mm / 2 m
     assert same.unit[1:3].tolist() == pytest.approx([1 / (11 * 0.3), 1 / (11 * 0.2)], rel=1e-6)
+
+
+def test_a_mount_says_where_it_is():
+    mount = Mount((0.1, 0.0, 0.5), (0.1, 0.1, 0.1), yaw_rad=math.radians(20), pitch_rad=math.pi / 4)
+    assert repr(mount) == "Mount(at 0.1, 0, 0.5 m, yaw, pitch, roll 20, 45, 0 degrees)"
+    assert repr(lens.ThinLens(8.0, 2.0)) == "ThinLens(8 mm, entrance pupil 2 mm)"
