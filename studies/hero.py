@@ -100,9 +100,9 @@ def study(run: Run[Config]) -> None:
     came, together = errors.values()
     run.finish(
         "The chain on a moving robot",
-        f"On the drives of {config.answers.name}, in worlds that no search saw, the design that came has a velocity error of "
-        f"{came:.2f}, the one designed together {together:.2f} (1: all is lost). hero.webp shows both on another drive, at "
-        f"{config.speed:g} m/s, to which these errors do not belong.",
+        f"On the drives of {config.answers.name}, in worlds that no search saw, the camera that the robot came with has a velocity "
+        f"error of {came:.2f}, the one designed as a whole {together:.2f} (0: right, 1: tells nothing). hero.webp shows both on another drive, at "
+        f"{config.speed:g} m/s; the errors beside the pictures are those of all drives.",
     )
 
 

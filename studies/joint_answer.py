@@ -64,7 +64,8 @@ def study(run: Run[Config]) -> None:
         "Over all robots",
         "Errors over those of a rival from the same start, in the same unseen worlds: geometric mean over worlds, median over "
         "starts; over all robots the mean of their logarithms. Intervals are 95 % of resampled starts and worlds, p by signs of "
-        "all starts after Holm over the rivals of a way. Best order: the one of the raced orders that errs least itself.",
+        "all starts after Holm over the rivals of a way. Signs do not know how worlds differ, so p may be small where the interval "
+        "holds 1. Best order: the one of the raced orders that errs least itself.",
     )
     starts = found["nested", ORDER].count
     titles = {"over": "error of", **{robot: robot for robot, *_ in robots}, "all": "all"}
@@ -78,7 +79,8 @@ def study(run: Run[Config]) -> None:
         "Error over that of each rival, over all robots (95 % of resampled starts and worlds).",
     )
     said = " ".join(
-        f"{name.capitalize()} leaves {found[way, ORDER]:.2f} of the error of the best order that was raced."
+        f"{name.capitalize()} leaves {found[way, ORDER]:.2f} of the error of the best order that was raced: "
+        f"{verdict(found[way, ORDER])}."
         for way, name in WAYS.items()
     )
     few = " So few starts decide nothing." if starts < ENOUGH * len(robots) else ""
@@ -101,6 +103,13 @@ def read(path: Path) -> tuple[str, list[Row], str]:
             f"'{path}' has not raced {', '.join(WAYS)} and an order of single blocks from all of its {starts} starts."
         )
     return str(setting["pair"]), whole, best
+
+
+def verdict(ratio: Interval) -> str:
+    """Of an error over a rival's."""
+    if ratio.high < 1:
+        return "less"
+    return "more" if ratio.low > 1 else "undecided"
 
 
 if __name__ == "__main__":

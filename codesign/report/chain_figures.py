@@ -44,8 +44,10 @@ def draw_curves(
       log: the axes that are logarithmic, of "xy".
       levels: heights of dashed lines: what is asked, what is allowed.
     """
-    for label, (x, y) in series.items():
-        axis.plot(x, y, label=label, marker="o" if len(x) < 20 else None, ms=3, lw=1.4)
+    for number, (label, (x, y)) in enumerate(series.items()):
+        dashes = ("-", "--", ":")[number // 10 % 3]  # there are ten colours
+        marker = "o" if len(x) < 20 else None
+        axis.plot(x, y, dashes, label=label, marker=marker, ms=3, lw=1.4)
     for level in levels:
         axis.axhline(level, color="firebrick", ls="--", lw=1)
     axis.set(xlabel=xlabel, ylabel=ylabel)
@@ -87,7 +89,7 @@ def heat_map(values: Any, rows: Sequence[str], columns: Sequence[str], label: st
                     ha="center",
                     va="center",
                     fontsize=8,
-                    color="w" if shown[i, j] > np.nanmedian(shown) else "k",
+                    color="w" if picture.norm(shown[i, j]) > 0.5 else "k",
                 )
     axis.set_xticks(range(len(columns)), columns, rotation=20, ha="right")
     axis.set_yticks(range(len(rows)), rows)

@@ -59,7 +59,8 @@ def answer(
     )
     where += "".join(f", {each}" for each in size.hold) + ", near starts" * size.near
     if size.seeds < ENOUGH:
-        return f"{counted(size.seeds, 'start')} shows that everything works, and decides nothing ({where})."
+        few = "" if size.quick else ", and decides nothing"
+        return f"{counted(size.seeds, 'start')} shows that everything works{few} ({where})."
     name = best_order(rows)
     rival = f"the best order of single blocks ({name})" if ">" in name else f"'{name}'"
     said = [f"In {where}, against {rival}:"]
@@ -143,8 +144,8 @@ def race(
         )
         run.figure(bars(ratios, "joint / arm", log=True, level=1.0), "ratios", caption)
         trails(run, rows)
-        best = max(ratios, key=lambda arm: ratios[arm].value)
-        run.card(f"joint over {best}", f"{ratios[best].value:.2f}", f"{ratios[best]:.2f}")
+        ends = f"{ratios[best].low:.2f} to {ratios[best].high:.2f}: joint {found[best][0].outcome}"
+        run.card(f"joint over {best}", f"{ratios[best].value:.2f}", ends)
 
 
 def every_ratio(rows: Sequence[Row]) -> dict[tuple[str, str], tuple[Interval, float]]:

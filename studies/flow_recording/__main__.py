@@ -22,6 +22,7 @@ from codesign.flow import metrics
 from codesign.flow.checkpoint import DELIVERED
 from codesign.flow.checkpoint import load as load_network
 from codesign.flow.sources import PacketOptions, read_packets, read_recording
+from codesign.report.prose import counted
 from studies.flow_recording import made, page, video
 from studies.frame.config import check_least
 from studies.frame.run import Run, StudyConfig, main
@@ -107,7 +108,7 @@ def study(run: Run[Config]) -> None:
         )
     read = options(config)
     packets = read_packets(recording, config.truth, read)
-    run.say(f"{len(packets)} packet(s); {'; '.join(packets[0].notes)}")
+    run.say(f"{counted(len(packets), 'packet')}; {'; '.join(packets[0].notes)}")
     rows = []
     with run.progress(len(packets) * len(estimators), "packets") as progress:
         for number, packet in enumerate(packets):

@@ -94,6 +94,8 @@ def answer(name, means):
     if "fwl" in means:
         sharper = f"{means['fwl_above_1_share']:.0%} of the packets (FWL {means['fwl']:.2f})"
         said.append(f"sharpens the events of {sharper}, warped along it")
+        if means["fwl"] > 1 < means.get("rsat", 0):
+            said.append(f"yet by RSAT ({means['rsat']:.2f}) blurs them: the measures disagree")
     return (
         f"The flow of '{name}' {', and '.join(said) or 'cannot be judged: no packet has events'}."
     )
@@ -159,13 +161,13 @@ def doubts(packets, rows, name):
         ),
         (
             empty or blind,
-            f"{empty} packet(s) hold no event, {blind} have no true flow; they do not count in the "
+            f"Packets without any event: {empty}, without true flow: {blind}; they do not count in the "
             "figures that need one.",
         ),
         (left_out, f"**Left out**: {', '.join(left_out)}."),
         (
             gaps,
-            f"**{gaps} packet(s) lie across a gap** of the recording, where no pixel sent an event: their "
+            f"**Across a gap lie {counted(gaps, 'packet')}** of the recording, where no pixel sent an event: their "
             "flow is that of the rest of the window.",
         ),
         (
@@ -206,7 +208,7 @@ def _sharper(rows, name):
 
 
 def _some(names):
-    return f"{len(names)} packet(s) ({', '.join(names[:NAMED])}{', ...' if len(names) > NAMED else ''})"
+    return f"{counted(len(names), 'packet')} ({', '.join(names[:NAMED])}{', ...' if len(names) > NAMED else ''})"
 
 
 def caption(packet):

@@ -12,6 +12,7 @@ import torch
 from codesign import events, render
 from codesign.errors import MissingPackageError
 from codesign.report import lens_figures
+from codesign.report.prose import counted
 from scenes import worlds
 from studies.frame.compare import Interval, log_ratio
 from studies.frame.show import Panel, bars, panels, pictures, table
@@ -199,8 +200,8 @@ def _settings(run, course):
         "The rivals at their best",
         "Refocusing moves the film alone. The spot designer minimises the weighted mean square "
         "spot of the wall in the camera's own light by damped least squares, from "
-        f"{config.spot_starts} starts. Both choose among the settings below by the geometric mean "
-        f"flow error on {config.developed} development cases, of other textures than those "
+        f"{counted(config.spot_starts, 'start')}. Both choose among the settings below by the geometric mean "
+        f"flow error on {counted(config.developed, 'development case')}, of other textures than those "
         "optimised on and those judged on. The other gradient objective runs from the same start, "
         "for as many steps, with a clip and a step size of its own, the best of a few on "
         "development cases.",

@@ -21,6 +21,7 @@ from studies.frame.show import Panel, panels
 from studies.frame.show import pictures as show_pictures
 
 tensorboard = optional("torch.utils.tensorboard", "training-logs", "the log of a training")
+FEW = 8  # windows, below which a set decides nothing
 RECENT = 50  # steps over which the shown loss is averaged
 
 
@@ -165,7 +166,7 @@ def show(run, job, scores):
         run.card(
             f"{'error' if ours.blur is None else 'blur'} over zero flow's, {name.replace('_', ' ')}",
             f"{ours.ratio:.3f}",
-            f"closed form {closed.ratio:.3f}; worse than zero flow on {ours.worse_percent:.1f} %",
+            f"closed form {closed.ratio:.3f}; network worse than zero flow on {ours.worse_percent:.1f} %",
         )
         errors = (ours.aee_px, closed.aee_px, ours.zero_flow_px)
         errors = (*(errors if ours.blur is None else [None] * 3), ours.ratio, closed.ratio)
@@ -209,7 +210,9 @@ def answer(scores):
         f"{ours.ratio:.2f} on {name.replace('_', ' ')} (closed form {closed.ratio:.2f})"
         for name, (ours, closed) in scores.items()
     ]
-    return f"The network's error or blur over that of zero flow: {', '.join(said)}."
+    few = min((ours.windows for ours, _ in scores.values()), default=FEW)
+    decides = f" So few windows ({few}) decide nothing." if few < FEW else ""
+    return f"The network's error or blur over that of zero flow: {', '.join(said)}.{decides}"
 
 
 def curves(progress):
