@@ -19,7 +19,7 @@ GROUPS = {
     "whole chain": (
         *("lens_opt", "lens_motion", "placement"),
         *("codesign", "joint_map", "joint_levers", "joint_controls"),
-        *("joint_refiner", "velocity_head"),
+        *("joint_answer", "velocity_head"),
         *("gradient_flow", "speed_error", "stability", "chain_picture", "hero", "viewer"),
     ),
 }
