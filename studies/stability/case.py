@@ -223,7 +223,7 @@ def _ends(value):
     """A number, or the ends of several."""
     value = torch.as_tensor(value).detach().double()
     ends = dict.fromkeys((float(value.min()), float(value.max())))
-    return " to ".join(f"{end:.6g}" for end in ends)
+    return " to ".join(f"{end + 0.0:.6g}" for end in ends)
 
 
 def _sentence(error):
