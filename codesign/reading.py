@@ -10,7 +10,7 @@ import math
 import os
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -75,6 +75,13 @@ def noting() -> Iterator[dict[Path, None]]:
         yield found
     finally:
         _OPENED.reset(token)
+        note(found)
+
+
+def note(paths: Iterable[Path]) -> None:
+    """Files that something else than our readers opens."""
+    if (opened := _OPENED.get()) is not None:
+        opened.update(dict.fromkeys(paths))
 
 
 def open_regular(path: str | Path, most_bytes: int | None = None) -> BinaryIO:
@@ -94,8 +101,7 @@ def open_regular(path: str | Path, most_bytes: int | None = None) -> BinaryIO:
         raise FileFormatError(
             f"{path} cannot be read ({said}); give a file you may read."
         ) from error
-    if (opened := _OPENED.get()) is not None:
-        opened[Path(path)] = None
+    note([Path(path)])
     length = os.fstat(file.fileno()).st_size
     if most_bytes is not None and length > most_bytes:
         file.close()

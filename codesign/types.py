@@ -2,7 +2,6 @@
 windows to learn flow from."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Protocol
 
 from torch import Tensor
@@ -43,10 +42,15 @@ class EventStream:
     height_px: int
     width_px: int
 
-    @cached_property
+    @property
     def in_order(self) -> bool:
-        """Whether times never go back; looked at once."""
-        return not bool((self.t_us[1:] < self.t_us[:-1]).any())
+        """Whether times never go back; looked at again only where torch has changed them."""
+        version = None if self.t_us.is_inference() else self.t_us._version
+        known, found = self.__dict__.get("_order", (None, False))
+        if version is None or version != known:
+            found = not bool((self.t_us[1:] < self.t_us[:-1]).any())
+            self.__dict__["_order"] = version, found
+        return found
 
     def __len__(self):
         return int(self.t_us.numel())

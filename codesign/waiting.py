@@ -18,19 +18,26 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 def threads_sleep() -> None:
     """See to it where torch was imported before codesign too.
 
-    Its OpenMP, libgomp, lets threads sleep soon when there are more of them than cores: so another
-    team of them is held, which does nothing.
+    Its OpenMP, libgomp, lets threads sleep soon when there are more of them than cores: so other
+    teams of them are held, which do nothing. Asked once, of as many threads as torch has then.
     """
     if not CAME_LATE:
         return
     import torch
 
-    begun = threading.Event()
+    team, cores = torch.get_num_threads(), os.cpu_count() or 1
+    if team == 1 or 4 * team <= cores:  # none waits, or there are cores enough to wait on
+        return
+    begun = threading.Semaphore(0)
 
     def hold():
-        torch.ones(1 << 20).sum()
-        begun.set()
+        try:
+            torch.ones(1 << 20).sum()
+        finally:
+            begun.release()
         threading.Event().wait()
 
-    threading.Thread(target=hold, name="codesign-waiting", daemon=True).start()
-    begun.wait()
+    for _ in range(held := cores // team):
+        threading.Thread(target=hold, name="codesign-waiting", daemon=True).start()
+    for _ in range(held):
+        begun.acquire()

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from codesign.errors import FileFormatError
-from codesign.reading import open_regular
+from codesign.reading import note, open_regular
 from scenes import rgbe
 
 LONGEST_S = 600.0
@@ -69,6 +69,7 @@ def check(
         if each.is_file()
     ]
     tried = (TRIAL, asked, *facts)
+    note(each for each in files if each.is_file())
     if (file is None and not named) or tried in SURVIVED:
         return
     for kind, name in named:

@@ -64,7 +64,8 @@ def run_at(command: str) -> str:
 
 
 def _git(*words: str) -> str:
-    return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True).stdout.strip()
+    done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True)
+    return "" if done.returncode else done.stdout.strip()  # what is not there it says back
 
 
 def stale(part: Mapping[str, Any]) -> list[str]:

@@ -8,29 +8,29 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 UNCOUNTED = (ast.expr_context, ast.operator, ast.unaryop, ast.cmpop, ast.boolop)
 BUDGETS = {
-    "codesign": 10_230,  # a pose out of its rotation and its place, for mounts and paths alike, what is differentiable once, threads of a torch that came first, threads of a torch that came first
+    "codesign": 10_340,  # a pose out of its rotation and its place, for mounts and paths alike, what is differentiable once, threads of a torch that came first, threads of a torch that came first
     "codesign/events": 48_620,  # leaks that have begun before, counts that a type holds, kinds of TIFFs, noise events of all intervals at once, times too coarse
     "codesign/fidelity": 3_030,  # stages without a level, levels that are told wrong
-    "codesign/flow": 43_150,  # truth that is unknown, windows that share no event, polarities told two ways
+    "codesign/flow": 43_180,  # truth that is unknown, windows that share no event, polarities told two ways, truths without a time
     "codesign/grad": 3_370,  # stairs of single precision in double
     "codesign/lens": 48_420,  # makers of glass, fans of single precision, stops and apertures in their own axes, forecasts of nothing, what a line says beside a name, cones at a distance, a stop that cuts a pupil
-    "codesign/mount": 14_950,  # rays traced once for several depths, films looked at all over, angles in degrees, blur of the whole pupil, points that stand alone, a mount prints where it is
+    "codesign/mount": 14_960,  # rays traced once for several depths, films looked at all over, angles in degrees, blur of the whole pupil, points that stand alone, a mount prints where it is
     "codesign/optimise": 3_940,  # rates in a state
     "codesign/render": 43_800,  # chief rays of a spectrum, curves as the real pupil sees them, no second derivatives
     "codesign/report": 7_710,  # unknown flow, paths from above, wheels beside flow, corners without light, samples beside frames, directions of a sphere in any order
     "codesign/system": 9_820,  # truth of what is read, a lens in its camera, bins that were asked for, one colour handed over, truth of another interval, refusals that lose nothing
     "codesign/train": 5_870,  # bins of windows, ends of sources, losses by what is in them
-    "scenes": 15_530,  # polygons with inward corners, colours of materials, mesh files that are read in part, tints colour by colour, wrap is checked
+    "scenes": 15_550,  # polygons with inward corners, colours of materials, mesh files that are read in part, tints colour by colour, wrap is checked
     "scenes/robots": 9_520,  # held joints, directions of axes, colours by name
     "scenes/trajectories": 3_030,  # numbers that are finite, directions that lead somewhere
     "scenes/windows": 8_710,  # what estimators are judged on, told twice in studies before
-    "setup": 7_150,  # couplings by themselves, tables of races, answers raced again, all robots together, every arm
+    "setup": 7_160,  # couplings by themselves, tables of races, answers raced again, all robots together, every arm
     "studies": 8_490,  # heads by an interval, names given twice, all robots together
     "studies/chain_picture": 1_630,  # each stage alone, for the gallery
     "studies/codesign": 15_780,  # blur over the view, what a family reaches, where answers lie, the best of all answers, what blur does by experiment, what a design was judged in
     "studies/flow_quality": 5_560,  # names of recordings, no truth of rotation alone
-    "studies/flow_recording": 3_440,  # windows that are not judged
-    "studies/frame": 9_220,  # titles of columns, options without effect, files that a run was given and read piece by piece, tables put together
+    "studies/flow_recording": 3_470,  # windows that are not judged
+    "studies/frame": 9_250,  # titles of columns, options without effect, files that a run was given and read piece by piece, tables put together
     "studies/gradient_flow": 6_300,  # a first line that answers
     "studies/lens_motion": 4_190,  # a table read case by case, poses that stand still
     "studies/lens_opt": 6_480,  # seeds that judge; where windows lie, designs that err alike
@@ -44,10 +44,10 @@ BUDGETS = {
     "studies/train_flow": 5_180,  # steps of a race, options without effect, windows that reach into one another
     "studies/viewer": 3_450,  # says what a fail may be
     "studies/video_to_events": 4_290,
-    "tests": 15_250,  # words of numbers for all rooms, pictures of poses, pycollada, arrays of far paths
+    "tests": 15_270,  # words of numbers for all rooms, pictures of poses, pycollada, arrays of far paths
     "tests/data": 1_000,
-    "tests/events": 30_180,  # rates of leaks in short runs, sums over wide spreads, times with decimals
-    "tests/flow": 27_810,  # chunks that may come again
+    "tests/events": 30_240,  # rates of leaks in short runs, sums over wide spreads, times with decimals
+    "tests/flow": 27_830,  # chunks that may come again
     "tests/gradients": 3_400,  # single precision in double
     "tests/hard_cases": 2_540,
     "tests/hostile": 19_030,
@@ -55,7 +55,7 @@ BUDGETS = {
     "tests/mount": 14_060,  # blur of a wide lens, lone points, gradients to the flow
     "tests/optimise": 3_440,  # a state is a copy; schedules, weights that nothing reaches, rates in a state
     "tests/render": 28_980,  # outlines from the real pupil, no second derivatives
-    "tests/scenes": 20_530,  # polygons from every corner, colours of materials and vertices, tints colour by colour
+    "tests/scenes": 20_540,  # polygons from every corner, colours of materials and vertices, tints colour by colour
     "tests/studies": 34_880,  # blur over the view, families that are slower, blur that is drawn, first lines that are true, the best of all answers, files that change, few starts, all robots together
     "tests/system": 6_600,  # estimates of their own kind, one colour handed over, levels that are told wrong, truth of another interval
     "tests/train": 5_090,  # bins of windows, ends of sources, losses by what is in them

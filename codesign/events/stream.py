@@ -44,10 +44,12 @@ def ordered(
     return EventStream(t_us[rank], x[rank], y[rank], p[rank], int(height_px), int(width_px))
 
 
-def check_stream(stream: EventStream, part: slice = slice(None)) -> EventStream:
+def check_stream(
+    stream: EventStream, part: slice = slice(None), ordered: bool = True
+) -> EventStream:
     """Return ``stream`` when it is one: lists of int64 of equal length, times that do not go back
-    and, in ``part``, pixels of the sensor, polarities +1 and -1; DomainError, ShapeError
-    otherwise."""
+    (where asked) and, in ``part``, pixels of the sensor, polarities +1 and -1; DomainError,
+    ShapeError otherwise."""
     check_kind(
         stream, EventStream, "the events", "events.read and events.simulate give an EventStream"
     )
@@ -66,7 +68,7 @@ def check_stream(stream: EventStream, part: slice = slice(None)) -> EventStream:
             f"t_us, x, y, p of the stream are {given}; dense tensors of int64 are needed."
         )
     _check_columns(*columns, stream.height_px, stream.width_px, part)
-    if not stream.in_order:
+    if ordered and not stream.in_order:
         raise DomainError(
             "the times of the stream go back; order it with codesign.events.stream.ordered."
         )
@@ -102,7 +104,7 @@ def concatenate(streams: Iterable[EventStream]) -> EventStream:
     """
     if not isinstance(streams, Iterable):
         raise DomainError(f"the streams are {streams!r}; a list of EventStreams is needed.")
-    streams = [check_stream(stream, slice(0)) for stream in streams]
+    streams = [check_stream(stream, slice(0), ordered=False) for stream in streams]
     sizes = {(stream.height_px, stream.width_px) for stream in streams}
     if len(sizes) != 1:
         raise ShapeError(

@@ -188,7 +188,7 @@ class Tracker:
         """The chunk as rows [4, N] of this sensor, no event before the last one of the chunks
         before."""
         if isinstance(chunk, EventStream):
-            stream = check_stream(chunk, slice(0))
+            stream = check_stream(chunk, slice(0), ordered=False)
             size_px = stream.height_px, stream.width_px
             self.size_px = self.size_px or size_px
             if size_px != self.size_px:

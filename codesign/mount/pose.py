@@ -132,12 +132,12 @@ class Mount(nn.Module):
         return rigid(self.start_attitude @ turn, position)
 
     def extra_repr(self) -> str:
+        if not self.numbers.isfinite().all():
+            return "numbers that are not finite"
         pose = self().detach()
         place = ", ".join(f"{each:.4g}" for each in pose[:3, 3].tolist())
         turns = yaw_pitch_roll_rad(pose).rad2deg().tolist()
-        return (
-            f"at {place} m, yaw, pitch, roll {', '.join(f'{each:.3g}' for each in turns)} degrees"
-        )
+        return f"at {place} m, yaw, pitch, roll {', '.join(f'{each + 0.0:.3g}' for each in turns)} degrees"
 
     def numbers_at(self, T_body_cam: Tensor) -> Tensor:
         """Numbers [..., 6] that give poses [..., 4, 4], the inverse of ``forward``; no gradient.

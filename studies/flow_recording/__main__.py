@@ -17,7 +17,7 @@ from typing import Literal
 import torch
 
 from codesign import events, flow
-from codesign.errors import DomainError, ShapeError
+from codesign.errors import DomainError, FileFormatError, ShapeError
 from codesign.flow import metrics
 from codesign.flow.checkpoint import DELIVERED
 from codesign.flow.checkpoint import load as load_network
@@ -77,7 +77,8 @@ class Config(StudyConfig):
     """Faults to leave out and count instead of refusing (events) or keeping (windows):
     events_back_in_time, events_off_sensor, windows_without_events, windows_across_gaps."""
     truth_interval_ms: float | None = None
-    """What a flow file without times covers; the whole packet when left out."""
+    """What a flow file without times covers; needed where packets are cut into windows, else the
+    whole packet."""
     gyro_axes: str = "xyz"
     """The camera's axes in terms of the gyroscope's, for example x-y-z."""
     calibration: Path | None = None
@@ -108,6 +109,9 @@ def study(run: Run[Config]) -> None:
         )
     read = options(config)
     packets = read_packets(recording, config.truth, read)
+    truths = [packet.truth for packet in packets if packet.truth is not None]
+    if truths and not any(bool(truth.valid.any()) for truth in truths):
+        raise FileFormatError("no true flow has a number that is finite; is it the right file?")
     run.say(f"{counted(len(packets), 'packet')}; {'; '.join(packets[0].notes)}")
     rows = []
     with run.progress(len(packets) * len(estimators), "packets") as progress:

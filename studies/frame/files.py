@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from codesign.errors import DomainError
+from codesign.reading import reading
 from studies.frame.config import StudyConfig
 
 BEGINNING = 1 << 16  # bytes that are read of each file of a folder
@@ -19,23 +20,27 @@ def digest(content: bytes | BinaryIO) -> str:
     return hashlib.file_digest(content, "sha256").hexdigest()[:12]
 
 
-def digests(paths: Iterable[Path]) -> dict[str, str]:
+def digests(paths: Iterable[Path], but: Path | None = None) -> dict[str, str]:
     """Name -> digest of the files among some paths, and of names, sizes and beginnings of what lies
-    in folders."""
-    found = {}
+    in folders, less what lies in ``but``."""
+    found, own = {}, but and but.resolve()
     for path in paths:
         if path.is_file():
             with path.open("rb") as content:
                 found[f"'{path}'"] = digest(content)
         elif path.is_dir():
-            inside = sorted(each for each in path.rglob("*") if each.is_file())
+            inside = sorted(
+                each
+                for each in path.resolve().rglob("*")
+                if each.is_file() and own not in each.parents
+            )
             told = b"".join(map(_beginning, inside))
             found[f"what lies in '{path}'"] = digest(told)
     return found
 
 
 def _beginning(path):
-    with path.open("rb") as content:
+    with reading(path), path.open("rb") as content:
         begins = content.read(BEGINNING)
     return digest(f"{path.name} {path.stat().st_size} ".encode() + begins).encode()
 

@@ -291,7 +291,7 @@ def open_run(
         remove_unfinished(config.resume)
         begun = config.resume / "files.json"
         if begun.exists():
-            files.check_same(read_json(begun), files.digests(files.given(stored)))
+            files.check_same(read_json(begun), files.digests(files.given(stored), config.resume))
         # earlier versions stored what "auto" found, whether the study used it or not
         device = _device(stored) if stored.GPU else torch.device("cpu")
         return Run(study, stored, config.resume, device, True, interruption)
@@ -302,7 +302,7 @@ def open_run(
     folder = folders.fresh(study, config.out)
     _hold(folder, held)
     write_atomic(folder / "config.json", text.encode())
-    if begun := files.digests(files.given(config)):
+    if begun := files.digests(files.given(config), folder):
         write_atomic(folder / "files.json", json.dumps(begun, indent=2).encode())
     return Run(study, config, folder, device, False, interruption)
 

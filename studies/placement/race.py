@@ -48,7 +48,11 @@ def kept(problem: Problem, share: Tensor) -> bool:
 def fingerprints(pair: RobotPair) -> dict[str, str]:
     """What a user may have changed since a run was begun: the robot's page, and the files of which
     it was made."""
-    return {"the robot's page": digest(pair.page.encode())} | digests(pair.files)
+    found: dict[str, str] = {"the robot's page": digest(pair.page.encode())}
+    for path in pair.files:
+        name = f"'{path.name}'"  # alone: a folder may be copied elsewhere
+        found[name] = "".join([found.get(name, ""), *digests([path]).values()])
+    return found
 
 
 class Race:

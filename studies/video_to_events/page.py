@@ -116,7 +116,7 @@ def write_page(view, state, sensor, clock, written):
         f"{frames}",
         f"{view.log.width_px} x {view.log.height_px}, {seconds(view.duration_s)}",
     )
-    run.card("Speed", f"{speed:.2g} Mpixel/s", f"{state.seconds:.1f} s, decoding included")
+    run.card("Speed", f"{speed:.3g} Mpixel/s", f"{state.seconds:.1f} s, decoding included")
     slow = state.large_share > WORRYING
     run.section("Is the video fast enough?")
     for sentence in warnings(view, state, sensor, slow):

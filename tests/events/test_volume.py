@@ -8,7 +8,7 @@ import torch
 
 from codesign.errors import DomainError
 from codesign.events import decay, from_counts, from_stream, surface_from_counts, to_counts
-from codesign.events.stream import ordered
+from codesign.events.stream import concatenate, ordered
 from codesign.events.volumes.surface import decay_from_stream, surface_from_stream
 from codesign.events.volumes.volume import spikes_from_stream
 from tests.event_streams import part, random_stream, rows, stream_of
@@ -167,3 +167,12 @@ def test_counts_that_a_type_does_not_hold_are_refused():
         from_stream(twice, 0, many, 1, dtype=torch.float16)
     with pytest.raises(DomainError, match=r"1.7e\+18 us is too long for 8 bins"):
         from_stream(stream, 0, 17 * 10**17, 8)
+
+
+def test_streams_out_of_order_are_joined_in_order_and_refused_though_they_were_in_order_before():
+    stream = at_one_pixel(10, 20, 30)
+    assert float(from_stream(stream, 0, 40, 2).counts.sum()) == 3
+    stream.t_us[0] = 35
+    with pytest.raises(DomainError, match="go back"):
+        from_stream(stream, 0, 40, 2)
+    assert concatenate([stream]).t_us.tolist() == [20, 30, 35]

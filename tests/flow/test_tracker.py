@@ -218,6 +218,9 @@ def test_arrays_are_taken_and_faults_left_out_on_request():
     lenient = tracker(*skip)
     assert sum(window.events for window in lenient.track([(t_us, x, y, on)])) == 17
     assert lenient.left_out == {"events_off_sensor": 2, "events_back_in_time": 1}
+    turned = stream_of(np.arange(20) * 100)
+    turned.t_us[10] = 150
+    assert sum(window.events for window in tracker(skip[1]).track([turned])) == 19
     again = tracker()
     again.add(stream_of(np.arange(20) * 100))
     with pytest.raises(DomainError, match="lies before 1900 us"):

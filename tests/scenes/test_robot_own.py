@@ -255,6 +255,7 @@ def test_rendered_flow_of_a_world_of_ones_own_gives_the_twist_back(write, files,
     check_pair(found)
     assert found.depth == "scene"
     assert {path.name for path in found.files} == {"box.obj", "screw.csv", *files}
+    assert own_pair(tmp_path / "page.yaml").files == found.files  # what was loaded before too
     drives = found.batch((0, UNSEEN), 2)
     system = found.system(found.design).replaced(
         flow=lambda volume, truth: truth, estimate=EgoVelocity(FREE, (1e3,) * 6, "scene")

@@ -28,6 +28,7 @@ from codesign.flow.sources.packet_truth import NO_TRUTH, Opened, is_motion, read
 from codesign.reading import open_regular, reading
 
 LONGEST_S = 1.0  # of a packet that is a file of its own
+SAME = 1e-3  # share of its length by which a window may differ from what a true flow covers
 # width, height: the sensors that recordings without a size come from, smallest first
 SENSORS_PX = {
     "DAVIS240C": (240, 180),
@@ -208,21 +209,6 @@ def _cut_by_flows(one, flows, start_us):
     whole = one.whole
     left_out = {}
     over = None
-    if not any(bool(flow.valid.any()) for flow in flows):
-        raise FileFormatError(
-            "none of the true flows has a number that is finite; is it the right file?"
-        )
-    if (
-        len(flows) == 1
-        and flows[0].span_s is None
-        and options.window_s
-        and options.truth_unit == "px"
-        and not options.truth_interval_s
-    ):
-        raise DomainError(
-            f"the true flow does not say over what time it is, and windows of {1e3 * options.window_s:g} ms are asked for: "
-            "give its time (truth_interval_s, --truth-interval-ms), or its unit as px/s."
-        )
     if all(flow.span_s is not None for flow in flows[:-1] or flows):
         ends = enumerate(flow.span_s for flow in flows)
         spans = [(k, (round(span[0] * 1e6), round(span[1] * 1e6))) for k, span in ends if span]
@@ -247,6 +233,13 @@ def _cut_by_flows(one, flows, start_us):
             ]
         over = edges[:2]
         pairs = _parts(one, list(pairwise(edges)), start_us)[: options.count]
+        lasts_us, cut_us = edges[1] - edges[0], pairs[0][1][1] - pairs[0][1][0]
+        timed = options.truth_interval_s or options.truth_unit != "px"
+        if len(flows) == 1 and not timed and abs(cut_us - lasts_us) > SAME * lasts_us:
+            raise DomainError(
+                f"{one.file.name}: the true flow does not say over what time it is, and a window of {1e-3 * cut_us:g} ms is cut from "
+                f"{1e-3 * lasts_us:g} ms: give its time (truth_interval_s, --truth-interval-ms), or its unit as px/s."
+            )
     kept, more = without([window for _, window in pairs], one.events, options.skip)
     found = [
         one.packet(f"{one.file.name} {k}", window, flows[k], over, left_out | more)

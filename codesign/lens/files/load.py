@@ -39,7 +39,7 @@ def load(source: str | Path, dtype: torch.dtype = torch.float64) -> GeoLens:
       dtype: precision of the lens.
     Returns: GeoLens. Files are parsed, never executed; at most 2 MB and 500 surfaces are read.
     Warns: when coordinate breaks of a .zmx file put the stop beside the axis, and when nd and Vd
-      beside a glass of its first catalogue are those of another.
+      beside a glass of its first catalogue are those of another; when the stop cuts the pupil.
     Raises: FileFormatError or DomainError, one sentence naming file, place, fault and remedy;
       nothing is half loaded or dropped.
 
