@@ -25,6 +25,7 @@ STAGES = {
     "events": events.stage,
     "spiking": events.spiking_stage,
     "flow": flow.stage,
+    "live": flow.live_stage,
 }
 
 
