@@ -38,6 +38,7 @@ def study(run: Run[Config]) -> None:
     if not robots:
         raise DomainError("--raw names no table; give answers.jsonl of one run or more.")
     found: dict[tuple[str, str], Interval] = {}
+    outcomes: dict[tuple[str, str], str] = {}
     lines = []
     arms = [{row["arm"]: None for row in rows} for _, rows, _ in robots]
     others = [arm for arm in arms[0] if arm not in WAYS and all(arm in each for each in arms)]
@@ -48,7 +49,8 @@ def study(run: Run[Config]) -> None:
         }
         p = holm([sign_flip(torch.cat([each.mean(1) for each in of])) for of in logs.values()])
         for (rival, of), chance in zip(logs.items(), p, strict=True):
-            found[way, rival] = crossed(*of).ratio()
+            over = crossed(*of)
+            found[way, rival], outcomes[way, rival] = over.ratio(), over.outcome
             line: Row = {"over": f"{WAYS[way]} over {rival}"}
             for (robot, *_), each in zip(robots, of, strict=True):
                 alone = crossed(each).ratio()
@@ -80,7 +82,7 @@ def study(run: Run[Config]) -> None:
     )
     said = " ".join(
         f"{name.capitalize()} leaves {found[way, ORDER]:.2f} of the error of the best order that was raced: "
-        f"{verdict(found[way, ORDER])}."
+        f"it {outcomes[way, ORDER]}."
         for way, name in WAYS.items()
     )
     few = " So few starts decide nothing." if starts < ENOUGH * len(robots) else ""
@@ -103,13 +105,6 @@ def read(path: Path) -> tuple[str, list[Row], str]:
             f"'{path}' has not raced {', '.join(WAYS)} and an order of single blocks from all of its {starts} starts."
         )
     return str(setting["pair"]), whole, best
-
-
-def verdict(ratio: Interval) -> str:
-    """Of an error over a rival's."""
-    if ratio.high < 1:
-        return "less"
-    return "more" if ratio.low > 1 else "undecided"
 
 
 if __name__ == "__main__":
