@@ -236,10 +236,8 @@ def follow(optics: Camera | ProjectionTable, hits: Hits, later: Tensor, pixels: 
     points, in_front = _before(hits, later)
     chief = None
     if isinstance(optics, ProjectionTable):
-        # a matrix product rounds by its shape: one frame per call keeps a frame's bits in any
-        # company
-        to, base, slope = (torch.stack(v) for v in zip(*map(optics, points), strict=True))
-        chief = (base, slope)
+        to, *chief = (v.unflatten(0, points.shape[:2]) for v in optics(points.flatten(0, 1)))
+        chief = tuple(chief)
     else:
         to = project(optics, points)
     valid = in_front & ~to.detach().isnan().any(-1)

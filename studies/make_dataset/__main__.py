@@ -11,10 +11,13 @@ import itertools
 import math
 import sys
 import time
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from collections.abc import Callable
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, Literal
 
+import drjit
 import numpy as np
 import torch
 
@@ -23,7 +26,7 @@ from codesign.atomic import write_atomic
 from codesign.errors import DomainError
 from codesign.events import SensorModel, SensorState, simulate
 from codesign.fidelity import Task
-from codesign.fidelity.levels import camera_at
+from codesign.fidelity.levels import Fidelity, camera_at
 from codesign.flow import estimate_lk
 from codesign.flow.files import write_flow
 from codesign.lens import catalogue
@@ -35,7 +38,9 @@ from codesign.render.truth import truth_of_frames
 from scenes.dataset_motion import FAMILIES, LEAD_S, make_world, motion
 from scenes.trajectories import times
 from scenes.tum import write_tum
+from studies.frame import workers
 from studies.frame.bench import resident_mb as resident_mb_now
+from studies.frame.config import check_least, read_config
 from studies.frame.fidelity import Tolerant, chosen
 from studies.frame.run import Run, main
 from studies.make_dataset import page as pages
@@ -54,6 +59,7 @@ LONGEST_S = 4000.0  # event times are 32-bit microseconds
 @dataclass(frozen=True)
 class Config(Tolerant):
     QUICK: ClassVar = {"trajectories": 2, "frames": 40, "size": 64, "samples": 4}
+    ANEW: ClassVar = ("processes",)
     trajectories: int = 5
     """Number of sequences; the families orbital, radial, vertical, driving, flying take turns."""
     frames: int = 600
@@ -85,6 +91,9 @@ class Config(Tolerant):
     is killed."""
     flo: bool = False
     """Also write every flow as a Middlebury .flo file, exact to float32."""
+    processes: int = 0
+    """Sequences that are made at once, each in a process of its own with a thread; 0: one after the
+    other in this one. The files are the same."""
 
 
 class Clock:
@@ -108,8 +117,10 @@ def study(run: Run[Config]) -> None:
     start = time.perf_counter()
     config = checked(run.config)
     maker = Maker(config)
+    fidelity = None
     if config.tolerance:
-        maker = Maker(*cheapest(run, maker))
+        fidelity = cheapest(run, maker)
+        maker = Maker(config, fidelity)
     names = [
         f"sequence_{index:03d}_{FAMILIES[index % len(FAMILIES)]}"
         for index in range(config.trajectories)
@@ -118,24 +129,43 @@ def study(run: Run[Config]) -> None:
     ready = [
         maker.chunks if store.is_done(folder) else store.parts_done(folder) for folder in folders
     ]
-    resident_mb = []
+    missing = {
+        index: {"folder": str(folder), "index": index}
+        for index, folder in enumerate(folders)
+        if not store.is_done(folder)
+    }
+    found = []
     with run.progress(maker.chunks * len(names), "chunks", sum(ready)) as progress:
-        for index, folder in enumerate(folders):
-            if store.is_done(folder):
-                continue
-            sequence = Sequence(maker, index, folder)
-            for chunk in range(ready[index], maker.chunks):
-                progress.advance(sequence=index, events=sequence.make(chunk))
-            sequence.finish()
-            resident_mb.append(resident_mb_now())
+        if config.processes:
+            beside = {"fidelity": asdict(fidelity)} if fidelity else {}
+            calls = {index: {**given, **beside} for index, given in missing.items()}
+            with closing(workers.in_processes(made, calls, config.processes)) as answers:
+                for index, told in answers:
+                    for _ in range(ready[index], maker.chunks):
+                        progress.advance(sequence=index, events=told["events"])
+                    for part, seconds in told.pop("spent").items():
+                        maker.clock.spent[part] += seconds
+                    found.append(told)
+        else:
+            found += [maker.make(index, folders[index], progress.advance) for index in missing]
     wall_s = time.perf_counter() - start
     write_atomic(run.folder / "manifest.json", store.manifest(run.folder, names).encode())
-    if resident_mb:
-        run.record(
-            session_resident_mb_first=resident_mb[0], session_resident_mb_last=resident_mb[-1]
-        )
+    if found:
+        first, last = (found[k]["resident_mb"] for k in (0, -1))
+        run.record(session_resident_mb_first=first, session_resident_mb_last=last)
     fresh = sum(max(config.frames - done * maker.chunk_frames, 0) for done in ready)
     pages.show(run, names, maker.clock.spent, wall_s, fresh)
+
+
+@torch.no_grad()
+def made(folder: str, index: int, fidelity: dict[str, Any] | None = None) -> dict[str, Any]:
+    """A sequence of the run around its folder, in a process that knows nothing yet, on one thread:
+    as of ``Maker.make``, and seconds ``spent``."""
+    torch.set_num_threads(1)
+    drjit.set_thread_count(1)
+    config = read_config(Path(folder).parent / "config.json", "make_dataset", Config)
+    maker = Maker(config, Fidelity(**fidelity) if fidelity else None)
+    return {**maker.make(index, Path(folder)), "spent": maker.clock.spent}
 
 
 def checked(config):
@@ -152,6 +182,7 @@ def checked(config):
             raise DomainError(
                 f"--{name} is {getattr(config, name)}; {least} to {most} are possible."
             )
+    check_least(config, 0, "processes")
     if not (0 < config.rate_hz <= 1e5 and config.frames / config.rate_hz <= LONGEST_S):
         raise DomainError(
             f"--rate-hz is {config.rate_hz:g}: above 0, at most 100000, and such that {config.frames} "
@@ -190,26 +221,29 @@ def make_camera(config):
 
 
 def cheapest(run, maker):
-    """The configuration and the camera that --tolerance allows, chosen on windows from the middle
-    of the paths of the first sequences."""
+    """What --tolerance allows, chosen on windows from the middle of the paths of the first
+    sequences."""
     config = maker.config
     count = min(config.trajectories, len(FAMILIES))
     t_s = times(min(WINDOW, config.frames), config.rate_hz)
     since_s = LEAD_S + (config.frames - len(t_s)) // 2 / config.rate_hz
     poses = torch.stack([maker.path(index)(since_s + t_s).detach() for index in range(count)])
     task = Task(maker.camera, maker.sensor, poses, t_s, flow=estimate_lk)
-    found = chosen(run, maker.scene, task, "hard", BINS, "the data set")
-    config = replace(config, level=found.camera, samples=found.samples)
-    return config, camera_at(maker.camera, found)
+    return chosen(run, maker.scene, task, "hard", BINS, "the data set")
 
 
 class Maker:
-    """What all sequences share: world, camera, sensor, the tables of truth, and the clock."""
+    """What all sequences share: world, camera, sensor, the tables of truth, and the clock.
 
-    def __init__(self, config, camera=None):
+    fidelity: whose camera it is, in place of that of the options."""
+
+    def __init__(self, config: Config, fidelity: Fidelity | None = None) -> None:
+        self.camera = make_camera(config)
+        if fidelity:
+            self.camera = camera_at(self.camera, fidelity)
+            config = replace(config, level=fidelity.camera, samples=fidelity.samples)
         self.config = config
         self.scene, self.stage = make_world(config.world, config.light)
-        self.camera = camera or make_camera(config)
         self.sensor = SensorModel(
             config.theta, config.theta, config.theta_sigma, shot_rate_hz=config.shot_rate_hz
         )
@@ -221,6 +255,19 @@ class Maker:
         self.chief = self.camera.chief_rays(self.camera.film.pixels())
         self.segments = Segments(self.scene)
         self.clock = Clock()
+
+    def make(
+        self, index: int, folder: Path, advance: Callable[..., Any] = lambda **_: None
+    ) -> dict[str, float]:
+        """What is missing of a sequence; ``advance`` is told each chunk. Returns: events of the last
+        chunk, memory that is held."""
+        sequence = Sequence(self, index, folder)
+        events = 0
+        for chunk in range(store.parts_done(folder), self.chunks):
+            events = sequence.make(chunk)
+            advance(sequence=index, events=events)
+        sequence.finish()
+        return {"events": events, "resident_mb": resident_mb_now()}
 
     def path(self, index):
         family = FAMILIES[index % len(FAMILIES)]

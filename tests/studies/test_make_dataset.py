@@ -271,8 +271,8 @@ def test_a_run_killed_many_times_ends_with_the_same_bytes(dataset, tmp_path):
     for appears in ("*/events.h5", "sequence_001*/parts/000002.h5"):
         assert kill_when(folder, appears, *resume)
     # a finished one is finished
-    for _ in range(2):
-        assert ran(study, "--resume", folder) == 0
+    for again in ("--processes 2 --resume", "--resume"):
+        assert ran(study, again, folder) == 0
         assert (folder / "manifest.json").read_bytes() == (dataset / "manifest.json").read_bytes()
     for name in stored(folder, "manifest")["files"]:
         assert (folder / name).read_bytes() == (dataset / name).read_bytes()

@@ -126,7 +126,8 @@ def from_stream(
     if bins > 1:
         counts.index_add_(0, cell + height * width, share)
     counts = counts[: 2 * bins * height * width]
-    if float(counts.max()) > torch.finfo(dtype).max:
+    most = torch.finfo(dtype).max
+    if len(t_us) > most and float(counts.max()) > most:
         raise DomainError(
             f"a bin holds {float(counts.max()):.3g} events, more than {dtype} can; take torch.float32."
         )

@@ -78,8 +78,12 @@ def weighed_down(counts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def _boxes(images):
     """Sums over the 5 x 5 pixels around each of [B, H, W], or as many of them as there are."""
-    across = avg_pool2d(images, (1, SIDE), 1, (0, SIDE // 2), divisor_override=1)
-    return avg_pool2d(across, (SIDE, 1), 1, (SIDE // 2, 0), divisor_override=1)
+    # shifted images and their sum: pooling one channel takes seven times as long
+    around = pad(images, (SIDE // 2,) * 4)
+    for along in (2, 1):
+        size = around.shape[along] - SIDE + 1
+        around = sum(around.narrow(along, k, size) for k in range(SIDE))
+    return around
 
 
 def along_path(volume: EventVolume, clock: str) -> tuple[Path, Tensor, Tensor]:
