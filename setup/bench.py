@@ -7,8 +7,9 @@
     make cuda-check ARGS="--device cpu --quick"    the same path on the processor: does the command work?
 
 Work and yardstick take turns, and a ratio is of the least times of both, which what else the machine
-does hardly meets; what is slower than committed is measured once more. A yardstick is a copy of memory
-(what is near the limit of memory) or a convolution (what is near that of arithmetic).
+does hardly meets; what is slower than committed is measured once more. A yardstick is the least kernel of
+the same compiler that does this kind of work, or a convolution: beside a copy, ratios are those of the
+machine's memory.
 """
 
 import argparse
@@ -57,16 +58,15 @@ STEP = "robot step, 12 drives"
 class Work:
     """call: one go. amount: how much of ``unit`` it does, in millions. beside: its yardstick.
     moved: bytes a unit that have to pass through memory: what comes in once, what goes out once.
-    bare: the least kernel (``bare``) that a unit's share of it is set beside, and how many of its
-    units; or multiply-adds of the convolution.
+    bare: units of the yardstick that a unit does at least; 0 where nobody counted.
     least: what is asked of an H100-class GPU, millions of the unit a second."""
 
     call: Callable[[], Any]
     amount: float
     unit: str
-    beside: str = "copy"
+    beside: str = "rows"
     moved: float = 0
-    bare: tuple[str, float] | None = None
+    bare: float = 0
     least: float | None = None
 
 
@@ -76,16 +76,47 @@ def slopes(function: Callable[[], torch.Tensor], *leaves: torch.Tensor) -> Calla
     return lambda: torch.autograd.grad(function(), leaves, ones, allow_unused=True)
 
 
-def yardsticks(device: torch.device) -> dict[str, Callable[[], Any]]:
-    """A copy of 256 MiB into memory that is there; a convolution of 0.6 billion multiply-adds
-    (``MOVED``, ``SUMS``)."""
-    memory = torch.ones(2**26, device=device)
+def yardsticks(device: torch.device) -> dict[str, tuple[Callable[[], Any], float]]:
+    """Plain work, and how many units it does: "copy", 256 MiB into memory that is there, bytes read
+    and written; "convolution", multiply-adds; "surfaces", the operations of a sphere met and
+    refracted at, one after the other; "rows", a loop over time that reads a number of every pixel
+    and writes two."""
+    memory = torch.ones(MOVED // 8, device=device)
     there = torch.zeros_like(memory)  # new pages from the system cost now this, now that
     image = torch.ones(1, 32, 256, 256, device=device)
     taps = torch.ones(32, 32, 3, 3, device=device)
+    arr = arrays(device.type, torch.float32)
+    ray = drjit.linspace(arr.Float, 1, 2, 2**20)
+    one = drjit.opaque(arr.Float, 1)
+    frames = torch.rand(100, 260, 346, device=device)
+    lanes = Lanes(frames, frames[0].numel())
+    numbers, target = lanes.load(frames), lanes.fresh(2 * len(frames))
+
+    def surfaces():
+        value = ray
+        for _ in range(SURFACES):
+            for _ in range(45):
+                value = drjit.fma(value, one, one)
+            value = drjit.sqrt(one / (one / (one / drjit.sqrt(value))))
+        drjit.eval(value)
+        drjit.sync_thread()
+
+    def rows():
+        def step(index, total):
+            value = lanes.at(numbers, index)
+            lanes.put(target, value, 2 * index)
+            lanes.put(target, total, 2 * index + 1)
+            return (total + value,)
+
+        drjit.eval(lanes.loop(lanes.opaque(0), lanes.opaque(len(frames)), step, lanes.lane * one))
+        drjit.eval(target)
+        drjit.sync_thread()
+
     return {
-        "copy": lambda: there.copy_(memory),
-        "convolution": lambda: torch.conv2d(image, taps, padding=1),
+        "copy": (lambda: there.copy_(memory), MOVED),
+        "convolution": (lambda: torch.conv2d(image, taps, padding=1), SUMS),
+        "surfaces": (surfaces, SURFACES * 2**20),
+        "rows": (rows, frames.numel()),
     }
 
 
@@ -113,10 +144,15 @@ def _of_lens(device, share):
 
     rays = SURFACES * count / 1e6
     # six numbers in and three out over all surfaces
-    each = {"amount": rays, "unit": "ray-surfaces", "moved": 36 / SURFACES}
+    each = {
+        "amount": rays,
+        "unit": "ray-surfaces",
+        "beside": "surfaces",
+        "moved": 36 / SURFACES,
+    }
     return {
-        "tracing": Work(forward, **each, bare=("surfaces", 1), least=20_000),
-        "tracing with gradient": Work(slopes(trace, curves), **each, bare=("surfaces", 3)),
+        "tracing": Work(forward, **each, bare=1, least=20_000),
+        "tracing with gradient": Work(slopes(trace, curves), **each, bare=3),
     }
 
 
@@ -140,13 +176,13 @@ def _of_events(device, small):
         made = events.layer(name, events.SensorModel(0.2, 0.2)).to(device)
         leaf = frames.clone().requires_grad_()
         # frames in twice; counts out; what they are worth in; slopes out
-        return Work(slopes(lambda: made(leaf, t_s), leaf), **pixels, moved=28, bare=("rows", 2))
+        return Work(slopes(lambda: made(leaf, t_s), leaf), **pixels, moved=28, bare=2)
 
     drive = torch.rand(40 if small else 200, 2, 128, 128, device=device).requires_grad_()
     spikes = slopes(lambda: events.srm(drive, theta=1.0, tau_r=3.0)[0], drive)
     return {
-        "hard events": Work(hard(calm), **pixels, moved=4, bare=("rows", 1), least=5000),
-        "hard events, busy": Work(hard(busy), **pixels, moved=4 + 0.2 * EVENT, bare=("rows", 1)),
+        "hard events": Work(hard(calm), **pixels, moved=4, bare=1, least=5000),
+        "hard events, busy": Work(hard(busy), **pixels, moved=4 + 0.2 * EVENT, bare=1),
         "memory layer with gradient": layer("memory"),
         "memory layer with gradient, busy": layer("memory", busy),
         "sigmoid with gradient": layer("sigmoid"),
@@ -174,7 +210,7 @@ def _of_flow(device, small):
 
     with FlopCounterMode(display=False) as counted, torch.no_grad():
         learnt(volume)
-    sums = "convolution", counted.get_total_flops() / 2 / side**2
+    sums = counted.get_total_flops() / 2 / side**2
     step = _robot_step(device, 2 if small else 12)
     return {
         "closed form": Work(forward(flow.estimate_lk), **pixels),
@@ -246,7 +282,7 @@ def timed(
     for name, work in works(device, small).items():
         if only and name not in only:
             continue
-        yard = beside[work.beside]
+        yard, units = beside[work.beside]
         first = seconds(work.call, device, 10)
         own, other = [], []
         for _ in range(rounds):
@@ -257,7 +293,8 @@ def timed(
             "ms": 1e3 * time_s,
             "over_yardstick": min(own) / min(other),
             "yardstick": work.beside,
-            "yardstick_ms": 1e3 * min(other),
+            "yardstick_ns": 1e9 * min(other) / units,
+            "least_ns": 1e3 * min(own) / work.amount,
             "million_per_s": work.amount / time_s,
             "unit": work.unit,
             "second_over_tenth": first[1] / first[9],
@@ -299,8 +336,10 @@ def bench_check(options: argparse.Namespace) -> int:
     if options.write:
         result = {"machine": machine.hardware(), "works": found}
         KEPT.write_text(json.dumps(result, indent=1) + "\n")
+        copy, units = yardsticks(torch.device("cpu"))["copy"]
+        byte_ns = 1e9 * min(measure(copy, 11, warm=2).cpu_s) / units
         before, _, after = LIMITS.read_text().split(TABLE)
-        LIMITS.write_text(f"{before}{TABLE}\n{limits(found, bare())}\n{TABLE}{after}")
+        LIMITS.write_text(f"{before}{TABLE}\n{limits(found, byte_ns)}\n{TABLE}{after}")
         return 0
     kept = json.loads(KEPT.read_text())["works"]
     if slow := [name for name in found.keys() & kept.keys() if is_worse(found[name], kept[name])]:
@@ -311,68 +350,22 @@ def bench_check(options: argparse.Namespace) -> int:
     return bool(said)
 
 
-def bare() -> dict[str, float]:
-    """Least ns of kernels that do nothing else, a unit each: "surfaces", the operations of a sphere
-    met and refracted at, one after the other; "rows", a loop over time that reads a number of every
-    pixel and writes two."""
-    arr = arrays("cpu", torch.float32)
-    ray = arr.Float(torch.rand(2**20) + 1)
-    one = drjit.opaque(arr.Float, 1)
+def limits(found: dict[str, dict[str, Any]], byte_ns: float) -> str:
+    """Table of how near each work comes to what a copy and its yardstick of the same run allow.
 
-    def surfaces():
-        value = ray
-        for _ in range(SURFACES):
-            for _ in range(45):
-                value = drjit.fma(value, one, one)
-            value = drjit.sqrt(one / (one / (one / drjit.sqrt(value))))
-        drjit.eval(value)
-        drjit.sync_thread()
-
-    frames = torch.rand(100, 260, 346)
-    lanes = Lanes(frames, frames[0].numel())
-    numbers, target = lanes.load(frames), lanes.fresh(2 * len(frames))
-
-    def rows():
-        def step(index, total):
-            value = lanes.at(numbers, index)
-            lanes.put(target, value, 2 * index)
-            lanes.put(target, total, 2 * index + 1)
-            return (total + value,)
-
-        drjit.eval(lanes.loop(lanes.opaque(0), lanes.opaque(len(frames)), step, lanes.lane * one))
-        drjit.eval(target)
-        drjit.sync_thread()
-
-    units = {surfaces: SURFACES * 2**20, rows: frames.numel()}
-    return {
-        call.__name__: 1e9 * min(measure(call, 11, warm=2).cpu_s) / count
-        for call, count in units.items()
-    }
-
-
-def limits(found: dict[str, dict[str, Any]], bare_ns: dict[str, float]) -> str:
-    """Table of how near each work comes to what a copy and the least kernels of the same run
-    allow."""
-
-    def least_ms(yardstick):
-        return min(row["yardstick_ms"] for row in found.values() if row["yardstick"] == yardstick)
-
-    byte_ns = 1e6 * least_ms("copy") / MOVED
-    bare_ns = {**bare_ns, "convolution": 1e6 * least_ms("convolution") / SUMS}
+    byte_ns: least time of the copy, a byte."""
     lines = [
         "| work | ns a unit | unit | a copy takes | the bare kernel takes | of the nearer limit |",
         "|---|---|---|---|---|---|",
     ]
     for name, row in found.items():
         if row["moved_b"]:
-            time_ns = row["over_yardstick"] * row["yardstick_ms"] / row["ms"]  # of the least time
-            time_ns *= 1e3 / row["million_per_s"]
-            kernel, times = row["bare"] or ("", 0)
-            by = [row["moved_b"] * byte_ns, times * bare_ns.get(kernel, 0)]
+            by = [row["moved_b"] * byte_ns, row["bare"] * row["yardstick_ns"]]
             told = [f"{float(f'{each:.2g}'):g}" if each else "not counted" for each in by]
-            time = f"{float(f'{time_ns:.3g}'):g}"
+            least_ns = row["least_ns"]
+            time = f"{float(f'{least_ns:.3g}'):g}"
             unit = row["unit"].removesuffix("s")
-            share = f"{100 * max(by) / time_ns:.2g} %" if by[1] else "not told"
+            share = f"{100 * max(by) / least_ns:.2g} %" if by[1] else "not told"
             lines.append(f"| {name} | {time} | {unit} | {told[0]} | {told[1]} | {share} |")
     return "\n".join(lines)
 

@@ -27,27 +27,25 @@ def test_a_slowdown_fails_and_says_of_what():
 
 
 def test_a_ratio_is_that_of_work_and_yardstick(monkeypatch):
-    """Work of three units beside a yardstick of two, by a clock that counts calls."""
+    """Work of three seconds beside a yardstick of two, by a clock that counts calls."""
     passed = [0.0]
 
     def spend(seconds):
         passed[0] += seconds
 
     monkeypatch.setattr(time, "process_time", lambda: passed[0])
-    monkeypatch.setattr(bench, "yardsticks", lambda device: {"copy": lambda: spend(2.0)})
+    monkeypatch.setattr(bench, "yardsticks", lambda device: {"rows": (lambda: spend(2.0), 4.0)})
     work = bench.Work(lambda: spend(3.0), 6.0, "rays")
     monkeypatch.setattr(bench, "works", lambda device, small: {"trace": work})
     row = bench.timed(torch.device("cpu"), 3, small=True)["trace"]
     assert (row["over_yardstick"], row["ms"], row["million_per_s"]) == (1.5, 3000.0, 2.0)
+    assert (row["least_ns"], row["yardstick_ns"]) == (500.0, 5e8)
 
 
 def test_a_work_stands_beside_the_nearer_of_its_limits():
-    """Twice a copy of half a GiB that took 100 ms, of a million units in 200 ms; the bare kernel
-    takes 50 of its 200 ns."""
-    of = {"over_yardstick": 2.0, "yardstick_ms": 100.0, "ms": 200.0, "million_per_s": 5.0}
-    beside = {"yardstick": "convolution", "yardstick_ms": 1.0, "moved_b": 0}
-    trace = of | {"unit": "rays", "yardstick": "copy", "moved_b": 8, "bare": ("surfaces", 2)}
-    table = bench.limits({"trace": trace, "other": beside}, {"surfaces": 25.0})
+    """Of 200 ns a unit its two surfaces take 50, a copy of its 8 bytes 1.5."""
+    trace = {"unit": "rays", "moved_b": 8, "bare": 2, "yardstick_ns": 25.0, "least_ns": 200.0}
+    table = bench.limits({"trace": trace, "other": {"moved_b": 0}}, 0.1875)
     assert table.splitlines()[2:] == ["| trace | 200 | ray | 1.5 | 50 | 25 % |"]
 
 
