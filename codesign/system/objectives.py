@@ -2,7 +2,6 @@
 ``System``."""
 
 import torch
-from kornia.filters import spatial_gradient
 from torch import Tensor
 
 from codesign import render
@@ -51,6 +50,8 @@ def angular_error_mrad(
 def edge_energy(volume: EventVolume) -> Tensor:
     """Mean squared Sobel gradient of the signed event frames (one per bin), events^2 per
     pixel^2."""
+    from kornia.filters import spatial_gradient
+
     signed = volume.counts[:, 0] - volume.counts[:, 1]
     return spatial_gradient(signed, mode="sobel", normalized=True).square().sum(2).mean()
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from scipy.stats import t as student_t
+from scipy.special import stdtrit
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
@@ -81,7 +81,7 @@ def student(values: Any, level: float = LEVEL) -> Interval:
     mean = float(values.mean())
     if count == 1:
         return Interval(mean, -math.inf, math.inf, 1)
-    half = float(student_t.ppf((1 + level) / 2, count - 1)) * float(values.std()) / math.sqrt(count)
+    half = float(stdtrit(count - 1, (1 + level) / 2)) * float(values.std()) / math.sqrt(count)
     return Interval(mean, mean - half, mean + half, count)
 
 

@@ -6,7 +6,6 @@ find what a coarse picture no longer shows.
 import math
 
 import torch
-from kornia.filters import gaussian_blur2d
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, pad
 
 DATA_WEIGHT = 20.0  # lambda, for pictures of natural-log units
@@ -290,5 +289,7 @@ def _halved(levels):
 
 def blurred(field, deviation_px):
     """Gaussian blur of [B, 1, H, W], the border repeated."""
+    from kornia.filters import gaussian_blur2d
+
     size = 2 * int(3 * deviation_px + 0.5) + 1
     return gaussian_blur2d(field, (size, size), (deviation_px, deviation_px), "replicate")
