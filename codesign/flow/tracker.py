@@ -16,7 +16,7 @@ from codesign.checks import check, check_number, check_whole
 from codesign.errors import DomainError, ShapeError, shown
 from codesign.events.formats.arrival import BACKWARDS, OFF_SENSOR
 from codesign.events.stream import check_stream
-from codesign.events.volumes.volume import check_bins, from_stream
+from codesign.events.volumes.volume import check_bins, check_interval, of_rows
 from codesign.flow.checks import check_field, check_size
 from codesign.flow.sources.packet import EMPTY
 from codesign.flow.warp import pixel_grid, read_at
@@ -287,7 +287,8 @@ class Tracker:
         warm = before is not None and before.events > 0 and count > 0
         height, width = self.size_px or (0, 0)
         if count:
-            volume = from_stream(EventStream(*rows, height, width), t0_us, t1_us, self.bins)
+            check_interval((height, width), t1_us - t0_us, self.bins)
+            volume = of_rows(rows, (height, width), t0_us, t1_us - t0_us, self.bins)
             start = {"start_px": _carried_on(before, t1_us - t0_us)} if warm else {}
             field = check_field(self.estimate(volume, **start), "what the estimator returned")
             if tuple(field.flow_px.shape) != (1, 2, height, width):

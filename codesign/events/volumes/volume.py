@@ -9,6 +9,8 @@ Spike tensors [2, W, H, T] hold one binary spike per polarity, column, row and t
 as spiking networks take them.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -100,21 +102,39 @@ def from_stream(
     check_whole(t1_us, "end of the interval t1_us", int(t0_us) + 1)
     check_bins(bins)
     check_dtype(dtype, fractions=True)
-    check_room(2 * bins * stream.height_px * stream.width_px, "the volume")
+    size_px = stream.height_px, stream.width_px
     duration_us = int(t1_us) - int(t0_us)
-    if duration_us * bins >= 2**63:
-        raise DomainError(
-            f"the interval of {duration_us:.3g} us is too long for {bins} bins; times are in microseconds."
-        )
+    check_interval(size_px, duration_us, bins)
     first, last = torch.searchsorted(
         stream.t_us, torch.tensor([int(t0_us), int(t1_us) + 1], device=stream.t_us.device)
     ).tolist()
     check_stream(stream, slice(first, last))
-    t_us, x, y, p = (column[first:last] for column in (stream.t_us, stream.x, stream.y, stream.p))
-    height = stream.height_px
-    width = stream.width_px
+    rows = [column[first:last] for column in (stream.t_us, stream.x, stream.y, stream.p)]
+    return of_rows(rows, size_px, int(t0_us), duration_us, bins, dtype)
+
+
+def check_interval(size_px: tuple[int, int], duration_us: int, bins: int) -> None:
+    """Raise DomainError for an interval, or pixels, of which there is no volume."""
+    check_room(2 * bins * size_px[0] * size_px[1], "the volume")
+    if duration_us * bins >= 2**63:
+        raise DomainError(
+            f"the interval of {duration_us:.3g} us is too long for {bins} bins; times are in microseconds."
+        )
+
+
+def of_rows(
+    rows: Sequence[Tensor],
+    size_px: tuple[int, int],
+    t0_us: int,
+    duration_us: int,
+    bins: int,
+    dtype: torch.dtype = torch.float32,
+) -> EventVolume:
+    """``from_stream`` of events t_us, x, y, p [N] and an interval that are checked."""
+    t_us, x, y, p = rows
+    height, width = size_px
     # numerators of the place in node spacings: whole numbers, exact at any time
-    scaled = (t_us - int(t0_us)) * (bins - 1)
+    scaled = (t_us - t0_us) * (bins - 1)
     node = torch.div(scaled, duration_us, rounding_mode="floor")
     share = (scaled - node * duration_us).to(torch.float64) / duration_us
     cell = (((p < 0).long() * bins + node) * height + y) * width + x
