@@ -163,13 +163,14 @@ def _lens(camera, windows, nearness, mounts):
     ahead = ahead / _length(ahead)[:, None]
     focal = -torch.linalg.det(slope_step).abs().log() / 2 - torch.tensor(FOCAL_PX).log()
     lines = (base, slope, base_step, slope_step)
-    depths = (nearness, torch.zeros_like(nearness))
-    blur = [_blur_px(camera, pixels, *lines, near).log1p() for near in depths]
+    depths = torch.stack([nearness, torch.zeros_like(nearness)])
+    blur = _blur_px(camera, pixels, *lines, depths).log1p()
     direction = (mounts[:, None, :3, :3] @ ahead[:, :, None])[..., 0]
     return torch.cat([direction, torch.stack([focal.expand_as(nearness), *blur], -1)], -1)
 
 
 def _blur_px(camera, pixels, base, slope, base_step, slope_step, nearness):
+    """[..., W] of what is as near as 1 / nearness [..., W] m in each window."""
     if not hasattr(camera, "rays_through"):
         return torch.zeros_like(nearness)
     points, weight = _pupil()
@@ -185,7 +186,7 @@ def _blur_px(camera, pixels, base, slope, base_step, slope_step, nearness):
     off_base = start[..., :2] - (off_slope + slope[:, None]) * start[..., 2:] - base[:, None]
     near = nearness[..., None, None]
     share = lit / lit.sum(-1, keepdim=True).clamp_min(1e-12)
-    # [N, W, 2, points]
+    # [..., W, 2, points]
     shift = torch.linalg.solve(near * base_step + slope_step, (near * off_base + off_slope).mT)
     shift = shift - (shift * share[:, None]).sum(-1, keepdim=True)
     return ((shift.square().sum(-2) * share).sum(-1) + 1e-12).sqrt()

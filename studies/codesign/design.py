@@ -263,8 +263,9 @@ class Whole:
     def with_numbers(self, **numbers: float) -> "Whole":
         """The same design with other numbers, bounds or not."""
         other = replace(self, numbers={**self.numbers, **numbers})
-        if not set(numbers) & set(BLOCKS["lens"]):
-            vars(other)["camera"] = self.camera  # as cached there
+        for block, made in (("lens", "camera"), ("mount", "T_body_cam")):
+            if not set(numbers) & set(BLOCKS[block]):
+                vars(other)[made] = getattr(self, made)  # as cached there
         return other
 
     def __str__(self) -> str:
