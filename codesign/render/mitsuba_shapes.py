@@ -106,15 +106,22 @@ def check_scene(mi: Any, scene: Any, emissive: bool) -> None:
         )
         _check_radiance(emitter.id() if shape is None else shape.id(), values)
         if shape is not None:
-            _check_attributes(shape, emitter)
+            _check_attributes(mi, shape, emitter)
 
 
-def _check_attributes(shape, emitter):
+def _check_attributes(mi, shape, emitter):
     for name in re.findall(r'MeshAttribute\[\s*name = "(\w+)"', str(emitter)):
         if not bool(shape.has_attribute(name)[0]):
             raise DomainError(
                 f"radiance of '{shape.id()}': the mesh has no attribute '{name}', so it would be black; add "
                 "it (mesh.add_attribute), or name one that is there."
+            )
+        held = shape.face_count() if name.startswith("face") else shape.vertex_count()
+        size = len(mi.traverse(shape)[name]) / max(held, 1)
+        if size not in (1, 3):
+            raise DomainError(
+                f"radiance of '{shape.id()}': attribute '{name}' has {size:g} numbers each; one, or three "
+                "(a colour), are needed."
             )
 
 
@@ -132,7 +139,7 @@ def _check_shape(mi, name, shape):
             name,
             *(np.array(parameters[key]).reshape(-1, 3) for key in ("vertex_positions", "faces")),
         )
-        if vertex_attribute(shape.bsdf()):
+        if (attribute_of(shape.bsdf()) or "").startswith("vertex"):
             _check_thick(name, vertices[faces])
         attributes = (
             key
@@ -236,26 +243,38 @@ def _against_normals(shape, parameters, faces):
     return (across(corners) * normals.sum(1)).sum(1) < 0
 
 
-def vertex_attribute(surface: Any) -> str | None:
-    """Name of the attribute at vertices that an emitter or material of Mitsuba shows, None where it
-    shows none."""
-    found = re.search(r'MeshAttribute\[\s*name = "(vertex_\w+)"', str(surface))
+def attribute_of(surface: Any) -> str | None:
+    """Name of the attribute at vertices or faces that an emitter or material of Mitsuba shows, None
+    where it shows none."""
+    found = re.search(r'MeshAttribute\[\s*name = "((?:vertex|face)_\w+)"', str(surface))
     return found[1] if found else None
 
 
-def interpolated(mi: Any, shape: Any, name: str, si: Any) -> Any:
-    """An attribute at vertices of a mesh where it is met (drjit arrays), between the values of the
-    corners.
+def attribute_at(mi: Any, shape: Any, name: str, si: Any) -> Any:
+    """An attribute of a mesh where it is met (drjit arrays): of the face, or between the values at
+    its corners; of three colours their luminance. Mitsuba itself would ask all shapes of all scenes
+    that there are.
     Gradient: to the place."""
     import drjit as dr
 
     parameters = mi.traverse(shape)
+    values = parameters[name]
+    on_faces = name.startswith("face")
+    held = dr.width(parameters["faces" if on_faces else "vertex_positions"]) // 3
+    colours = dr.width(values) // held
+
+    def read(index):
+        told = [dr.gather(mi.Float, values, colours * index + k) for k in range(colours)]
+        return told[0] if colours == 1 else mi.luminance(mi.Color3f(told))
+
+    if on_faces:
+        return read(si.prim_index)
     corner = [dr.gather(mi.UInt32, parameters["faces"], 3 * si.prim_index + k) for k in range(3)]
     at = [
         mi.Point3d(dr.gather(mi.Point3f, parameters["vertex_positions"], vertex))
         for vertex in corner
     ]
-    value = [dr.gather(mi.Float, parameters[name], vertex) for vertex in corner]
+    value = [read(vertex) for vertex in corner]
     u = at[1] - at[0]
     v = at[2] - at[0]
     towards = mi.Point3d(si.p) - at[0]

@@ -15,14 +15,14 @@ from codesign.exclusive import exclusive
 from codesign.reading import reading
 from codesign.render.mitsuba_shapes import (
     are_geometric,
+    attribute_at,
+    attribute_of,
     box_around,
     check_description,
     check_scene,
     eval_repeated,
-    interpolated,
     repeats,
     shape_numbers,
-    vertex_attribute,
 )
 from codesign.render.pixel_means import with_slopes
 from codesign.render.silhouettes import outlines
@@ -185,11 +185,11 @@ class MitsubaScene:
         import drjit as dr
 
         si.wi = self.mi.Vector3f(0, 0, facing)
-        name = vertex_attribute(emitter)
+        name = attribute_of(emitter)
         if name is None:
             return eval_repeated(self.mi, emitter, si, self._repeats.get(emitter))[0]
         scale = float(self.mi.traverse(emitter)["radiance.scale"])
-        return dr.select(facing > 0, scale * interpolated(self.mi, shape, name, si), 0)
+        return dr.select(facing > 0, scale * attribute_at(self.mi, shape, name, si), 0)
 
     def sky(self, direction: Any) -> Any:
         """Radiance that comes against directions (drjit arrays) where nothing is met; 0 without a

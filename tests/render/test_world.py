@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from codesign import lens, render
+from codesign import backend, lens, render
 from codesign.pose import look_at
 from codesign.render import Camera
 from scenes import textures, worlds
@@ -177,3 +177,23 @@ def test_faded_pictures_end_in_the_level():
     for border in (faded[:2], faded[-2:], faded[:, :2], faded[:, -2:]):
         assert (border == 60).all()
     np.testing.assert_array_equal(faded[12:-12, 12:-12], quadrants()[12:-12, 12:-12])
+
+
+@pytest.mark.parametrize("at", ["vertex", "face"])
+def test_an_attribute_of_three_colours_shows_its_luminance(at):
+    """Of a square that fills the picture; by the weights of Rec. 709."""
+    mi = backend.mitsuba()
+    radiance = {"type": "mesh_attribute", "name": f"{at}_radiance"}
+    options = mi.Properties()
+    options["mesh_emitter"] = mi.load_dict({"type": "area", "radiance": radiance})
+    square = mi.Mesh("square", 4, 2, props=options)
+    parameters = mi.traverse(square)
+    parameters["vertex_positions"] = [-1, 0, -1, 1, 0, -1, 1, 0, 1, -1, 0, 1]
+    parameters["faces"] = [0, 1, 2, 0, 2, 3]
+    parameters.update()
+    square.add_attribute(f"{at}_radiance", 3, [10, 20, 30] * (4 if at == "vertex" else 2))
+    camera = render.Camera(lens.Pinhole(4.0), 6, 6, 0.5, 4)
+    found = render.frames(
+        camera, render.MitsubaScene({"square": square}), look_at((0, -2, 0), (0, 0, 0))[None]
+    )
+    close(found, torch.full((1, 6, 6), 0.2126 * 10 + 0.7152 * 20 + 0.0722 * 30), rtol=1e-3)
