@@ -37,6 +37,7 @@ BOUND = 0.9
 # floats ahead of the potential: where potentials and their gradient share their place in a memory
 # page, backward takes 1.4 times as long
 STAGGER = 768
+SPAN = 48  # steps of a kernel, of many lanes
 
 
 @dataclass(frozen=True)
@@ -162,7 +163,6 @@ class Srm(Function):
         spikes = dr.empty(loops.arr.Float, drive.numel())
         potential = dr.empty(loops.arr.Float, drive.numel() + STAGGER)
         states, bad = loops.forward(loops.split(response, reset), spikes, potential)
-        dr.eval(spikes, potential, states, bad)
         dr.sync_thread()
         if bool(dr.any(bad)):
             check_finite(
@@ -205,7 +205,6 @@ def _backward(setup, saved, grads, need):
     flat = {name: None if tensor is None else loops.load(tensor) for name, tensor in given.items()}
     flat["grad_drive"] = dr.empty(loops.arr.Float, drive.numel()) if need[0] else None
     carried = loops.backward(loops.after(need, grads[2], grads[3]), flat)
-    dr.eval(carried, flat["grad_drive"])
     dr.sync_thread()
 
     def rows(name):
@@ -241,6 +240,10 @@ class _Loops(Lanes):
         self.response = h_response if h_response is None else response_coefficients(h_response)
         self.theta = theta
         self.h_reset = h_reset
+        # rows as far apart as a power of two share their places in what remembers pages: more at a
+        # time take four times as long
+        size = max(SPAN, (1 << 18) // lanes)
+        self.spans = [(t, min(t + size, self.steps)) for t in range(0, self.steps, size)]
 
     def surrogate(self, kind):
         """The functions that the surrogate is written in, and its numbers."""
@@ -321,8 +324,10 @@ class _Loops(Lanes):
                 dr.scatter(potential, kept, place + shift, mode=dr.ReduceMode.NoConflicts)
             return bad, moved
 
-        healthy = dr.zeros(self.arr.Bool, self.width)
-        bad, states = self.loop(0, self.opaque(self.steps), body, healthy, states)
+        bad = dr.zeros(self.arr.Bool, self.width)
+        for span in self.spans:
+            bad, states = self.loop(*map(self.opaque, span), body, bad, states)
+            dr.eval(spikes, potential, states, bad)
         return states, bad
 
     def after(self, need, grad_response, grad_reset):
@@ -439,4 +444,7 @@ class _Loops(Lanes):
                 before.append({name: moved.get(name, []) for name in part})
             return (before,)
 
-        return self.loop_back(0, self.opaque(self.steps), body, carried)[0]
+        for span in reversed(self.spans):
+            (carried,) = self.loop_back(*map(self.opaque, span), body, carried)
+            dr.eval(carried, flat["grad_drive"])
+        return carried
