@@ -17,10 +17,10 @@ from codesign.exclusive import exclusive
 
 class Lanes:
     """drjit, its array types, and a lane for every pixel of a frame; flat arrays hold rows of
-    pixels. With ``packs`` a lane has up to eight neighbours, and values an axis for them: a
-    processor then reads and writes them at once, in half the time."""
+    pixels. With ``packs`` a lane has that many neighbours, where they divide, and values an axis
+    for them: a processor then reads and writes them at once, in half the time."""
 
-    def __init__(self, like, width, packs=False):
+    def __init__(self, like, width, packs=0):
         import drjit as dr
 
         self.dr = dr
@@ -29,7 +29,7 @@ class Lanes:
         self.device = like.device
         self.packs = packs
         # a GPU reads at once what neighbouring lanes read
-        count = next(n for n in (8, 4, 2, 1) if width % n == 0 and (like.is_cpu or n == 1))
+        count = math.gcd(packs, width) if like.is_cpu else 1
         self.extent = (count, width // count) if packs else (width,)
         self.lane = dr.arange(self.arr.UInt32, self.extent[-1])
         self.pixels = dr.opaque(self.arr.UInt32, self.extent[-1])
@@ -109,9 +109,9 @@ class Lanes:
         """A tensor with memory of its own."""
         return value.torch().reshape(shape).clone()
 
-    def stack(self, values, shape):
+    def stack(self, values, shape, kind=None):
         """A tensor of several values, in memory of drjit (``fresh``)."""
-        target = self.fresh(len(values))
+        target = self.fresh(len(values), kind)
         for k, value in enumerate(values):
             self.put(target, value, k)
         self.dr.eval(target)

@@ -53,7 +53,7 @@ class Loop(Lanes):
     """Frames, thresholds, and the loop over time. Without a start the first frame is where the rest
     begins."""
 
-    def __init__(self, frames, start, theta_on, theta_off, front_end, packs=True):
+    def __init__(self, frames, start, theta_on, theta_off, front_end, packs=8):
         super().__init__(frames, frames[0].numel(), packs)
         self.theta_on, self.theta_off = (
             self.load_row(theta if theta.numel() == 1 else theta.expand(frames.shape[1:]))
@@ -218,7 +218,7 @@ def turns_adjoint(frames, start, theta_on, theta_off, front_end, grad_counts, gr
       theta_off/2.
     """
     # pairs fill the registers
-    loop = Loop(frames, start, theta_on, theta_off, front_end, packs=False)
+    loop = Loop(frames, start, theta_on, theta_off, front_end, packs=0)
     dr = loop.dr
     arr = loop.arr
     seed = loop.load(grad_counts)
