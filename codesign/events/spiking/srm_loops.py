@@ -34,9 +34,6 @@ RESETS = {"slayer": "pair", "thesis": "early", "exp": "early", "step": "early"}
 # "bounded" keeps rho * sum|nu| at most this: the adjoint then shrinks by 10 % per pass through the
 # reset
 BOUND = 0.9
-# floats ahead of the potential: where potentials and their gradient share their place in a memory
-# page, backward takes 1.4 times as long
-STAGGER = 768
 
 
 @dataclass(frozen=True)
@@ -159,8 +156,7 @@ class Srm(Function):
     def forward(ctx, setup, drive, theta, h_response, h_reset, response, reset):
         loops = _Loops(setup, drive, theta, h_response, h_reset)
         dr = loops.dr
-        spikes = dr.empty(loops.arr.Float, drive.numel())
-        potential = dr.empty(loops.arr.Float, drive.numel() + STAGGER)
+        spikes, potential = (dr.empty(loops.arr.Float, drive.numel()) for _ in range(2))
         states, bad = loops.forward(loops.split(response, reset), spikes, potential)
         dr.sync_thread()
         if bool(dr.any(bad, axis=None)):
@@ -174,7 +170,7 @@ class Srm(Function):
                 "factor)."
             )
         spikes = spikes.torch().view(drive.shape)
-        potential = potential.torch()[STAGGER:].view(drive.shape)
+        potential = potential.torch().view(drive.shape)
         ctx.save_for_backward(drive, theta, h_response, h_reset, response, reset, spikes, potential)
         ctx.setup = setup
         ctx.set_materialize_grads(False)
@@ -284,7 +280,7 @@ class _Loops(Lanes):
         return self.stack(values, self.theta.shape[1:], self.flat)
 
     def forward(self, states, spikes, potential):
-        """Run all steps, which fill flat arrays of spikes and, behind STAGGER, potentials.
+        """Run all steps, which fill flat arrays of spikes and potentials.
 
         Args:
           states: per channel, of response and reset.
@@ -296,7 +292,6 @@ class _Loops(Lanes):
         numbers = self.numbers()
         surrogate = self.surrogate(Double)
         one = self.full(1, self.flat)
-        shift = self.opaque(STAGGER // self.extent[0])
 
         def body(t, bad, states):
             responses, resets, moved = [], [], []
@@ -319,9 +314,8 @@ class _Loops(Lanes):
                 reset[0] = reset[0] + s
                 kept = Single(u)
                 bad |= ~dr.isfinite(kept)
-                place = self.place(t * self.channels + k)
-                dr.scatter(spikes, Single(s), place, mode=dr.ReduceMode.NoConflicts)
-                dr.scatter(potential, kept, place + shift, mode=dr.ReduceMode.NoConflicts)
+                self.put(spikes, Single(s), t * self.channels + k)
+                self.put(potential, kept, t * self.channels + k)
             return bad, moved
 
         bad = self.full(False, self.arr.Bool)
@@ -368,11 +362,12 @@ class _Loops(Lanes):
         Single, Double = self.of_lanes(self.arr.Float), self.Double
         reset, response = self.reset, self.response
         by_h = {"response_a_h": response.a_h, "response_m_h": response.m_h} if response else {}
+        if setup.through_reset == "bounded":
+            by_h["limit"] = BOUND / setup.reset_sum(self.theta, self.h_reset, self.steps)
         numbers = self.numbers(
             reset_a_h=reset.a_h,
             reset_m_h=reset.m_h,
             reset_m_theta=reset.m / self.theta,
-            limit=BOUND / setup.reset_sum(self.theta, self.h_reset, self.steps),
             **by_h,
         )
         surrogate = self.surrogate(Single)
