@@ -54,7 +54,7 @@ class Lanes:
     def full(self, value, kind):
         return self.dr.full(self.of_lanes(kind), value, self.extent)
 
-    def of_lanes(self, kind):
+    def of_lanes(self, kind) -> Any:
         """The type of values whose flat arrays are of that kind."""
         packed = self.dr.replace_type_t(self.arr.ArrayX, self.dr.type_v(kind))
         return packed if self.packs else kind

@@ -70,7 +70,7 @@ def memory(
     Warns: RuntimeWarning where a gradient may be asked for and thresholds differ by more than a
       factor of 4.
     Cost: one pass over the frames forward, one backward; no memory beside counts, gradients and two
-      bits per pixel and frame. "exact" takes 3 times as long backward.
+      bits per pixel and frame. "exact" takes 4 to 6 times as long backward.
     Source: Rebecq et al., ESIM, CoRL 2018; v2e (Hu et al., CVPR-W 2021), memorised brightness;
       Bengio et al. 2013, straight-through; the mean count's play and pairs are ours.
 
