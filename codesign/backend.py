@@ -198,6 +198,7 @@ class Arrays:
     Bool: Any
     Array3: Any
     Array4: Any
+    ArrayX: Any
 
 
 @lru_cache(maxsize=8)
@@ -210,9 +211,11 @@ def arrays(device: str = "cpu", dtype: torch.dtype = torch.float32) -> Arrays:
     else:
         import drjit.llvm.ad as ad
     if dtype == torch.float32:
-        return Arrays(ad.Float, ad.UInt32, ad.Int, ad.Bool, ad.Array3f, ad.Array4f)
+        return Arrays(ad.Float, ad.UInt32, ad.Int, ad.Bool, ad.Array3f, ad.Array4f, ad.ArrayXf)
     if dtype == torch.float64:
-        return Arrays(ad.Float64, ad.UInt32, ad.Int, ad.Bool, ad.Array3f64, ad.Array4f64)
+        return Arrays(
+            ad.Float64, ad.UInt32, ad.Int, ad.Bool, ad.Array3f64, ad.Array4f64, ad.ArrayXf64
+        )
     raise GradientError(
         f"kernels compute in float32 or float64, not {dtype}; convert the tensor first."
     )

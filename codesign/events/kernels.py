@@ -17,17 +17,22 @@ from codesign.exclusive import exclusive
 
 class Lanes:
     """drjit, its array types, and a lane for every pixel of a frame; flat arrays hold rows of
-    pixels."""
+    pixels. With ``packs`` a lane has that many neighbours, where they divide, and values an axis
+    for them: a processor then reads and writes them at once, in half the time."""
 
-    def __init__(self, like, width):
+    def __init__(self, like, width, packs=0):
         import drjit as dr
 
         self.dr = dr
         self.arr = arrays(like.device.type, like.dtype)
         self.width = width
         self.device = like.device
-        self.lane = dr.arange(self.arr.UInt32, width)
-        self.pixels = dr.opaque(self.arr.UInt32, width)
+        self.packs = packs
+        # a GPU reads at once what neighbouring lanes read
+        count = math.gcd(packs, width) if like.is_cpu else 1
+        self.extent = (count, width // count) if packs else (width,)
+        self.lane = dr.arange(self.arr.UInt32, self.extent[-1])
+        self.pixels = dr.opaque(self.arr.UInt32, self.extent[-1])
 
     def opaque(self, value):
         """A whole number that may change from call to call without a new kernel."""
@@ -36,14 +41,29 @@ class Lanes:
     def load(self, tensor):
         return load(self.arr.Float, tensor)
 
-    def rows(self, tensor):
-        return [self.load(row) for row in tensor]
+    def load_row(self, tensor):
+        """Values of all pixels, or one number for all."""
+        flat = self.load(tensor)
+        if self.packs and tensor.numel() == 1:  # a quotient by it alone would be a rounded product
+            return self.of_lanes(self.arr.Float)([flat] * self.extent[0])
+        return self.at(flat, 0) if self.packs else flat
 
-    def fresh(self, rows):
+    def rows(self, tensor):
+        return [self.load_row(row) for row in tensor]
+
+    def full(self, value, kind):
+        return self.dr.full(self.of_lanes(kind), value, self.extent)
+
+    def of_lanes(self, kind) -> Any:
+        """The type of values whose flat arrays are of that kind."""
+        packed = self.dr.replace_type_t(self.arr.ArrayX, self.dr.type_v(kind))
+        return packed if self.packs else kind
+
+    def fresh(self, rows, kind=None):
         """Rows to be filled by kernels. The memory is drjit's, which hands the same pages out again
         and
         again: new pages from the system cost more than the kernel."""
-        target = self.dr.empty(self.arr.Float, rows * self.width)
+        target = self.dr.empty(kind or self.arr.Float, rows * self.width)
         self.dr.eval(target)
         return target
 
@@ -57,7 +77,8 @@ class Lanes:
         return row * self.pixels + self.lane
 
     def at(self, flat, row, active=True):
-        return self.dr.gather(self.arr.Float, flat, self.place(row), active)
+        kind = self.of_lanes(type(flat))
+        return self.dr.gather(kind, flat, self.place(row), active, shape=self.extent)
 
     def put(self, flat, value, row, active=True):
         self.dr.scatter(flat, value, self.place(row), active, mode=self.dr.ReduceMode.NoConflicts)
@@ -68,7 +89,7 @@ class Lanes:
         def step(index, *carried):
             return index + 1, *body(index, *carried)
 
-        start = first + self.dr.zeros(self.arr.UInt32, self.width)
+        start = first + self.dr.zeros(self.arr.UInt32, self.extent[-1])
         return self.dr.while_loop(
             (start, *carried), lambda index, *_: index < end, step, mode="symbolic"
         )[1:]
@@ -79,7 +100,7 @@ class Lanes:
         def step(index, *carried):
             return index - 1, *body(index - 1, *carried)
 
-        start = end + self.dr.zeros(self.arr.UInt32, self.width)
+        start = end + self.dr.zeros(self.arr.UInt32, self.extent[-1])
         return self.dr.while_loop(
             (start, *carried), lambda index, *_: index > first, step, mode="symbolic"
         )[1:]
@@ -87,6 +108,15 @@ class Lanes:
     def tensor(self, value, shape):
         """A tensor with memory of its own."""
         return value.torch().reshape(shape).clone()
+
+    def stack(self, values, shape, kind=None):
+        """A tensor of several values, in memory of drjit (``fresh``)."""
+        target = self.fresh(len(values), kind)
+        for k, value in enumerate(values):
+            self.put(target, value, k)
+        self.dr.eval(target)
+        self.dr.sync_thread()
+        return target.torch().reshape(len(values), *shape)
 
 
 def beyond(dr, level, centre, theta_on, theta_off):

@@ -1,5 +1,5 @@
 """The memory layer as one drjit loop over time per pixel, forward and adjoint, front end included;
-nothing is stored between the two.
+two bits per step are stored between the two.
 
 Forward, with L the log level, r the memorised level and C the threshold on the side of L - r: n =
 floor(|L - r|/C), r += C n.
@@ -8,8 +8,8 @@ Backward is the play of width w = (C_on + C_off)/2 and centre m that the mean of
 where in its threshold a pixel happens to stand (exactly for C_on = C_off, see docs/events.md;
 ``turns_adjoint`` is exact for all). It moves only where L leaves it, by as much as L does: n_on =
 (L - m - w/2)/C_on, n_off = (m - w/2 - L)/C_off, and the edge then stands at L. So an engaged step
-pulls at its own level, and pushes at the level of the step engaged before: the loop forward in time
-writes both.
+pulls at its own level, and pushes at the level of the step engaged before. Which edge moved when is
+stored: the loop back in time takes no logarithm, and writes row by row.
 
 The exact gradient of the mean count for unequal thresholds, as one drjit loop over time per pixel.
 
@@ -35,12 +35,11 @@ distance is spread evenly over the threshold in use: mass is kept.
 
 from typing import Any
 
-import torch
-
-from codesign.backend import frames_per_kernel
 from codesign.events.kernels import Lanes, beyond
 from codesign.exclusive import exclusive
 
+WORD = 16  # steps, which fill a whole number with what moved the play at each
+ROSE, FELL = 1, 2  # it: its upper edge, its lower one
 PAIRS = 4
 WIDTH = 6  # values of a pair
 TIE = 1e-5  # thresholds: a pixel on the brink has not fired yet
@@ -51,42 +50,76 @@ NONE = 0xFFFFFFFF
 
 
 class Loop(Lanes):
-    """Frames, thresholds and the loop over time, in chunks."""
+    """Frames, thresholds, and the loop over time. Without a start the first frame is where the rest
+    begins."""
 
-    def __init__(self, frames, theta_on, theta_off):
-        super().__init__(frames, frames[0].numel())
-        self.frames = frames
+    def __init__(self, frames, start, theta_on, theta_off, front_end, packs=8):
+        super().__init__(frames, frames[0].numel(), packs)
         self.theta_on, self.theta_off = (
-            self.load(theta if theta.numel() == 1 else theta.expand(frames.shape[1:]))
+            self.load_row(theta if theta.numel() == 1 else theta.expand(frames.shape[1:]))
             for theta in (theta_on, theta_off)
         )
+        self.frames = frames
+        # all of them: packs of what begins at an odd address take four times as long
         self.values = self.load(frames)
+        self.begins = start is None
+        self.steps = len(frames) - self.begins
+        self.words = -(-self.steps // WORD)
+        self.first, self.count = map(self.opaque, (self.begins, self.steps))
+        # the first level comes by the arithmetic of the loop: a static scene then differs from it
+        # by nothing
+        self.begun = self.at(self.values, 0)
+        level, self.begun_slope = front_end.traced(self.dr, self.begun)
+        self.start = [level, level] if self.begins else self.rows(start)
 
-    def __call__(self, step, carried, target) -> Any:
-        """Carry values through step(index, value, *carried) for every frame; ``target`` is what the
-        steps write to."""
-        size = frames_per_kernel(self.width)
+    def __call__(self, step, carried, target, moves=None, back=False) -> Any:
+        """Carry values through step(index, frame, word, *carried), the last frame first where it
+        goes ``back``; ``target`` is what the steps write to. moves: rows of words of ``WORD``
+        frames, which a way back reads and a way there fills."""
+        loop = self.loop_back if back else self.loop
 
-        def body(index, *carried):
-            return step(index, self.at(self.values, index), *carried)
+        def step_of(index, word, *carried):
+            return step(index, self.at(self.values, index + self.first), word, *carried)
+
+        def body(row, *carried):
+            first = row * WORD
+            end = self.dr.minimum(first + WORD, self.count)
+            word = self.at(moves, row) if back else self.full(0, self.arr.UInt32)
+            word, *carried = loop(first, end, step_of, word, *carried)
+            if moves is not None and not back:
+                self.put(moves, word, row)
+            return carried
 
         with self.dr.suspend_grad():
-            for first in range(0, len(self.frames), size):
-                end = min(first + size, len(self.frames))
-                carried = self.loop(self.opaque(first), self.opaque(end), body, *carried)
-                self.dr.eval(carried, target)
+            carried = loop(self.opaque(0), self.opaque(self.words), body, *carried)
+            self.dr.eval(carried, target, moves)
         return carried
+
+    def gradients(self, target, grad_start):
+        """Gradients of the frames, and of the start where one was given. The mean count alone
+        carries it: what reaches the memorised level reaches it through the place of the pixels that
+        may be meant."""
+        if self.begins:
+            self.put(target, grad_start * self.begun_slope(), 0)
+            self.dr.eval(target)
+        grads = [self.full(0, self.arr.Float), grad_start]
+        of_start = None if self.begins else self.stack(grads, self.frames.shape[1:])
+        self.dr.sync_thread()
+        return target.torch().reshape(self.frames.shape), of_start
 
 
 @exclusive
-def count(frames, start, theta_on, theta_off, front_end):
+def count(frames, start, theta_on, theta_off, front_end, *, keeps):
     """Counts [T, 2, ...] of frames [T, ...] from a start [2, ...] (memorised level, centre of the
-    play); the state after them; whether a value may not enter."""
-    loop = Loop(frames, theta_on, theta_off)
+    play), T - 1 from the first frame where it is None; the state after them; what moved the play,
+    for ``play_adjoint``, where it ``keeps`` that, else None; whether a value may not enter."""
+    loop = Loop(frames, start, theta_on, theta_off, front_end)
     dr = loop.dr
-    target = loop.fresh(2 * len(frames))
+    arr = loop.arr
+    target = loop.fresh(2 * loop.steps)
+    moves = loop.fresh(loop.words, arr.UInt32) if keeps else None
 
-    def step(index, value, bad, reference, centre):
+    def step(index, value, word, bad, reference, centre):
         level = front_end.traced(dr, value)[0]
         difference = level - reference
         rose = difference > 0
@@ -97,15 +130,16 @@ def count(frames, start, theta_on, theta_off, front_end):
         loop.put(target, on, 2 * index)
         loop.put(target, off, 2 * index + 1)
         rise, fall = beyond(dr, level, centre, loop.theta_on, loop.theta_off)
+        word = dr.select(rise > 0, 4 * word + ROSE, 4 * word + dr.select(fall > 0, FELL, 0))
         bad = bad | ~front_end.accepts(dr, value)
-        return bad, reference + (on - off) * theta, centre + (rise - fall)
+        return word, bad, reference + (on - off) * theta, centre + (rise - fall)
 
-    bad, *after = loop(step, (dr.zeros(loop.arr.Bool, loop.width), *loop.rows(start)), target)
-    bad = bool(dr.any(bad)[0])
-    dr.sync_thread()
+    begun = (~front_end.accepts(dr, loop.begun), *loop.start)
+    bad, *after = loop(step, begun, target, moves)
+    bad = bool(dr.any(bad, axis=None)[0])
     pixels = frames.shape[1:]
-    counts = target.torch().reshape(len(frames), 2, *pixels)
-    return counts, torch.stack([loop.tensor(value, pixels) for value in after]), bad
+    after = loop.stack(after, pixels)
+    return target.torch().reshape(loop.steps, 2, *pixels), after, moves, bad
 
 
 def exact_floor(dr, value, divisor):
@@ -118,136 +152,102 @@ def exact_floor(dr, value, divisor):
 
 @exclusive
 def play_adjoint(
-    frames, start, theta_on, theta_off, front_end, grad_counts, grad_end, *, first, wants_thetas
+    frames, start, theta_on, theta_off, front_end, grad_counts, grad_end, *, moves, wants_thetas
 ):
-    """Adjoint of ``count``: gradients of the frames [first + T, ...] (rows before ``first`` are
-    left to the caller), start, theta_on, theta_off [...] (zero unless wanted).
+    """Adjoint of ``count``: gradients of the frames, start (None where it is), thresholds [2, ...]
+    (None unless wanted).
 
     Args:
-      grad_end: [...] of the memorised level and the play's centre together; the start's is theirs
-        together, too.
+      grad_end: of the state.
+      moves: of ``count``.
     """
-    loop = Loop(frames, theta_on, theta_off)
+    loop = Loop(frames, start, theta_on, theta_off, front_end)
     dr = loop.dr
-    arr = loop.arr
+    Float = loop.arr.Float
     seed = loop.load(grad_counts)
-    offset = loop.opaque(first)
-    target = loop.zeros(first + len(frames))  # steps inside the play keep 0
+    target = loop.fresh(len(frames))
+    half = (loop.theta_on + loop.theta_off) * 0.25
 
-    def step(
-        index,
-        value,
-        centre,
-        pull,
-        slope,
-        engaged,
-        anchor,
-        grad_start,
-        grad_on,
-        grad_off,
-        grad_width,
-    ):
-        level, now_slope = front_end.traced(dr, value)
-        rise, fall = beyond(dr, level, centre, loop.theta_on, loop.theta_off)
-        is_on = rise > 0
-        is_off = fall > 0
-        moves = is_on | is_off
-        seed_on = loop.at(seed, 2 * index, is_on) / loop.theta_on
-        seed_off = loop.at(seed, 2 * index + 1, is_off) / loop.theta_off
-        now_pull = seed_on - seed_off  # of this level through this step's count
-        known = moves & (engaged != NONE)
-        loop.put(target, (pull - now_pull) * slope, engaged + offset, known)
-        grad_start = grad_start - dr.select(moves & ~known, now_pull, 0)
-        moved_centre = centre + (rise - fall)
+    def step(index, value, word, push, *of_thetas):
+        rose, fell = ((word & one) != 0 for one in (ROSE, FELL))
+        on, off = loop.at(seed, 2 * index), loop.at(seed, 2 * index + 1)
+        # of this level through this step's count
+        pull = dr.select(rose, on / loop.theta_on, -off / loop.theta_off)
+        level, slope = front_end.traced(dr, value)
+        grad = dr.select(rose | fell, (pull + push) * slope(), 0)
+        loop.put(target, grad, index + loop.first)
         if wants_thetas:
-            # as it is rounded: what rounding leaves of ``rise`` would add up over many small steps
-            moved = dr.abs(moved_centre - centre)
-            grad_on = grad_on - seed_on * moved / loop.theta_on
-            grad_off = grad_off - seed_off * moved / loop.theta_off
-            # anchor: how the upper edge moves with the width: 0 where it stands at a level, 1 where
-            # the lower one does, 1/2 at the start
-            grad_width = (
-                grad_width
-                - dr.select(is_on, now_pull * anchor, 0)
-                + dr.select(is_off, now_pull * (1 - anchor), 0)
-            )
-            anchor = dr.select(is_on, 0, dr.select(is_off, 1, anchor))
-        pull = dr.select(moves, now_pull, pull)
-        slope = dr.select(moves, now_slope(), slope)
-        engaged = dr.select(moves, index, engaged)
+            edge = dr.select(fell, loop.full(1, Float), 0)
+            centre = level + dr.select(fell, half, -half)
+            of_thetas = [
+                dr.select(rose | fell, new, old)
+                for new, old in zip(passed(push, edge, centre, *of_thetas), of_thetas, strict=True)
+            ]
+        return word >> 2, dr.select(rose | fell, -pull, push), *of_thetas
+
+    def passed(push, edge, centre, later_edge, later_centre, grad_on, grad_off, grad_width):
+        """Gradients to the thresholds, with those of the way from one edge of the play to the
+        next."""
+        gain = push * (later_centre - centre)
         return (
-            moved_centre,
-            pull,
-            slope,
-            engaged,
-            anchor,
-            grad_start,
-            grad_on,
-            grad_off,
-            grad_width,
+            edge,
+            centre,
+            grad_on + dr.select(later_edge == 0, gain / loop.theta_on, 0),
+            grad_off + dr.select(later_edge == 1, gain / loop.theta_off, 0),
+            # how the upper edge moves with the width: 0 where it stands at a level, 1 where the
+            # lower one does, 1/2 at the start
+            grad_width + push * (edge - later_edge),
         )
 
-    zero = dr.zeros(arr.Float, loop.width)
-    never = dr.full(arr.UInt32, NONE, loop.width)
-    begun = (loop.load(start[1]), zero, zero, never, zero + 0.5, *[zero] * 4)
-    _, pull, slope, engaged, anchor, grad_start, grad_on, grad_off, grad_width = loop(
-        step, begun, target
-    )
-    end = loop.load(grad_end)
-    known = engaged != NONE
-    loop.put(target, (pull + end) * slope, engaged + offset, known)
-    grad_start = grad_start + dr.select(known, 0, end)
-    grad_width = grad_width + end * (anchor - 0.5)
-    dr.eval(target, grad_start, grad_on, grad_off, grad_width)
-    dr.sync_thread()
-    grad_frames = target.torch().reshape(first + len(frames), *frames.shape[1:])
-    return grad_frames, *(
-        loop.tensor(grad, start.shape[1:])
-        for grad in (grad_start, grad_on + grad_width / 2, grad_off + grad_width / 2)
-    )
+    # of the level of the step that moves the play next, through its count
+    push = sum(loop.rows(grad_end))
+    zero, middle = loop.full(0, Float), loop.full(0.5, Float)
+    begun = [middle, zero, zero, zero, zero] if wants_thetas else []
+    push, *of_thetas = loop(step, (push, *begun), target, moves, back=True)
+    if wants_thetas:
+        grad_on, grad_off, width = passed(push, middle, loop.start[1], *of_thetas)[2:]
+        of_thetas = loop.stack([grad_on + width / 2, grad_off + width / 2], frames.shape[1:])
+    return *loop.gradients(target, push), of_thetas
 
 
 @exclusive
-def turns_adjoint(frames, start, theta_on, theta_off, front_end, grad_counts, grad_end, *, first):
-    """Gradients of the frames [first + T, ...] (rows before ``first`` are left to the caller) and
-    of the place of the box that the pixels begin in, [...].
+def turns_adjoint(frames, start, theta_on, theta_off, front_end, grad_counts, grad_end):
+    """Gradients of the frames, and of the place of the box that the pixels begin in.
 
-    Args: as for ``play_adjoint``; the box lies from centre - theta_on/2 to centre +
+    Args, returns: as for ``play_adjoint``; the box lies from centre - theta_on/2 to centre +
       theta_off/2.
     """
-    loop = Loop(frames, theta_on, theta_off)
+    # pairs fill the registers
+    loop = Loop(frames, start, theta_on, theta_off, front_end, packs=0)
     dr = loop.dr
     arr = loop.arr
     seed = loop.load(grad_counts)
-    offset = loop.opaque(first)
-    target = loop.zeros(first + len(frames))
+    target = loop.zeros(len(frames))
     share = 2 / (loop.theta_on + loop.theta_off)  # of a pixel per level, in the box
 
     def emit(frame, grad, grad_start):
-        loop.put(target, grad * share, frame + offset, frame < START)
+        loop.put(target, grad * share, frame + loop.first, frame < START)
         return dr.select(frame == START, grad * share, grad_start)
 
-    def step(index, value, grad_start, before, *slots):
+    def step(index, value, word, grad_start, before, *slots):
         level, slope = front_end.traced(dr, value)
         pairs = _Pairs(loop, level, before, slots)
         pairs.walk(loop.at(seed, 2 * index + dr.select(pairs.rises, loop.arr.UInt32(0), 1)))
         grad_start = emit(*pairs.renew(index, slope()), grad_start)
-        return grad_start, level, *pairs.joined()
+        return word, grad_start, level, *pairs.joined()
 
-    reference, centre = loop.rows(start)
+    reference, centre = loop.start
     zero = dr.zeros(arr.Float, loop.width)
     none = dr.full(arr.UInt32, NONE, loop.width)
     box = (centre + loop.theta_off / 2, centre - loop.theta_on / 2, zero + 1, zero, zero + 1)
     empty = (zero, zero, zero, zero, zero, none)
-    grad_start, _, *slots = loop(step, (zero, reference, *box, none - 1, *empty * PAIRS), target)
-    end = loop.load(grad_end)
+    begun = (zero, reference, *box, none - 1, *empty * PAIRS)
+    grad_start, _, *slots = loop(step, begun, target)
+    end = sum(loop.rows(grad_end))
     for k in range(0, len(slots), WIDTH):
         plus, minus, weight, grad, slope, frame = slots[k : k + WIDTH]
         grad_start = emit(frame, (grad + end * weight * (plus - minus)) * slope, grad_start)
-    dr.eval(target, grad_start)
-    dr.sync_thread()
-    grad_frames = target.torch().reshape(first + len(frames), *frames.shape[1:])
-    return grad_frames, loop.tensor(grad_start, start.shape[1:])
+    return loop.gradients(target, grad_start)
 
 
 class _Pairs:

@@ -34,9 +34,6 @@ RESETS = {"slayer": "pair", "thesis": "early", "exp": "early", "step": "early"}
 # "bounded" keeps rho * sum|nu| at most this: the adjoint then shrinks by 10 % per pass through the
 # reset
 BOUND = 0.9
-# floats ahead of the potential: where potentials and their gradient share their place in a memory
-# page, backward takes 1.4 times as long
-STAGGER = 768
 
 
 @dataclass(frozen=True)
@@ -159,12 +156,10 @@ class Srm(Function):
     def forward(ctx, setup, drive, theta, h_response, h_reset, response, reset):
         loops = _Loops(setup, drive, theta, h_response, h_reset)
         dr = loops.dr
-        spikes = dr.empty(loops.arr.Float, drive.numel())
-        potential = dr.empty(loops.arr.Float, drive.numel() + STAGGER)
+        spikes, potential = (dr.empty(loops.arr.Float, drive.numel()) for _ in range(2))
         states, bad = loops.forward(loops.split(response, reset), spikes, potential)
-        dr.eval(spikes, potential, states, bad)
         dr.sync_thread()
-        if bool(dr.any(bad)):
+        if bool(dr.any(bad, axis=None)):
             check_finite(
                 drive.view(setup.shape),
                 "drive",
@@ -175,7 +170,7 @@ class Srm(Function):
                 "factor)."
             )
         spikes = spikes.torch().view(drive.shape)
-        potential = potential.torch()[STAGGER:].view(drive.shape)
+        potential = potential.torch().view(drive.shape)
         ctx.save_for_backward(drive, theta, h_response, h_reset, response, reset, spikes, potential)
         ctx.setup = setup
         ctx.set_materialize_grads(False)
@@ -205,13 +200,10 @@ def _backward(setup, saved, grads, need):
     flat = {name: None if tensor is None else loops.load(tensor) for name, tensor in given.items()}
     flat["grad_drive"] = dr.empty(loops.arr.Float, drive.numel()) if need[0] else None
     carried = loops.backward(loops.after(need, grads[2], grads[3]), flat)
-    dr.eval(carried, flat["grad_drive"])
     dr.sync_thread()
 
     def rows(name):
-        columns = [
-            torch.stack([x.torch() for x in part[name]]) for part in carried if part.get(name)
-        ]
+        columns = [loops.rows_of(part[name]) for part in carried if part.get(name)]
         return torch.stack(columns, 1) if columns else theta.new_zeros(0, *theta.shape)
 
     def parameter(name, initial):
@@ -233,9 +225,12 @@ class _Loops(Lanes):
 
     def __init__(self, setup, drive, theta, h_response, h_reset):
         self.steps, self.channels, lanes = drive.shape
-        super().__init__(drive, lanes)
+        # alone, rows a power of two apart share their places in what remembers pages: four times as
+        # long
+        super().__init__(drive, lanes, packs=2)
         self.setup = setup
-        self.Double = arrays(drive.device.type, torch.float64).Float
+        self.flat = arrays(drive.device.type, torch.float64).Float
+        self.Double = self.of_lanes(self.flat)
         self.drive = self.load(drive)
         self.reset = setup.reset_of(theta, h_reset)
         self.response = h_response if h_response is None else response_coefficients(h_response)
@@ -245,7 +240,8 @@ class _Loops(Lanes):
     def surrogate(self, kind):
         """The functions that the surrogate is written in, and its numbers."""
         dr = self.dr
-        numbers = [dr.opaque(kind, value) for value in astuple(self.setup.surrogate)]
+        # one for each neighbour: a quotient by one alone would be a rounded product
+        numbers = [dr.opaque(kind, x, (self.extent[0], 1)) for x in astuple(self.setup.surrogate)]
         return Operations(dr.exp2, dr.abs, dr.maximum, dr.select), *numbers
 
     def read(self, flat, step, channel):
@@ -260,29 +256,31 @@ class _Loops(Lanes):
             columns |= {"response_a": self.response.a, "response_m": self.response.m}
         return [
             {"response_a": None, "response_m": None}
-            | {name: load(self.Double, column[k]) for name, column in columns.items()}
+            | {name: self.lanes_of(column[k]) for name, column in columns.items()}
             for k in range(self.channels)
         ]
+
+    def lanes_of(self, numbers):
+        return self.at(load(self.flat, numbers), 0)
 
     def split(self, response, reset):
         """Per channel, the states of response and reset [states, channels, lanes] as drjit arrays
         [lanes]."""
         return [
-            [[load(self.Double, row[k]) for row in rows] for rows in (response, reset)]
+            [[self.lanes_of(row[k]) for row in rows] for rows in (response, reset)]
             for k in range(self.channels)
         ]
 
     def join(self, states):
         """The inverse of ``split``."""
-        empty = self.theta.new_zeros(0, *self.theta.shape)
-        parts = [
-            [torch.stack([x.torch() for x in rows]) if rows else empty[:, 0] for rows in part]
-            for part in states
-        ]
+        parts = [[self.rows_of(rows) for rows in part] for part in states]
         return [torch.stack(rows, 1) for rows in zip(*parts, strict=True)]
 
+    def rows_of(self, values):
+        return self.stack(values, self.theta.shape[1:], self.flat)
+
     def forward(self, states, spikes, potential):
-        """Run all steps, which fill flat arrays of spikes and, behind STAGGER, potentials.
+        """Run all steps, which fill flat arrays of spikes and potentials.
 
         Args:
           states: per channel, of response and reset.
@@ -290,10 +288,10 @@ class _Loops(Lanes):
           infinite.
         """
         dr, setup = self.dr, self.setup
-        Single, Double = self.arr.Float, self.Double
+        Single, Double = self.of_lanes(self.arr.Float), self.Double
         numbers = self.numbers()
         surrogate = self.surrogate(Double)
-        shift = self.opaque(STAGGER)
+        one = self.full(1, self.flat)
 
         def body(t, bad, states):
             responses, resets, moved = [], [], []
@@ -312,17 +310,17 @@ class _Loops(Lanes):
                 if setup.smooth:
                     s = setup.surrogate.integral(surrogate[0], x, *surrogate[1:])
                 else:
-                    s = dr.select(x >= 0, Double(1), Double(0))
+                    s = dr.select(x >= 0, one, 0)
                 reset[0] = reset[0] + s
                 kept = Single(u)
                 bad |= ~dr.isfinite(kept)
-                place = self.place(t * self.channels + k)
-                dr.scatter(spikes, Single(s), place, mode=dr.ReduceMode.NoConflicts)
-                dr.scatter(potential, kept, place + shift, mode=dr.ReduceMode.NoConflicts)
+                self.put(spikes, Single(s), t * self.channels + k)
+                self.put(potential, kept, t * self.channels + k)
             return bad, moved
 
-        healthy = dr.zeros(self.arr.Bool, self.width)
-        bad, states = self.loop(0, self.opaque(self.steps), body, healthy, states)
+        bad = self.full(False, self.arr.Bool)
+        bad, states = self.loop(0, self.opaque(self.steps), body, bad, states)
+        dr.eval(spikes, potential, states, bad)
         return states, bad
 
     def after(self, need, grad_response, grad_reset):
@@ -344,8 +342,8 @@ class _Loops(Lanes):
 
         def begun(name, j, k):
             if given.get(name) is None:
-                return self.dr.zeros(self.Double, self.width)
-            return load(self.Double, given[name][j, k])
+                return self.full(0, self.flat)
+            return self.lanes_of(given[name][j, k])
 
         return [
             {name: [begun(name, j, k) for j in range(count)] for name, count in counts.items()}
@@ -361,14 +359,15 @@ class _Loops(Lanes):
         Returns: loop variables before the first step.
         """
         dr, setup = self.dr, self.setup
-        Single, Double = self.arr.Float, self.Double
+        Single, Double = self.of_lanes(self.arr.Float), self.Double
         reset, response = self.reset, self.response
         by_h = {"response_a_h": response.a_h, "response_m_h": response.m_h} if response else {}
+        if setup.through_reset == "bounded":
+            by_h["limit"] = BOUND / setup.reset_sum(self.theta, self.h_reset, self.steps)
         numbers = self.numbers(
             reset_a_h=reset.a_h,
             reset_m_h=reset.m_h,
             reset_m_theta=reset.m / self.theta,
-            limit=BOUND / setup.reset_sum(self.theta, self.h_reset, self.steps),
             **by_h,
         )
         surrogate = self.surrogate(Single)
@@ -380,7 +379,9 @@ class _Loops(Lanes):
             # no better known than the stored potential
             rho = Double(setup.surrogate.density(surrogate[0], x, *surrogate[1:]))
             seeded = flat["grad_spikes"] is not None
-            spiking = rho * self.read(flat["grad_spikes"], t, k) if seeded else Double(0)
+            spiking = (
+                rho * self.read(flat["grad_spikes"], t, k) if seeded else self.full(0, self.flat)
+            )
             if setup.through_reset != "off":
                 # part["reset"][0]: what this spike does to all later potentials
                 slope = rho if setup.through_reset == "full" else dr.minimum(rho, n["limit"])
@@ -439,4 +440,6 @@ class _Loops(Lanes):
                 before.append({name: moved.get(name, []) for name in part})
             return (before,)
 
-        return self.loop_back(0, self.opaque(self.steps), body, carried)[0]
+        (carried,) = self.loop_back(0, self.opaque(self.steps), body, carried)
+        dr.eval(carried, flat["grad_drive"])
+        return carried
