@@ -27,6 +27,9 @@ from codesign.events.low_pass import coefficients, passed
 # of a pixel in one interval: beyond it a unit is wrong, and single precision would soon stop
 # counting
 MOST_EVENTS = 1e6
+WIDE = 31  # all intervals of a chunk are one group
+APART = 16  # counts of groups stand apart by a line of the processor's memory
+MANY = 1 << 15  # from so many keys on torch sorts in little time
 # what changes from frame to frame
 CARRIED = (
     "reference",
@@ -69,66 +72,82 @@ def normal_pair(dr, arr, bits):
 
 class EventKeys:
     """Events as integers that sort by (t, y, x, p): microseconds since an origin, row, column,
-    polarity, from high to low bits."""
+    polarity, from high to low bits. Groups of intervals have room and an origin of their own, so
+    that they sort apart, in 32 bits where those hold an interval, and threads seldom meet."""
 
-    def __init__(self, lanes, start_s, end_s, layout, capacity):
-        """Args: start_s, end_s: lists, ends of every interval, seconds. layout: KeyLayout.
-        capacity: room for so many events; ``found`` tells how many there were."""
-        dr, Float = lanes.dr, lanes.arr.Float
+    def __init__(self, lanes, start_s, end_s, layout, density):
+        """Args: start_s, end_s: lists, ends of every interval, seconds. layout: KeyLayout. density:
+        events per pixel and interval that there is room for in a group; ``density`` of the fullest
+        is known afterwards."""
+        dr, arr = lanes.dr, lanes.arr
         start_s, end_s = np.array(start_s), np.array(end_s)
         start_us, end_us = (
             np.array([round(time_s * 1e6) for time_s in times]) for times in (start_s, end_s)
         )
-        length_us = (end_s - start_s) * 1e6
+        shift, self.origins_us = layout.groups(start_us, end_us)
+        groups = len(self.origins_us)
+        self._pixels = lanes.width * min(1 << shift, len(start_s))
+        self._room = 4096 + int(density * self._pixels)
         # of single precision a chunk with a long interval would round otherwise than the whole
-        self._Time = dr.float64_array_t(Float)
-        self._Key = dr.uint64_array_t(Float)
+        self._Time = dr.float64_array_t(arr.Float)
+        self._Key = (dr.int64_array_t if shift == WIDE else dr.int32_array_t)(arr.Float)
         self._lanes = lanes
-        # of every interval: its length, the fraction of a microsecond that it starts with, whole
-        # ones to its end
-        spans = length_us, start_s * 1e6 - start_us, (end_us - start_us).astype(np.float64)
+        self._layout = layout
+        # of every interval: its length and the fraction of a microsecond that it starts with; whole
+        # ones from its group's origin and to its end
+        spans = (end_s - start_s) * 1e6, start_s * 1e6 - start_us
         self._spans = [self._Time(span) for span in spans]
-        first = (start_us - layout.origin_us).astype(np.uint64)
-        self._start = self._Key(first << np.uint64(layout.pixel_bits))
+        since_us = start_us - self.origins_us[np.arange(len(start_us)) >> shift]
+        self._whole = [self._Key(since_us << layout.pixel_bits), self._Key(end_us - start_us)]
         self._pixel = self._Key(layout.pixels())
-        self._bits = layout.pixel_bits
-        self.capacity = capacity
-        self._keys = dr.empty(self._Key, capacity)
-        self._count = dr.zeros(lanes.arr.UInt32, 1)
-        dr.eval(self._spans, self._start, self._pixel, self._keys, self._count)
+        self._keys = dr.empty(self._Key, groups * self._room)
+        self._counts = dr.zeros(arr.UInt32, groups * APART)
+        self._opaque = lanes.opaque(shift), lanes.opaque(self._room)
+        dr.eval(self._spans, self._whole, self._pixel, self._keys, self._counts)
 
     def tally(self):
         return self._lanes.arr.UInt32(0)
 
     def take(self, index, when, on, kept, tally):
-        dr, UInt32 = self._lanes.dr, self._lanes.arr.UInt32
-        length, fraction, span = (dr.gather(self._Time, table, index) for table in self._spans)
-        # after the start, so that rounding moves no event to the interval before
+        dr, (shift, room) = self._lanes.dr, self._opaque
+        length, fraction = (dr.gather(self._Time, table, index) for table in self._spans)
+        start, span = (dr.gather(self._Key, table, index) for table in self._whole)
+        # after the start, so that rounding moves no event to the interval before; whole numbers are
+        # clipped in less time than floats
         since_us = dr.clip(
-            dr.round(self._Time(when) * length + fraction), dr.minimum(span, 1), span
+            self._Key(dr.round(self._Time(when) * length + fraction)), dr.minimum(span, 1), span
         )
-        start = dr.gather(self._Key, self._start, index)
-        key = (start + (self._Key(since_us) << self._bits)) | self._pixel
-        slot = dr.scatter_inc(self._count, UInt32(0), active=kept)
-        key = key | self._Key(dr.select(on, UInt32(1), 0))
-        dr.scatter(self._keys, key, slot, active=kept & (slot < self.capacity))
+        key = (start + (since_us << self._layout.pixel_bits)) | self._pixel
+        slot = dr.scatter_inc(self._counts, (index >> shift) * APART, active=kept)
+        key = key | dr.select(on, self._Key(1), 0)
+        place = (index >> shift) * room + slot
+        dr.scatter(self._keys, key, place, active=kept & (slot < room))
         return tally
 
     def close(self, index, tally):
         pass
 
     def arrays(self):
-        return self._keys, self._count
+        return self._keys, self._counts
 
-    @property
-    def found(self):
-        """Number of events, also those that had no room."""
-        return int(self._count[0])
+    def counted(self):
+        """Whether all events had room; then ``density`` and ``sorted`` hold."""
+        self._found = self._counts.numpy()[::APART].tolist()
+        self.density = max(self._found) / self._pixels
+        return max(self._found) <= self._room
 
     def sorted(self):
-        """[N] int64 keys in order."""
-        keys = torch.from_numpy(self._keys.numpy()[: self.found].view(np.int64))
-        return keys.sort().values.numpy()  # numpy takes twice as long for keys that come in runs
+        """List of an origin and the [N] keys from it in order, for every group."""
+        keys = self._keys.torch()
+        parts = [keys[k * self._room :][:found] for k, found in enumerate(self._found)]
+        return list(zip(self.origins_us.tolist(), map(_in_order, parts), strict=True))
+
+
+def _in_order(keys):
+    # torch counts digits where it has many, and takes long for few
+    if keys.is_cuda or len(keys) >= MANY:
+        return keys.sort().values
+    return torch.from_numpy(np.sort(keys.numpy()))
 
 
 @dataclass(frozen=True)
@@ -154,14 +173,34 @@ class KeyLayout:
             (pixel % self.width_px) << np.uint64(1)
         )
 
-    def columns(self, lanes, keys):
-        """t_us, x, y, p of int64 keys: int64 [N] each, where the frames are."""
-        if not len(keys):
+    def groups(self, start_us, end_us):
+        """How many intervals, as a power of 2, have keys of 32 bits from the middle of what those
+        hold on, and these origins; ``WIDE`` for all in 64 bits, from the first on."""
+        if (end_us > start_us).all():  # else events of two groups may come at one time
+            for shift in range(len(start_us).bit_length(), -1, -1):
+                first_us = start_us[:: 1 << shift]
+                if (np.append(first_us[1:], end_us[-1]) - first_us).max() < 2 ** (
+                    32 - self.pixel_bits
+                ):
+                    return shift, first_us + 2 ** (31 - self.pixel_bits)
+        return WIDE, start_us[:1]
+
+    def columns(self, lanes, parts):
+        """t_us, x, y, p of parts of keys, an origin and those from it: int64 [N] each, where the
+        frames are."""
+        count = sum(len(keys) for _, keys in parts)
+        if not count:
             like = torch.zeros(0, dtype=torch.int64, device=lanes.device)
             return tuple(like.clone() for _ in range(4))
         dr = lanes.dr
         Int = dr.int64_array_t(lanes.arr.Float)
-        keys = Int(keys)
+        keys = dr.empty(Int, count)
+        dr.eval(keys)
+        target = keys.torch()
+        for place, (origin_us, part) in zip(
+            target.split([len(keys) for _, keys in parts]), parts, strict=True
+        ):
+            place.copy_(part).add_((origin_us - self.origin_us) << self.pixel_bits)
 
         def low(shift, bits):
             return (keys >> shift) & ((1 << bits) - 1)
@@ -240,8 +279,9 @@ def run(lanes, frames, front_end, dt_s, interval_key, sensor, state, sink):
     with dr.suspend_grad():
         none = dr.zeros(arr.Bool, lanes.width)
         bad, busy, *carried = lanes.loop(0, lanes.opaque(len(frames)), body, none, none, *carried)
-        wrong = dr.max(dr.select(bad, arr.UInt32(1), dr.select(busy, arr.UInt32(2), 0)))
-        dr.eval(carried, wrong, sink.arrays())
+        wrong = dr.select(bad, arr.UInt32(1), dr.select(busy, arr.UInt32(2), 0))
+        dr.eval(carried, wrong, sink.arrays())  # together: a maximum alone runs the loop once more
+        wrong = dr.max(wrong)
     dr.sync_thread()
     after = {}
     for name, value in zip(names, carried, strict=True):

@@ -213,36 +213,35 @@ def _v2e_events(frames, times_s, sensor, generator, state, front_end):
 def _interpolated(frames, times_s, sensor, generator, state, front_end, layout):
     """Stream of the events between frames; keys are views of drjit's memory, which nobody else may
     use meanwhile."""
-    keys = []
+    parts = []
     lanes = Lanes(frames, frames[0].numel())
     size = backend.frames_per_kernel(lanes.width)
     density = EVENTS_PER_PIXEL
     for first in range(0, len(frames), size):
         chunk = frames[first : first + size], times_s[first : first + size]
-        keys.append(
-            _interpolated_keys(lanes, *chunk, sensor, generator, state, front_end, layout, density)
+        sink = _interpolated_keys(
+            lanes, *chunk, sensor, generator, state, front_end, layout, density
         )
-        density = max(density, 1.25 * len(keys[-1]) / chunk[0].numel())
-    together = keys[0] if len(keys) == 1 else np.concatenate(keys)
-    return EventStream(*layout.columns(lanes, together), layout.height_px, layout.width_px)
+        parts += sink.sorted()
+        density = max(density, 1.25 * sink.density)
+    return EventStream(*layout.columns(lanes, parts), layout.height_px, layout.width_px)
 
 
 def _interpolated_keys(
     lanes, frames, times_s, sensor, generator, state, front_end, layout, density
 ):
-    """Sorted keys of the events of one chunk; a chunk busier than the room made for it is run again
-    with the room it needs."""
+    """Keys of the events of one chunk; a chunk busier than the room made for it is run again with
+    the room it needs."""
     random_keys = _random_keys(len(frames), sensor, state, generator)
     starts_s = [state.time_s, *times_s[:-1]]
-    capacity = 4096 + int(density * frames.numel())
     while True:
-        sink = EventKeys(lanes, starts_s, times_s, layout, capacity)
+        sink = EventKeys(lanes, starts_s, times_s, layout, density)
         trial = replace(state)
         _advance(lanes, frames, times_s, random_keys, sensor, trial, front_end, sink)
-        if sink.found <= capacity:
+        if sink.counted():
             state.__dict__.update(trial.__dict__)
-            return sink.sorted()
-        capacity = sink.found
+            return sink
+        density = sink.density
 
 
 def _random_keys(count, sensor, state, generator):
