@@ -39,9 +39,25 @@ def ordered(
             )
     t_us, x, y, p = (values.to(torch.int64) for values in (t_us, x, y, p))
     _check_columns(t_us, x, y, p, height_px, width_px)
-    rank = torch.argsort((y * width_px + x) * 2 + (p > 0), stable=True)
-    rank = rank[torch.argsort(t_us[rank], stable=True)]
-    return EventStream(t_us[rank], x[rank], y[rank], p[rank], int(height_px), int(width_px))
+    x_bits, y_bits = (int(side - 1).bit_length() for side in (width_px, height_px))
+    bits = x_bits + y_bits + 1
+    if len(t_us) and int(t_us.max()) - int(t_us.min()) < 2 ** (63 - bits):
+        times_us, since = None, t_us - t_us.min()
+    else:
+        times_us, since = t_us.unique(return_inverse=True)
+    # one sort of all that there is to an event; in place, as new pages cost more than the sums
+    since <<= bits
+    since |= ((y << x_bits) | x) << 1
+    key = since.bitwise_or_(p > 0).sort().values
+    since = key >> bits
+    return EventStream(
+        since.add_(t_us.min()) if times_us is None else times_us[since],
+        (key >> 1).bitwise_and_((1 << x_bits) - 1),
+        (key >> (x_bits + 1)).bitwise_and_((1 << y_bits) - 1),
+        (key & 1).mul_(2).sub_(1),
+        int(height_px),
+        int(width_px),
+    )
 
 
 def check_stream(

@@ -167,11 +167,9 @@ class KeyLayout:
         return self.x_bits + max(1, (self.height_px - 1).bit_length()) + 1
 
     def pixels(self):
-        """[H W] uint64 low bits of every pixel, OFF."""
-        pixel = np.arange(self.height_px * self.width_px, dtype=np.uint64)
-        return ((pixel // self.width_px) << np.uint64(self.x_bits + 1)) | (
-            (pixel % self.width_px) << np.uint64(1)
-        )
+        """[H W] low bits of every pixel, OFF."""
+        rows = np.arange(self.height_px)[:, None] << (self.x_bits + 1)
+        return (rows | (np.arange(self.width_px) << 1)).ravel()
 
     def groups(self, start_us, end_us):
         """How many intervals, as a power of 2, have keys of 32 bits from the middle of what those
