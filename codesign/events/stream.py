@@ -50,14 +50,10 @@ def ordered(
     since |= ((y << x_bits) | x) << 1
     key = since.bitwise_or_(p > 0).sort().values
     since = key >> bits
-    return EventStream(
-        since.add_(t_us.min()) if times_us is None else times_us[since],
-        (key >> 1).bitwise_and_((1 << x_bits) - 1),
-        (key >> (x_bits + 1)).bitwise_and_((1 << y_bits) - 1),
-        (key & 1).mul_(2).sub_(1),
-        int(height_px),
-        int(width_px),
-    )
+    t_us = since.add_(t_us.min()) if times_us is None else times_us[since]
+    x = (key >> 1).bitwise_and_((1 << x_bits) - 1)
+    y = (key >> (x_bits + 1)).bitwise_and_((1 << y_bits) - 1)
+    return EventStream(t_us, x, y, (key & 1).mul_(2).sub_(1), int(height_px), int(width_px))
 
 
 def check_stream(

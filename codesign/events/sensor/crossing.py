@@ -27,7 +27,6 @@ from codesign.events.low_pass import coefficients, passed
 # of a pixel in one interval: beyond it a unit is wrong, and single precision would soon stop
 # counting
 MOST_EVENTS = 1e6
-WIDE = 31  # all intervals of a chunk are one group
 APART = 16  # counts of groups stand apart by a line of the processor's memory
 MANY = 1 << 15  # from so many keys on torch sorts in little time
 # what changes from frame to frame
@@ -77,31 +76,35 @@ class EventKeys:
 
     def __init__(self, lanes, start_s, end_s, layout, density):
         """Args: start_s, end_s: lists, ends of every interval, seconds. layout: KeyLayout. density:
-        events per pixel and interval that there is room for in a group; ``density`` of the fullest
-        is known afterwards."""
+        events per pixel and interval that every group has room for."""
         dr, arr = lanes.dr, lanes.arr
         start_s, end_s = np.array(start_s), np.array(end_s)
         start_us, end_us = (
             np.array([round(time_s * 1e6) for time_s in times]) for times in (start_s, end_s)
         )
-        shift, self.origins_us = layout.groups(start_us, end_us)
-        groups = len(self.origins_us)
+        lasts_us, bits = end_us - start_us, layout.pixel_bits
+        # as many intervals, as a power of 2, as have keys of 32 bits from their middle on; all in 64
+        # bits where not one has, and where events of two groups might come at one time
+        narrow = lasts_us.min() > 0 and lasts_us.max() < 2 ** (32 - bits)
+        shift = int((2 ** (32 - bits) - 1) // lasts_us.max()).bit_length() - 1 if narrow else 31
+        origins_us = start_us[:: 1 << shift] + (2 ** (31 - bits) if narrow else 0)
+        self._origins = ((origins_us - layout.origin_us) << bits).tolist()
         self._pixels = lanes.width * min(1 << shift, len(start_s))
         self._room = 4096 + int(density * self._pixels)
         # of single precision a chunk with a long interval would round otherwise than the whole
         self._Time = dr.float64_array_t(arr.Float)
-        self._Key = (dr.int64_array_t if shift == WIDE else dr.int32_array_t)(arr.Float)
+        self._Key = (dr.int32_array_t if narrow else dr.int64_array_t)(arr.Float)
         self._lanes = lanes
-        self._layout = layout
+        self._bits = bits
         # of every interval: its length and the fraction of a microsecond that it starts with; whole
         # ones from its group's origin and to its end
         spans = (end_s - start_s) * 1e6, start_s * 1e6 - start_us
         self._spans = [self._Time(span) for span in spans]
-        since_us = start_us - self.origins_us[np.arange(len(start_us)) >> shift]
-        self._whole = [self._Key(since_us << layout.pixel_bits), self._Key(end_us - start_us)]
+        since_us = start_us - origins_us[np.arange(len(start_us)) >> shift]
+        self._whole = [self._Key(since_us << bits), self._Key(lasts_us)]
         self._pixel = self._Key(layout.pixels())
-        self._keys = dr.empty(self._Key, groups * self._room)
-        self._counts = dr.zeros(arr.UInt32, groups * APART)
+        self._keys = dr.empty(self._Key, len(origins_us) * self._room)
+        self._counts = dr.zeros(arr.UInt32, len(origins_us) * APART)
         self._opaque = lanes.opaque(shift), lanes.opaque(self._room)
         dr.eval(self._spans, self._whole, self._pixel, self._keys, self._counts)
 
@@ -117,7 +120,7 @@ class EventKeys:
         since_us = dr.clip(
             self._Key(dr.round(self._Time(when) * length + fraction)), dr.minimum(span, 1), span
         )
-        key = (start + (since_us << self._layout.pixel_bits)) | self._pixel
+        key = (start + (since_us << self._bits)) | self._pixel
         slot = dr.scatter_inc(self._counts, (index >> shift) * APART, active=kept)
         key = key | dr.select(on, self._Key(1), 0)
         place = (index >> shift) * room + slot
@@ -131,16 +134,18 @@ class EventKeys:
         return self._keys, self._counts
 
     def counted(self):
-        """Whether all events had room; then ``density`` and ``sorted`` hold."""
+        """Whether all events had room, and how many came per pixel and interval in the fullest
+        group."""
         self._found = self._counts.numpy()[::APART].tolist()
-        self.density = max(self._found) / self._pixels
-        return max(self._found) <= self._room
+        return max(self._found) <= self._room, max(self._found) / self._pixels
 
     def sorted(self):
         """List of an origin and the [N] keys from it in order, for every group."""
-        keys = self._keys.torch()
-        parts = [keys[k * self._room :][:found] for k, found in enumerate(self._found)]
-        return list(zip(self.origins_us.tolist(), map(_in_order, parts), strict=True))
+        groups = self._keys.torch().split(self._room)
+        return [
+            (origin, _in_order(keys[:found]))
+            for origin, keys, found in zip(self._origins, groups, self._found, strict=True)
+        ]
 
 
 def _in_order(keys):
@@ -171,34 +176,19 @@ class KeyLayout:
         rows = np.arange(self.height_px)[:, None] << (self.x_bits + 1)
         return (rows | (np.arange(self.width_px) << 1)).ravel()
 
-    def groups(self, start_us, end_us):
-        """How many intervals, as a power of 2, have keys of 32 bits from the middle of what those
-        hold on, and these origins; ``WIDE`` for all in 64 bits, from the first on."""
-        if (end_us > start_us).all():  # else events of two groups may come at one time
-            for shift in range(len(start_us).bit_length(), -1, -1):
-                first_us = start_us[:: 1 << shift]
-                if (np.append(first_us[1:], end_us[-1]) - first_us).max() < 2 ** (
-                    32 - self.pixel_bits
-                ):
-                    return shift, first_us + 2 ** (31 - self.pixel_bits)
-        return WIDE, start_us[:1]
-
     def columns(self, lanes, parts):
         """t_us, x, y, p of parts of keys, an origin and those from it: int64 [N] each, where the
         frames are."""
-        count = sum(len(keys) for _, keys in parts)
-        if not count:
+        sizes = [len(keys) for _, keys in parts]
+        if not any(sizes):
             like = torch.zeros(0, dtype=torch.int64, device=lanes.device)
             return tuple(like.clone() for _ in range(4))
         dr = lanes.dr
         Int = dr.int64_array_t(lanes.arr.Float)
-        keys = dr.empty(Int, count)
+        keys = dr.empty(Int, sum(sizes))
         dr.eval(keys)
-        target = keys.torch()
-        for place, (origin_us, part) in zip(
-            target.split([len(keys) for _, keys in parts]), parts, strict=True
-        ):
-            place.copy_(part).add_((origin_us - self.origin_us) << self.pixel_bits)
+        for place, (origin, part) in zip(keys.torch().split(sizes), parts, strict=True):
+            place.copy_(part).add_(origin)
 
         def low(shift, bits):
             return (keys >> shift) & ((1 << bits) - 1)

@@ -211,36 +211,24 @@ def _v2e_events(frames, times_s, sensor, generator, state, front_end):
 @exclusive
 def _interpolated(frames, times_s, sensor, generator, state, front_end, layout):
     """Stream of the events between frames; keys are views of drjit's memory, which nobody else may
-    use meanwhile."""
+    use meanwhile. A chunk busier than the room made for it is run again with the room it needs."""
     parts = []
     lanes = Lanes(frames, frames[0].numel())
     size = backend.frames_per_kernel(lanes.width)
     density = EVENTS_PER_PIXEL
     for first in range(0, len(frames), size):
-        chunk = frames[first : first + size], times_s[first : first + size]
-        sink = _interpolated_keys(
-            lanes, *chunk, sensor, generator, state, front_end, layout, density
-        )
+        chunk, ends_s = frames[first : first + size], times_s[first : first + size]
+        random_keys = _random_keys(len(chunk), sensor, state, generator)
+        had_room = False
+        while not had_room:
+            sink = EventKeys(lanes, [state.time_s, *ends_s[:-1]], ends_s, layout, density)
+            trial = replace(state)
+            _advance(lanes, chunk, ends_s, random_keys, sensor, trial, front_end, sink)
+            had_room, found = sink.counted()
+            density = max(density, 1.25 * found)
+        state.__dict__.update(trial.__dict__)
         parts += sink.sorted()
-        density = max(density, 1.25 * sink.density)
     return EventStream(*layout.columns(lanes, parts), layout.height_px, layout.width_px)
-
-
-def _interpolated_keys(
-    lanes, frames, times_s, sensor, generator, state, front_end, layout, density
-):
-    """Keys of the events of one chunk; a chunk busier than the room made for it is run again with
-    the room it needs."""
-    random_keys = _random_keys(len(frames), sensor, state, generator)
-    starts_s = [state.time_s, *times_s[:-1]]
-    while True:
-        sink = EventKeys(lanes, starts_s, times_s, layout, density)
-        trial = replace(state)
-        _advance(lanes, frames, times_s, random_keys, sensor, trial, front_end, sink)
-        if sink.counted():
-            state.__dict__.update(trial.__dict__)
-            return sink
-        density = sink.density
 
 
 def _random_keys(count, sensor, state, generator):
