@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -9,6 +10,15 @@ from codesign.checks import check_kind, check_whole
 from codesign.errors import DomainError, ShapeError
 from codesign.events.entry import Times, check_dtype, check_room, check_times, exactly
 from codesign.types import EventStream
+
+MANY = 1 << 15  # from so many keys on torch counts digits, below numpy is faster
+
+
+def sorted_keys(keys):
+    """[N] whole numbers, sorted."""
+    if keys.is_cuda or len(keys) >= MANY:
+        return keys.sort().values
+    return torch.from_numpy(np.sort(keys.numpy()))
 
 
 def ordered(
@@ -45,15 +55,10 @@ def ordered(
         times_us, since = None, t_us - t_us.min()
     else:
         times_us, since = t_us.unique(return_inverse=True)
-    # one sort of all that there is to an event; in place, as new pages cost more than the sums
-    since <<= bits
-    since |= ((y << x_bits) | x) << 1
-    key = since.bitwise_or_(p > 0).sort().values
-    since = key >> bits
-    t_us = since.add_(t_us.min()) if times_us is None else times_us[since]
-    x = (key >> 1).bitwise_and_((1 << x_bits) - 1)
-    y = (key >> (x_bits + 1)).bitwise_and_((1 << y_bits) - 1)
-    return EventStream(t_us, x, y, (key & 1).mul_(2).sub_(1), int(height_px), int(width_px))
+    key = sorted_keys((since << bits) | (y << (x_bits + 1)) | (x << 1) | (p > 0))
+    t_us = (key >> bits) + t_us.min() if times_us is None else times_us[key >> bits]
+    x, y = (key >> 1) & ((1 << x_bits) - 1), (key >> (x_bits + 1)) & ((1 << y_bits) - 1)
+    return EventStream(t_us, x, y, 2 * (key & 1) - 1, int(height_px), int(width_px))
 
 
 def check_stream(

@@ -23,12 +23,12 @@ import torch
 from codesign.backend import load
 from codesign.events.intensity import light_share
 from codesign.events.low_pass import coefficients, passed
+from codesign.events.stream import sorted_keys
 
 # of a pixel in one interval: beyond it a unit is wrong, and single precision would soon stop
 # counting
 MOST_EVENTS = 1e6
 APART = 16  # counts of groups stand apart by a line of the processor's memory
-MANY = 1 << 15  # from so many keys on torch sorts in little time
 # what changes from frame to frame
 CARRIED = (
     "reference",
@@ -143,16 +143,9 @@ class EventKeys:
         """List of an origin and the [N] keys from it in order, for every group."""
         groups = self._keys.torch().split(self._room)
         return [
-            (origin, _in_order(keys[:found]))
+            (origin, sorted_keys(keys[:found]))
             for origin, keys, found in zip(self._origins, groups, self._found, strict=True)
         ]
-
-
-def _in_order(keys):
-    # torch counts digits where it has many, and takes long for few
-    if keys.is_cuda or len(keys) >= MANY:
-        return keys.sort().values
-    return torch.from_numpy(np.sort(keys.numpy()))
 
 
 @dataclass(frozen=True)
@@ -181,8 +174,7 @@ class KeyLayout:
         frames are."""
         sizes = [len(keys) for _, keys in parts]
         if not any(sizes):
-            like = torch.zeros(0, dtype=torch.int64, device=lanes.device)
-            return tuple(like.clone() for _ in range(4))
+            return torch.zeros((4, 0), dtype=torch.int64, device=lanes.device).unbind()
         dr = lanes.dr
         Int = dr.int64_array_t(lanes.arr.Float)
         keys = dr.empty(Int, sum(sizes))

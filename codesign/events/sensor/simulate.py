@@ -2,6 +2,7 @@
 
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import pairwise
 
 import torch
 from torch import Generator, Tensor
@@ -30,6 +31,7 @@ from codesign.types import EventStream
 
 EVENTS_PER_PIXEL = 1.0  # room made at first; on a processor, what no event writes to is no memory
 KEY_BITS = 63
+NEAR = 1 << 20  # pixels of all frames whose events sort together
 
 
 @torch.no_grad()
@@ -198,14 +200,22 @@ def _fired(counts, t_us):
 
 
 def _v2e_events(frames, times_s, sensor, generator, state, front_end):
-    parts = []
+    """Stream of the events between frames, of a few at a time, whose keys stay near the processor
+    while they sort."""
+    found, streams = [], []
     for frame, time_s in zip(frames, times_s, strict=True):
         check_frames(frame[None], 1, non_negative=not front_end.log_input)
         intensity = frame.exp() if front_end.log_input else frame
         level = v2e.levels(frame, front_end)
-        parts.append(v2e.interval(intensity, level, time_s, sensor, generator, state))
-    t_us, x, y, p = (torch.cat(column) for column in zip(*parts, strict=True))
-    return ordered(t_us, x, y, p, *frames.shape[1:])
+        found.append(v2e.interval(intensity, level, time_s, sensor, generator, state))
+        if len(found) * frame.numel() >= NEAR or time_s == times_s[-1]:
+            columns = (torch.cat(column) for column in zip(*found, strict=True))
+            streams.append(ordered(*columns, *frame.shape))
+            found = []
+    if any(a.t_us[-1] >= b.t_us[0] for a, b in pairwise(filter(len, streams))):
+        return concatenate(streams)
+    columns = zip(*((part.t_us, part.x, part.y, part.p) for part in streams), strict=True)
+    return EventStream(*map(torch.cat, columns), *frames.shape[1:])
 
 
 @exclusive

@@ -37,8 +37,7 @@ def interval(frame, level, time_s, sensor, generator, state):
     Returns: t_us, x, y, p: int64 [N] each, unsorted.
     """
     dt_s = time_s - state.time_s
-    lit = sensor.cutoff_hz > 0 or sensor.has_shots
-    light = light_share(frame.double()) if lit else None
+    light = light_share(frame.double()) if sensor.cutoff_hz > 0 or sensor.has_shots else None
     seen = _photoreceptor(level, light, dt_s, sensor, generator, state)
     if sensor.leaks:
         rate_hz = state.leak_hz
@@ -57,15 +56,12 @@ def interval(frame, level, time_s, sensor, generator, state):
     else:
         place, nth = _each(fired)
         if state.last_event_s is not None:
-            state.last_event_s = torch.where(
-                fired > 0,
-                times.to(state.last_event_s.dtype)[(fired - 1).clamp(min=0).long()],
-                state.last_event_s,
-            )
+            last_s = times.to(state.last_event_s.dtype)[(fired - 1).clamp(min=0).long()]
+            state.last_event_s = torch.where(fired > 0, last_s, state.last_event_s)
     found = [(place, nth, 2 * rising.flatten()[place].long() - 1)]
     # a single-precision product at all times
-    moved = (fired.float() * theta.float()).copysign(difference)
-    state.reference = state.reference.to(difference) + moved
+    moved = fired.float() * theta.float()
+    state.reference = state.reference.to(difference) + moved.copysign(difference)
     if sensor.has_shots:
         found += _shots(light, dt_s, slots, sensor, generator, state)
     state.time_s = time_s
