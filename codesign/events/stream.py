@@ -16,9 +16,9 @@ MANY = 1 << 15  # from so many keys on torch counts digits, below numpy is faste
 
 def sorted_keys(keys):
     """[N] whole numbers, sorted."""
-    if keys.is_cuda or len(keys) >= MANY:
+    if len(keys) >= MANY:
         return keys.sort().values
-    return torch.from_numpy(np.sort(keys.numpy()))
+    return torch.from_numpy(np.sort(keys.cpu().numpy())).to(keys.device)
 
 
 def ordered(

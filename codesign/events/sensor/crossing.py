@@ -85,15 +85,15 @@ class EventKeys:
         lasts_us, bits = end_us - start_us, layout.pixel_bits
         # as many intervals, as a power of 2, as have keys of 32 bits from their middle on; all in 64
         # bits where not one has, and where events of two groups might come at one time
-        narrow = lasts_us.min() > 0 and lasts_us.max() < 2 ** (32 - bits)
-        shift = int((2 ** (32 - bits) - 1) // lasts_us.max()).bit_length() - 1 if narrow else 31
-        origins_us = start_us[:: 1 << shift] + (2 ** (31 - bits) if narrow else 0)
+        fit = int(2 ** (32 - bits) - 1) // int(lasts_us.max()) if lasts_us.min() > 0 else 0
+        shift = fit.bit_length() - 1 if fit else 31
+        origins_us = start_us[:: 1 << shift] + (2 ** (31 - bits) if fit else 0)
         self._origins = ((origins_us - layout.origin_us) << bits).tolist()
         self._pixels = lanes.width * min(1 << shift, len(start_s))
         self._room = 4096 + int(density * self._pixels)
         # of single precision a chunk with a long interval would round otherwise than the whole
         self._Time = dr.float64_array_t(arr.Float)
-        self._Key = (dr.int32_array_t if narrow else dr.int64_array_t)(arr.Float)
+        self._Key = (dr.int32_array_t if fit else dr.int64_array_t)(arr.Float)
         self._lanes = lanes
         self._bits = bits
         # of every interval: its length and the fraction of a microsecond that it starts with; whole
