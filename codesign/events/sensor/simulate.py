@@ -209,13 +209,14 @@ def _v2e_events(frames, times_s, sensor, generator, state, front_end):
         level = v2e.levels(frame, front_end)
         found.append(v2e.interval(intensity, level, time_s, sensor, generator, state))
         if len(found) * frame.numel() >= NEAR or time_s == times_s[-1]:
-            columns = (torch.cat(column) for column in zip(*found, strict=True))
-            streams.append(ordered(*columns, *frame.shape))
+            t_us, x, y, p = (torch.cat(column) for column in zip(*found, strict=True))
+            streams.append(ordered(t_us, x, y, p, *frame.shape))
             found = []
     if any(a.t_us[-1] >= b.t_us[0] for a, b in pairwise(filter(len, streams))):
         return concatenate(streams)
     columns = zip(*((part.t_us, part.x, part.y, part.p) for part in streams), strict=True)
-    return EventStream(*map(torch.cat, columns), *frames.shape[1:])
+    t_us, x, y, p = map(torch.cat, columns)
+    return EventStream(t_us, x, y, p, *frames.shape[1:])
 
 
 @exclusive
