@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parents[1]
 UNCOUNTED = (ast.expr_context, ast.operator, ast.unaryop, ast.cmpop, ast.boolop)
 BUDGETS = {
     "codesign": 10_340,  # a pose out of its rotation and its place, for mounts and paths alike, what is differentiable once, threads of a torch that came first, threads of a torch that came first
-    "codesign/events": 48_620,  # leaks that have begun before, counts that a type holds, kinds of TIFFs, noise events of all intervals at once, times too coarse
+    "codesign/events": 48_970,  # leaks that have begun before, counts that a type holds, kinds of TIFFs, noise events of all intervals at once, times too coarse, keys that sort by groups in 32 bits
     "codesign/fidelity": 3_030,  # stages without a level, levels that are told wrong
     "codesign/flow": 43_180,  # truth that is unknown, windows that share no event, polarities told two ways, truths without a time
     "codesign/grad": 3_370,  # stairs of single precision in double

@@ -23,10 +23,12 @@ import torch
 from codesign.backend import load
 from codesign.events.intensity import light_share
 from codesign.events.low_pass import coefficients, passed
+from codesign.events.stream import sorted_keys
 
 # of a pixel in one interval: beyond it a unit is wrong, and single precision would soon stop
 # counting
 MOST_EVENTS = 1e6
+APART = 16  # counts of groups stand apart by a line of the processor's memory
 # what changes from frame to frame
 CARRIED = (
     "reference",
@@ -69,66 +71,81 @@ def normal_pair(dr, arr, bits):
 
 class EventKeys:
     """Events as integers that sort by (t, y, x, p): microseconds since an origin, row, column,
-    polarity, from high to low bits."""
+    polarity, from high to low bits. Groups of intervals have room and an origin of their own, so
+    that they sort apart, in 32 bits where those hold an interval, and threads seldom meet."""
 
-    def __init__(self, lanes, start_s, end_s, layout, capacity):
-        """Args: start_s, end_s: lists, ends of every interval, seconds. layout: KeyLayout.
-        capacity: room for so many events; ``found`` tells how many there were."""
-        dr, Float = lanes.dr, lanes.arr.Float
+    def __init__(self, lanes, start_s, end_s, layout, density):
+        """Args: start_s, end_s: lists, ends of every interval, seconds. layout: KeyLayout. density:
+        events per pixel and interval that every group has room for."""
+        dr, arr = lanes.dr, lanes.arr
         start_s, end_s = np.array(start_s), np.array(end_s)
         start_us, end_us = (
             np.array([round(time_s * 1e6) for time_s in times]) for times in (start_s, end_s)
         )
-        length_us = (end_s - start_s) * 1e6
+        lasts_us, bits = end_us - start_us, layout.pixel_bits
+        # as many intervals, as a power of 2, as have keys of 32 bits from their middle on; all in 64
+        # bits where not one has, and where events of two groups might come at one time
+        fit = int(2 ** (32 - bits) - 1) // int(lasts_us.max()) if lasts_us.min() > 0 else 0
+        shift = fit.bit_length() - 1 if fit else 31
+        origins_us = start_us[:: 1 << shift] + (2 ** (31 - bits) if fit else 0)
+        self._origins = ((origins_us - layout.origin_us) << bits).tolist()
+        self._pixels = lanes.width * min(1 << shift, len(start_s))
+        self._room = 4096 + int(density * self._pixels)
         # of single precision a chunk with a long interval would round otherwise than the whole
-        self._Time = dr.float64_array_t(Float)
-        self._Key = dr.uint64_array_t(Float)
+        self._Time = dr.float64_array_t(arr.Float)
+        self._Key = (dr.int32_array_t if fit else dr.int64_array_t)(arr.Float)
         self._lanes = lanes
-        # of every interval: its length, the fraction of a microsecond that it starts with, whole
-        # ones to its end
-        spans = length_us, start_s * 1e6 - start_us, (end_us - start_us).astype(np.float64)
+        self._bits = bits
+        # of every interval: its length and the fraction of a microsecond that it starts with; whole
+        # ones from its group's origin and to its end
+        spans = (end_s - start_s) * 1e6, start_s * 1e6 - start_us
         self._spans = [self._Time(span) for span in spans]
-        first = (start_us - layout.origin_us).astype(np.uint64)
-        self._start = self._Key(first << np.uint64(layout.pixel_bits))
+        since_us = start_us - origins_us[np.arange(len(start_us)) >> shift]
+        self._whole = [self._Key(since_us << bits), self._Key(lasts_us)]
         self._pixel = self._Key(layout.pixels())
-        self._bits = layout.pixel_bits
-        self.capacity = capacity
-        self._keys = dr.empty(self._Key, capacity)
-        self._count = dr.zeros(lanes.arr.UInt32, 1)
-        dr.eval(self._spans, self._start, self._pixel, self._keys, self._count)
+        self._keys = dr.empty(self._Key, len(origins_us) * self._room)
+        self._counts = dr.zeros(arr.UInt32, len(origins_us) * APART)
+        self._opaque = lanes.opaque(shift), lanes.opaque(self._room)
+        dr.eval(self._spans, self._whole, self._pixel, self._keys, self._counts)
 
     def tally(self):
         return self._lanes.arr.UInt32(0)
 
     def take(self, index, when, on, kept, tally):
-        dr, UInt32 = self._lanes.dr, self._lanes.arr.UInt32
-        length, fraction, span = (dr.gather(self._Time, table, index) for table in self._spans)
-        # after the start, so that rounding moves no event to the interval before
+        dr, (shift, room) = self._lanes.dr, self._opaque
+        length, fraction = (dr.gather(self._Time, table, index) for table in self._spans)
+        start, span = (dr.gather(self._Key, table, index) for table in self._whole)
+        # after the start, so that rounding moves no event to the interval before; whole numbers are
+        # clipped in less time than floats
         since_us = dr.clip(
-            dr.round(self._Time(when) * length + fraction), dr.minimum(span, 1), span
+            self._Key(dr.round(self._Time(when) * length + fraction)), dr.minimum(span, 1), span
         )
-        start = dr.gather(self._Key, self._start, index)
-        key = (start + (self._Key(since_us) << self._bits)) | self._pixel
-        slot = dr.scatter_inc(self._count, UInt32(0), active=kept)
-        key = key | self._Key(dr.select(on, UInt32(1), 0))
-        dr.scatter(self._keys, key, slot, active=kept & (slot < self.capacity))
+        key = (start + (since_us << self._bits)) | self._pixel
+        slot = dr.scatter_inc(self._counts, (index >> shift) * APART, active=kept)
+        key = key | dr.select(on, self._Key(1), 0)
+        place = (index >> shift) * room + slot
+        dr.scatter(self._keys, key, place, active=kept & (slot < room))
         return tally
 
     def close(self, index, tally):
         pass
 
     def arrays(self):
-        return self._keys, self._count
+        return self._keys, self._counts
 
-    @property
-    def found(self):
-        """Number of events, also those that had no room."""
-        return int(self._count[0])
+    def counted(self):
+        """Whether all events had room, and how many came per pixel and interval in the fullest
+        group."""
+        self._found = self._counts.numpy()[::APART].tolist()
+        return max(self._found) <= self._room, max(self._found) / self._pixels
 
     def sorted(self):
-        """[N] int64 keys in order."""
-        keys = torch.from_numpy(self._keys.numpy()[: self.found].view(np.int64))
-        return keys.sort().values.numpy()  # numpy takes twice as long for keys that come in runs
+        """List of an origin and the [N] keys from it in order, for every group."""
+        groups = self._keys.torch().split(self._room)
+        return [
+            (origin, sorted_keys(keys[:found]))
+            for origin, keys, found in zip(self._origins, groups, self._found, strict=True)
+        ]
 
 
 @dataclass(frozen=True)
@@ -148,20 +165,22 @@ class KeyLayout:
         return self.x_bits + max(1, (self.height_px - 1).bit_length()) + 1
 
     def pixels(self):
-        """[H W] uint64 low bits of every pixel, OFF."""
-        pixel = np.arange(self.height_px * self.width_px, dtype=np.uint64)
-        return ((pixel // self.width_px) << np.uint64(self.x_bits + 1)) | (
-            (pixel % self.width_px) << np.uint64(1)
-        )
+        """[H W] low bits of every pixel, OFF."""
+        rows = np.arange(self.height_px)[:, None] << (self.x_bits + 1)
+        return (rows | (np.arange(self.width_px) << 1)).ravel()
 
-    def columns(self, lanes, keys):
-        """t_us, x, y, p of int64 keys: int64 [N] each, where the frames are."""
-        if not len(keys):
-            like = torch.zeros(0, dtype=torch.int64, device=lanes.device)
-            return tuple(like.clone() for _ in range(4))
+    def columns(self, lanes, parts):
+        """t_us, x, y, p of parts of keys, an origin and those from it: int64 [N] each, where the
+        frames are."""
+        sizes = [len(keys) for _, keys in parts]
+        if not any(sizes):
+            return torch.zeros((4, 0), dtype=torch.int64, device=lanes.device).unbind()
         dr = lanes.dr
         Int = dr.int64_array_t(lanes.arr.Float)
-        keys = Int(keys)
+        keys = dr.empty(Int, sum(sizes))
+        dr.eval(keys)
+        for place, (origin, part) in zip(keys.torch().split(sizes), parts, strict=True):
+            place.copy_(part).add_(origin)
 
         def low(shift, bits):
             return (keys >> shift) & ((1 << bits) - 1)
@@ -240,8 +259,9 @@ def run(lanes, frames, front_end, dt_s, interval_key, sensor, state, sink):
     with dr.suspend_grad():
         none = dr.zeros(arr.Bool, lanes.width)
         bad, busy, *carried = lanes.loop(0, lanes.opaque(len(frames)), body, none, none, *carried)
-        wrong = dr.max(dr.select(bad, arr.UInt32(1), dr.select(busy, arr.UInt32(2), 0)))
-        dr.eval(carried, wrong, sink.arrays())
+        wrong = dr.select(bad, arr.UInt32(1), dr.select(busy, arr.UInt32(2), 0))
+        dr.eval(carried, wrong, sink.arrays())  # together: a maximum alone runs the loop once more
+        wrong = dr.max(wrong)
     dr.sync_thread()
     after = {}
     for name, value in zip(names, carried, strict=True):

@@ -2,8 +2,8 @@
 
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import pairwise
 
-import numpy as np
 import torch
 from torch import Generator, Tensor
 
@@ -31,6 +31,7 @@ from codesign.types import EventStream
 
 EVENTS_PER_PIXEL = 1.0  # room made at first; on a processor, what no event writes to is no memory
 KEY_BITS = 63
+NEAR = 1 << 20  # pixels of all frames whose events sort together
 
 
 @torch.no_grad()
@@ -199,50 +200,46 @@ def _fired(counts, t_us):
 
 
 def _v2e_events(frames, times_s, sensor, generator, state, front_end):
-    parts = []
+    """Stream of the events between frames, of a few at a time, whose keys stay near the processor
+    while they sort."""
+    found, streams = [], []
     for frame, time_s in zip(frames, times_s, strict=True):
         check_frames(frame[None], 1, non_negative=not front_end.log_input)
         intensity = frame.exp() if front_end.log_input else frame
         level = v2e.levels(frame, front_end)
-        parts.append(v2e.interval(intensity, level, time_s, sensor, generator, state))
-    t_us, x, y, p = (torch.cat(column) for column in zip(*parts, strict=True))
-    return ordered(t_us, x, y, p, *frames.shape[1:])
+        found.append(v2e.interval(intensity, level, time_s, sensor, generator, state))
+        if len(found) * frame.numel() >= NEAR or time_s == times_s[-1]:
+            t_us, x, y, p = (torch.cat(column) for column in zip(*found, strict=True))
+            streams.append(ordered(t_us, x, y, p, *frame.shape))
+            found = []
+    if any(a.t_us[-1] >= b.t_us[0] for a, b in pairwise(filter(len, streams))):
+        return concatenate(streams)
+    columns = zip(*((part.t_us, part.x, part.y, part.p) for part in streams), strict=True)
+    t_us, x, y, p = map(torch.cat, columns)
+    return EventStream(t_us, x, y, p, *frames.shape[1:])
 
 
 @exclusive
 def _interpolated(frames, times_s, sensor, generator, state, front_end, layout):
     """Stream of the events between frames; keys are views of drjit's memory, which nobody else may
-    use meanwhile."""
-    keys = []
+    use meanwhile. A chunk busier than the room made for it is run again with the room it needs."""
+    parts = []
     lanes = Lanes(frames, frames[0].numel())
     size = backend.frames_per_kernel(lanes.width)
     density = EVENTS_PER_PIXEL
     for first in range(0, len(frames), size):
-        chunk = frames[first : first + size], times_s[first : first + size]
-        keys.append(
-            _interpolated_keys(lanes, *chunk, sensor, generator, state, front_end, layout, density)
-        )
-        density = max(density, 1.25 * len(keys[-1]) / chunk[0].numel())
-    together = keys[0] if len(keys) == 1 else np.concatenate(keys)
-    return EventStream(*layout.columns(lanes, together), layout.height_px, layout.width_px)
-
-
-def _interpolated_keys(
-    lanes, frames, times_s, sensor, generator, state, front_end, layout, density
-):
-    """Sorted keys of the events of one chunk; a chunk busier than the room made for it is run again
-    with the room it needs."""
-    random_keys = _random_keys(len(frames), sensor, state, generator)
-    starts_s = [state.time_s, *times_s[:-1]]
-    capacity = 4096 + int(density * frames.numel())
-    while True:
-        sink = EventKeys(lanes, starts_s, times_s, layout, capacity)
-        trial = replace(state)
-        _advance(lanes, frames, times_s, random_keys, sensor, trial, front_end, sink)
-        if sink.found <= capacity:
-            state.__dict__.update(trial.__dict__)
-            return sink.sorted()
-        capacity = sink.found
+        chunk, ends_s = frames[first : first + size], times_s[first : first + size]
+        random_keys = _random_keys(len(chunk), sensor, state, generator)
+        had_room = False
+        while not had_room:
+            sink = EventKeys(lanes, [state.time_s, *ends_s[:-1]], ends_s, layout, density)
+            trial = replace(state)
+            _advance(lanes, chunk, ends_s, random_keys, sensor, trial, front_end, sink)
+            had_room, found = sink.counted()
+            density = max(density, 1.25 * found)
+        state.__dict__.update(trial.__dict__)
+        parts += sink.sorted()
+    return EventStream(*layout.columns(lanes, parts), layout.height_px, layout.width_px)
 
 
 def _random_keys(count, sensor, state, generator):
