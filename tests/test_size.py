@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parents[1]
 UNCOUNTED = (ast.expr_context, ast.operator, ast.unaryop, ast.cmpop, ast.boolop)
 BUDGETS = {
     "codesign": 10_340,  # a pose out of its rotation and its place, for mounts and paths alike, what is differentiable once, threads of a torch that came first
-    "codesign/events": 49_330,  # leaks that have begun before, counts that a type holds, kinds of TIFFs, noise events of all intervals at once, times too coarse, keys that sort by groups in 32 bits, lanes of several neighbours, what moved the play
+    "codesign/events": 49_330,  # leaks that have begun before, kinds of TIFFs, noise of all intervals at once, times too coarse, keys of 32 bits by groups, lanes of several neighbours, what moved the play
     "codesign/fidelity": 3_030,  # stages without a level, levels that are told wrong
     "codesign/flow": 43_210,  # truth that is unknown, windows that share no event, polarities told two ways, truths without a time, windows that are checked once
     "codesign/grad": 3_370,  # stairs of single precision in double
