@@ -207,14 +207,15 @@ class Tracker:
             )
         height, width = self.size_px
         _, x, y, _ = rows
-        outside = (x < 0) | (x >= width) | (y < 0) | (y >= height)
-        rows = self._without(
-            OFF_SENSOR, outside, rows, f"lies outside the sensor of {width} x {height} px"
-        )
+        if not (_within(x, width) and _within(y, height)):
+            outside = (x < 0) | (x >= width) | (y < 0) | (y >= height)
+            said = f"lies outside the sensor of {width} x {height} px"
+            rows = self._without(OFF_SENSOR, outside, rows, said)
         t_us = rows[0]
         before = t_us[:1] if self._last_us is None else t_us.new_tensor([self._last_us])
-        latest = torch.cat([before, t_us]).cummax(0).values[1:] if len(t_us) else t_us
-        rows = self._without(BACKWARDS, t_us < latest, rows, "lies before {} us", latest)
+        if bool((t_us < torch.cat([before, t_us[:-1]])[: len(t_us)]).any()):
+            latest = torch.cat([before, t_us]).cummax(0).values[1:]
+            rows = self._without(BACKWARDS, t_us < latest, rows, "lies before {} us", latest)
         check_stream(EventStream(*rows, height, width))
         return rows
 
@@ -306,6 +307,11 @@ class Tracker:
         self.processor_s += spent_s
         self.event_s += (t1_us - t0_us) * 1e-6
         return self._before
+
+
+def _within(column, size):
+    """Whether all of them lie on an axis of so many pixels."""
+    return not len(column) or (int(column.min()) >= 0 and int(column.max()) < size)
 
 
 def _takes_start(estimate):

@@ -18,9 +18,9 @@ import math
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, pad
+from torch.nn.functional import pad
 
-from codesign.flow.lk.blur import blurred
+from codesign.flow.lk.blur import blurred, pooled
 from codesign.flow.lk.lanes import Grid
 from codesign.flow.lk.path import Path, even, path
 from codesign.flow.lk.polynomials import Moments, Polynomials
@@ -125,7 +125,7 @@ class Level:
         self.stride = stride(sigma_px, min(shape.height, shape.width))
         self.grid = Grid(shape.height, shape.width, self.stride)
         self.counts = blurred_to(way.counts, sigma_px, self.grid)
-        self.density = avg_pool2d(density, self.stride) if self.stride > 1 else density
+        self.density = pooled(density, self.stride)
         self.moments = Moments(shape, self.grid, density)
         weight, time = bins
         self.place = time - weight @ time
