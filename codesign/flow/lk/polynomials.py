@@ -6,7 +6,7 @@ coordinates that reach from -1 to 1 along the longer side. Parameters are [B, 2K
 q_1..q_K.
 """
 
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import torch
 from torch import Tensor
@@ -27,7 +27,10 @@ FIXED_POINT_STEPS = 4  # each gains a factor of half the flow's gradient, some 0
 
 
 class Polynomials:
-    """Fields of one model over an image of height x width pixels."""
+    """Fields of one model over an image of height x width pixels.
+
+    unit: [2K, 2K], equations (``_equations``): float64.
+    """
 
     def __init__(
         self,
@@ -43,9 +46,9 @@ class Polynomials:
         self.height = height
         self.width = width
         self.half = max(height, width) / 2
-        # [2K, 2K]: parameters = unit @ numbers that are independent and of variance 1
-        self.unit = torch.linalg.cholesky(torch.linalg.inv(self.prior_precision(prior_px))).to(
-            device
+        # unit [2K, 2K]: parameters = unit @ numbers that are independent and of variance 1
+        self.unit, self.equations = (
+            torch.from_numpy(each).to(device=device) for each in _by_prior(model, float(prior_px))
         )
 
     def scaled(self, x_px: Tensor, y_px: Tensor) -> tuple[Tensor, Tensor]:
@@ -55,51 +58,6 @@ class Polynomials:
     def basis(self, u: Tensor, v: Tensor, dim: int = 0) -> Tensor:
         """[..., K at dim, ...]."""
         return torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v][: self.terms], dim)
-
-    def prior_precision(self, prior_px: float) -> Tensor:
-        """Inverse covariance [2K, 2K] of the parameters, per px^2: constant, divergence, rotation,
-        two shears, quadratic terms, all independent."""
-        k = self.terms
-        unit = torch.eye(2 * k, dtype=torch.float64)
-        precision = torch.zeros(2 * k, 2 * k, dtype=torch.float64)
-        independent = [(unit[0], 1.0), (unit[k], 1.0)]
-        if k >= 3:
-            ux = unit[1]
-            uy = unit[2]
-            vx = unit[k + 1]
-            vy = unit[k + 2]
-            independent += [
-                ((ux + vy) / 2, AFFINE),
-                ((vx - uy) / 2, AFFINE),
-                ((ux - vy) / 2, SHEAR),
-                ((vx + uy) / 2, SHEAR),
-            ]
-        if k == 6:
-            independent += [(unit[i + offset], QUADRATIC) for i in (3, 4, 5) for offset in (0, k)]
-        for direction, relative in independent:
-            precision += torch.outer(direction, direction) / (relative * prior_px) ** 2
-        return precision
-
-    @cached_property
-    def equations(self) -> Tensor:
-        """Sums over an image to normal equations, which are linear in them:
-        [8 s^2, 8 K^2 + 2 K + 2], float64.
-
-        Rows: the sums of ``slopes.cell_sums`` times y^i x^j, i, j < s = 2 degree + 1. Columns: in
-        units of the prior the matrix of the slopes and that of events as slopes along x and y, [2K,
-        2K] each, and the pull [2K]; then energy of the temporal slopes, and events.
-        """
-        side = 2 * self.degree + 1
-        one = torch.eye(8 * side**2, dtype=torch.float64, device=self.unit.device)
-        sums = one.unflatten(1, (8, side, side))
-        x, y = self.powers.T
-        xx, xy, yy, events = sums[:, [0, 1, 2, 7]][..., y[:, None] + y, x[:, None] + x].unbind(1)
-        none = torch.zeros_like(events)
-        slopes = torch.cat([torch.cat([xx, xy], 2), torch.cat([xy, yy], 2)], 1)
-        scattered = torch.cat([torch.cat([events, none], 2), torch.cat([none, events], 2)], 1)
-        pull = -sums[:, 3:5][..., y, x].flatten(1)
-        matrices = [(self.unit.T @ matrix @ self.unit).flatten(1) for matrix in (slopes, scattered)]
-        return torch.cat([*matrices, pull @ self.unit, sums[:, 5, 0, :1], sums[:, 7, 0, :1]], 1)
 
     @cached_property
     def second_moments(self) -> Tensor:
@@ -147,6 +105,60 @@ class Polynomials:
         place = (sums[:, None] == powers).all(2).to(covariance)  # [K^2, M]
         blocks = torch.stack([covariance[:, :k, :k], covariance[:, :k, k:], covariance[:, k:, k:]])
         return blocks.flatten(2) @ place
+
+
+@lru_cache(maxsize=64)
+def _by_prior(model, prior_px):
+    """``unit`` and ``equations`` of a model, float64, as arrays: no mode of torch that a caller is
+    in stays with them."""
+    powers = torch.tensor(POWERS[: TERMS[model]])
+    unit = torch.linalg.cholesky(torch.linalg.inv(_prior_precision(len(powers), prior_px)))
+    return unit.cpu().numpy(), _equations(powers, unit).cpu().numpy()
+
+
+def _prior_precision(k, prior_px):
+    """Inverse covariance [2K, 2K] of the parameters, per px^2: constant, divergence, rotation,
+    two shears, quadratic terms, all independent."""
+    unit = torch.eye(2 * k, dtype=torch.float64)
+    precision = torch.zeros(2 * k, 2 * k, dtype=torch.float64)
+    independent = [(unit[0], 1.0), (unit[k], 1.0)]
+    if k >= 3:
+        ux = unit[1]
+        uy = unit[2]
+        vx = unit[k + 1]
+        vy = unit[k + 2]
+        independent += [
+            ((ux + vy) / 2, AFFINE),
+            ((vx - uy) / 2, AFFINE),
+            ((ux - vy) / 2, SHEAR),
+            ((vx + uy) / 2, SHEAR),
+        ]
+    if k == 6:
+        independent += [(unit[i + offset], QUADRATIC) for i in (3, 4, 5) for offset in (0, k)]
+    for direction, relative in independent:
+        precision += torch.outer(direction, direction) / (relative * prior_px) ** 2
+    return precision
+
+
+def _equations(powers, unit):
+    """Sums over an image to normal equations, which are linear in them:
+    [8 s^2, 8 K^2 + 2 K + 2], float64.
+
+    Rows: the sums of ``slopes.cell_sums`` times y^i x^j, i, j < s = 2 degree + 1. Columns: in
+    units of the prior the matrix of the slopes and that of events as slopes along x and y, [2K,
+    2K] each, and the pull [2K]; then energy of the temporal slopes, and events.
+    """
+    side = 2 * int(powers.sum(1).max()) + 1
+    one = torch.eye(8 * side**2, dtype=torch.float64)
+    sums = one.unflatten(1, (8, side, side))
+    x, y = powers.T
+    xx, xy, yy, events = sums[:, [0, 1, 2, 7]][..., y[:, None] + y, x[:, None] + x].unbind(1)
+    none = torch.zeros_like(events)
+    slopes = torch.cat([torch.cat([xx, xy], 2), torch.cat([xy, yy], 2)], 1)
+    scattered = torch.cat([torch.cat([events, none], 2), torch.cat([none, events], 2)], 1)
+    pull = -sums[:, 3:5][..., y, x].flatten(1)
+    matrices = [(unit.T @ matrix @ unit).flatten(1) for matrix in (slopes, scattered)]
+    return torch.cat([*matrices, pull @ unit, sums[:, 5, 0, :1], sums[:, 7, 0, :1]], 1)
 
 
 class Moments:
