@@ -308,14 +308,15 @@ def timed(
 
 def is_worse(row: dict[str, Any], kept: dict[str, Any]) -> bool:
     """Whether a ratio is more than WORSE of the committed one."""
-    return row["over_yardstick"] > WORSE * kept["over_yardstick"]
+    alike = row["yardstick"] == kept["yardstick"]
+    return alike and row["over_yardstick"] > WORSE * kept["over_yardstick"]
 
 
 def worse(found: dict[str, dict[str, Any]], kept: dict[str, Any]) -> list[str]:
     """Sentences on ratios that are worse, and on work that is not there."""
     said = [f"{name}: no longer measured" for name in kept if name not in found]
     for name, row in found.items():
-        if name not in kept:
+        if name not in kept or kept[name]["yardstick"] != row["yardstick"]:
             said.append(f"{name}: not in docs/bench.json; measure with --write")
         elif is_worse(row, kept[name]):
             said.append(

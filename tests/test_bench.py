@@ -12,18 +12,18 @@ bench = script("bench")
 
 
 def test_a_slowdown_fails_and_says_of_what():
-    kept = {"trace": {"over_yardstick": 2.0}, "lost": {"over_yardstick": 1.0}}
+    def row(ratio, yardstick="rows"):
+        return {"over_yardstick": ratio, "yardstick": yardstick}
 
-    def row(ratio):
-        return {"over_yardstick": ratio, "yardstick": "copy"}
-
-    said = bench.worse({"trace": row(2.5), "new": row(1.0)}, kept)
+    kept = {"trace": row(2.0), "lost": row(1.0), "moved": row(1.0, "copy")}
+    said = bench.worse({"trace": row(2.5), "new": row(1.0), "moved": row(9.0)}, kept)
     assert said == [
         "lost: no longer measured",
-        "trace: 2.5 times its copy, 2 when committed",
+        "trace: 2.5 times its rows, 2 when committed",
         "new: not in docs/bench.json; measure with --write",
+        "moved: not in docs/bench.json; measure with --write",
     ]
-    assert bench.worse({"trace": row(2.3), "lost": row(0.1)}, kept) == []
+    assert bench.worse({"trace": row(2.3), "lost": row(0.1), "moved": row(1, "copy")}, kept) == []
 
 
 def test_a_ratio_is_that_of_work_and_yardstick(monkeypatch):

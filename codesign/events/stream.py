@@ -51,14 +51,16 @@ def ordered(
     _check_columns(t_us, x, y, p, height_px, width_px)
     x_bits, y_bits = (int(side - 1).bit_length() for side in (width_px, height_px))
     bits = x_bits + y_bits + 1
-    if len(t_us) and int(t_us.max()) - int(t_us.min()) < 2 ** (63 - bits):
-        times_us, since = None, t_us - t_us.min()
-    else:
-        times_us, since = t_us.unique(return_inverse=True)
-    key = sorted_keys((since << bits) | (y << (x_bits + 1)) | (x << 1) | (p > 0))
-    t_us = (key >> bits) + t_us.min() if times_us is None else times_us[key >> bits]
-    x, y = (key >> 1) & ((1 << x_bits) - 1), (key >> (x_bits + 1)) & ((1 << y_bits) - 1)
-    return EventStream(t_us, x, y, 2 * (key & 1) - 1, int(height_px), int(width_px))
+    place = (y << (x_bits + 1)) | (x << 1) | (p > 0)
+    if len(t_us) and int(t_us.max()) - (first_us := int(t_us.min())) < 2 ** (63 - bits):
+        key = sorted_keys(((t_us - first_us) << bits) | place)
+        x, y = (key >> 1) & ((1 << x_bits) - 1), (key >> (x_bits + 1)) & ((1 << y_bits) - 1)
+        columns = (key >> bits) + first_us, x, y, 2 * (key & 1) - 1
+    else:  # more than one number holds
+        rank = torch.argsort(place, stable=True)
+        rank = rank[torch.argsort(t_us[rank], stable=True)]
+        columns = t_us[rank], x[rank], y[rank], p[rank]
+    return EventStream(*columns, int(height_px), int(width_px))
 
 
 def check_stream(

@@ -116,8 +116,11 @@ def _check_attributes(mi, shape, emitter):
                 f"radiance of '{shape.id()}': the mesh has no attribute '{name}', so it would be black; add "
                 "it (mesh.add_attribute), or name one that is there."
             )
+        numbers = mi.traverse(shape)
+        if name not in numbers:  # a picture
+            continue
         held = shape.face_count() if name.startswith("face") else shape.vertex_count()
-        size = len(mi.traverse(shape)[name]) / max(held, 1)
+        size = len(numbers[name]) / max(held, 1)
         if size not in (1, 3):
             raise DomainError(
                 f"radiance of '{shape.id()}': attribute '{name}' has {size:g} numbers each; one, or three "
@@ -139,7 +142,7 @@ def _check_shape(mi, name, shape):
             name,
             *(np.array(parameters[key]).reshape(-1, 3) for key in ("vertex_positions", "faces")),
         )
-        if (attribute_of(shape.bsdf()) or "").startswith("vertex"):
+        if re.search(r'MeshAttribute\[\s*name = "vertex_', str(shape.bsdf())):
             _check_thick(name, vertices[faces])
         attributes = (
             key
@@ -243,11 +246,11 @@ def _against_normals(shape, parameters, faces):
     return (across(corners) * normals.sum(1)).sum(1) < 0
 
 
-def attribute_of(surface: Any) -> str | None:
-    """Name of the attribute at vertices or faces that an emitter or material of Mitsuba shows, None
-    where it shows none."""
-    found = re.search(r'MeshAttribute\[\s*name = "((?:vertex|face)_\w+)"', str(surface))
-    return found[1] if found else None
+def attribute_of(mi: Any, shape: Any, emitter: Any) -> str | None:
+    """Name of the attribute at vertices or faces of a mesh that its emitter shows, as it is and
+    without anything else; None where it shows none."""
+    found = re.search(r'radiance = MeshAttribute\[\s*name = "((?:vertex|face)_\w+)"', str(emitter))
+    return found[1] if found and shape.is_mesh() and found[1] in mi.traverse(shape) else None
 
 
 def attribute_at(mi: Any, shape: Any, name: str, si: Any) -> Any:

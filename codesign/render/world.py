@@ -185,7 +185,7 @@ class MitsubaScene:
         import drjit as dr
 
         si.wi = self.mi.Vector3f(0, 0, facing)
-        name = attribute_of(emitter)
+        name = attribute_of(self.mi, shape, emitter)
         if name is None:
             return eval_repeated(self.mi, emitter, si, self._repeats.get(emitter))[0]
         scale = float(self.mi.traverse(emitter)["radiance.scale"])

@@ -6,7 +6,7 @@ import os
 import socket
 import sys
 from collections.abc import Callable, Generator, Mapping
-from concurrent.futures import ThreadPoolExecutor, as_completed, wait
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from threading import Event
 from typing import Any, TypeVar
@@ -17,16 +17,21 @@ from studies.frame import bench
 
 Key = TypeVar("Key")
 TRIES = 3
+PACE_S = 0.5
 PATIENCE_S = 5.0  # with the head of a cluster
 HERE = "here"  # a Ray of this machine's own, for the time of the calls
 
 
 def in_processes(
-    function: Callable[..., Any], calls: Mapping[Key, Mapping[str, Any]], processes: int
+    function: Callable[..., Any],
+    calls: Mapping[Key, Mapping[str, Any]],
+    processes: int,
+    meanwhile: Callable[[], object] = lambda: None,
 ) -> Generator[tuple[Key, Any]]:
     """What a function of the top level of a module returns for the arguments of each call, in the
     order in which they are
-    done: so many fresh processes at a time.
+    done: so many fresh processes at a time; ``meanwhile`` is called every PACE_S, and ends them all
+    where it raises.
 
     Raises: CodesignError of a call that fails, or whose worker was killed TRIES times.
     """
@@ -44,8 +49,12 @@ def in_processes(
     with ThreadPoolExecutor(processes) as pool:
         waiting = {pool.submit(tried, given): key for key, given in calls.items()}
         try:
-            for done in as_completed(waiting):
-                yield waiting[done], done.result()
+            left = set(waiting)
+            while left:
+                done, left = wait(left, PACE_S, FIRST_COMPLETED)
+                meanwhile()
+                for each in done:
+                    yield waiting[each], each.result()
         finally:
             ending.set()
             pool.shutdown(wait=False, cancel_futures=True)

@@ -9,6 +9,7 @@ and ends with the same bytes. The layout is described in docs/datasets.md.
 import io
 import itertools
 import math
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -23,7 +24,7 @@ import torch
 
 from codesign import lens
 from codesign.atomic import write_atomic
-from codesign.errors import DomainError
+from codesign.errors import CodesignError, DomainError
 from codesign.events import SensorModel, SensorState, simulate
 from codesign.fidelity import Task
 from codesign.fidelity.levels import Fidelity, camera_at
@@ -42,6 +43,7 @@ from studies.frame import workers
 from studies.frame.bench import resident_mb as resident_mb_now
 from studies.frame.config import check_least, read_config
 from studies.frame.fidelity import Tolerant, chosen
+from studies.frame.folder import held
 from studies.frame.run import Run, main
 from studies.make_dataset import page as pages
 from studies.make_dataset import store
@@ -139,10 +141,22 @@ def study(run: Run[Config]) -> None:
         if config.processes:
             beside = {"fidelity": asdict(fidelity)} if fidelity else {}
             calls = {index: {**given, **beside} for index, given in missing.items()}
-            with closing(workers.in_processes(made, calls, config.processes)) as answers:
+
+            told_of = list(ready)
+
+            def advance(index, chunks):
+                while told_of[index] < chunks:
+                    told_of[index] += 1
+                    progress.advance(sequence=index)
+
+            def look():
+                for index in missing:
+                    advance(index, store.parts_done(folders[index]))
+
+            answering = workers.in_processes(made, calls, config.processes, look)
+            with closing(answering) as answers:
                 for index, told in answers:
-                    for _ in range(ready[index], maker.chunks):
-                        progress.advance(sequence=index, events=told["events"])
+                    advance(index, maker.chunks)
                     for part, seconds in told.pop("spent").items():
                         maker.clock.spent[part] += seconds
                     found.append(told)
@@ -165,7 +179,13 @@ def made(folder: str, index: int, fidelity: dict[str, Any] | None = None) -> dic
     drjit.set_thread_count(1)
     config = read_config(Path(folder).parent / "config.json", "make_dataset", Config)
     maker = Maker(config, Fidelity(**fidelity) if fidelity else None)
-    return {**maker.make(index, Path(folder)), "spent": maker.clock.spent}
+    parent = os.getppid()
+
+    def go_on(**_):
+        if os.getppid() != parent:  # a run that goes on has workers of its own
+            raise CodesignError("the run that asked has ended.")
+
+    return {**maker.make(index, Path(folder), go_on), "spent": maker.clock.spent}
 
 
 def checked(config):
@@ -259,15 +279,16 @@ class Maker:
     def make(
         self, index: int, folder: Path, advance: Callable[..., Any] = lambda **_: None
     ) -> dict[str, float]:
-        """What is missing of a sequence; ``advance`` is told each chunk. Returns: events of the last
-        chunk, memory that is held."""
-        sequence = Sequence(self, index, folder)
-        events = 0
-        for chunk in range(store.parts_done(folder), self.chunks):
-            events = sequence.make(chunk)
-            advance(sequence=index, events=events)
-        sequence.finish()
-        return {"events": events, "resident_mb": resident_mb_now()}
+        """What is missing of a sequence; ``advance`` is told each chunk. Returns: memory that is
+        held. Raises: CodesignError where another process, of a run that was killed, is at it."""
+        folder.mkdir(parents=True, exist_ok=True)
+        with held(folder):
+            if not store.is_done(folder):
+                sequence = Sequence(self, index, folder)
+                for chunk in range(store.parts_done(folder), self.chunks):
+                    advance(sequence=index, events=sequence.make(chunk))
+                sequence.finish()
+        return {"resident_mb": resident_mb_now()}
 
     def path(self, index):
         family = FAMILIES[index % len(FAMILIES)]

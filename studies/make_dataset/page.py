@@ -115,7 +115,7 @@ def show(run, names, spent, wall_s, frames_made):
         {"part": part, "seconds": seconds, "ms per frame": 1e3 * seconds / max(frames_made, 1)}
         for part, seconds in spent.items()
     ]
-    caption = "Of this session. Writing includes joining the parts and the statistics."
+    caption = "Of this session, all processes together. Writing includes joining the parts and the statistics."
     run.table("Time", *table(times), caption)
     run.text("`manifest.json` holds the SHA-256 of every file; `docs/datasets.md` the layout.")
     run.finish(

@@ -323,3 +323,22 @@ def test_chunks_around_a_long_interval_are_the_whole_in_single_precision():
         for chunk in (slice(5), slice(5, None))
     ]
     assert same(events.concatenate(parts), whole)
+
+
+def test_one_flash_in_a_long_recording_has_room():
+    """A level that jumps by 9000 once fires 900,000 events of 0.01; the intervals before and after
+    are too long for keys of 32 bits, so each is a group of its own."""
+    level = torch.zeros(5000, 1, 1)
+    level[2500:] = 9000.0
+    t_s = torch.arange(5000, dtype=torch.float64) * 300
+    found = simulate(level, t_s, SensorModel(theta_on=0.01, theta_off=0.01), log_input=True)
+    assert len(found) == 900_000
+    assert found.in_order
+
+
+def test_events_of_the_largest_sensors_are_put_in_order():
+    """Places alone fill 63 bits."""
+    zero, one = torch.zeros(2, dtype=torch.int64), torch.ones(2, dtype=torch.int64)
+    side = 2**31 - 1
+    found = ordered(torch.tensor([5, 0]), zero, zero + side - 1, one, side, side)
+    assert found.t_us.tolist() == [0, 5]

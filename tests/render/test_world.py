@@ -7,6 +7,7 @@ import torch
 from codesign import backend, lens, render
 from codesign.pose import look_at
 from codesign.render import Camera
+from codesign.render.charts import emissive_mesh
 from scenes import textures, worlds
 from tests.numbers import D, close
 
@@ -197,3 +198,24 @@ def test_an_attribute_of_three_colours_shows_its_luminance(at):
         camera, render.MitsubaScene({"square": square}), look_at((0, -2, 0), (0, 0, 0))[None]
     )
     close(found, torch.full((1, 6, 6), 0.2126 * 10 + 0.7152 * 20 + 0.0722 * 30), rtol=1e-3)
+
+
+def test_a_picture_named_as_an_attribute_and_an_attribute_within_a_picture_show(tmp_path):
+    """Mitsuba's own evaluation has them, not the short way of plain attributes."""
+    mi = backend.mitsuba()
+    camera = render.Camera(lens.Pinhole(4.0), 6, 6, 0.5, 4)
+    facing = mi.ScalarTransform4f().translate([0, 0, 3]).rotate([0, 1, 0], 180)
+    squares = {"type": "checkerboard", "color0": 5.0, "color1": 9.0}
+    named = {"type": "mesh_attribute", "name": "face_squares"}
+    within = {"type": "checkerboard", "color0": {"type": "mesh_attribute", "name": "face_radiance"}}
+    plain = emissive_mesh(
+        mi, np.array([[-1.0, -1, 3], [1, -1, 3], [1, 1, 3]]), np.array([[0, 2, 1]]), np.array([7.0])
+    )
+    picture = {"type": "rectangle", "to_world": facing, "face_squares": squares}
+    picture["emitter"] = {"type": "area", "radiance": named}
+    plain.write_ply(str(mesh := tmp_path / "mesh.ply"))
+    mixed = {"type": "ply", "filename": str(mesh)}
+    mixed["emitter"] = {"type": "area", "radiance": within | {"color1": 7.0}}
+    for shape, seen in ((picture, {5.0, 9.0}), (mixed, {7.0})):
+        image = render.frames(camera, render.MitsubaScene({"shape": shape}), torch.eye(4)[None])
+        assert seen <= set(image.flatten().tolist())

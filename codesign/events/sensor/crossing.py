@@ -28,6 +28,7 @@ from codesign.events.stream import sorted_keys
 # of a pixel in one interval: beyond it a unit is wrong, and single precision would soon stop
 # counting
 MOST_EVENTS = 1e6
+UNEVEN = 4  # times the mean of all groups, beyond which room for each as for the fullest is waste
 APART = 16  # counts of groups stand apart by a line of the processor's memory
 # what changes from frame to frame
 CARRIED = (
@@ -74,9 +75,10 @@ class EventKeys:
     polarity, from high to low bits. Groups of intervals have room and an origin of their own, so
     that they sort apart, in 32 bits where those hold an interval, and threads seldom meet."""
 
-    def __init__(self, lanes, start_s, end_s, layout, density):
+    def __init__(self, lanes, start_s, end_s, layout, density, total=None):
         """Args: start_s, end_s: lists, ends of every interval, seconds. layout: KeyLayout. density:
-        events per pixel and interval that every group has room for."""
+        events per pixel and interval that every group has room for. total: of events, for which one
+        group has room instead."""
         dr, arr = lanes.dr, lanes.arr
         start_s, end_s = np.array(start_s), np.array(end_s)
         start_us, end_us = (
@@ -85,12 +87,13 @@ class EventKeys:
         lasts_us, bits = end_us - start_us, layout.pixel_bits
         # as many intervals, as a power of 2, as have keys of 32 bits from their middle on; all in 64
         # bits where not one has, and where events of two groups might come at one time
-        fit = int(2 ** (32 - bits) - 1) // int(lasts_us.max()) if lasts_us.min() > 0 else 0
+        apart = total is None and lasts_us.min() > 0
+        fit = int(2 ** (32 - bits) - 1) // int(lasts_us.max()) if apart else 0
         shift = fit.bit_length() - 1 if fit else 31
         origins_us = start_us[:: 1 << shift] + (2 ** (31 - bits) if fit else 0)
         self._origins = ((origins_us - layout.origin_us) << bits).tolist()
         self._pixels = lanes.width * min(1 << shift, len(start_s))
-        self._room = 4096 + int(density * self._pixels)
+        self._room = total or 4096 + int(density * self._pixels)
         # of single precision a chunk with a long interval would round otherwise than the whole
         self._Time = dr.float64_array_t(arr.Float)
         self._Key = (dr.int32_array_t if fit else dr.int64_array_t)(arr.Float)
@@ -134,10 +137,13 @@ class EventKeys:
         return self._keys, self._counts
 
     def counted(self):
-        """Whether all events had room, and how many came per pixel and interval in the fullest
-        group."""
+        """Whether all events had room; how many came per pixel and interval in the fullest group,
+        and None. Where that has most of all: in the mean, and the total."""
         self._found = self._counts.numpy()[::APART].tolist()
-        return max(self._found) <= self._room, max(self._found) / self._pixels
+        fullest, total, groups = max(self._found), sum(self._found), len(self._found)
+        uneven = groups * fullest > UNEVEN * total
+        density = total / groups if uneven else fullest
+        return fullest <= self._room, density / self._pixels, total if uneven else None
 
     def sorted(self):
         """List of an origin and the [N] keys from it in order, for every group."""

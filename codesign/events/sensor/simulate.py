@@ -230,12 +230,12 @@ def _interpolated(frames, times_s, sensor, generator, state, front_end, layout):
     for first in range(0, len(frames), size):
         chunk, ends_s = frames[first : first + size], times_s[first : first + size]
         random_keys = _random_keys(len(chunk), sensor, state, generator)
-        had_room = False
+        had_room, total = False, None
         while not had_room:
-            sink = EventKeys(lanes, [state.time_s, *ends_s[:-1]], ends_s, layout, density)
+            sink = EventKeys(lanes, [state.time_s, *ends_s[:-1]], ends_s, layout, density, total)
             trial = replace(state)
             _advance(lanes, chunk, ends_s, random_keys, sensor, trial, front_end, sink)
-            had_room, found = sink.counted()
+            had_room, found, total = sink.counted()
             density = max(density, 1.25 * found)
         state.__dict__.update(trial.__dict__)
         parts += sink.sorted()
