@@ -128,20 +128,15 @@ def study(run: Run[Config]) -> None:
         for index in range(config.trajectories)
     ]
     folders = [run.folder / name for name in names]
-    ready = [
-        maker.chunks if store.is_done(folder) else store.parts_done(folder) for folder in folders
-    ]
-    missing = {
-        index: {"folder": str(folder), "index": index}
-        for index, folder in enumerate(folders)
-        if not store.is_done(folder)
-    }
-    found = []
+    missing = [index for index, folder in enumerate(folders) if not store.is_done(folder)]
+    ready = [maker.chunks] * len(folders)
+    for index in missing:
+        ready[index] = store.parts_done(folders[index])
+    resident_mb = []
     with run.progress(maker.chunks * len(names), "chunks", sum(ready)) as progress:
         if config.processes:
-            beside = {"fidelity": asdict(fidelity)} if fidelity else {}
-            calls = {index: {**given, **beside} for index, given in missing.items()}
-
+            same = {"fidelity": asdict(fidelity) if fidelity else None}
+            calls = {k: {"folder": str(folders[k]), "index": k, **same} for k in missing}
             told_of = list(ready)
 
             def advance(index, chunks):
@@ -157,24 +152,27 @@ def study(run: Run[Config]) -> None:
             with closing(answering) as answers:
                 for index, told in answers:
                     advance(index, maker.chunks)
-                    for part, seconds in told.pop("spent").items():
+                    for part, seconds in told["spent"].items():
                         maker.clock.spent[part] += seconds
-                    found.append(told)
+                    resident_mb.append(told["resident_mb"])
         else:
-            found += [maker.make(index, folders[index], progress.advance) for index in missing]
+            for index in missing:
+                maker.make(index, folders[index], progress.advance)
+                resident_mb.append(resident_mb_now())
     wall_s = time.perf_counter() - start
     write_atomic(run.folder / "manifest.json", store.manifest(run.folder, names).encode())
-    if found:
-        first, last = (found[k]["resident_mb"] for k in (0, -1))
-        run.record(session_resident_mb_first=first, session_resident_mb_last=last)
+    if resident_mb:
+        run.record(
+            session_resident_mb_first=resident_mb[0], session_resident_mb_last=resident_mb[-1]
+        )
     fresh = sum(max(config.frames - done * maker.chunk_frames, 0) for done in ready)
     pages.show(run, names, maker.clock.spent, wall_s, fresh)
 
 
 @torch.no_grad()
-def made(folder: str, index: int, fidelity: dict[str, Any] | None = None) -> dict[str, Any]:
-    """A sequence of the run around its folder, in a process that knows nothing yet, on one thread:
-    as of ``Maker.make``, and seconds ``spent``."""
+def made(folder: str, index: int, fidelity: dict[str, Any] | None) -> dict[str, Any]:
+    """A sequence of the run around its folder, in a process that knows nothing yet, on one thread.
+    Returns: memory that is held, and seconds ``spent``."""
     torch.set_num_threads(1)
     drjit.set_thread_count(1)
     config = read_config(Path(folder).parent / "config.json", "make_dataset", Config)
@@ -185,7 +183,8 @@ def made(folder: str, index: int, fidelity: dict[str, Any] | None = None) -> dic
         if os.getppid() != parent:  # a run that goes on has workers of its own
             raise CodesignError("the run that asked has ended.")
 
-    return {**maker.make(index, Path(folder), go_on), "spent": maker.clock.spent}
+    maker.make(index, Path(folder), go_on)
+    return {"resident_mb": resident_mb_now(), "spent": maker.clock.spent}
 
 
 def checked(config):
@@ -276,11 +275,9 @@ class Maker:
         self.segments = Segments(self.scene)
         self.clock = Clock()
 
-    def make(
-        self, index: int, folder: Path, advance: Callable[..., Any] = lambda **_: None
-    ) -> dict[str, float]:
-        """What is missing of a sequence; ``advance`` is told each chunk. Returns: memory that is
-        held. Raises: CodesignError where another process, of a run that was killed, is at it."""
+    def make(self, index: int, folder: Path, advance: Callable[..., Any]) -> None:
+        """Make what is missing of a sequence; ``advance`` is told each chunk. Raises: CodesignError
+        where another process, of a run that was killed, is at it."""
         folder.mkdir(parents=True, exist_ok=True)
         with held(folder):
             if not store.is_done(folder):
@@ -288,7 +285,6 @@ class Maker:
                 for chunk in range(store.parts_done(folder), self.chunks):
                     advance(sequence=index, events=sequence.make(chunk))
                 sequence.finish()
-        return {"resident_mb": resident_mb_now()}
 
     def path(self, index):
         family = FAMILIES[index % len(FAMILIES)]
