@@ -2,6 +2,7 @@
 
 import copy
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -366,10 +367,11 @@ def project(camera: Camera, points_cam_m: Tensor, pupil: Tensor | None = None) -
         apart_px = _STEP_MM / camera.film.pixel_pitch_mm
         one = camera.in_one_colour()
         rough = images(one, points_cam_m, pupil, colour, guess, apart_px, 1e-6)
-    rays = camera.rays_through(rough.at_px, pupil)
+    found = rough.step_px.isfinite()
+    near_px = torch.where(found[:, None], rough.at_px, camera.film.middle_px.to(rough.at_px))
+    rays = camera.rays_through(near_px, pupil)
     base, slope = lines(rays)
     miss = base + slope * points_cam_m[:, 2:] - points_cam_m[:, :2]
-    found = rough.step_px.isfinite()
     change = torch.linalg.solve(rough.m_per_px, torch.where(found[:, None], miss, 0))
     found = (
         found
@@ -377,7 +379,7 @@ def project(camera: Camera, points_cam_m: Tensor, pupil: Tensor | None = None) -
         & (rays.direction.detach()[:, 2] > 1e-6)
         & (change.detach().abs() < 1e-3).all(1)
     )
-    at_px = torch.where(found[:, None], rough.at_px - change, torch.nan).reshape(shape)
+    at_px = torch.where(found[:, None], near_px - change, torch.nan).reshape(shape)
     return differentiable_once(
         at_px, "project: its gradient has none of its own; use differences of gradients."
     )
@@ -421,7 +423,9 @@ def images(
     rows = torch.arange(len(at), device=at.device)
     for _ in range(_NEWTON_STEPS):
         film_px = (at[rows] - step[rows] + shifts[:, None]).reshape(-1, 2)
-        rays = camera.coloured_rays(film_px, pupil[rows].repeat(3, 1), colour[rows].repeat(3))
+        with warnings.catch_warnings():  # a search looks where no light passes, too
+            warnings.filterwarnings("ignore", ".* rays cannot be aimed", UserWarning)
+            rays = camera.coloured_rays(film_px, pupil[rows].repeat(3, 1), colour[rows].repeat(3))
         origin, direction = (v.reshape(3, -1, 3) for v in (rays.origin_m, rays.direction))
         passes = ((rays.weight.reshape(3, -1) > 0) & (direction[..., 2] > 1e-6)).all(0)
         slopes = direction[..., :2] / torch.where(passes[:, None], direction[..., 2:], 1.0)

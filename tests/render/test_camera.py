@@ -96,6 +96,12 @@ def test_points_outside_the_field_are_nan_and_leave_the_others_alone():
     assert project(camera, inside[:0]).shape == (0, 2)
 
 
+def test_a_search_that_finds_no_light_says_nothing():
+    camera = Camera(lens.load("cooke-triplet").scaled(0.22), 24, 24, 8 / 24, 1, aim=True)
+    found = project(camera, f64([[1.0, 0.0, 1.0], [0.0, 0.0, 1.0]]))  # warnings are errors here
+    assert found[0].isnan().all() and found[1].isfinite().all()
+
+
 @pytest.mark.parametrize("semi_aperture_mm", [0.02, 0.2])
 def test_points_behind_the_edge_of_an_aperture_are_nan(semi_aperture_mm):
     """The stop is seen through a plane 3 mm behind it, in glass of 1.5: the exit pupil lies 2 mm
