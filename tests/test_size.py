@@ -16,7 +16,7 @@ BUDGETS = {
     "codesign/lens": 48_420,  # makers of glass, fans of single precision, stops and apertures in their own axes, forecasts of nothing, what a line says beside a name, cones at a distance, a stop that cuts a pupil
     "codesign/mount": 14_970,  # rays traced once for several depths, films looked at all over, angles in degrees, blur of the whole pupil, points that stand alone, a mount prints where it is, two nearnesses at once
     "codesign/optimise": 3_940,  # rates in a state
-    "codesign/render": 43_970,  # chief rays of a spectrum, curves as the real pupil sees them, no second derivatives, attributes at faces, and of colours
+    "codesign/render": 44_000,  # chief rays of a spectrum, quiet searches, curves as the real pupil sees them, no second derivatives, attributes at faces, and of colours
     "codesign/report": 7_710,  # unknown flow, paths from above, wheels beside flow, corners without light, samples beside frames, directions of a sphere in any order
     "codesign/system": 9_820,  # truth of what is read, a lens in its camera, bins that were asked for, one colour handed over, truth of another interval, refusals that lose nothing
     "codesign/train": 5_870,  # bins of windows, ends of sources, losses by what is in them
@@ -54,7 +54,7 @@ BUDGETS = {
     "tests/lens": 36_730,  # stops of their own axes, dense transforms, makers of glass, pictures of even sizes, names that count, cones at a distance
     "tests/mount": 14_060,  # blur of a wide lens, lone points, gradients to the flow
     "tests/optimise": 3_440,  # a state is a copy; schedules, weights that nothing reaches, rates in a state
-    "tests/render": 29_360,  # outlines from the real pupil, no second derivatives, attributes of colours
+    "tests/render": 29_410,  # quiet searches, outlines from the real pupil, no second derivatives, attributes of colours
     "tests/scenes": 20_540,  # polygons from every corner, colours of materials and vertices, tints colour by colour
     "tests/studies": 34_880,  # blur over the view, families that are slower, blur that is drawn, first lines that are true, the best of all answers, files that change, few starts, all robots together
     "tests/system": 6_600,  # estimates of their own kind, one colour handed over, levels that are told wrong, truth of another interval
