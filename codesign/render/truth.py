@@ -236,8 +236,8 @@ def follow(optics: Camera | ProjectionTable, hits: Hits, later: Tensor, pixels: 
     points, in_front = _before(hits, later)
     chief = None
     if isinstance(optics, ProjectionTable):
-        to, *chief = (v.unflatten(0, points.shape[:2]) for v in optics(points.flatten(0, 1)))
-        chief = tuple(chief)
+        to, *lines = (v.unflatten(0, points.shape[:2]) for v in optics(points.flatten(0, 1)))
+        chief = tuple(lines)
     else:
         to = project(optics, points)
     valid = in_front & ~to.detach().isnan().any(-1)

@@ -9,7 +9,6 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
-import drjit
 import torch
 from torch import Tensor
 
@@ -121,20 +120,13 @@ def run_arm(
     }
 
 
-def with_threads(threads: int) -> None:
-    """Leave so many threads to a process that works beside others; 0: as it is."""
-    if threads:
-        torch.set_num_threads(threads)
-        drjit.set_thread_count(threads)
-
-
 def racing(seed: int, arm: str, setting: Mapping[str, Any], threads: int = 0) -> dict[str, Any]:
     """``run_arm`` in a process that may know nothing yet.
 
     setting: of the race, plain values. threads: that the process may use, beside others; 0: as it
       is.
     """
-    with_threads(threads)
+    workers.with_threads(threads)
     sizes = setting["steps"], setting["settling"], setting.get("near")
     found = run_arm(training(setting), arm, seed, *sizes)
     return {**found, "setting": dict(setting)}

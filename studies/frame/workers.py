@@ -11,6 +11,9 @@ from contextlib import contextmanager
 from threading import Event
 from typing import Any, TypeVar
 
+import drjit
+import torch
+
 from codesign.errors import CodesignError
 from codesign.optional import require
 from studies.frame import bench
@@ -20,6 +23,13 @@ TRIES = 3
 PACE_S = 0.5
 PATIENCE_S = 5.0  # with the head of a cluster
 HERE = "here"  # a Ray of this machine's own, for the time of the calls
+
+
+def with_threads(threads: int) -> None:
+    """Leave so many threads to a process that works beside others; 0: as it is."""
+    if threads:
+        torch.set_num_threads(threads)
+        drjit.set_thread_count(threads)
 
 
 def in_processes(

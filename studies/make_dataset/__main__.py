@@ -18,7 +18,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-import drjit
 import numpy as np
 import torch
 
@@ -173,8 +172,7 @@ def study(run: Run[Config]) -> None:
 def made(folder: str, index: int, fidelity: dict[str, Any] | None) -> dict[str, Any]:
     """A sequence of the run around its folder, in a process that knows nothing yet, on one thread.
     Returns: memory that is held, and seconds ``spent``."""
-    torch.set_num_threads(1)
-    drjit.set_thread_count(1)
+    workers.with_threads(1)
     config = read_config(Path(folder).parent / "config.json", "make_dataset", Config)
     maker = Maker(config, Fidelity(**fidelity) if fidelity else None)
     parent = os.getppid()
