@@ -135,7 +135,8 @@ def presence(counts: Tensor) -> Tensor:
 def pad_to(image: Tensor, stride: int) -> Tensor:
     """Zeros to the right and below, up to the next multiple of ``stride``; pixels keep their
     places. Crop with ``[..., :H, :W]``."""
-    return pad(image, (0, -image.shape[-1] % stride, 0, -image.shape[-2] % stride))
+    beyond = 0, -image.shape[-1] % stride, 0, -image.shape[-2] % stride
+    return pad(image, beyond) if any(beyond) else image  # no copy
 
 
 def to_field(flow_px: Tensor, volume: EventVolume) -> FlowField:

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import avg_pool2d, pad, pixel_shuffle, silu, unfold
+from torch.nn.functional import avg_pool2d, pad, pixel_shuffle, silu
 
 from codesign.checks import check_whole
 from codesign.errors import DomainError
@@ -105,19 +105,24 @@ class Refiner(nn.Module):
         Raises: ShapeError for other shapes or numbers of bins; DomainError for counts that are no
           events.
         """
-        return self.predictions(volume, start_px, clock)[-1]
+        return self.predictions(volume, start_px, clock, every=False)[-1]
 
     @takes_volume
     def predictions(
-        self, volume: EventVolume, start_px: Tensor | None = None, clock: str = "time"
+        self,
+        volume: EventVolume,
+        start_px: Tensor | None = None,
+        clock: str = "time",
+        every: bool = True,
     ) -> list[FlowField]:
-        """FlowFields after each correction. Arguments, gradient and errors as ``forward``."""
+        """FlowFields after each correction, or the last alone. Arguments, gradient and errors as
+        ``forward``."""
         start = self.start(volume, start_px, clock)
         with torch.autocast(volume.counts.device.type, enabled=False):
             share = _bends(start.flow_px)
         return [
             _mixed(volume, start, field, share)
-            for field in self.refined(volume, start, clock=clock)
+            for field in self.refined(volume, start, clock=clock, every=every)
         ]
 
     def start(
@@ -132,11 +137,16 @@ class Refiner(nn.Module):
             return estimate_lk(volume, model="local", start_px=start_px, clock=clock)
 
     def refined(
-        self, volume: EventVolume, start: FlowField, through: bool = True, clock: str = "time"
+        self,
+        volume: EventVolume,
+        start: FlowField,
+        through: bool = True,
+        clock: str = "time",
+        every: bool = True,
     ) -> list[FlowField]:
-        """FlowFields after each whole correction, as it is trained, of an estimate with covariance,
-        such as ``start(volume)``, whose covariance says how far it may be off. Gradient: counts,
-        start and weights.
+        """FlowFields after each whole correction, as it is trained, or after the last alone, of an
+        estimate with covariance, such as ``start(volume)``, whose covariance says how far it may be
+        off. Gradient: counts, start and weights.
 
         through: False leaves out the gradient through the places at which bins are read, as in the
           training of RAFT (Teed and Deng, ECCV 2020): it takes a third off a step.
@@ -152,7 +162,7 @@ class Refiner(nn.Module):
         told = torch.cat([near.log(), far.log(), (deviation + SPARE_PX2).log()], 1) / 4
         unit = (deviation + SMALLEST_PX2).sqrt()
         found = []
-        for _ in range(self.config["steps"]):
+        for left in reversed(range(self.config["steps"])):
             with torch.autocast(flow.device.type, enabled=False):
                 where = flow if through else flow.detach()
                 known, solved = evidence.at(where, unit.square())
@@ -164,7 +174,9 @@ class Refiner(nn.Module):
             own, shares = self.change(core).split([2, SOLVED + len(AROUND)], 1)
             moves = torch.cat([solved, offered], 1)
             flow = flow + unit * own + (shares[:, :, None] * moves).sum(1)
-            found.append((_on_pixels(net * (flow - first), self.edges(core)), self.claim(core)))
+            if every or not left:
+                change = _on_pixels(net * (flow - first), self.edges(core))
+                found.append((change, self.claim(core)))
         present = presence(volume.counts)
         shown = present * evidence.net.clamp_min(0) ** TURNS
         return [_field(volume, start, present, shown, *parts) for parts in found]
@@ -192,12 +204,17 @@ def mixed(image: Tensor, logits: Tensor) -> Tensor:
     """Pixels [B, C, side h, side w] of an image [B, C, h, w] on cells: each a mean of the nine
     cells around, by weights of these logits [B, 9 side^2, h, w]. Source: Teed and Deng, RAFT, ECCV
     2020, sec. 3.3."""
-    channels, rows, columns = image.shape[1:]
+    rows, columns = image.shape[2:]
     side = math.isqrt(logits.shape[1] // 9)
-    weights = logits.unflatten(1, (9, side, side)).softmax(1).flatten(4)
-    around = unfold(pad(image, (1, 1, 1, 1), mode="replicate"), 3).unflatten(1, (channels, 9))
-    found = torch.einsum("bnijp,bcnp->bcijp", weights, around)
-    return pixel_shuffle(found.flatten(1, 3).unflatten(2, (rows, columns)), side)
+    weights = logits.unflatten(1, (9, side, side)).softmax(1)
+    around = pad(image, (1, 1, 1, 1), mode="replicate")[:, :, None, None]
+    found = sum(
+        weights[:, None, 3 * down + right]
+        * around[..., down : down + rows, right : right + columns]
+        for down in range(3)
+        for right in range(3)
+    )
+    return pixel_shuffle(found.flatten(1, 3), side)
 
 
 def _on_pixels(image, edges):

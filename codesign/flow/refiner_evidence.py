@@ -96,7 +96,7 @@ class Evidence:
             )
             sums = cell_sums(mean, slope, seen, density, grid, CELL // blur)
             for size in sizes:
-                wide = avg_pool2d(sums, size, 1, size // 2) * size**2
+                wide = _around(sums, size) * size**2
                 here, sure, trust = self._solved(wide, blur, variance)
                 told += [here, sure, trust]
                 solved += [here, sure]
@@ -121,7 +121,7 @@ class Evidence:
                 counts, there, self.time, self.contrast, grid, fade_px=1.0 + blur
             )
             square = avg_pool2d((seen * mean.square())[:, None], CELL // blur)
-            return [avg_pool2d(square, size, 1, size // 2) for size in TRIED_IN]
+            return [_around(square, size) for size in TRIED_IN]
 
         told = []
         offered = []
@@ -176,6 +176,13 @@ class Evidence:
         ]
         free = torch.stack([u, v], 1)
         return _within(free, 3.0 * blur), _within(sure, 3.0 * blur), torch.stack(trust, 1)
+
+
+def _around(image, size):
+    """Means of an image [B, C, h, w] over squares of so many cells a side, an odd number, around each
+    cell; 0 beyond its border."""
+    along = avg_pool2d(image, (1, size), 1, (0, size // 2))
+    return avg_pool2d(along, (size, 1), 1, (size // 2, 0))
 
 
 def _within(flow, reach):

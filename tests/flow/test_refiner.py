@@ -92,6 +92,14 @@ def test_a_fresh_network_is_the_closed_form(size):
         assert torch.equal(made(given, **options).flow_px, closed)
 
 
+def test_the_flow_is_that_after_the_last_correction():
+    given = in_even_bins(drawn(1, 2, 8, 32, 24, rate=0.3, seed=2))
+    made = network()
+    whole, *before = reversed(made.predictions(given))
+    assert torch.equal(made(given).flow_px, whole.flow_px)
+    assert (whole.flow_px - before[0].flow_px).abs().max() > 1e-3
+
+
 def on_noise():
     return [HARSH["noise"](SEED, 8).batch(range(8))]
 
