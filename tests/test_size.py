@@ -47,7 +47,7 @@ BUDGETS = {
     "tests": 15_280,  # words of numbers for all rooms, pictures of poses, pycollada, arrays of far paths
     "tests/data": 1_000,
     "tests/events": 30_350,  # flashes, largest sensors, rates of leaks in short runs, sums over wide spreads, times with decimals
-    "tests/flow": 27_830,  # chunks that may come again
+    "tests/flow": 27_890,  # the last correction alone, chunks that may come again
     "tests/gradients": 3_400,  # single precision in double
     "tests/hard_cases": 2_540,
     "tests/hostile": 19_030,
