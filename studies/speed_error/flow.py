@@ -16,9 +16,9 @@ from codesign.flow.baselines import FlowNetEvents, SpikeFlowNet
 from codesign.flow.baselines.parts import count_weights
 from codesign.flow.metrics import aee
 from codesign.flow.refiner import Refiner
-from codesign.types import EventStream, EventVolume
+from codesign.types import EventStream, EventVolume, FlowField
 from scenes import trajectories, worlds
-from studies.frame.bench import cost
+from studies.frame.bench import cost, installed
 from studies.frame.run import Run
 from studies.frame.show import Asked, tabulate
 from studies.frame.sweep import sweep
@@ -30,6 +30,8 @@ CELLS = "closed form with cells"
 REFINER = "refiner"
 TWO_LEVELS = ", two levels, no warm start"
 PUBLISHED = "Spike-FlowNet form"
+SEARCH = "dense inverse search"
+PEERS = {SEARCH: "cv2"}
 SIZE_PX = 256
 SIZES_PX = (128, 256, 512, 1024)
 SMALL = (64, 32)  # pixels a side and number of windows, as loops that design a lens take them
@@ -89,10 +91,17 @@ def stage(run: Run[Config]) -> list[Asked]:
 
 def live_stage(run: Run[Config]) -> list[Asked]:
     """Live streams, 30 windows a second of a camera that moves through a room, on all threads: the
-    clock over the time of a window, and the flow's error over that of zero flow. Medians over
-    windows, the first three left out; in turns, each in a process of its own."""
+    clock over the time of a window, and the flow's error over that of zero flow; beside them dense
+    inverse search, where OpenCV is installed. Medians over windows, the first three left out; in
+    turns, each in a process of its own."""
     rows = sweep(
-        run, live, "live", 1, run.config.rounds, sensor=LIVE, estimator=list(LIVE_ESTIMATORS)
+        run,
+        live,
+        "live",
+        1,
+        run.config.rounds,
+        sensor=LIVE,
+        estimator=[name for name in LIVE_ESTIMATORS if name not in PEERS or installed(PEERS)],
     )
     tabulate(
         run, "A window of a live stream, all threads", rows, "sensor", "estimator", prefix="live"
@@ -104,6 +113,7 @@ def live_stage(run: Run[Config]) -> list[Asked]:
             most=1.0,
         )
         for row in rows
+        if row["estimator"] not in PEERS
     ]
 
 
@@ -130,6 +140,23 @@ ESTIMATORS: dict[str, Callable[[int], Any]] = {
 }
 
 
+def inverse_search(volume: EventVolume) -> FlowField:
+    """Dense inverse search (Kroeger et al., ECCV 2016) as OpenCV has it, between the event images of a
+    window's halves: bytes, white where a pixel has three times the mean of those with events."""
+    import cv2  # pyright: ignore[reportMissingImports]
+
+    half = volume.counts.shape[2] // 2
+    pair = [part.sum(0) for part in volume.counts[0].sum(0).split(half)[:2]]
+    white = 3 * max(float(pair[0].sum() / (pair[0] > 0).sum().clamp_min(1)), 1.0)
+    images = [(255 * (image / white).clamp(max=1)).byte().numpy() for image in pair]
+    search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    found = torch.from_numpy(search.calc(*images, None)).movedim(-1, 0)[None]
+    before, after = (part.mean() for part in volume.centroid_s.split(half)[:2])
+    whole_s = float(volume.collected_s.sum())
+    seen = torch.ones_like(found[:, 0], dtype=torch.bool)
+    return FlowField(found * (whole_s / float(after - before)), seen, whole_s)
+
+
 FAST = {"levels_px": (4.0, 2.0), "steps": 2}
 LIVE_ESTIMATORS: dict[str, Callable[[], Any]] = {
     CLOSED: lambda: estimate_lk,
@@ -137,6 +164,7 @@ LIVE_ESTIMATORS: dict[str, Callable[[], Any]] = {
     CELLS: lambda: partial(estimate_lk, model="local"),
     f"{CELLS}{TWO_LEVELS}": lambda: partial(estimate_lk, model="local", **FAST),
     REFINER: lambda: load("refiner"),
+    SEARCH: lambda: inverse_search,
 }
 
 
