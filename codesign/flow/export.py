@@ -2,15 +2,23 @@
 operation has a counterpart, ONNX (.onnx)."""
 
 import contextlib
+import gc
 import io
 import logging
 import warnings
+from collections import defaultdict
+from functools import partial
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.fx.experimental.proxy_tensor import make_fx
+from torch.fx import Graph
+from torch.fx.node import map_aggregate
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from codesign.atomic import replacing
 from codesign.checks import check, check_kind, check_path, check_whole
@@ -62,7 +70,8 @@ def export(
         raise DomainError(
             f"'{path.name}' is no program file; give a name that ends in .pt2 (torch.export) or .onnx."
         )
-    with replacing(path) as temporary:  # where nothing can be written, nothing is traced
+    # where nothing can be written, nothing is traced
+    with replacing(path) as temporary, _uncollected():
         program = trace(network, height_px, width_px, batch)
         if path.suffix == ".pt2":
             buffer = io.BytesIO()
@@ -73,6 +82,19 @@ def export(
             temporary.write_bytes(buffer.getvalue())
         else:
             temporary.write_bytes(_onnx(program, type(network).__name__))
+
+
+@contextlib.contextmanager
+def _uncollected():
+    """Without the search for garbage, which among the millions of parts of a program takes as long
+    as writing it."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
 
 
 def trace(
@@ -107,29 +129,134 @@ def trace(
     counts = torch.zeros(batch, 2, config["bins"], height_px, width_px, device=device)
     with modes_kept(network), torch.no_grad(), plain_operations():
         network.eval()
-        # traced with values, since torch.export alone cannot follow a check for finite input or a
-        # number computed from the bins' times
-        graph = make_fx(program, tracing_mode="real", _error_on_data_dependent_ops=False)(counts)
-        _tidy(graph)
-        return torch.export.export(graph, (counts,), strict=False)
+        recording = _Recording(program, counts)
+        if recording.writes:
+            recording = _Recording(program, counts, shortens=False)
+        return _exported(recording, counts)
 
 
-def _tidy(graph):
-    """Drop what only looked at values while tracing; give every constant storage of its own, so
-    that none is saved with a larger one it is a view of."""
-    for looking in (
-        torch.ops.aten._local_scalar_dense.default,
-        torch.ops.aten._linalg_check_errors.default,
-    ):
-        for node in graph.graph.find_nodes(op="call_function", target=looking):
-            if not node.users:
-                graph.graph.erase_node(node)
-    graph.graph.eliminate_dead_code()
-    for name in {node.target for node in graph.graph.find_nodes(op="get_attr")}:
-        value = getattr(graph, name).detach().clone()
-        delattr(graph, name)
-        setattr(graph, name, value)
-    graph.recompile()
+class _Recording(TorchDispatchMode):
+    """Operations of a function with their values, since torch.export alone cannot follow a check
+    for finite input or a number computed from the bins' times.
+
+    shortens: what does not depend on the counts becomes a constant, and equal operations one, which
+      is right as long as nothing writes into a tensor (``writes``).
+    graph: with get_attr nodes for ``constants``. found: what the function returned.
+    """
+
+    def __init__(self, function, counts, shortens=True):
+        super().__init__()
+        self.shortens = shortens
+        self.writes = False
+        self.graph = Graph()
+        self.constants = {}
+        self.known = defaultdict(list)
+        self.nodes = WeakTensorKeyDictionary()
+        self.nodes[counts] = self.graph.placeholder("counts")
+        with self:
+            self.found = function(counts)
+        self.graph.output(tuple(self.node(value) for value in self.found))
+        self.graph.eliminate_dead_code()
+
+    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        drawn = torch.Tag.nondeterministic_seeded in operation.tags
+        tensors = [value for value in tree_leaves((args, kwargs)) if isinstance(value, Tensor)]
+        if self.shortens and not drawn and not any(value in self.nodes for value in tensors):
+            return operation(*args, **kwargs)
+        given = map_aggregate((args, kwargs), self.node)
+        found = operation(*args, **kwargs)
+        self.writes |= operation._schema.is_mutable
+        if self.shortens and isinstance(found, Tensor) and _is(found, args[0]):
+            self.nodes[found] = self.node(args[0])
+        elif isinstance(found, Tensor | list | tuple):  # others only looked at values
+            node = self.called(operation, *given, found, drawn)
+            for number, part in enumerate([] if isinstance(found, Tensor) else found):
+                self.nodes[part] = self.called(getitem, (node, number), {}, part)
+            if isinstance(found, Tensor):
+                self.nodes[found] = node
+        return found
+
+    def called(self, operation, args, kwargs, found, drawn=False):
+        same = self.known[str((operation, args, kwargs))]
+        if not same or drawn or not self.shortens:
+            same[:] = [self.graph.call_function(operation, args, kwargs)]
+            same[0].meta["val"] = map_aggregate(found, _like)
+        return same[0]
+
+    def node(self, value):
+        """Of a tensor; other values as they are."""
+        if not isinstance(value, Tensor):
+            return value
+        if value in self.nodes:
+            return self.nodes[value]
+        # of its own storage: a view would be saved with all that it is a view of
+        constant = value.detach().clone()
+        bits = constant.reshape(-1).view(torch.uint8)
+        same = self.known[value.shape, value.stride(), value.dtype, value.device]
+        for node, others in same if self.shortens else []:
+            if torch.equal(bits, others):
+                return node
+        name = f"constant_{len(self.constants)}"
+        self.constants[name] = constant
+        node = self.graph.get_attr(name)
+        same.append((node, bits))
+        if not self.shortens:
+            self.nodes[value] = node
+        return node
+
+
+def _is(found, given):
+    """Whether what an operation found is its argument."""
+    return isinstance(given, Tensor) and all(
+        getattr(found, name)() == getattr(given, name)()
+        for name in ("data_ptr", "type", "size", "stride", "is_conj", "is_neg")
+    )
+
+
+def _like(found):
+    """Maker of tensors with the layout of one that was found."""
+    if not isinstance(found, Tensor):
+        return found
+    return partial(
+        torch.empty_strided, found.size(), found.stride(), dtype=found.dtype, device=found.device
+    )
+
+
+class _Frame(nn.Module):
+    """Inputs, constants and outputs of a program, without what leads from one to the other."""
+
+    def __init__(self, recording):
+        super().__init__()
+        for node in recording.graph.find_nodes(op="get_attr"):
+            self.register_buffer(node.target, recording.constants[node.target])
+        self.found = [_like(value) for value in recording.found]
+
+    def forward(self, counts):
+        return tuple(make().clone() for make in self.found)
+
+
+def _exported(recording, counts):
+    """ExportedProgram of a recording. torch.export would trace each operation again, which takes
+    several times as long as all the rest: it traces a frame, which the operations are put into."""
+    program = torch.export.export(_Frame(recording), (counts,), strict=False)
+    graph = program.graph
+    places = {node.name: node for node in graph.find_nodes(op="placeholder")}
+    buffers = program.graph_signature.inputs_to_buffers
+    values = {buffers.get(name, "counts"): node for name, node in places.items()}
+    known = {node: values[node.target] for node in recording.graph.nodes if node.target in values}
+    with values["counts"].meta["val"].fake_mode:
+        for node in recording.graph.nodes:
+            if node.op == "call_function":
+                node.meta["val"] = map_aggregate(node.meta["val"], lambda make: make and make())
+    ends = graph.output_node().args[0]
+    with graph.inserting_before(ends[0]):
+        found = graph.graph_copy(recording.graph, known)
+    for end, node in zip(ends, found, strict=True):
+        end.args = (node,)
+    graph.eliminate_dead_code()
+    program.graph_module.recompile()
+    return program
 
 
 def eliminate(matrix: Tensor, right: Tensor) -> Tensor:
