@@ -6,14 +6,13 @@ import gc
 import io
 import logging
 import warnings
-from collections import defaultdict
-from functools import partial
 from operator import getitem
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.fx import Graph
 from torch.fx.node import map_aggregate
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -29,6 +28,10 @@ from codesign.flow.lk.lanes import plain_operations
 from codesign.flow.sources.windows import bin_times
 from codesign.optional import require
 from codesign.types import EventVolume
+
+aten = torch.ops.aten
+# that give what they are given where it keeps its shape
+SAME = (aten.alias.default, aten.detach.default, aten.expand.default, aten.view.default)
 
 
 def evenly_timed(counts: Tensor) -> EventVolume:
@@ -71,7 +74,10 @@ def export(
             f"'{path.name}' is no program file; give a name that ends in .pt2 (torch.export) or .onnx."
         )
     # where nothing can be written, nothing is traced
-    with replacing(path) as temporary, _uncollected():
+    with replacing(path) as temporary, contextlib.ExitStack() as after:
+        if gc.isenabled():  # its search among the many parts of a program takes half of the time
+            after.callback(gc.enable)
+            gc.disable()
         program = trace(network, height_px, width_px, batch)
         if path.suffix == ".pt2":
             buffer = io.BytesIO()
@@ -82,19 +88,6 @@ def export(
             temporary.write_bytes(buffer.getvalue())
         else:
             temporary.write_bytes(_onnx(program, type(network).__name__))
-
-
-@contextlib.contextmanager
-def _uncollected():
-    """Without the search for garbage, which among the millions of parts of a program takes as long
-    as writing it."""
-    collects = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if collects:
-            gc.enable()
 
 
 def trace(
@@ -132,7 +125,7 @@ def trace(
         recording = _Recording(program, counts)
         if recording.writes:
             recording = _Recording(program, counts, shortens=False)
-        return _exported(recording, counts)
+        return recording.exported(counts)
 
 
 class _Recording(TorchDispatchMode):
@@ -140,8 +133,7 @@ class _Recording(TorchDispatchMode):
     for finite input or a number computed from the bins' times.
 
     shortens: what does not depend on the counts becomes a constant, and equal operations one, which
-      is right as long as nothing writes into a tensor (``writes``).
-    graph: with get_attr nodes for ``constants``. found: what the function returned.
+      is right as long as no operation ``writes`` into a tensor.
     """
 
     def __init__(self, function, counts, shortens=True):
@@ -149,40 +141,55 @@ class _Recording(TorchDispatchMode):
         self.shortens = shortens
         self.writes = False
         self.graph = Graph()
-        self.constants = {}
-        self.known = defaultdict(list)
+        self.layouts = FakeTensorMode()
+        self.known = {}
         self.nodes = WeakTensorKeyDictionary()
         self.nodes[counts] = self.graph.placeholder("counts")
         with self:
-            self.found = function(counts)
-        self.graph.output(tuple(self.node(value) for value in self.found))
+            found = function(counts)
+        self.graph.output(map_aggregate(found, self.node))
         self.graph.eliminate_dead_code()
 
     def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
-        kwargs = kwargs or {}
-        drawn = torch.Tag.nondeterministic_seeded in operation.tags
-        tensors = [value for value in tree_leaves((args, kwargs)) if isinstance(value, Tensor)]
-        if self.shortens and not drawn and not any(value in self.nodes for value in tensors):
-            return operation(*args, **kwargs)
-        given = map_aggregate((args, kwargs), self.node)
-        found = operation(*args, **kwargs)
+        given = args, kwargs or {}
+        shortens = self.shortens and torch.Tag.nondeterministic_seeded not in operation.tags
+        tensors = (part for part in tree_leaves(given) if isinstance(part, Tensor))
+        if shortens and not any(part in self.nodes for part in tensors):
+            return operation(*given[0], **given[1])
+        nodes = map_aggregate(given, self.node)
+        found = operation(*given[0], **given[1])
         self.writes |= operation._schema.is_mutable
-        if self.shortens and isinstance(found, Tensor) and _is(found, args[0]):
-            self.nodes[found] = self.node(args[0])
+        if shortens and operation in SAME and found.shape == args[0].shape:
+            self.nodes[found] = nodes[0][0]
         elif isinstance(found, Tensor | list | tuple):  # others only looked at values
-            node = self.called(operation, *given, found, drawn)
-            for number, part in enumerate([] if isinstance(found, Tensor) else found):
-                self.nodes[part] = self.called(getitem, (node, number), {}, part)
-            if isinstance(found, Tensor):
-                self.nodes[found] = node
+            key = str((operation, nodes)) if shortens else object()
+            node = self.once(key, self.graph.call_function, operation, *nodes)
+            node.meta["val"] = map_aggregate(found, self.layout)
+            for number, part in enumerate([found] if isinstance(found, Tensor) else found):
+                if part is found:
+                    self.nodes[part] = node
+                elif part is not None:
+                    each = self.once(
+                        (node, number), self.graph.call_function, getitem, (node, number)
+                    )
+                    each.meta["val"] = node.meta["val"][number]
+                    self.nodes[part] = each
         return found
 
-    def called(self, operation, args, kwargs, found, drawn=False):
-        same = self.known[str((operation, args, kwargs))]
-        if not same or drawn or not self.shortens:
-            same[:] = [self.graph.call_function(operation, args, kwargs)]
-            same[0].meta["val"] = map_aggregate(found, _like)
-        return same[0]
+    def once(self, key, make, *given):
+        if key not in self.known:
+            self.known[key] = make(*given)
+        return self.known[key]
+
+    def layout(self, value):
+        with self.layouts:
+            return (
+                value
+                if value is None
+                else torch.empty_strided(
+                    value.size(), value.stride(), dtype=value.dtype, device=value.device
+                )
+            )
 
     def node(self, value):
         """Of a tensor; other values as they are."""
@@ -190,73 +197,31 @@ class _Recording(TorchDispatchMode):
             return value
         if value in self.nodes:
             return self.nodes[value]
-        # of its own storage: a view would be saved with all that it is a view of
-        constant = value.detach().clone()
-        bits = constant.reshape(-1).view(torch.uint8)
-        same = self.known[value.shape, value.stride(), value.dtype, value.device]
-        for node, others in same if self.shortens else []:
-            if torch.equal(bits, others):
-                return node
-        name = f"constant_{len(self.constants)}"
-        self.constants[name] = constant
-        node = self.graph.get_attr(name)
-        same.append((node, bits))
-        if not self.shortens:
-            self.nodes[value] = node
+        bits = value.detach().reshape(-1).view(torch.uint8).cpu().numpy().tobytes()
+        key = value.stride(), value.type(), value.device, bits if self.shortens else id(value)
+        node = self.once(key, self.graph.get_attr, f"constant_{len(self.known)}")
+        # a view would be saved with all that it is a view of
+        node.meta.setdefault("val", value.detach().clone())
         return node
 
-
-def _is(found, given):
-    """Whether what an operation found is its argument."""
-    return isinstance(given, Tensor) and all(
-        getattr(found, name)() == getattr(given, name)()
-        for name in ("data_ptr", "type", "size", "stride", "is_conj", "is_neg")
-    )
-
-
-def _like(found):
-    """Maker of tensors with the layout of one that was found."""
-    if not isinstance(found, Tensor):
-        return found
-    return partial(
-        torch.empty_strided, found.size(), found.stride(), dtype=found.dtype, device=found.device
-    )
-
-
-class _Frame(nn.Module):
-    """Inputs, constants and outputs of a program, without what leads from one to the other."""
-
-    def __init__(self, recording):
-        super().__init__()
-        for node in recording.graph.find_nodes(op="get_attr"):
-            self.register_buffer(node.target, recording.constants[node.target])
-        self.found = [_like(value) for value in recording.found]
-
-    def forward(self, counts):
-        return tuple(make().clone() for make in self.found)
-
-
-def _exported(recording, counts):
-    """ExportedProgram of a recording. torch.export would trace each operation again, which takes
-    several times as long as all the rest: it traces a frame, which the operations are put into."""
-    program = torch.export.export(_Frame(recording), (counts,), strict=False)
-    graph = program.graph
-    places = {node.name: node for node in graph.find_nodes(op="placeholder")}
-    buffers = program.graph_signature.inputs_to_buffers
-    values = {buffers.get(name, "counts"): node for name, node in places.items()}
-    known = {node: values[node.target] for node in recording.graph.nodes if node.target in values}
-    with values["counts"].meta["val"].fake_mode:
-        for node in recording.graph.nodes:
-            if node.op == "call_function":
-                node.meta["val"] = map_aggregate(node.meta["val"], lambda make: make and make())
-    ends = graph.output_node().args[0]
-    with graph.inserting_before(ends[0]):
-        found = graph.graph_copy(recording.graph, known)
-    for end, node in zip(ends, found, strict=True):
-        end.args = (node,)
-    graph.eliminate_dead_code()
-    program.graph_module.recompile()
-    return program
+    def exported(self, counts):
+        """ExportedProgram. torch.export would trace each operation again, which takes longer than
+        all the rest; it traces a frame for them: constants, input and outputs."""
+        places = [*self.graph.find_nodes(op="get_attr"), *self.graph.find_nodes(op="placeholder")]
+        frame = nn.Module()
+        frame.forward = lambda counts: (counts.clone(), counts.clone())
+        for place in places[:-1]:
+            frame.register_buffer(place.target, place.meta["val"])
+        program = torch.export.export(frame, (counts,), strict=False)
+        known = dict(zip(places, program.graph.find_nodes(op="placeholder"), strict=True))
+        ends = program.graph.output_node().args[0]
+        with program.graph.inserting_before(ends[0]):
+            found = program.graph.graph_copy(self.graph, known)
+        for end, node in zip(ends, found, strict=True):
+            end.args = (node,)
+            end.meta["val"] = node.meta["val"]
+        program.graph_module.recompile()
+        return program
 
 
 def eliminate(matrix: Tensor, right: Tensor) -> Tensor:
