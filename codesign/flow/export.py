@@ -14,9 +14,8 @@ import torch
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.fx import Graph
-from torch.fx.node import map_aggregate
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
+from torch.utils._pytree import tree_leaves, tree_map_only
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from codesign.atomic import replacing
@@ -29,9 +28,8 @@ from codesign.flow.sources.windows import bin_times
 from codesign.optional import require
 from codesign.types import EventVolume
 
-aten = torch.ops.aten
 # that give what they are given where it keeps its shape
-SAME = (aten.alias.default, aten.detach.default, aten.expand.default, aten.view.default)
+SAME = "aten.alias.default", "aten.detach.default", "aten.expand.default", "aten.view.default"
 
 
 def evenly_timed(counts: Tensor) -> EventVolume:
@@ -99,15 +97,13 @@ def trace(
     """torch.export's ExportedProgram of a network, in evaluation mode.
 
     What depends on the bins' times alone becomes a constant. The program looks at no value and so
-    refuses
-    none: counts that are not finite give a flow that is not.
+    refuses none: counts that are not finite give a flow that is not.
     """
 
     def program(counts):
         field = network(evenly_timed(counts))
-        return field.flow_px, field.valid.to(
-            field.flow_px
-        ) if field.confidence is None else field.confidence
+        sure = field.valid.to(field.flow_px) if field.confidence is None else field.confidence
+        return field.flow_px, sure
 
     height_px, width_px, batch = (
         check_whole(value, name, 1, MOST_SIDE_PX)
@@ -133,7 +129,7 @@ class _Recording(TorchDispatchMode):
     for finite input or a number computed from the bins' times.
 
     shortens: what does not depend on the counts becomes a constant, and equal operations one, which
-      is right as long as no operation ``writes`` into a tensor.
+      is right as long as none ``writes`` into a tensor.
     """
 
     def __init__(self, function, counts, shortens=True):
@@ -147,7 +143,7 @@ class _Recording(TorchDispatchMode):
         self.nodes[counts] = self.graph.placeholder("counts")
         with self:
             found = function(counts)
-        self.graph.output(map_aggregate(found, self.node))
+        self.graph.output(tree_map_only(Tensor, self.node, found))
         self.graph.eliminate_dead_code()
 
     def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
@@ -156,53 +152,41 @@ class _Recording(TorchDispatchMode):
         tensors = (part for part in tree_leaves(given) if isinstance(part, Tensor))
         if shortens and not any(part in self.nodes for part in tensors):
             return operation(*given[0], **given[1])
-        nodes = map_aggregate(given, self.node)
+        nodes = tree_map_only(Tensor, self.node, given)
         found = operation(*given[0], **given[1])
         self.writes |= operation._schema.is_mutable
-        if shortens and operation in SAME and found.shape == args[0].shape:
+        if shortens and str(operation) in SAME and found.shape == args[0].shape:
             self.nodes[found] = nodes[0][0]
-        elif isinstance(found, Tensor | list | tuple):  # others only looked at values
-            key = str((operation, nodes)) if shortens else object()
-            node = self.once(key, self.graph.call_function, operation, *nodes)
-            node.meta["val"] = map_aggregate(found, self.layout)
-            for number, part in enumerate([found] if isinstance(found, Tensor) else found):
-                if part is found:
-                    self.nodes[part] = node
-                elif part is not None:
-                    each = self.once(
-                        (node, number), self.graph.call_function, getitem, (node, number)
-                    )
-                    each.meta["val"] = node.meta["val"][number]
-                    self.nodes[part] = each
+        elif isinstance(found, Tensor | list | tuple) or operation._schema.is_mutable:
+            self.add(str((operation, nodes)) if shortens else object(), found, operation, *nodes)
         return found
 
-    def once(self, key, make, *given):
+    def add(self, key, found, operation, args, kwargs):
+        """Node of what an operation found."""
         if key not in self.known:
-            self.known[key] = make(*given)
-        return self.known[key]
+            self.known[key] = self.graph.call_function(operation, args, kwargs)
+            self.known[key].meta["val"] = tree_map_only(Tensor, self.layout, found)
+        if isinstance(found, Tensor):
+            self.nodes[found] = self.known[key]
+        elif isinstance(found, list | tuple):
+            for number, part in enumerate(found):
+                self.add((key, number), part, getitem, (self.known[key], number), {})
 
-    def layout(self, value):
+    def layout(self, x):
         with self.layouts:
-            return (
-                value
-                if value is None
-                else torch.empty_strided(
-                    value.size(), value.stride(), dtype=value.dtype, device=value.device
-                )
-            )
+            return torch.empty_strided(x.size(), x.stride(), dtype=x.dtype, device=x.device)
 
     def node(self, value):
-        """Of a tensor; other values as they are."""
-        if not isinstance(value, Tensor):
-            return value
         if value in self.nodes:
             return self.nodes[value]
         bits = value.detach().reshape(-1).view(torch.uint8).cpu().numpy().tobytes()
-        key = value.stride(), value.type(), value.device, bits if self.shortens else id(value)
-        node = self.once(key, self.graph.get_attr, f"constant_{len(self.known)}")
-        # a view would be saved with all that it is a view of
-        node.meta.setdefault("val", value.detach().clone())
-        return node
+        place = self.shortens or value.data_ptr()
+        key = value.size(), value.stride(), value.dtype, value.device, place, bits
+        if key not in self.known:
+            self.known[key] = self.graph.get_attr(f"constant_{len(self.known)}")
+            # a view would be saved with all that it is a view of
+            self.known[key].meta["val"] = value.detach().clone()
+        return self.known[key]
 
     def exported(self, counts):
         """ExportedProgram. torch.export would trace each operation again, which takes longer than
