@@ -12,10 +12,10 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch._subclasses.fake_tensor import FakeTensorMode
+from torch._subclasses import FakeTensorMode
 from torch.fx import Graph
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map_only
+from torch.utils._pytree import tree_any_only, tree_map_only
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from codesign.atomic import replacing
@@ -73,9 +73,8 @@ def export(
         )
     # where nothing can be written, nothing is traced
     with replacing(path) as temporary, contextlib.ExitStack() as after:
-        if gc.isenabled():  # its search among the many parts of a program takes half of the time
-            after.callback(gc.enable)
-            gc.disable()
+        after.callback(gc.enable if gc.isenabled() else gc.disable)
+        gc.disable()  # its search among the many parts of a program takes half of the time
         program = trace(network, height_px, width_px, batch)
         if path.suffix == ".pt2":
             buffer = io.BytesIO()
@@ -125,19 +124,17 @@ def trace(
 
 
 class _Recording(TorchDispatchMode):
-    """Operations of a function with their values, since torch.export alone cannot follow a check
-    for finite input or a number computed from the bins' times.
+    """Operations of a function with their values: torch.export alone cannot follow a check for
+    finite input or a number computed from the bins' times.
 
-    shortens: what does not depend on the counts becomes a constant, and equal operations one, which
-      is right as long as none ``writes`` into a tensor.
+    shortens: what does not depend on the counts becomes a constant, and equal operations are one:
+      right where none ``writes`` into a tensor.
     """
 
     def __init__(self, function, counts, shortens=True):
         super().__init__()
-        self.shortens = shortens
-        self.writes = False
-        self.graph = Graph()
-        self.layouts = FakeTensorMode()
+        self.shortens, self.writes = shortens, False
+        self.graph, self.layouts = Graph(), FakeTensorMode()
         self.known = {}
         self.nodes = WeakTensorKeyDictionary()
         self.nodes[counts] = self.graph.placeholder("counts")
@@ -149,8 +146,7 @@ class _Recording(TorchDispatchMode):
     def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
         given = args, kwargs or {}
         shortens = self.shortens and torch.Tag.nondeterministic_seeded not in operation.tags
-        tensors = (part for part in tree_leaves(given) if isinstance(part, Tensor))
-        if shortens and not any(part in self.nodes for part in tensors):
+        if shortens and not tree_any_only(Tensor, self.nodes.__contains__, given):
             return operation(*given[0], **given[1])
         nodes = tree_map_only(Tensor, self.node, given)
         found = operation(*given[0], **given[1])
@@ -162,7 +158,6 @@ class _Recording(TorchDispatchMode):
         return found
 
     def add(self, key, found, operation, args, kwargs):
-        """Node of what an operation found."""
         if key not in self.known:
             self.known[key] = self.graph.call_function(operation, args, kwargs)
             self.known[key].meta["val"] = tree_map_only(Tensor, self.layout, found)
@@ -184,8 +179,7 @@ class _Recording(TorchDispatchMode):
         key = value.size(), value.stride(), value.dtype, value.device, place, bits
         if key not in self.known:
             self.known[key] = self.graph.get_attr(f"constant_{len(self.known)}")
-            # a view would be saved with all that it is a view of
-            self.known[key].meta["val"] = value.detach().clone()
+            self.known[key].meta["val"] = value.detach().clone()  # views take all of a storage
         return self.known[key]
 
     def exported(self, counts):
@@ -202,8 +196,7 @@ class _Recording(TorchDispatchMode):
         with program.graph.inserting_before(ends[0]):
             found = program.graph.graph_copy(self.graph, known)
         for end, node in zip(ends, found, strict=True):
-            end.args = (node,)
-            end.meta["val"] = node.meta["val"]
+            end.args, end.meta["val"] = (node,), node.meta["val"]
         program.graph_module.recompile()
         return program
 

@@ -336,8 +336,7 @@ def _gain(variance, xx, xy, yy):
 
 def _times(matrix, x, y):
     """A symmetric matrix (xx, xy, yy) times (x, y)."""
-    a, b, d = matrix
-    return _fma(a, x, b * y), _fma(b, x, d * y)
+    return _fma(matrix[0], x, matrix[1] * y), _fma(matrix[1], x, matrix[2] * y)
 
 
 def _fma(a, b, c):
