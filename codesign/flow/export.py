@@ -13,7 +13,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch._subclasses import FakeTensorMode
-from torch.fx import Graph
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_any_only, tree_map_only
 from torch.utils.weak import WeakTensorKeyDictionary
@@ -71,8 +70,7 @@ def export(
         raise DomainError(
             f"'{path.name}' is no program file; give a name that ends in .pt2 (torch.export) or .onnx."
         )
-    # where nothing can be written, nothing is traced
-    with replacing(path) as temporary, contextlib.ExitStack() as after:
+    with replacing(path) as temporary, contextlib.ExitStack() as after:  # fails before tracing
         after.callback(gc.enable if gc.isenabled() else gc.disable)
         gc.disable()  # its search among the many parts of a program takes half of the time
         program = trace(network, height_px, width_px, batch)
@@ -125,17 +123,13 @@ def trace(
 
 class _Recording(TorchDispatchMode):
     """Operations of a function with their values: torch.export alone cannot follow a check for
-    finite input or a number computed from the bins' times.
-
-    shortens: what does not depend on the counts becomes a constant, and equal operations are one:
-      right where none ``writes`` into a tensor.
-    """
+    finite input or a number computed from the bins' times. Shortened, with constants for what does
+    not depend on the counts and equal operations once, where none ``writes`` into a tensor."""
 
     def __init__(self, function, counts, shortens=True):
         super().__init__()
         self.shortens, self.writes = shortens, False
-        self.graph, self.layouts = Graph(), FakeTensorMode()
-        self.known = {}
+        self.graph, self.layouts, self.known = torch.fx.Graph(), FakeTensorMode(), {}
         self.nodes = WeakTensorKeyDictionary()
         self.nodes[counts] = self.graph.placeholder("counts")
         with self:
