@@ -186,9 +186,9 @@ class _Recording(TorchDispatchMode):
             frame.register_buffer(place.target, place.meta["val"])
         program = torch.export.export(frame, (counts,), strict=False)
         known = dict(zip(places, program.graph.find_nodes(op="placeholder"), strict=True))
-        ends = program.graph.output_node().args[0]
+        ends: Any = program.graph.output_node().args[0]
         with program.graph.inserting_before(ends[0]):
-            found = program.graph.graph_copy(self.graph, known)
+            found: Any = program.graph.graph_copy(self.graph, known)
         for end, node in zip(ends, found, strict=True):
             end.args, end.meta["val"] = (node,), node.meta["val"]
         program.graph_module.recompile()
