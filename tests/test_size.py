@@ -11,7 +11,7 @@ BUDGETS = {
     "codesign": 10_340,  # a pose out of its rotation and its place, for mounts and paths alike, what is differentiable once, threads of a torch that came first
     "codesign/events": 49_400,  # leaks that have begun before, kinds of TIFFs, noise of all intervals at once, times too coarse, keys of 32 bits by groups, lanes of several neighbours, what moved the play
     "codesign/fidelity": 3_030,  # stages without a level, levels that are told wrong
-    "codesign/flow": 43_950,  # programs that are recorded once, truth that is unknown, windows that share no event, polarities told two ways, truths without a time, windows that are checked once
+    "codesign/flow": 43_960,  # programs that are recorded once, truth that is unknown, windows that share no event, polarities told two ways, truths without a time, windows that are checked once
     "codesign/grad": 3_370,  # stairs of single precision in double
     "codesign/lens": 48_420,  # makers of glass, fans of single precision, stops and apertures in their own axes, forecasts of nothing, what a line says beside a name, cones at a distance, a stop that cuts a pupil
     "codesign/mount": 14_970,  # rays traced once for several depths, films looked at all over, angles in degrees, blur of the whole pupil, points that stand alone, a mount prints where it is, two nearnesses at once
