@@ -2,15 +2,20 @@
 operation has a counterpart, ONNX (.onnx)."""
 
 import contextlib
+import gc
 import io
 import logging
 import warnings
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.fx.experimental.proxy_tensor import make_fx
+from torch._subclasses import FakeTensorMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_any_only, tree_map_only
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from codesign.atomic import replacing
 from codesign.checks import check, check_kind, check_path, check_whole
@@ -21,6 +26,9 @@ from codesign.flow.lk.lanes import plain_operations
 from codesign.flow.sources.windows import bin_times
 from codesign.optional import require
 from codesign.types import EventVolume
+
+# that give what they are given where it keeps its shape
+SAME = "aten.alias.default", "aten.detach.default", "aten.expand.default", "aten.view.default"
 
 
 def evenly_timed(counts: Tensor) -> EventVolume:
@@ -62,7 +70,9 @@ def export(
         raise DomainError(
             f"'{path.name}' is no program file; give a name that ends in .pt2 (torch.export) or .onnx."
         )
-    with replacing(path) as temporary:  # where nothing can be written, nothing is traced
+    with replacing(path) as temporary, contextlib.ExitStack() as after:  # fails before tracing
+        after.callback(gc.enable if gc.isenabled() else gc.disable)
+        gc.disable()  # its search among the many parts of a program takes half of the time
         program = trace(network, height_px, width_px, batch)
         if path.suffix == ".pt2":
             buffer = io.BytesIO()
@@ -84,15 +94,13 @@ def trace(
     """torch.export's ExportedProgram of a network, in evaluation mode.
 
     What depends on the bins' times alone becomes a constant. The program looks at no value and so
-    refuses
-    none: counts that are not finite give a flow that is not.
+    refuses none: counts that are not finite give a flow that is not.
     """
 
     def program(counts):
         field = network(evenly_timed(counts))
-        return field.flow_px, field.valid.to(
-            field.flow_px
-        ) if field.confidence is None else field.confidence
+        sure = field.valid.to(field.flow_px) if field.confidence is None else field.confidence
+        return field.flow_px, sure
 
     height_px, width_px, batch = (
         check_whole(value, name, 1, MOST_SIDE_PX)
@@ -107,29 +115,84 @@ def trace(
     counts = torch.zeros(batch, 2, config["bins"], height_px, width_px, device=device)
     with modes_kept(network), torch.no_grad(), plain_operations():
         network.eval()
-        # traced with values, since torch.export alone cannot follow a check for finite input or a
-        # number computed from the bins' times
-        graph = make_fx(program, tracing_mode="real", _error_on_data_dependent_ops=False)(counts)
-        _tidy(graph)
-        return torch.export.export(graph, (counts,), strict=False)
+        recording = _Recording(program, counts)
+        if recording.writes:
+            recording = _Recording(program, counts, shortens=False)
+        return recording.exported(counts)
 
 
-def _tidy(graph):
-    """Drop what only looked at values while tracing; give every constant storage of its own, so
-    that none is saved with a larger one it is a view of."""
-    for looking in (
-        torch.ops.aten._local_scalar_dense.default,
-        torch.ops.aten._linalg_check_errors.default,
-    ):
-        for node in graph.graph.find_nodes(op="call_function", target=looking):
-            if not node.users:
-                graph.graph.erase_node(node)
-    graph.graph.eliminate_dead_code()
-    for name in {node.target for node in graph.graph.find_nodes(op="get_attr")}:
-        value = getattr(graph, name).detach().clone()
-        delattr(graph, name)
-        setattr(graph, name, value)
-    graph.recompile()
+class _Recording(TorchDispatchMode):
+    """Operations of a function with their values: torch.export alone cannot follow a check for
+    finite input or a number computed from the bins' times. Shortened, with constants for what does
+    not depend on the counts and equal operations once, where none ``writes`` into a tensor."""
+
+    def __init__(self, function, counts, shortens=True):
+        super().__init__()
+        self.shortens, self.writes = shortens, False
+        self.graph, self.layouts, self.known = torch.fx.Graph(), FakeTensorMode(), {}
+        self.nodes = WeakTensorKeyDictionary()
+        self.nodes[counts] = self.graph.placeholder("counts")
+        with self:
+            found = function(counts)
+        self.graph.output(tree_map_only(Tensor, self.node, found))
+        self.graph.eliminate_dead_code()
+
+    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+        given = args, kwargs or {}
+        shortens = self.shortens and torch.Tag.nondeterministic_seeded not in operation.tags
+        if shortens and not tree_any_only(Tensor, self.nodes.__contains__, given):
+            return operation(*given[0], **given[1])
+        nodes = tree_map_only(Tensor, self.node, given)
+        found = operation(*given[0], **given[1])
+        self.writes |= operation._schema.is_mutable
+        if shortens and str(operation) in SAME and found.shape == args[0].shape:
+            self.nodes[found] = nodes[0][0]
+        elif isinstance(found, Tensor | list | tuple) or operation._schema.is_mutable:
+            self.add(str((operation, nodes)) if shortens else object(), found, operation, *nodes)
+        return found
+
+    def add(self, key, found, operation, args, kwargs):
+        if key not in self.known:
+            self.known[key] = self.graph.call_function(operation, args, kwargs)
+            self.known[key].meta["val"] = tree_map_only(Tensor, self.layout, found)
+        if isinstance(found, Tensor):
+            self.nodes[found] = self.known[key]
+        elif isinstance(found, list | tuple):
+            for number, part in enumerate(found):
+                self.add((key, number), part, getitem, (self.known[key], number), {})
+
+    def layout(self, x):
+        with self.layouts:
+            return torch.empty_strided(x.size(), x.stride(), dtype=x.dtype, device=x.device)
+
+    def node(self, value):
+        if value in self.nodes:
+            return self.nodes[value]
+        bits = value.detach().reshape(-1).view(torch.uint8).cpu().numpy().tobytes()
+        place = self.shortens or value.data_ptr()
+        key = value.size(), value.stride(), value.dtype, value.device, place, bits
+        if key not in self.known:
+            self.known[key] = self.graph.get_attr(f"constant_{len(self.known)}")
+            self.known[key].meta["val"] = value.detach().clone()  # views take all of a storage
+        return self.known[key]
+
+    def exported(self, counts):
+        """ExportedProgram. torch.export would trace each operation again, which takes longer than
+        all the rest; it traces a frame for them: constants, input and outputs."""
+        places = [*self.graph.find_nodes(op="get_attr"), *self.graph.find_nodes(op="placeholder")]
+        frame = nn.Module()
+        frame.forward = lambda counts: (counts.clone(), counts.clone())
+        for place in places[:-1]:
+            frame.register_buffer(place.target, place.meta["val"])
+        program = torch.export.export(frame, (counts,), strict=False)
+        known = dict(zip(places, program.graph.find_nodes(op="placeholder"), strict=True))
+        ends: Any = program.graph.output_node().args[0]
+        with program.graph.inserting_before(ends[0]):
+            found: Any = program.graph.graph_copy(self.graph, known)
+        for end, node in zip(ends, found, strict=True):
+            end.args, end.meta["val"] = (node,), node.meta["val"]
+        program.graph_module.recompile()
+        return program
 
 
 def eliminate(matrix: Tensor, right: Tensor) -> Tensor:

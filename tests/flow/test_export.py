@@ -20,12 +20,12 @@ needs_onnx = pytest.mark.skipif(
 
 class Small(nn.Module):
     """Every kind of step that flow networks have: a check of the values, numbers worked out from
-    the bins' times, a solve, a warp, a branch for the size."""
+    the bins' times, a solve, a branch, values written into one of two equal tensors."""
 
-    def __init__(self, solves=True):
+    def __init__(self, solves=True, writes=False):
         super().__init__()
         self.config = {"bins": 4}
-        self.solves = solves
+        self.solves, self.writes = solves, writes
         self.layer = nn.Conv2d(8, 2, 3, padding=1)
         self.layer.weight.data = self.layer.weight.data.contiguous(
             memory_format=torch.channels_last
@@ -45,6 +45,8 @@ class Small(nn.Module):
             cross = torch.einsum("bihw,bjhw->bij", x, x) + torch.diag(torch.tensor([1.0, 2.0]))
             solved = torch.linalg.solve(cross, torch.eye(2) + 0.5 * cross)
             x = torch.einsum("bij,bjhw->bihw", solved + torch.linalg.inv(cross), x)
+        if self.writes:
+            x = (2 * x).add_(1) - (2 * x).tanh()
         return FlowField(x, counts.sum((1, 2)) > 0, span)
 
 
@@ -59,11 +61,11 @@ def load(path, counts):
     return [torch.from_numpy(output) for output in outputs]
 
 
-@pytest.mark.parametrize("name", ["small.pt2", pytest.param("small.onnx", marks=needs_onnx)])
+@pytest.mark.parametrize("name", ["a.pt2", "writes.pt2", pytest.param("a.onnx", marks=needs_onnx)])
 def test_the_program_gives_the_numbers_of_the_network(tmp_path, generator, name):
     """torch.export runs the same operations; ONNX's own order of sums differs in the last bits of
     numbers of order 1."""
-    network = Small().train()
+    network = Small(writes=name == "writes.pt2").train()
     network.drop.eval()
     with warnings.catch_warnings():
         # of the packages that write and read programs

@@ -49,20 +49,15 @@ def pooled(images: Tensor, side: int) -> Tensor:
 def _along_rows(images, taps):
     """A symmetric kernel along the last axis, mirrored about the outermost samples as often as need
     be."""
+    radius = len(taps) - 1
     size = images.shape[-1]
-    place = torch.arange(size)
-    found = taps[0] * images
+    place = torch.arange(-radius, size + radius) % max(2 * size - 2, 1)
+    images = images[..., torch.minimum(place, 2 * size - 2 - place)]
+    found = taps[0] * images.narrow(-1, radius, size)
     for shift, tap in enumerate(taps[1:], 1):
-        for side in (-shift, shift):
-            found = found + tap * images[..., _mirrored(place + side, size)]
+        before, after = (images.narrow(-1, radius + side, size) for side in (-shift, shift))
+        found = found.add(before + after, alpha=tap)
     return found
-
-
-def _mirrored(place, size):
-    if size == 1:
-        return torch.zeros_like(place)
-    place = place % (2 * size - 2)
-    return torch.minimum(place, 2 * size - 2 - place)
 
 
 @exclusive
@@ -73,13 +68,13 @@ def _forward(grid, taps, samples):
 
 
 def _adjoint(grid, taps, samples, grads, wanted):
-    rows, columns = (_ends(count, samples) for count in grid.shape)
-    ends = rows[:, None] * columns
-    ((found,), _) = _forward(grid, taps, grads[0] * ends)
-    return (found / ends,)
+    rows, columns = (ends(count, samples) for count in grid.shape)
+    both = rows[:, None] * columns
+    ((found,), _) = _forward(grid, taps, grads[0] * both)
+    return (found / both,)
 
 
-def _ends(count, like):
+def ends(count: int, like: Tensor) -> Tensor:
     """[count] 2 at either end, 1 within."""
     found = torch.ones(count).to(like)
     found[[0, -1]] = 2

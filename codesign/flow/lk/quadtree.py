@@ -306,22 +306,22 @@ def _above(log, variance, xx, xy, yy, px, py):
     """What cells say of their parents, and the logarithm of their evidence."""
     (a, b, d), scale = _gain(variance, xx, xy, yy)
     x, y = _times((a, b, d), px, py)
-    evidence = (variance * (px * x + py * y) + log(scale)) / 2
-    return a * xx + b * xy, a * xy + b * yy, b * xy + d * yy, x, y, evidence
+    evidence = _fma(variance, _fma(px, x, py * y), log(scale)) / 2
+    return _fma(a, xx, b * xy), _fma(a, xy, b * yy), _fma(b, xy, d * yy), x, y, evidence
 
 
 def _below(variance, xx, xy, yy, px, py, x, y, uu, uv, vv):
     """Mean and covariance of cells, from what is summed up there and the mean and covariance of
     their parents."""
     (a, b, d), _ = _gain(variance, xx, xy, yy)
-    mean = _times((a, b, d), x + variance * px, y + variance * py)
+    mean = _times((a, b, d), _fma(variance, px, x), _fma(variance, py, y))
     first = _times((a, b, d), uu, uv)
     second = _times((a, b, d), uv, vv)
     return (
         *mean,
-        a * first[0] + b * second[0] + variance * a,
-        b * first[0] + d * second[0] + variance * b,
-        b * first[1] + d * second[1] + variance * d,
+        _fma(variance, a, _fma(a, first[0], b * second[0])),
+        _fma(variance, b, _fma(b, first[0], d * second[0])),
+        _fma(variance, d, _fma(b, first[1], d * second[1])),
     )
 
 
@@ -336,4 +336,8 @@ def _gain(variance, xx, xy, yy):
 
 def _times(matrix, x, y):
     """A symmetric matrix (xx, xy, yy) times (x, y)."""
-    return matrix[0] * x + matrix[1] * y, matrix[1] * x + matrix[2] * y
+    return _fma(matrix[0], x, matrix[1] * y), _fma(matrix[1], x, matrix[2] * y)
+
+
+def _fma(a, b, c):
+    return torch.addcmul(c, a, b) if isinstance(c, Tensor) else a * b + c

@@ -6,6 +6,7 @@ from torch.nn.functional import pad
 
 from codesign.backend import pull_back
 from codesign.exclusive import exclusive
+from codesign.flow.lk.blur import ends
 from codesign.flow.lk.lanes import Form, Grid, Lanes, in_graph, plain_wanted, recorded, tensors
 
 PRODUCTS = 8
@@ -34,23 +35,18 @@ def cell_sums(
 
 
 def _plain(mean, slope, seen, density, grid, cell):
-    x = _differences(mean) / grid.stride
-    y = _differences(mean.mT).mT / grid.stride
+    rows, columns = grid.shape
+    around = pad(mean, (1, 1, 1, 1), mode="replicate")
+    per_row, per_column = (ends(count, mean) / (2 * grid.stride) for count in grid.shape)
+    x = (around[:, 1:-1, 2:] - around[:, 1:-1, :-2]) * per_column
+    y = (around[:, 2:, 1:-1] - around[:, :-2, 1:-1]) * per_row[:, None]
     ones = torch.ones_like(seen)
     parts = [x * x, x * y, y * y, x * slope, y * slope, slope * slope, ones, density]
     terms = seen[:, None] * torch.stack(parts, 1)
-    rows, columns = grid.shape
+    if cell == 1:
+        return terms
     padded = pad(terms, (0, -columns % cell, 0, -rows % cell))
     return padded.unflatten(3, (-1, cell)).unflatten(2, (-1, cell)).sum((3, 5))
-
-
-def _differences(image):
-    """Central differences along the last axis, one-sided at both ends; 0 where there is one
-    sample."""
-    if image.shape[-1] == 1:
-        return torch.zeros_like(image)
-    step = image.diff(dim=-1)
-    return torch.cat([step[..., :1], (step[..., 1:] + step[..., :-1]) / 2, step[..., -1:]], -1)
 
 
 @exclusive

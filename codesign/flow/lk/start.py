@@ -265,7 +265,7 @@ class _PlainPixels(_Outcome):
         self.per_half = 2 / max(grid.height, grid.width)
 
     def fma(self, a, b, c):
-        return a * b + c
+        return torch.addcmul(c, a, b)
 
     def share(self, value):
         return value.clamp(0, 1)

@@ -54,15 +54,15 @@ def moving(
 def _plain(rate, flow_px, time, contrast, grid, fade_px):
     place = pixel_grid(*grid.shape, rate)
     shift = time.to(rate)[:, None, None, None] * flow_px[:, None]
-    at = place + shift / grid.stride  # [B, n, 2, h, w]
-    warped = read_at(rate.flatten(0, 1)[:, None], at.flatten(0, 1)).reshape(rate.shape)
-    mean, slope = torch.einsum("kn,bnyx->kbyx", contrast.to(rate), warped).unbind(0)
+    at = place.add(shift, alpha=1 / grid.stride)  # [B, n, 2, h, w]
+    warped = read_at(rate.flatten(0, 1)[:, None], at.flatten(0, 1)).view(*rate.shape[:2], -1)
+    of_bins = contrast.to(rate).expand(len(rate), -1, -1)
+    mean, slope = torch.bmm(of_bins, warped).unflatten(2, grid.shape).unbind(1)
     reach = (torch.tensor([grid.width, grid.height]).to(rate)[:, None, None] - 1) / 2
-    off = place * grid.stride + (grid.stride - 1) / 2 + shift[:, [0, -1]] - reach
+    off = (place * grid.stride + (grid.stride - 1) / 2 - reach) + shift[:, [0, -1]]
     inside = ((reach - off.abs()) / fade_px).clamp(0, 1)
     window = inside.square() * (3 - 2 * inside)
-    window = window[:, 0] * window[:, 1]
-    return mean, slope, window[:, 0] * window[:, 1]
+    return mean, slope, window.flatten(1, 2).prod(1)
 
 
 @exclusive
