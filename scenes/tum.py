@@ -12,8 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from kornia.geometry.liegroup import Se3, So3
-from scipy.spatial.transform import Rotation
 
 from codesign.atomic import replacing
 from codesign.checks import check_finite
@@ -45,6 +43,8 @@ def write_tum(path: str | Path, t_s: torch.Tensor, poses: torch.Tensor) -> None:
     Raises: ShapeError, DomainError for anything else; FileFormatError when the folder is not
       writable.
     """
+    from scipy.spatial.transform import Rotation
+
     t_s, poses = _checked(t_s, poses)
     turn = Rotation.from_matrix(poses[:, :3, :3].numpy()).as_quat(canonical=True)
     rows = np.concatenate([t_s.numpy()[:, None], poses[:, :3, 3].numpy(), turn], 1).tolist()
@@ -106,6 +106,8 @@ def read_tum(path: str | Path) -> tuple[torch.Tensor, torch.Tensor]:
         if bad.any():
             at = int(np.flatnonzero(bad)[0])
             raise FileFormatError(f"{path}, line {numbers[at]}: {reason}.")
+    from scipy.spatial.transform import Rotation
+
     poses = torch.eye(4, dtype=torch.float64).repeat(len(table), 1, 1)
     poses[:, :3, :3] = torch.from_numpy(Rotation.from_quat(table[:, 4:]).as_matrix())
     poses[:, :3, 3] = torch.from_numpy(table[:, 1:4])
@@ -130,6 +132,9 @@ class Recorded(Trajectory):
     """
 
     def __init__(self, t_s, poses):
+        from kornia.geometry.liegroup import Se3, So3
+        from scipy.spatial.transform import Rotation
+
         self.t_s, self.poses = _checked(t_s, poses)
         if len(self.t_s) < 2:
             raise ShapeError("a recorded trajectory needs at least 2 poses.")

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from codesign import lens as lenses
@@ -132,6 +131,8 @@ def _check_frame(name):
 
 
 def _transform(pose, handed):
+    from scipy.spatial.transform import Rotation
+
     # x, y, z, w >= 0
     quaternion = Rotation.from_matrix(pose[:3, :3].cpu().numpy()).as_quat(canonical=True)
     return {
@@ -143,6 +144,8 @@ def _transform(pose, handed):
 
 
 def _pose(page):
+    from scipy.spatial.transform import Rotation
+
     pose = torch.eye(4, dtype=torch.float64)
     quaternion = torch.tensor(
         [page["rotation_quaternion"][axis] for axis in "xyzw"], dtype=torch.float64

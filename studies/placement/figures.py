@@ -4,11 +4,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from torch import Tensor
 
 from codesign import events
@@ -30,12 +27,14 @@ def ways(
     trails: dict[str, list[Trail]],
     errors: dict[str, Tensor],
     samples: int,
-) -> Figure:
+):
     """Errors on unseen samples, and the best that a search saw of its own, over drives rendered;
     and of all mounts looked at height, pitch and error, below the ways of the descents.
 
     errors: of the starts and of each search, [starts]. samples: drives that each rendered.
     """
+    import matplotlib.pyplot as plt
+
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
     for (name, found), colour in zip(trails.items(), COLOURS, strict=False):
         along = torch.stack([errors["start"], errors[name]])
@@ -72,9 +71,11 @@ def _pitch_and_height(problem: Problem, share: Tensor) -> tuple[np.ndarray, np.n
     return np.degrees(numbers[:, NAMES.index("pitch_rad")]), numbers[:, NAMES.index("z_m")]
 
 
-def before_and_after(problem: Problem, mount: Tensor) -> Figure:
+def before_and_after(problem: Problem, mount: Tensor):
     """Robot, frame, events and flow of an unseen drive, for the default mount and for one
     [4, 4]."""
+    import matplotlib.pyplot as plt
+
     figure = plt.figure(figsize=(13, 6.4), layout="constrained")
     drives = problem.batch(fastest(problem))
     for row, pose in enumerate((problem.ranges.pose(problem.start), mount)):
@@ -113,8 +114,10 @@ def tiled(windows: np.ndarray) -> np.ndarray:
     return np.concatenate(rows, 0)
 
 
-def robot_and_frame(pair: RobotPair, drives: Drives, camera: Camera, pose: Tensor) -> Figure:
+def robot_and_frame(pair: RobotPair, drives: Drives, camera: Camera, pose: Tensor):
     """The robot with its camera's view, and beside it the middle frame of the first drive."""
+    import matplotlib.pyplot as plt
+
     figure = plt.figure(figsize=(10, 4.4), layout="constrained")
     draw_pair(figure.add_subplot(1, 2, 1, projection="3d"), pair, camera, pose)
     right = figure.add_subplot(1, 2, 2)
@@ -133,6 +136,8 @@ def draw_pair(axis: Any, pair: RobotPair, camera: Camera, T_body_cam: Tensor) ->
 @torch.no_grad()
 def _draw_frame(axis: Any, drives: Drives, camera: Camera, T_body_cam: Tensor) -> None:
     """The middle frame [H, W] of the first drive on the whole sensor, with the camera's windows."""
+    import matplotlib.pyplot as plt
+
     whole = Camera(camera.lens, *SENSOR_PX, camera.film.pixel_pitch_mm, 8)
     scene = drives.scene[0].during([FRAMES // 2])
     pose = (drives.T_world_body[0, :, FRAMES // 2] @ T_body_cam)[:, None]
@@ -140,5 +145,5 @@ def _draw_frame(axis: Any, drives: Drives, camera: Camera, T_body_cam: Tensor) -
     axis.imshow(np.clip(frame / 255, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
     for corner in camera.film.windows_px or ():
         axis.add_patch(
-            Rectangle(corner, WINDOW_PX, WINDOW_PX, fill=False, color="tab:red", linewidth=0.6)
+            plt.Rectangle(corner, WINDOW_PX, WINDOW_PX, fill=False, color="tab:red", linewidth=0.6)
         )

@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import map_coordinates
-from scipy.spatial.transform import Rotation, Slerp
 
 from codesign.checks import check_kind, check_path
 from codesign.errors import DomainError, FileFormatError
@@ -102,6 +100,8 @@ class Calibration:
         Returns: flow_px [2, H, W] on the pixels as the lens makes them, 0 where not valid; valid
           [H, W], where the four undistorted pixels around are.
         """
+        from scipy.ndimage import map_coordinates
+
         height, width = valid.shape
         slopes = self.directions(height, width)[..., :2]
         place = slopes * self.focal_px + self.centre_px
@@ -189,6 +189,8 @@ class Attitude:
         Raises: FileFormatError when the window is not covered by samples, or lies across a gap of
           more than 0.1 s.
         """
+        from scipy.spatial.transform import Slerp
+
         reason = self.missing(t0_s, t1_s)
         if reason:
             raise FileFormatError(f"{reason}; choose windows inside.")
@@ -231,6 +233,8 @@ def read_gyroscope(path: str | Path, axes: str = "xyz") -> Attitude:
 
     axes: the camera's from the gyroscope's, as ``signed_axes`` takes them.
     """
+    from scipy.spatial.transform import Rotation
+
     turned = signed_axes(axes)
     table = _table(path, 7, "t ax ay az gx gy gz")
     t_s = table[:, 0]
@@ -242,6 +246,8 @@ def read_gyroscope(path: str | Path, axes: str = "xyz") -> Attitude:
 
 def read_poses(path: str | Path) -> Attitude:
     """Attitude of ``t px py pz qx qy qz qw`` (seconds, metres, quaternion of R_world_camera)."""
+    from scipy.spatial.transform import Rotation
+
     table = _table(path, 8, "t px py pz qx qy qz qw")
     length = np.linalg.norm(table[:, 4:], axis=1)
     if bool((np.abs(length - 1) > UNIT_TOLERANCE).any()):
