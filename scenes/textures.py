@@ -54,9 +54,10 @@ def photo(source: str | Path, size_px: int = 512) -> np.ndarray:
     Raises: FileFormatError when there is no such picture.
     """
     if str(source) in PHOTOS:
-        import skimage.data
+        import skimage  # whose own reader imports most of scipy
 
-        stored = getattr(skimage.data, str(source))()[:size_px, :size_px]
+        (path,) = Path(skimage.__file__).parent.glob(f"data/{source}.*")
+        stored = _stored(path)[:size_px, :size_px]
         return _radiance(linear(stored), str(source))
     if Path(source).suffix.lower() in HDR:
         return _scaled(
