@@ -136,7 +136,7 @@ def draw_pair(axis: Any, pair: RobotPair, camera: Camera, T_body_cam: Tensor) ->
 @torch.no_grad()
 def _draw_frame(axis: Any, drives: Drives, camera: Camera, T_body_cam: Tensor) -> None:
     """The middle frame [H, W] of the first drive on the whole sensor, with the camera's windows."""
-    import matplotlib.pyplot as plt
+    from matplotlib.patches import Rectangle
 
     whole = Camera(camera.lens, *SENSOR_PX, camera.film.pixel_pitch_mm, 8)
     scene = drives.scene[0].during([FRAMES // 2])
@@ -145,5 +145,5 @@ def _draw_frame(axis: Any, drives: Drives, camera: Camera, T_body_cam: Tensor) -
     axis.imshow(np.clip(frame / 255, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
     for corner in camera.film.windows_px or ():
         axis.add_patch(
-            plt.Rectangle(corner, WINDOW_PX, WINDOW_PX, fill=False, color="tab:red", linewidth=0.6)
+            Rectangle(corner, WINDOW_PX, WINDOW_PX, fill=False, color="tab:red", linewidth=0.6)
         )
