@@ -11,6 +11,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import scipy
 import torch
 
 from codesign.atomic import replacing
@@ -43,10 +44,9 @@ def write_tum(path: str | Path, t_s: torch.Tensor, poses: torch.Tensor) -> None:
     Raises: ShapeError, DomainError for anything else; FileFormatError when the folder is not
       writable.
     """
-    from scipy.spatial.transform import Rotation
-
     t_s, poses = _checked(t_s, poses)
-    turn = Rotation.from_matrix(poses[:, :3, :3].numpy()).as_quat(canonical=True)
+    turns = scipy.spatial.transform.Rotation.from_matrix(poses[:, :3, :3].numpy())
+    turn = turns.as_quat(canonical=True)
     rows = np.concatenate([t_s.numpy()[:, None], poses[:, :3, 3].numpy(), turn], 1).tolist()
     with replacing(path) as temporary:
         temporary.write_text(
@@ -106,10 +106,9 @@ def read_tum(path: str | Path) -> tuple[torch.Tensor, torch.Tensor]:
         if bad.any():
             at = int(np.flatnonzero(bad)[0])
             raise FileFormatError(f"{path}, line {numbers[at]}: {reason}.")
-    from scipy.spatial.transform import Rotation
-
     poses = torch.eye(4, dtype=torch.float64).repeat(len(table), 1, 1)
-    poses[:, :3, :3] = torch.from_numpy(Rotation.from_quat(table[:, 4:]).as_matrix())
+    turns = scipy.spatial.transform.Rotation.from_quat(table[:, 4:])
+    poses[:, :3, :3] = torch.from_numpy(turns.as_matrix())
     poses[:, :3, 3] = torch.from_numpy(table[:, 1:4])
     return torch.from_numpy(table[:, 0].copy()), poses
 
@@ -133,7 +132,6 @@ class Recorded(Trajectory):
 
     def __init__(self, t_s, poses):
         from kornia.geometry.liegroup import Se3, So3
-        from scipy.spatial.transform import Rotation
 
         self.t_s, self.poses = _checked(t_s, poses)
         if len(self.t_s) < 2:
@@ -141,7 +139,7 @@ class Recorded(Trajectory):
         self.span_s = (float(self.t_s[0]), float(self.t_s[-1]))
         step = inverse(self.poses[:-1]) @ self.poses[1:]
         turn = torch.from_numpy(
-            Rotation.from_matrix(step[:, :3, :3].numpy())
+            scipy.spatial.transform.Rotation.from_matrix(step[:, :3, :3].numpy())
             .as_quat(canonical=True)[:, [3, 0, 1, 2]]
             .copy()
         )

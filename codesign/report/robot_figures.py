@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 from codesign import pose
 from codesign.render import Camera
@@ -17,9 +19,6 @@ SMALL = 0.08
 def draw_robot(axis: Any, triangles: np.ndarray, shade: np.ndarray, lines: np.ndarray) -> None:
     """Draw triangles [F, 3, 3] m in greys [F] 0..1, and lines [L, 2, 3] m of a view, into a 3-D
     axis of matplotlib."""
-    from matplotlib.ticker import MaxNLocator
-    from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
-
     across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     kept = np.argsort(-np.linalg.norm(across, axis=1))[:MOST_DRAWN]
     longest = SMALL * np.ptp(triangles.reshape(-1, 3), axis=0).max()

@@ -12,7 +12,6 @@ from scenes.robots import pair as robot_pair
 from studies.codesign.design import Whole
 from studies.codesign.race import JUDGED, Judge
 from studies.frame.run import Run
-from studies.placement.figures import draw_pair, draw_seen, fastest
 
 COLUMNS = ("lens", "robot and view", "frame", "events", "flow")
 FIELDS_RAD = (0.0, 0.2, 0.4)  # of the rays that are drawn
@@ -24,6 +23,7 @@ def side_by_side(judge: Judge, designs: Mapping[str, Whole]):
     import matplotlib.pyplot as plt
 
     from codesign.report.lens_figures import draw_layout
+    from studies.placement.figures import draw_pair, draw_seen, fastest
 
     drawn = judge.drawn
     samples = fastest(drawn.base, JUDGED)

@@ -4,8 +4,11 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from torch import Tensor
 
 from codesign import events
@@ -27,14 +30,12 @@ def ways(
     trails: dict[str, list[Trail]],
     errors: dict[str, Tensor],
     samples: int,
-):
+) -> Figure:
     """Errors on unseen samples, and the best that a search saw of its own, over drives rendered;
     and of all mounts looked at height, pitch and error, below the ways of the descents.
 
     errors: of the starts and of each search, [starts]. samples: drives that each rendered.
     """
-    import matplotlib.pyplot as plt
-
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
     for (name, found), colour in zip(trails.items(), COLOURS, strict=False):
         along = torch.stack([errors["start"], errors[name]])
@@ -71,11 +72,9 @@ def _pitch_and_height(problem: Problem, share: Tensor) -> tuple[np.ndarray, np.n
     return np.degrees(numbers[:, NAMES.index("pitch_rad")]), numbers[:, NAMES.index("z_m")]
 
 
-def before_and_after(problem: Problem, mount: Tensor):
+def before_and_after(problem: Problem, mount: Tensor) -> Figure:
     """Robot, frame, events and flow of an unseen drive, for the default mount and for one
     [4, 4]."""
-    import matplotlib.pyplot as plt
-
     figure = plt.figure(figsize=(13, 6.4), layout="constrained")
     drives = problem.batch(fastest(problem))
     for row, pose in enumerate((problem.ranges.pose(problem.start), mount)):
@@ -114,10 +113,8 @@ def tiled(windows: np.ndarray) -> np.ndarray:
     return np.concatenate(rows, 0)
 
 
-def robot_and_frame(pair: RobotPair, drives: Drives, camera: Camera, pose: Tensor):
+def robot_and_frame(pair: RobotPair, drives: Drives, camera: Camera, pose: Tensor) -> Figure:
     """The robot with its camera's view, and beside it the middle frame of the first drive."""
-    import matplotlib.pyplot as plt
-
     figure = plt.figure(figsize=(10, 4.4), layout="constrained")
     draw_pair(figure.add_subplot(1, 2, 1, projection="3d"), pair, camera, pose)
     right = figure.add_subplot(1, 2, 2)
@@ -136,8 +133,6 @@ def draw_pair(axis: Any, pair: RobotPair, camera: Camera, T_body_cam: Tensor) ->
 @torch.no_grad()
 def _draw_frame(axis: Any, drives: Drives, camera: Camera, T_body_cam: Tensor) -> None:
     """The middle frame [H, W] of the first drive on the whole sensor, with the camera's windows."""
-    from matplotlib.patches import Rectangle
-
     whole = Camera(camera.lens, *SENSOR_PX, camera.film.pixel_pitch_mm, 8)
     scene = drives.scene[0].during([FRAMES // 2])
     pose = (drives.T_world_body[0, :, FRAMES // 2] @ T_body_cam)[:, None]

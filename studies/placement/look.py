@@ -32,13 +32,14 @@ from scenes.robots import pair as robot_pair
 from scenes.robots.check import check_width
 from scenes.robots.pair import RobotPair
 from studies.frame.run import Run
-from studies.placement import figures
 
 # under it a camera over flat ground tells nothing that a picture would not
 LEAST_HEIGHT_M = 0.05
 
 
 def look(run: Run[Any], pair: RobotPair, camera: render.Camera) -> None:
+    from studies.placement import figures
+
     check_width(pair, camera)
     pose = pair.design.mount()
     drives = pair.batch((0,), 1, run.config.seed)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 
 from codesign.checks import check_kind, check_path
 from codesign.errors import DomainError, FileFormatError
@@ -100,17 +101,14 @@ class Calibration:
         Returns: flow_px [2, H, W] on the pixels as the lens makes them, 0 where not valid; valid
           [H, W], where the four undistorted pixels around are.
         """
-        from scipy.ndimage import map_coordinates
-
         height, width = valid.shape
         slopes = self.directions(height, width)[..., :2]
         place = slopes * self.focal_px + self.centre_px
         # -1: beside the picture
         at = np.where(np.isfinite(place), place, -1.0)[..., ::-1].transpose(2, 0, 1)
-        known = map_coordinates(valid.astype(float), at, order=1, cval=0.0) > 1 - 1e-9
-        read = np.stack(
-            [map_coordinates(part, at, order=1) for part in np.where(valid, flow_px, 0.0)], -1
-        )
+        known = scipy.ndimage.map_coordinates(valid.astype(float), at, order=1, cval=0.0) > 1 - 1e-9
+        shown = np.where(valid, flow_px, 0.0)
+        read = np.stack([scipy.ndimage.map_coordinates(part, at, order=1) for part in shown], -1)
         landed = (
             self.distorted((place + read - self.centre_px) / self.focal_px) * self.focal_px
             + self.centre_px
@@ -189,15 +187,13 @@ class Attitude:
         Raises: FileFormatError when the window is not covered by samples, or lies across a gap of
           more than 0.1 s.
         """
-        from scipy.spatial.transform import Slerp
-
         reason = self.missing(t0_s, t1_s)
         if reason:
             raise FileFormatError(f"{reason}; choose windows inside.")
         first, last = self._around(t0_s, t1_s)
-        turns = Slerp(self.t_s[first : last + 1], self.turns[first : last + 1])(
-            np.array([t0_s, t1_s])
-        )
+        between = slice(first, last + 1)
+        turns = scipy.spatial.transform.Slerp(self.t_s[between], self.turns[between])
+        turns = turns(np.array([t0_s, t1_s]))
         return (turns[1].inv() * turns[0]).as_matrix()
 
     def missing(self, t0_s: float, t1_s: float) -> str:
@@ -233,21 +229,18 @@ def read_gyroscope(path: str | Path, axes: str = "xyz") -> Attitude:
 
     axes: the camera's from the gyroscope's, as ``signed_axes`` takes them.
     """
-    from scipy.spatial.transform import Rotation
-
     turned = signed_axes(axes)
     table = _table(path, 7, "t ax ay az gx gy gz")
     t_s = table[:, 0]
     rate = table[:, 4:] @ turned.T
-    steps = Rotation.from_rotvec((rate[1:] + rate[:-1]) / 2 * np.diff(t_s)[:, None])
-    turns = accumulate(steps, mul, initial=Rotation.identity())
-    return Attitude(t_s, Rotation.concatenate(list(turns)), None, str(path))
+    rotation = scipy.spatial.transform.Rotation
+    steps = rotation.from_rotvec((rate[1:] + rate[:-1]) / 2 * np.diff(t_s)[:, None])
+    turns = accumulate(steps, mul, initial=rotation.identity())
+    return Attitude(t_s, rotation.concatenate(list(turns)), None, str(path))
 
 
 def read_poses(path: str | Path) -> Attitude:
     """Attitude of ``t px py pz qx qy qz qw`` (seconds, metres, quaternion of R_world_camera)."""
-    from scipy.spatial.transform import Rotation
-
     table = _table(path, 8, "t px py pz qx qy qz qw")
     length = np.linalg.norm(table[:, 4:], axis=1)
     if bool((np.abs(length - 1) > UNIT_TOLERANCE).any()):
@@ -256,7 +249,8 @@ def read_poses(path: str | Path) -> Attitude:
             f"{path}, row {at + 1} of numbers: the quaternion has length {length[at]:.4g}, not 1; the order "
             "is qx qy qz qw."
         )
-    return Attitude(table[:, 0], Rotation.from_quat(table[:, 4:]), table[:, 1:4], str(path))
+    turns = scipy.spatial.transform.Rotation.from_quat(table[:, 4:])
+    return Attitude(table[:, 0], turns, table[:, 1:4], str(path))
 
 
 def _table(path, columns, names):
