@@ -6,7 +6,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch
-from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
 from codesign.checks import check_finite
@@ -29,6 +28,8 @@ def se3_exp(twist: Tensor) -> Tensor:
     >>> se3_exp(torch.tensor([1.0, 2.0, 3.0, 0.0, 0.0, 0.0]))[:3, 3].tolist()
     [1.0, 2.0, 3.0]
     """
+    from kornia.geometry.liegroup import Se3
+
     if twist.shape[-1] != 6:
         raise ShapeError(
             f"a twist has 6 components (3 of translation, 3 of rotation), got {tuple(twist.shape)}."

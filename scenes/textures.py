@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import PIL.Image
 import PIL.ImageOps
+import scipy
 import torch
-from scipy.ndimage import gaussian_filter
 
 from codesign.checks import check_whole
 from codesign.doors import explain
@@ -54,9 +54,10 @@ def photo(source: str | Path, size_px: int = 512) -> np.ndarray:
     Raises: FileFormatError when there is no such picture.
     """
     if str(source) in PHOTOS:
-        import skimage.data
+        import skimage  # whose own reader imports most of scipy
 
-        stored = getattr(skimage.data, str(source))()[:size_px, :size_px]
+        (path,) = Path(skimage.__file__).parent.glob(f"data/{source}.*")
+        stored = _stored(path)[:size_px, :size_px]
         return _radiance(linear(stored), str(source))
     if Path(source).suffix.lower() in HDR:
         return _scaled(
@@ -183,7 +184,7 @@ def shrunk(texture: np.ndarray, factor: int) -> np.ndarray:
 def softened(texture: np.ndarray, texels: float, mode: str = "nearest") -> np.ndarray:
     """The texture blurred by a Gaussian of this standard deviation, so that the kinks between
     bilinear texels become small; beside its border it goes on as SciPy's ``mode`` says."""
-    return gaussian_filter(
+    return scipy.ndimage.gaussian_filter(
         check_texture(texture, "to soften").astype(np.float64), texels, mode=mode
     ).astype(np.float32)
 
@@ -312,7 +313,7 @@ def sky(
     width = 2 * height_px
     elevation = np.pi / 2 - (np.arange(height_px)[:, None] + 0.5) * np.pi / height_px
     azimuth = (np.arange(width) + 0.5) * 2 * np.pi / width
-    noise = gaussian_filter(
+    noise = scipy.ndimage.gaussian_filter(
         np.random.default_rng(seed).standard_normal((height_px, width)),
         (height_px / 48, height_px / 20),
         mode=["nearest", "wrap"],  # pyright: ignore[reportArgumentType]

@@ -11,9 +11,8 @@ import re
 from pathlib import Path
 
 import numpy as np
+import scipy
 import torch
-from kornia.geometry.liegroup import Se3, So3
-from scipy.spatial.transform import Rotation
 
 from codesign.atomic import replacing
 from codesign.checks import check_finite
@@ -46,7 +45,8 @@ def write_tum(path: str | Path, t_s: torch.Tensor, poses: torch.Tensor) -> None:
       writable.
     """
     t_s, poses = _checked(t_s, poses)
-    turn = Rotation.from_matrix(poses[:, :3, :3].numpy()).as_quat(canonical=True)
+    turns = scipy.spatial.transform.Rotation.from_matrix(poses[:, :3, :3].numpy())
+    turn = turns.as_quat(canonical=True)
     rows = np.concatenate([t_s.numpy()[:, None], poses[:, :3, 3].numpy(), turn], 1).tolist()
     with replacing(path) as temporary:
         temporary.write_text(
@@ -107,7 +107,8 @@ def read_tum(path: str | Path) -> tuple[torch.Tensor, torch.Tensor]:
             at = int(np.flatnonzero(bad)[0])
             raise FileFormatError(f"{path}, line {numbers[at]}: {reason}.")
     poses = torch.eye(4, dtype=torch.float64).repeat(len(table), 1, 1)
-    poses[:, :3, :3] = torch.from_numpy(Rotation.from_quat(table[:, 4:]).as_matrix())
+    turns = scipy.spatial.transform.Rotation.from_quat(table[:, 4:])
+    poses[:, :3, :3] = torch.from_numpy(turns.as_matrix())
     poses[:, :3, 3] = torch.from_numpy(table[:, 1:4])
     return torch.from_numpy(table[:, 0].copy()), poses
 
@@ -130,13 +131,15 @@ class Recorded(Trajectory):
     """
 
     def __init__(self, t_s, poses):
+        from kornia.geometry.liegroup import Se3, So3
+
         self.t_s, self.poses = _checked(t_s, poses)
         if len(self.t_s) < 2:
             raise ShapeError("a recorded trajectory needs at least 2 poses.")
         self.span_s = (float(self.t_s[0]), float(self.t_s[-1]))
         step = inverse(self.poses[:-1]) @ self.poses[1:]
         turn = torch.from_numpy(
-            Rotation.from_matrix(step[:, :3, :3].numpy())
+            scipy.spatial.transform.Rotation.from_matrix(step[:, :3, :3].numpy())
             .as_quat(canonical=True)[:, [3, 0, 1, 2]]
             .copy()
         )

@@ -3,11 +3,11 @@ in a circle."""
 
 import ast
 from functools import cache
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+from tests.processes import ROOT, python
+
 FLOORS = (
     {"errors", "former", "shipped", "waiting"},
     {"doors", "checks"},
@@ -149,6 +149,15 @@ def test_mitsuba_is_for_pictures_and_worlds():
                 askers.add(name)
     assert importers == ["codesign.backend"]
     assert [name for name in sorted(askers) if not name.startswith(tuple(MITSUBA))] == []
+
+
+def test_studies_start_without_what_their_first_frame_does_not_need():
+    names = ("lens_opt", "codesign", "placement", "gradient_flow", "make_dataset", "chain_picture")
+    late = {"matplotlib", "kornia", "scipy.stats", "sympy", "skimage", "torch._dynamo"}
+    script = "import sys\nfrom importlib import import_module\n"
+    script += f"for name in {names}: import_module(f'studies.{{name}}.__main__')\n"
+    done = python("-c", f"{script}print({late} & sys.modules.keys())")
+    assert done.stdout == "set()\n", done.stderr
 
 
 @pytest.mark.parametrize(

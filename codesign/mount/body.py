@@ -6,8 +6,6 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from codesign.backend import differentiable_once
@@ -210,6 +208,9 @@ def solids_of(vertices_m: Any, faces: Any) -> list[Tensor]:
 
 def _components(corners):
     """Which connected component each face [F, 3] belongs to, and whether each of them is closed."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
     count = int(corners.max()) + 1
     edges = np.stack([corners, np.roll(corners, -1, 1)], -1)
     # of faces that are not folded to a line

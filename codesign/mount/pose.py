@@ -9,8 +9,8 @@ at zero the camera looks along the body's x axis with level rows.
 import math
 from collections.abc import Sequence
 
+import scipy
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from codesign.checks import check_finite, check_number, check_positive
@@ -148,7 +148,7 @@ class Mount(nn.Module):
             raise ShapeError(f"mount: poses are [..., 4, 4], got {tuple(T_body_cam.shape)}.")
         pose = check_finite(T_body_cam.detach().double(), "mount: T_body_cam")
         turn = self.start_attitude.mT @ pose[..., :3, :3]
-        turned = Rotation.from_matrix(turn.reshape(-1, 3, 3).cpu().numpy())
+        turned = scipy.spatial.transform.Rotation.from_matrix(turn.reshape(-1, 3, 3).cpu().numpy())
         vector = torch.from_numpy(turned.as_rotvec()).to(pose.device)
         return (
             torch.cat([self._unbounded(pose[..., :3, 3]), vector.reshape(*pose.shape[:-2], 3)], -1)

@@ -1,5 +1,6 @@
 """Momentum descent for noisy gradients, as a torch optimiser."""
 
+import inspect
 import math
 from collections.abc import Iterable
 from typing import Any
@@ -60,6 +61,12 @@ class Descent(torch.optim.Optimizer):
                 "grain": grain,
             },
         )
+
+    # as torch has them before it imports its compiler for each, which takes a second
+    add_param_group = inspect.unwrap(torch.optim.Optimizer.add_param_group)
+    zero_grad = inspect.unwrap(torch.optim.Optimizer.zero_grad)
+    state_dict = inspect.unwrap(torch.optim.Optimizer.state_dict)
+    load_state_dict = inspect.unwrap(torch.optim.Optimizer.load_state_dict)
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> Any:

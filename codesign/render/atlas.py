@@ -7,8 +7,7 @@ texture: a texture for any mesh, whatever texture coordinates it has. Meshes fin
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from codesign.render.triangles import edge_pairs, normals_of
 
@@ -218,8 +217,8 @@ def nodes_of(vertices: np.ndarray, faces: np.ndarray) -> Nodes:
     face, other, k, j = (part[smooth] for part in (face, other, k, j))
     ends = [(3 * face + k, 3 * other + (j + 1) % 3), (3 * face + (k + 1) % 3, 3 * other + j)]
     a, b = (np.concatenate(part) for part in zip(*ends, strict=True))
-    count, label = connected_components(
-        coo_matrix((np.ones(len(a)), (a, b)), shape=(faces.size,) * 2), directed=False
+    count, label = scipy.sparse.csgraph.connected_components(
+        scipy.sparse.coo_matrix((np.ones(len(a)), (a, b)), shape=(faces.size,) * 2), directed=False
     )
     corner = np.argsort(label, kind="stable")
     first = np.searchsorted(label[corner], np.arange(count + 1))

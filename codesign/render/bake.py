@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
-from scipy.ndimage import distance_transform_edt, zoom
 
 from codesign.checks import check_positive, check_whole
 from codesign.errors import DomainError
@@ -378,10 +378,12 @@ def _filled(values, known):
     """Unknown texels take the value of the nearest known one."""
     if known.all() or not known.any():
         return values
-    nearest: Any = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    how = {"return_distances": False, "return_indices": True}
+    nearest: Any = scipy.ndimage.distance_transform_edt(~known, **how)
     return values[nearest[0], nearest[1]]
 
 
 def _resized(light, shape):
     """Bilinear, texel centres at half-integers as a texture lookup has them."""
-    return zoom(light, np.array(shape) / light.shape, order=1, mode="nearest", grid_mode=True)
+    share = np.array(shape) / light.shape
+    return scipy.ndimage.zoom(light, share, order=1, mode="nearest", grid_mode=True)

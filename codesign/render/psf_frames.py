@@ -10,8 +10,8 @@ import itertools
 import math
 from collections.abc import Sequence
 
+import scipy
 import torch
-from scipy.fft import next_fast_len
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
@@ -165,7 +165,7 @@ def _convolved(psf, layers, depths_per_m):
     rows, columns = (n - 1 for n in psf.grid[1:])
     high, wide = psf.cell_px
     margin = 2 * psf.radius_px
-    size = tuple(next_fast_len(n + margin, real=True) for n in psf.cell_px)
+    size = tuple(scipy.fft.next_fast_len(n + margin, real=True) for n in psf.cell_px)
     transfer = torch.stack([_transfer(psf, v, layers, size) for v in depths_per_m])[:, None]
     padded = pad(layers, (0, columns * wide - film.width_px, 0, rows * high - film.height_px))
     cells = padded.unfold(-2, high + margin, high).unfold(-2, wide + margin, wide)

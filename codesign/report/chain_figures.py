@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.figure import Figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def draw_image(axis: Any, image: Any, of_scale: Sequence[Any], signed: bool = False) -> None:
@@ -66,8 +67,9 @@ def _between_powers(side, value, _):
     return f"{value:g}" if high < 4 * low or f"{value:.0e}"[0] in "25" else ""
 
 
-def heat_map(values: Any, rows: Sequence[str], columns: Sequence[str], label: str) -> Figure:
+def heat_map(values: Any, rows: Sequence[str], columns: Sequence[str], label: str) -> "Figure":
     """Figure of a labelled matrix on a logarithmic colour scale; NaN cells stay empty."""
+    import matplotlib.pyplot as plt
     from matplotlib.colors import LogNorm
 
     values = np.asarray(values, dtype=float)

@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import hsv_to_rgb
 
 
 def flow_colours(flow_px: np.ndarray, full_px: float | None = None) -> np.ndarray:
     """RGB picture [H, W, 3] of a flow [2, H, W]: hue the direction (red right, then yellow, green
     down), saturation the length, full at ``full_px``."""
+    from matplotlib.colors import hsv_to_rgb
+
     length = np.hypot(*flow_px)
     full = full_px or max(float(length.max()), 1e-9)
     return hsv_to_rgb(

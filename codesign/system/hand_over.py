@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import scipy
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from codesign import lens as lenses
@@ -133,7 +133,8 @@ def _check_frame(name):
 
 def _transform(pose, handed):
     # x, y, z, w >= 0
-    quaternion = Rotation.from_matrix(pose[:3, :3].cpu().numpy()).as_quat(canonical=True)
+    turn = scipy.spatial.transform.Rotation.from_matrix(pose[:3, :3].cpu().numpy())
+    quaternion = turn.as_quat(canonical=True)
     return {
         "parent_frame": handed.parent_frame,
         "child_frame": handed.child_frame,
@@ -151,7 +152,8 @@ def _pose(page):
         raise DomainError(
             f"the quaternion has length {float(quaternion.norm()):.6g}; give one of length 1."
         )
-    pose[:3, :3] = torch.from_numpy(Rotation.from_quat(quaternion.numpy()).as_matrix())
+    turn = scipy.spatial.transform.Rotation.from_quat(quaternion.numpy())
+    pose[:3, :3] = torch.from_numpy(turn.as_matrix())
     pose[:3, 3] = torch.tensor([page["translation_m"][axis] for axis in "xyz"], dtype=torch.float64)
     return pose
 

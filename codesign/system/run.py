@@ -5,6 +5,7 @@ from collections import ChainMap
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -206,8 +207,8 @@ class Pass(Mapping[str, Any]):
         if self.system.mount is not None:
             mounted = self["T_body_cam"][..., None, :, :].to(poses)
             try:
-                torch.broadcast_shapes(poses.shape, mounted.shape)
-            except RuntimeError:
+                np.broadcast_shapes(poses.shape, mounted.shape)  # torch's imports sympy
+            except ValueError:
                 raise ShapeError(
                     f"stage 'mount' returned poses of shape {tuple(self['T_body_cam'].shape)}, which do not go with "
                     f"those of the body, {tuple(poses.shape)}; give one for all, [4, 4], or one per trajectory."

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.interpolate import make_interp_spline
 from torch import Tensor
 
 from codesign.checks import check_finite
@@ -83,6 +82,8 @@ def minimum_snap(points, t_s):
             f"the segments last from {length.min():g} to {length.max():g} s; let the longest "
             f"be at most {LARGEST_RATIO:g} times the shortest."
         )
+    from scipy.interpolate import make_interp_spline
+
     at_rest = [(order, np.zeros(points.shape[1])) for order in (1, 2, 3)]
     spline = make_interp_spline(t_s.numpy(), points.numpy(), TERMS - 1, bc_type=(at_rest, at_rest))
     # of powers of the time since a segment's start, in lengths of the segment

@@ -20,7 +20,6 @@ from studies.chain_picture import panels
 from studies.frame.config import check_least
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.show import panels as charts
-from studies.hero import looped
 
 PITCH_MM = 0.0185
 DURATION_S = 0.05
@@ -105,6 +104,8 @@ def _each_stage(run, seen, t_s):
         dpi=110,
     )
     frames = torch.nn.functional.avg_pool2d(seen["frames"].detach(), 2).flatten(0, -3)
+    from studies.hero import looped
+
     write_atomic(run.path("events_decay.webp"), looped(list(panels.loop(frames, t_s))[::2]))
     run.video(
         "events_decay.webp",

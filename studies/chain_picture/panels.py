@@ -8,10 +8,8 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from PIL import Image
 from torch import Tensor
 
@@ -72,8 +70,10 @@ def lens_way(scene: Any, drive: Tensor, t_s: Tensor, steps: int) -> list[Panel]:
     ]
 
 
-def overlay(frame: Tensor, fields: dict[str, FlowField], every_px: int) -> Figure:
+def overlay(frame: Tensor, fields: dict[str, FlowField], every_px: int):
     """A frame [H, W] under arrows of the flow of each field, as long as the flow, in pixels."""
+    import matplotlib.pyplot as plt
+
     figure, axes = plt.subplots(1, len(fields), figsize=(5 * len(fields), 4), layout="constrained")
     y, x = torch.meshgrid(
         *(torch.arange(every_px // 2, n, every_px) for n in frame.shape), indexing="ij"

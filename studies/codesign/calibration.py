@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from typing import Any
 
+import scipy
 import torch
-from scipy.optimize import minimize
 from torch import Tensor
 
 from codesign.events import SensorModel
@@ -97,5 +97,5 @@ def fitted(
 
     corners = torch.cat([start[None], start + FIRST * torch.eye(len(start), dtype=torch.float64)])
     options = {"maxfev": LOOKS, "initial_simplex": corners.numpy()}
-    found = minimize(loss, start.numpy(), method="Nelder-Mead", options=options)
+    found = scipy.optimize.minimize(loss, start.numpy(), method="Nelder-Mead", options=options)
     return Calibration(*torch.as_tensor(found.x).exp().tolist())

@@ -4,26 +4,27 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import torch
-from matplotlib.figure import Figure
 
 from codesign import lens
-from codesign.report.lens_figures import draw_layout
 from codesign.system import HandOver, load_hand_over, save_hand_over
 from scenes.robots import pair as robot_pair
 from studies.codesign.design import Whole
 from studies.codesign.race import JUDGED, Judge
 from studies.frame.run import Run
-from studies.placement.figures import draw_pair, draw_seen, fastest
 
 COLUMNS = ("lens", "robot and view", "frame", "events", "flow")
 FIELDS_RAD = (0.0, 0.2, 0.4)  # of the rays that are drawn
 
 
-def side_by_side(judge: Judge, designs: Mapping[str, Whole]) -> Figure:
+def side_by_side(judge: Judge, designs: Mapping[str, Whole]):
     """A row for each design: lens, robot with the camera's view, frame, single events and flow of
     one unseen drive."""
+    import matplotlib.pyplot as plt
+
+    from codesign.report.lens_figures import draw_layout
+    from studies.placement.figures import draw_pair, draw_seen, fastest
+
     drawn = judge.drawn
     samples = fastest(drawn.base, JUDGED)
     figure = plt.figure(figsize=(13, 3.2 * len(designs)), layout="constrained")

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+import scipy
 import torch
-from scipy.stats import linregress, spearmanr
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
@@ -72,7 +72,8 @@ class Landscape:
     def slope(self) -> float | None:
         """Of hard errors over expected ones, over them; None where these are all alike."""
         expected, hard = ([row[name] for row in self.judged] for name in ("expected", "hard"))
-        return float(linregress(expected, hard).slope) if len(set(expected)) > 1 else None
+        alike = len(set(expected)) < 2
+        return None if alike else float(scipy.stats.linregress(expected, hard).slope)
 
     def csv(self, space: Space) -> str:
         """Every design: where it was drawn, its numbers, and its errors; "near" are those that
@@ -99,7 +100,7 @@ def ranked(one: Sequence[float], other: Sequence[float]) -> float | None:
     """Spearman's correlation; None where fewer than three, or all alike, tell none."""
     if len(one) < 3 or len(set(one)) == 1 or len(set(other)) == 1:
         return None
-    return float(spearmanr(one, other)[0])
+    return float(scipy.stats.spearmanr(one, other)[0])
 
 
 def all_over(space: Space, count: int) -> list[Tensor]:

@@ -10,8 +10,8 @@ these numbers a step.
 
 from collections.abc import Sequence
 
+import scipy
 import torch
-from scipy.optimize import minimize
 from torch import Tensor
 
 from codesign import mount
@@ -113,7 +113,7 @@ class Objective:
         corners = begun + torch.diag(torch.where(begun < 0.5, SIMPLEX, -SIMPLEX))
         simplex = torch.cat([begun[None], corners]).numpy()
         options = {"maxfev": tries, "initial_simplex": simplex}
-        minimize(error, begun.numpy(), method="Nelder-Mead", options=options)
+        scipy.optimize.minimize(error, begun.numpy(), method="Nelder-Mead", options=options)
         return min(tried, key=lambda one: one[0])[1]
 
     def forget(self) -> None:

@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any
 
 import torch
-from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
 from codesign.mount import (
@@ -221,6 +220,8 @@ class Looked:
     def blurred(self, generator: torch.Generator) -> tuple["Looked", Tensor]:
         """The same frames behind a blur that is drawn for every window, and the optics [N, windows,
         2] of what is read there."""
+        from kornia.filters import gaussian_blur2d
+
         frames, own = self.run["frames"], self.optics
         low, high = BLURS_PX
         drawn = torch.rand(own.shape[:2], generator=generator, dtype=own.dtype)

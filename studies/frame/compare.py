@@ -15,8 +15,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import scipy
 import torch
-from scipy.special import stdtrit
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
@@ -81,7 +81,8 @@ def student(values: Any, level: float = LEVEL) -> Interval:
     mean = float(values.mean())
     if count == 1:
         return Interval(mean, -math.inf, math.inf, 1)
-    half = float(stdtrit(count - 1, (1 + level) / 2)) * float(values.std()) / math.sqrt(count)
+    quantile = float(scipy.special.stdtrit(count - 1, (1 + level) / 2))
+    half = quantile * float(values.std()) / math.sqrt(count)
     return Interval(mean, mean - half, mean + half, count)
 
 

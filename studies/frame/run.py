@@ -22,6 +22,7 @@ import inspect
 import io
 import json
 import math
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -29,8 +30,6 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Generic
 
-import matplotlib
-import matplotlib.pyplot as plt
 import torch
 import tyro
 from rich.console import Console
@@ -206,6 +205,8 @@ class Run(Generic[Config]):
     def figure(self, figure, name: str, caption: str, dpi: int = 160):
         """Save a matplotlib figure as <name>.png, show it on the page, and close it. Returns the
         path."""
+        import matplotlib.pyplot as plt
+
         path = self.path(f"{name}.png")
         png = io.BytesIO()
         figure.savefig(png, format="png", dpi=dpi, bbox_inches="tight", facecolor="white")
@@ -329,7 +330,7 @@ def main(
             args=arguments,
         )
 
-    matplotlib.use("Agg")  # figures go to files; no screen is needed
+    os.environ["MPLBACKEND"] = "Agg"  # figures go to files; no screen is needed
     torch.set_num_threads(
         1
         # the heavy work is in drjit's own thread pool, which torch's waiting threads only slow down

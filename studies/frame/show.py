@@ -16,9 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.figure import Figure
 
 from codesign.report.chain_figures import draw_curves, draw_image
 from codesign.report.flow_colours import draw_wheel
@@ -104,9 +102,11 @@ class Panel:
     bands: Mapping[str, tuple[Any, Any, Any]] = field(default_factory=dict)
 
 
-def panels(*charts: Panel, width: float = 4.5) -> Figure:
+def panels(*charts: Panel, width: float = 4.5):
     """Figure of charts beside one another; below stands a legend for all where they have the same
     series, else one of its own below each chart that has several."""
+    import matplotlib.pyplot as plt
+
     figure, axes = plt.subplots(
         1, len(charts), figsize=(width * len(charts), 3.4), squeeze=False, layout="constrained"
     )
@@ -132,13 +132,15 @@ def pictures(
     signed: Iterable[str] = (),
     side: float = 2.3,
     flow: bool = False,
-) -> Figure:
+):
     """Figure of pictures: row label -> column title -> [H, W] or, in colours of 0 to 1, [H, W, 3].
 
     Grey pictures of a row share their scale, with a display's gamma; columns that are ``signed``
     are red above zero and blue below, on one scale per row. A picture that a row lacks leaves its
     place empty. ``flow``: beside them stands the wheel of the colours of flow.
     """
+    import matplotlib.pyplot as plt
+
     titles = list(dict.fromkeys(title for row in rows.values() for title in row))
     shapes = [np.shape(image)[:2] for row in rows.values() for image in row.values()]
     tallest = max(height / width for height, width in shapes)
@@ -170,9 +172,11 @@ def bars(
     xlabel: str,
     log: bool = False,
     level: float | None = None,
-) -> Figure:
+):
     """Figure of horizontal bars, with whiskers where a value is an Interval; ``level`` is drawn as
     a red line."""
+    import matplotlib.pyplot as plt
+
     figure, axis = plt.subplots(figsize=(7, 0.8 + 0.4 * len(values)), layout="constrained")
     for at, value in enumerate(values.values()):
         of = value if isinstance(value, Interval) else Interval(value, value, value, 1)

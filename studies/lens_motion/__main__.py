@@ -18,8 +18,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any, ClassVar
 
+import scipy
 import torch
-from scipy.stats import t as student_t
 
 from codesign import flow, lens, render
 from codesign.checks import check_positive
@@ -211,8 +211,8 @@ def ratios(rows, design: str, turned: int = 0) -> dict[str, Interval]:
 def detectable(pair: Interval) -> float:
     """The smallest change that the cases would have shown with a power of 80 %, as a log ratio."""
     free = pair.count - 1
-    at_95 = float(student_t.ppf(0.975, free))
-    return (pair.high - pair.low) / 2 / at_95 * (at_95 + float(student_t.ppf(POWER, free)))
+    at_95 = float(scipy.stats.t.ppf(0.975, free))
+    return (pair.high - pair.low) / 2 / at_95 * (at_95 + float(scipy.stats.t.ppf(POWER, free)))
 
 
 def _geometric(values):

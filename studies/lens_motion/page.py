@@ -2,9 +2,7 @@
 
 import math
 
-import matplotlib.pyplot as plt
 import torch
-from matplotlib.figure import Figure
 
 from studies.lens_motion.rivals import rays_at
 from studies.lens_opt.task import PITCH_MM
@@ -30,12 +28,14 @@ IMAGES = (
 REACH_PX = 8.0
 
 
-def point_images(lenses, motion) -> Figure:
+def point_images(lenses, motion):
     """A row of windows per lens: rays in pixels, radius turned to where it points on the sensor,
     and the flow.
 
     lenses: by the name of their designer.
     """
+    import matplotlib.pyplot as plt
+
     windows = motion.windows_px
     figure, axes = plt.subplots(
         len(windows),

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from itertools import combinations, product
 
 import numpy as np
+import scipy
 import torch
-from scipy.optimize import minimize
 from torch import Tensor
 
 from codesign.errors import CodesignError
@@ -90,7 +90,7 @@ def design(name: str, form: Form, motion: Motion, seed: int, steps: int) -> list
     line = [[film, *np.zeros(len(bounds) - 1)] for film in np.linspace(-30, 3, 12)]
     starts = sorted(([*line, *drawn]), key=lambda point: value(np.asarray(point))[0])
     how = {"jac": True, "method": "L-BFGS-B", "bounds": bounds, "options": {"maxfun": steps}}
-    found = [minimize(value, start, **how) for start in starts[:TRIED]]
+    found = [scipy.optimize.minimize(value, start, **how) for start in starts[:TRIED]]
     return min(found, key=lambda result: result.fun).x.tolist()
 
 

@@ -11,7 +11,6 @@ import torch
 
 from codesign import events, render
 from codesign.errors import MissingPackageError
-from codesign.report import lens_figures
 from codesign.report.prose import counted
 from scenes import worlds
 from studies.frame.compare import Interval, log_ratio
@@ -213,6 +212,8 @@ def _settings(run, course):
 
 
 def _lenses(run, task, shown):
+    from codesign.report import lens_figures
+
     run.section(
         "The lenses", "Cross-sections with meridional rays at the three fields, and their spots."
     )

@@ -31,7 +31,6 @@ from studies.frame.fidelity import Tolerant, chosen
 from studies.frame.run import Run, main
 from studies.placement.look import look, size_in_words
 from studies.placement.outcome import Outcome
-from studies.placement.page import report
 from studies.placement.problem import DRIVES, Problem, check_drives, traced_camera
 from studies.placement.race import Race, feasible
 from studies.placement.searches import SEARCHES, available
@@ -110,6 +109,8 @@ def study(run: Run[Config]) -> None:
         race.descent(number, start)
         for name in size.searches:
             race.search(number, name, start)
+    from studies.placement.page import report
+
     report(run, Outcome(race, unseen, race.judge(unseen, starts)))
 
 

@@ -28,18 +28,18 @@ from codesign.mount import (
     yaw_pitch_roll_rad,
 )
 from codesign.mount.requirements import Verdict
-from codesign.report.mount_sphere import mount_sphere
 from scenes.robots import pair as robot_pair
 from scenes.robots.check import check_width
 from scenes.robots.pair import RobotPair
 from studies.frame.run import Run
-from studies.placement import figures
 
 # under it a camera over flat ground tells nothing that a picture would not
 LEAST_HEIGHT_M = 0.05
 
 
 def look(run: Run[Any], pair: RobotPair, camera: render.Camera) -> None:
+    from studies.placement import figures
+
     check_width(pair, camera)
     pose = pair.design.mount()
     drives = pair.batch((0,), 1, run.config.seed)
@@ -144,6 +144,8 @@ def what_it_tells(
         f"{height:.2f} m over flat ground the motion that shows least from there is {told.weakest_named()} (in units of "
         f"0.1 m/s and 0.1 rad/s, deviation {told.weakest_deviation:.2f}); blind to: {', '.join(told.blind()) or 'nothing'}."
     )
+    from codesign.report.mount_sphere import mount_sphere
+
     yaw, pitch, errors = sight_map(camera, around, rows=9, columns=18)
     now = yaw_pitch_roll_rad(pose).tolist()
     run.figure(

@@ -9,6 +9,7 @@ first. What can be refused without a look costs none. The same seed and judge gi
 import math
 from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import TypeAlias
 
 import numpy as np
@@ -214,6 +215,7 @@ def available(names: Iterable[str]) -> dict[str, Search]:
         if name not in SEARCHES:
             raise DomainError(f"search '{name}' is unknown; choose from {', '.join(SEARCHES)}.")
         found[name] = SEARCHES[name]
-        if library := SEARCHES[name].library:
+        library = SEARCHES[name].library
+        if library and not find_spec(library):  # present ones are imported when they search
             require(library, "search", f"the search {name}")
     return found

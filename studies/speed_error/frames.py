@@ -1,10 +1,12 @@
 """Stage "render": what a step of frames costs."""
 
+import time
+
 import torch
 
 from codesign import lens, pose, render
 from scenes import trajectories, worlds
-from studies.frame.bench import measure, resident_mb
+from studies.frame.bench import apart, measure, resident_mb
 from studies.frame.run import Run
 from studies.frame.show import Asked, Panel, panels
 from studies.speed_error import Config
@@ -13,6 +15,13 @@ SIZE_PX = 96
 SAMPLES = 8
 START = ((0.0, -1.2, 1.3), (0.2, 2.0, 1.2))
 WARM = 10  # steps before memory counts: caches fill
+
+
+def first_frame_s() -> float:
+    """Processor seconds of this process, imports among them, up to a frame of the room."""
+    camera = render.Camera(lens.load("cooke-triplet").freeze(), SIZE_PX, SIZE_PX, 0.15, SAMPLES)
+    render.frames(camera, worlds.room(objects=False), pose.look_at(*START)[None])
+    return time.process_time()
 
 
 def render_stage(run: Run[Config]) -> list[Asked]:
@@ -53,6 +62,7 @@ def render_stage(run: Run[Config]) -> list[Asked]:
     # the pinhole computes in float64 by default; both get float32 rays
     over_pinhole = cost(geo.scaled(0.22).freeze()) / cost(lens.Pinhole(torch.tensor(11.0)))
     return [
+        Asked("CPU-s from start to the first frame", apart(first_frame_s), most=3.0),
         Asked("CPU-s of a render step", timing.cpu, most=1.0),
         Asked("growth of memory over the steps, MB", memory[-1] - memory[WARM - 1], most=50.0),
         Asked("traced triplet over pinhole, frames alone", over_pinhole, most=1.3),

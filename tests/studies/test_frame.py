@@ -7,6 +7,7 @@ import sys
 import time
 from statistics import stdev
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
@@ -350,4 +351,4 @@ def test_figures_hold_what_they_are_given():
     widths = [bar.get_width() for bar in drawn.axes[0].patches if isinstance(bar, Rectangle)]
     assert widths == [2, 1]
     for figure in (chart, grid, drawn):
-        show.plt.close(figure)
+        plt.close(figure)

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import map_coordinates
-from scipy.spatial.transform import Rotation, Slerp
+import scipy
 
 from codesign.checks import check_kind, check_path
 from codesign.errors import DomainError, FileFormatError
@@ -107,10 +106,9 @@ class Calibration:
         place = slopes * self.focal_px + self.centre_px
         # -1: beside the picture
         at = np.where(np.isfinite(place), place, -1.0)[..., ::-1].transpose(2, 0, 1)
-        known = map_coordinates(valid.astype(float), at, order=1, cval=0.0) > 1 - 1e-9
-        read = np.stack(
-            [map_coordinates(part, at, order=1) for part in np.where(valid, flow_px, 0.0)], -1
-        )
+        known = scipy.ndimage.map_coordinates(valid.astype(float), at, order=1, cval=0.0) > 1 - 1e-9
+        shown = np.where(valid, flow_px, 0.0)
+        read = np.stack([scipy.ndimage.map_coordinates(part, at, order=1) for part in shown], -1)
         landed = (
             self.distorted((place + read - self.centre_px) / self.focal_px) * self.focal_px
             + self.centre_px
@@ -193,9 +191,9 @@ class Attitude:
         if reason:
             raise FileFormatError(f"{reason}; choose windows inside.")
         first, last = self._around(t0_s, t1_s)
-        turns = Slerp(self.t_s[first : last + 1], self.turns[first : last + 1])(
-            np.array([t0_s, t1_s])
-        )
+        between = slice(first, last + 1)
+        turns = scipy.spatial.transform.Slerp(self.t_s[between], self.turns[between])
+        turns = turns(np.array([t0_s, t1_s]))
         return (turns[1].inv() * turns[0]).as_matrix()
 
     def missing(self, t0_s: float, t1_s: float) -> str:
@@ -235,9 +233,10 @@ def read_gyroscope(path: str | Path, axes: str = "xyz") -> Attitude:
     table = _table(path, 7, "t ax ay az gx gy gz")
     t_s = table[:, 0]
     rate = table[:, 4:] @ turned.T
-    steps = Rotation.from_rotvec((rate[1:] + rate[:-1]) / 2 * np.diff(t_s)[:, None])
-    turns = accumulate(steps, mul, initial=Rotation.identity())
-    return Attitude(t_s, Rotation.concatenate(list(turns)), None, str(path))
+    rotation = scipy.spatial.transform.Rotation
+    steps = rotation.from_rotvec((rate[1:] + rate[:-1]) / 2 * np.diff(t_s)[:, None])
+    turns = accumulate(steps, mul, initial=rotation.identity())
+    return Attitude(t_s, rotation.concatenate(list(turns)), None, str(path))
 
 
 def read_poses(path: str | Path) -> Attitude:
@@ -250,7 +249,8 @@ def read_poses(path: str | Path) -> Attitude:
             f"{path}, row {at + 1} of numbers: the quaternion has length {length[at]:.4g}, not 1; the order "
             "is qx qy qz qw."
         )
-    return Attitude(table[:, 0], Rotation.from_quat(table[:, 4:]), table[:, 1:4], str(path))
+    turns = scipy.spatial.transform.Rotation.from_quat(table[:, 4:])
+    return Attitude(table[:, 0], turns, table[:, 1:4], str(path))
 
 
 def _table(path, columns, names):

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import scipy
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -221,7 +221,8 @@ class FieldOfView:
         rays = camera.chief_rays(pixels)
         lit = rays.weight > 0
         lit |= ~lit.any()  # all meet an obstruction
-        self._chief_px, self._chief = pixels[lit], cKDTree(rays.direction[lit].numpy())
+        self._chief_px = pixels[lit]
+        self._chief = scipy.spatial.cKDTree(rays.direction[lit].numpy())
 
     def near_px(self, y: Tensor) -> Tensor:
         """Film position [n, 2] px of points y [n, 3] in camera axes: of the chief ray, of some

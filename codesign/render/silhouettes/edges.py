@@ -4,9 +4,7 @@ seams of walls, edges that overlap in part, a tube's end and its lid."""
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+import scipy
 
 from codesign.render.rows import Rows
 from codesign.render.triangles import across, edge_pairs
@@ -128,14 +126,16 @@ def welded(points: np.ndarray, apart_m: float) -> np.ndarray:
     place = np.empty(len(points), dtype=np.int64)
     place[order] = number
     apart_m = max(float(apart_m), float(np.abs(points).max(initial=0)) * ROUNDING)
-    pairs = cKDTree(unique, balanced_tree=False).query_pairs(apart_m, output_type="ndarray")
+    pairs = scipy.spatial.cKDTree(unique, balanced_tree=False).query_pairs(
+        apart_m, output_type="ndarray"
+    )
     if not len(pairs):
         return place
     size = len(unique)
-    graph = coo_matrix(
+    graph = scipy.sparse.coo_matrix(
         (np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(size, size)
     )
-    return connected_components(graph, directed=False)[1][place]
+    return scipy.sparse.csgraph.connected_components(graph, directed=False)[1][place]
 
 
 def _equal(points):
@@ -207,7 +207,7 @@ def _cut_at_ends(edges, apart_m):
     """Edges cut where ends of others lie on them, and how far off [E] these lay."""
     points = np.concatenate([edges.start, edges.end])
     points = points[np.unique(welded(points, 0.0), return_index=True)[1]]
-    tree = cKDTree(points)
+    tree = scipy.spatial.cKDTree(points)
     middle = (edges.start + edges.end) / 2
     half = edges.length_m / 2
     nearest, _ = tree.query(middle)
@@ -238,7 +238,7 @@ def _cut_at_ends(edges, apart_m):
 
 
 def within_reach(
-    tree: cKDTree,
+    tree: "scipy.spatial.cKDTree",
     points: np.ndarray,
     reach: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -274,7 +274,7 @@ def rims_once(
     kept = np.ones(len(centre), dtype=bool)
     axis = axis.copy()
     width = width_m.copy()
-    pairs = cKDTree(centre).query_pairs(apart_m, output_type="ndarray")
+    pairs = scipy.spatial.cKDTree(centre).query_pairs(apart_m, output_type="ndarray")
     for i, j in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]:
         apart = (
             np.linalg.norm(centre[i] - centre[j]) + np.linalg.norm(shape[i] - shape[j]) / radius[i]

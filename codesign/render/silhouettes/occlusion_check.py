@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+import scipy
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from codesign.errors import DomainError
@@ -354,7 +354,7 @@ def _near(curve, index, bounds, eye, origin, direction, distance, near_rad):
     share = float((half / (middle - eye).norm(dim=1).clamp_min(1e-9)).max()) + DEPTH
     at = origin + distance[:, None] * direction
     near = within_reach(
-        cKDTree(middle.numpy()), at.numpy(), (distance * share * (1 + share)).numpy()
+        scipy.spatial.cKDTree(middle.numpy()), at.numpy(), (distance * share * (1 + share)).numpy()
     )
     ray, piece = map(torch.tensor, near)
     # in the plane across the ray

@@ -10,8 +10,8 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
+import scipy
 import torch
-from scipy import stats
 from torch import Tensor
 
 from codesign import events, flow, render
@@ -177,7 +177,7 @@ def judged(chosen: Sequence[Line], slopes: Tensor, differences: Tensor, bent: Te
     for group in groups:
         own = [k for k, (other, _) in enumerate(chosen) if other == group]
         one = group, slopes[:, own], differences[:, own], bent[own]
-        row = _judged(*one, stats.norm.sf(SIGMAS))
+        row = _judged(*one, scipy.stats.norm.sf(SIGMAS))
         if row.verdict == "fail" and _judged(*one, RARE).verdict != "fail":
             row = replace(row, verdict="noise")
         rows.append(row)
@@ -189,7 +189,7 @@ def _judged(group, slopes, differences, bent, chance):
     noise = bent
     draws = len(slopes)
     if draws > 1:
-        student = stats.t.isf(chance, len(bent) * (draws - 1)) / SIGMAS
+        student = scipy.stats.t.isf(chance, len(bent) * (draws - 1)) / SIGMAS
         noise = torch.hypot(bent, student * (slopes - differences).std(0) / math.sqrt(draws))
     pairs = zip(differences.mean(0).tolist(), noise.tolist(), strict=True)
     found = [Difference(value, 1.0, deviation, ()) for value, deviation in pairs]
