@@ -30,7 +30,7 @@ BUDGETS = {
     "studies/codesign": 15_780,  # blur over the view, what a family reaches, where answers lie, the best of all answers, what blur does by experiment, what a design was judged in
     "studies/flow_quality": 5_560,  # names of recordings, no truth of rotation alone
     "studies/flow_recording": 3_470,  # windows that are not judged
-    "studies/frame": 9_300,  # threads of workers, titles of columns, options without effect, files that a run was given and read piece by piece, tables put together, what is looked at meanwhile
+    "studies/frame": 9_310,  # threads of workers, titles of columns, options without effect, files that a run was given and read piece by piece, tables put together, what is looked at meanwhile
     "studies/gradient_flow": 6_300,  # a first line that answers
     "studies/lens_motion": 4_190,  # a table read case by case, poses that stand still
     "studies/lens_opt": 6_480,  # seeds that judge; where windows lie, designs that err alike
@@ -38,7 +38,7 @@ BUDGETS = {
     "studies/make_dataset": 4_310,  # sequences side by side
     "studies/placement": 7_910,  # options without effect
     "studies/sensor_fit": 2_140,  # the best step, rates beside correlation
-    "studies/speed_error": 8_690,  # growth of the whole chain, inverse search beside live flow, the first frame of a process
+    "studies/speed_error": 8_940,  # growth of the whole chain, inverse search beside live flow, first frames and gradients of a process, programs
     "studies/spike_esim": 2_940,
     "studies/stability": 8_220,
     "studies/train_flow": 5_180,  # steps of a race, options without effect, windows that reach into one another

@@ -2,9 +2,11 @@
 
 import itertools
 import statistics
+import tempfile
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -14,11 +16,12 @@ from codesign import events, lens, pose, render
 from codesign.flow import Tracker, estimate_lk, load
 from codesign.flow.baselines import FlowNetEvents, SpikeFlowNet
 from codesign.flow.baselines.parts import count_weights
+from codesign.flow.export import export
 from codesign.flow.metrics import aee
 from codesign.flow.refiner import Refiner
 from codesign.types import EventStream, EventVolume, FlowField
 from scenes import trajectories, worlds
-from studies.frame.bench import cost, installed
+from studies.frame.bench import apart, cost, installed
 from studies.frame.run import Run
 from studies.frame.show import Asked, tabulate
 from studies.frame.sweep import sweep
@@ -86,6 +89,8 @@ def stage(run: Run[Config]) -> list[Asked]:
         first, last = (cpu_s[name, "forward", size, 1] / size**2 for size in (sizes[0], sizes[-1]))
         what = f"{name}, CPU per pixel at {sizes[-1]} px over {sizes[0]} px"
         figures.append(Asked(what, last / first, 1 - ASKED_GROWTH, 1 + ASKED_GROWTH))
+    for what, seconds in apart(program_s).items():
+        figures.append(Asked(f"CPU-s to {what} a refiner's program", seconds, most=10.0))
     return figures
 
 
@@ -195,6 +200,18 @@ def flow(case: tuple[str, str, int, int], repeats: int, seed: int) -> dict[str, 
     work(scattered(64, bins, seed))
     volume = scattered(size, bins, seed, windows)
     return cost(lambda: work(volume), repeats) | {"weights": sum(p.numel() for p in learned)}
+
+
+def program_s() -> dict[str, float]:
+    """Processor seconds to write the refiner as a program for 48 x 64 pixels, and to read it."""
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "refiner.pt2"
+        begun_s = time.process_time()
+        export(load("refiner"), path, 48, 64)
+        written_s = time.process_time()
+        torch.export.load(path)
+    return {"write": written_s - begun_s, "read": time.process_time() - written_s}
 
 
 def live(sensor: tuple[int, int], estimator: str) -> dict[str, float]:

@@ -1,5 +1,6 @@
 """Stage "render": what a step of frames costs."""
 
+import tempfile
 import time
 
 import torch
@@ -22,6 +23,25 @@ def first_frame_s() -> float:
     camera = render.Camera(lens.load("cooke-triplet").freeze(), SIZE_PX, SIZE_PX, 0.15, SAMPLES)
     render.frames(camera, worlds.room(objects=False), pose.look_at(*START)[None])
     return time.process_time()
+
+
+def first_gradient_s() -> float:
+    """Processor seconds of the first trace of 10,000 rays with gradients through a lens of 80 surfaces,
+    whose kinds are drawn: spheres, conics and aspheres."""
+    drawn = torch.randint(3, (80,), generator=torch.Generator().manual_seed(0)).tolist()
+    kinds = {}, {"conic": -0.5}, {"conic": -0.3, "asphere": (0.0, 1e-8)}
+    glass = lens.Glass.named("N-BK7"), None
+    bend = 400.0, -400.0
+    surfaces = [
+        lens.Surface(bend[k % 2], 1.0, glass[k % 2], 20.0, is_stop=k == 40, **kinds[kind])
+        for k, kind in enumerate(drawn)
+    ]
+    made = lens.GeoLens(surfaces, 8.0)
+    origin = torch.rand(10_000, 3, generator=torch.Generator().manual_seed(0)).double()
+    direction = origin.new_tensor([0.0, 0.0, 1.0]).expand_as(origin)
+    since_s = time.process_time()
+    made.trace(origin - 2, direction).position_mm.square().mean().backward()
+    return time.process_time() - since_s
 
 
 def render_stage(run: Run[Config]) -> list[Asked]:
@@ -61,7 +81,10 @@ def render_stage(run: Run[Config]) -> list[Asked]:
 
     # the pinhole computes in float64 by default; both get float32 rays
     over_pinhole = cost(geo.scaled(0.22).freeze()) / cost(lens.Pinhole(torch.tensor(11.0)))
+    with tempfile.TemporaryDirectory() as home:  # where no kernels are kept
+        gradient_s = apart(first_gradient_s, environment={"HOME": home})
     return [
+        Asked("CPU-s of the first gradient of 80 unlike surfaces", gradient_s, most=2.0),
         Asked("CPU-s from start to the first frame", apart(first_frame_s), most=3.0),
         Asked("CPU-s of a render step", timing.cpu, most=1.0),
         Asked("growth of memory over the steps, MB", memory[-1] - memory[WARM - 1], most=50.0),
