@@ -2,7 +2,6 @@
 
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import pairwise
 
 import torch
 from torch import Generator, Tensor
@@ -22,7 +21,7 @@ from codesign.events.entry import (
 from codesign.events.intensity import FrontEnd, kernel_levels, log_levels
 from codesign.events.kernels import Lanes
 from codesign.events.sensor import crossing, v2e
-from codesign.events.sensor.crossing import DenseCounts, EventKeys, KeyLayout
+from codesign.events.sensor.crossing import CrossingKeys, DenseCounts, KeyLayout
 from codesign.events.sensor.model import SensorModel, check_generator, check_sensor, draw_keys
 from codesign.events.sensor.state import SensorState, begin, change, check_state, leak_before
 from codesign.events.stream import concatenate, ordered
@@ -31,7 +30,6 @@ from codesign.types import EventStream
 
 EVENTS_PER_PIXEL = 1.0  # room made at first; on a processor, what no event writes to is no memory
 KEY_BITS = 63
-NEAR = 1 << 20  # pixels of all frames whose events sort together
 
 
 @torch.no_grad()
@@ -93,13 +91,9 @@ def simulate(
             frames, t_s, sensor, generator, state, front_end
         )
         start_us = round(moved.time_s * 1e6)
-        height_px, width_px = frames.shape[1:]
-        if sensor.timing == "v2e":
-            stream = _v2e_events(frames, times_s, sensor, generator, moved, front_end)
-        else:
-            layout = KeyLayout(start_us, height_px, width_px)
-            _check_range(layout, times_s[-1])
-            stream = _interpolated(frames, times_s, sensor, generator, moved, front_end, layout)
+        layout = KeyLayout(start_us, *frames.shape[1:])
+        _check_range(layout, times_s[-1])
+        stream = _events(frames, times_s, sensor, generator, moved, front_end, layout)
         if at_once is not None:
             # behind the interval before, as all others
             stream = concatenate([_fired(at_once, start_us + 1), stream])
@@ -199,47 +193,59 @@ def _fired(counts, t_us):
     return ordered(torch.full_like(x, t_us), x, y, p, *counts.shape[1:])
 
 
-def _v2e_events(frames, times_s, sensor, generator, state, front_end):
-    """Stream of the events between frames, of a few at a time, whose keys stay near the processor
-    while they sort."""
-    found, streams = [], []
-    for frame, time_s in zip(frames, times_s, strict=True):
-        check_frames(frame[None], 1, non_negative=not front_end.log_input)
-        intensity = frame.exp() if front_end.log_input else frame
-        level = v2e.levels(frame, front_end)
-        found.append(v2e.interval(intensity, level, time_s, sensor, generator, state))
-        if len(found) * frame.numel() >= NEAR or time_s == times_s[-1]:
-            t_us, x, y, p = (torch.cat(column) for column in zip(*found, strict=True))
-            streams.append(ordered(t_us, x, y, p, *frame.shape))
-            found = []
-    if any(a.t_us[-1] >= b.t_us[0] for a, b in pairwise(filter(len, streams))):
-        return concatenate(streams)
-    columns = zip(*((part.t_us, part.x, part.y, part.p) for part in streams), strict=True)
-    t_us, x, y, p = map(torch.cat, columns)
-    return EventStream(t_us, x, y, p, *frames.shape[1:])
-
-
 @exclusive
-def _interpolated(frames, times_s, sensor, generator, state, front_end, layout):
+def _events(frames, times_s, sensor, generator, state, front_end, layout):
     """Stream of the events between frames; keys are views of drjit's memory, which nobody else may
     use meanwhile. A chunk busier than the room made for it is run again with the room it needs."""
     parts = []
     lanes = Lanes(frames, frames[0].numel())
-    size = backend.frames_per_kernel(lanes.width)
+    kind = _v2e if sensor.timing == "v2e" else _interpolated
     density = EVENTS_PER_PIXEL
-    for first in range(0, len(frames), size):
-        chunk, ends_s = frames[first : first + size], times_s[first : first + size]
-        random_keys = _random_keys(len(chunk), sensor, state, generator)
+    while len(times_s):
+        size, attempt = kind(lanes, frames, times_s, sensor, generator, state, front_end, layout)
         had_room, total = False, None
         while not had_room:
-            sink = EventKeys(lanes, [state.time_s, *ends_s[:-1]], ends_s, layout, density, total)
             trial = replace(state)
-            _advance(lanes, chunk, ends_s, random_keys, sensor, trial, front_end, sink)
+            sink = attempt(trial, density, total)
             had_room, found, total = sink.counted()
             density = max(density, 1.25 * found)
         state.__dict__.update(trial.__dict__)
+        frames, times_s = frames[size:], times_s[size:]
         parts += sink.sorted()
-    return EventStream(*layout.columns(lanes, parts), layout.height_px, layout.width_px)
+    columns = layout.columns(lanes, parts)
+    if sensor.timing == "v2e" and layout.meet(parts):
+        return ordered(*columns, layout.height_px, layout.width_px)
+    return EventStream(*columns, layout.height_px, layout.width_px)
+
+
+def _interpolated(lanes, frames, times_s, sensor, generator, state, front_end, layout):
+    """How many frames the next kernel takes, and what runs it on a state and gives the events."""
+    size = backend.frames_per_kernel(lanes.width)
+    frames, times_s = frames[:size], times_s[:size]
+    keys = _random_keys(len(frames), sensor, state, generator)
+
+    def attempt(trial, *room):
+        sink = CrossingKeys(lanes, [state.time_s, *times_s[:-1]], times_s, layout, *room)
+        _advance(lanes, frames, times_s, keys, sensor, trial, front_end, sink)
+        return sink
+
+    return len(frames), attempt
+
+
+def _v2e(lanes, frames, times_s, sensor, generator, state, front_end, layout):
+    """The same for the slots of v2e."""
+    size = v2e.chunk_size(frames, front_end, sensor, state)
+    frames, times_s = frames[:size], times_s[:size]
+    chunk = v2e.Chunk(lanes, frames, times_s, front_end, sensor, generator, state)
+    slots, wrong = chunk.slots()
+    _refuse(wrong, frames, front_end)
+
+    def attempt(trial, *room):
+        sink = v2e.SlotKeys(lanes, slots, layout, *room)
+        trial.__dict__.update(chunk.run(slots, sink)[0], time_s=times_s[-1])
+        return sink
+
+    return len(frames), attempt
 
 
 def _random_keys(count, sensor, state, generator):
@@ -256,6 +262,14 @@ def _advance(lanes, frames, times_s, keys, sensor, state, front_end, sink):
     carried, wrong = crossing.run(
         lanes, frames, front_end, dt_s.to(frames), keys, sensor, state, sink
     )
+    _refuse(wrong, frames, front_end)
+    for name, tensor in carried.items():
+        setattr(state, name, tensor)
+    state.time_s = times_s[-1]
+
+
+def _refuse(wrong, frames, front_end):
+    """Raise for what a kernel found wrong."""
     if wrong == 1:
         check_frames(frames, 1, non_negative=not front_end.log_input)
     if wrong:
@@ -264,9 +278,6 @@ def _advance(lanes, frames, times_s, keys, sensor, state, front_end, sink):
             f"a pixel would fire {many}; check the unit of the frames (log levels are natural logarithms), "
             "the thresholds, the noise rates and the times."
         )
-    for name, tensor in carried.items():
-        setattr(state, name, tensor)
-    state.time_s = times_s[-1]
 
 
 def _check_range(layout, end_s):
