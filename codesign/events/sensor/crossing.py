@@ -16,7 +16,6 @@ nothing.
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import torch
@@ -74,14 +73,17 @@ def normal_pair(dr, arr, bits):
 class EventKeys:
     """Events as integers that sort by (t, y, x, p): microseconds since an origin, row, column,
     polarity, from high to low bits. Groups of intervals have room and an origin of their own, so
-    that they sort apart, in 32 bits where those hold an interval, and threads seldom meet. A kind
-    of them says what microsecond an event has (``_since_us``)."""
+    that they sort apart, in 32 bits where those hold an interval, and threads seldom meet."""
 
-    def __init__(self, lanes, start_us, end_us, layout, density, total=None):
-        """Args: start_us, end_us: arrays, ends of every interval. layout: KeyLayout. density:
+    def __init__(self, lanes, start_s, end_s, layout, density, total=None):
+        """Args: start_s, end_s: lists, ends of every interval, seconds. layout: KeyLayout. density:
         events per pixel and interval that every group has room for. total: of events, for which one
         group has room instead."""
         dr, arr = lanes.dr, lanes.arr
+        start_s, end_s = np.array(start_s), np.array(end_s)
+        start_us, end_us = (
+            np.array([round(time_s * 1e6) for time_s in times]) for times in (start_s, end_s)
+        )
         lasts_us, bits = end_us - start_us, layout.pixel_bits
         # as many intervals, as a power of 2, as have keys of 32 bits from their middle on; all in 64
         # bits where not one has, and where events of two groups might come at one time
@@ -90,33 +92,49 @@ class EventKeys:
         shift = fit.bit_length() - 1 if fit else 31
         origins_us = start_us[:: 1 << shift] + (2 ** (31 - bits) if fit else 0)
         self._origins = ((origins_us - layout.origin_us) << bits).tolist()
-        self._pixels = lanes.width * min(1 << shift, len(start_us))
+        self._pixels = lanes.width * min(1 << shift, len(start_s))
         self._room = total or 4096 + int(density * self._pixels)
+        # of single precision a chunk with a long interval would round otherwise than the whole
+        self._Time = dr.float64_array_t(arr.Float)
         self._Key = (dr.int32_array_t if fit else dr.int64_array_t)(arr.Float)
         self._lanes = lanes
         self._bits = bits
-        # of every interval, from its group's origin
+        # of every interval: its length and the fraction of a microsecond that it starts with; whole
+        # ones from its group's origin and to its end
+        spans = (end_s - start_s) * 1e6, start_s * 1e6 - start_us
+        self._spans = [self._Time(span) for span in spans]
         since_us = start_us - origins_us[np.arange(len(start_us)) >> shift]
-        self._starts = self._Key(since_us << bits)
+        self._whole = [self._Key(since_us << bits), self._Key(lasts_us)]
         self._pixel = self._Key(layout.pixels())
         self._keys = dr.empty(self._Key, len(origins_us) * self._room)
         self._counts = dr.zeros(arr.UInt32, len(origins_us) * APART)
         self._opaque = lanes.opaque(shift), lanes.opaque(self._room)
-        dr.eval(self._starts, self._pixel, self._keys, self._counts)
+        dr.eval(self._spans, self._whole, self._pixel, self._keys, self._counts)
 
     def tally(self):
         return self._lanes.arr.UInt32(0)
 
     def take(self, index, when, on, kept, tally):
+        dr = self._lanes.dr
+        length, fraction = (dr.gather(self._Time, table, index) for table in self._spans)
+        span = dr.gather(self._Key, self._whole[1], index)
+        # after the start, so that rounding moves no event to the interval before; whole numbers are
+        # clipped in less time than floats
+        since_us = dr.clip(
+            self._Key(dr.round(self._Time(when) * length + fraction)), dr.minimum(span, 1), span
+        )
+        self.put(index, since_us, on, kept)
+        return tally
+
+    def put(self, index, since_us, on, kept):
+        """An event so many microseconds behind the start of its interval."""
         dr, (shift, room) = self._lanes.dr, self._opaque
-        since_us = self._since_us(index, when)
-        start = dr.gather(self._Key, self._starts, index)
-        key = (start + (since_us << self._bits)) | self._pixel
+        start = dr.gather(self._Key, self._whole[0], index)
+        key = (start + (self._Key(since_us) << self._bits)) | self._pixel
         slot = dr.scatter_inc(self._counts, (index >> shift) * APART, active=kept)
         key = key | dr.select(on, self._Key(1), 0)
         place = (index >> shift) * room + slot
         dr.scatter(self._keys, key, place, active=kept & (slot < room))
-        return tally
 
     def close(self, index, tally):
         pass
@@ -142,37 +160,6 @@ class EventKeys:
         ]
 
 
-class CrossingKeys(EventKeys):
-    """Events at a share of their interval."""
-
-    def __init__(self, lanes, start_s, end_s, layout, *room):
-        """Args: start_s, end_s: lists, ends of every interval, seconds. The others are those of
-        ``EventKeys``."""
-        start_s, end_s = np.array(start_s), np.array(end_s)
-        start_us, end_us = (
-            np.array([round(time_s * 1e6) for time_s in times]) for times in (start_s, end_s)
-        )
-        super().__init__(lanes, start_us, end_us, layout, *room)
-        # of single precision a chunk with a long interval would round otherwise than the whole
-        self._Time = lanes.dr.float64_array_t(lanes.arr.Float)
-        # of every interval: its length, also in whole microseconds, and the fraction of one that it
-        # starts with
-        spans = (end_s - start_s) * 1e6, start_s * 1e6 - start_us
-        self._spans = [self._Time(span) for span in spans]
-        self._lasts = self._Key(end_us - start_us)
-        lanes.dr.eval(self._spans, self._lasts)
-
-    def _since_us(self, index, when):
-        dr = self._lanes.dr
-        length, fraction = (dr.gather(self._Time, table, index) for table in self._spans)
-        span = dr.gather(self._Key, self._lasts, index)
-        # after the start, so that rounding moves no event to the interval before; whole numbers are
-        # clipped in less time than floats
-        return dr.clip(
-            self._Key(dr.round(self._Time(when) * length + fraction)), dr.minimum(span, 1), span
-        )
-
-
 @dataclass(frozen=True)
 class KeyLayout:
     """Which bits of a key hold what. origin_us: time of key 0."""
@@ -193,16 +180,6 @@ class KeyLayout:
         """[H W] low bits of every pixel, OFF."""
         rows = np.arange(self.height_px)[:, None] << (self.x_bits + 1)
         return (rows | (np.arange(self.width_px) << 1)).ravel()
-
-    def meet(self, parts):
-        """Whether one of these parts of keys ends at the microsecond at which the next one begins,
-        or later."""
-        ends_us = [
-            [(origin + int(keys[k])) >> self.pixel_bits for k in (0, -1)]
-            for origin, keys in parts
-            if len(keys)
-        ]
-        return any(before[1] >= after[0] for before, after in pairwise(ends_us))
 
     def columns(self, lanes, parts):
         """t_us, x, y, p of parts of keys, an origin and those from it: int64 [N] each, where the
@@ -260,35 +237,23 @@ class DenseCounts:
         return self._counts.torch().reshape(shape)
 
 
-def run(lanes, frames, front_end, dt_s, interval_key, sensor, state, sink):
-    """Run the sensor over a chunk.
+def run(lanes, frames, front_end, step, carried, written):
+    """Run a sensor over a chunk.
 
     Args:
       lanes: of a frame's pixels.
       frames: [T, ...] float32 or float64, not yet checked.
       front_end: FrontEnd.
-      dt_s: [T] length of the interval that ends with each frame.
-      interval_key: [T] int32, random.
-      sensor: SensorModel.
-      state: SensorState (read only).
-      sink: ``EventKeys`` or ``DenseCounts`` of the lanes; takes every event.
+      step: (index, value, carried) -> (carried, too many events), of one frame; a ``Step``.
+      carried: dict of tensors before the chunk, None for what the sensor has not.
+      written: arrays that steps write to.
     Returns: dict of the carried tensors after the chunk; what was wrong: 0 nothing, 1 a value that
       is not finite or negative, 2 a pixel with more than ``MOST_EVENTS`` events in an interval
       (then everything else is void).
     """
-    step = _Step(lanes, front_end, dt_s, interval_key, sensor, state, sink)
-    carried = {name: getattr(state, name) for name in CARRIED}
-    return over_frames(lanes, frames, front_end, step, carried, sink)
-
-
-def over_frames(lanes, frames, front_end, step, carried, sink):
-    """Take a step (index, value, carried) -> (carried, too many events) for every frame of a chunk.
-
-    Args: carried: dict of tensors, or None.
-    Returns: as ``run``.
-    """
     dr, arr = lanes.dr, lanes.arr
-    tensors = {name: tensor for name, tensor in carried.items() if tensor is not None}
+    before = {name: tensor for name, tensor in carried.items() if tensor is not None}
+    carried = [loaded(lanes, tensor) for tensor in before.values()]
     values = lanes.load(frames)
 
     def body(index, bad, busy, *carried):
@@ -296,31 +261,32 @@ def over_frames(lanes, frames, front_end, step, carried, sink):
         fits = front_end.accepts(dr, value)
         # an infinite level would fire without end
         after, too_many = step(
-            index, dr.select(fits, value, 1), dict(zip(tensors, carried, strict=True))
+            index, dr.select(fits, value, 1), dict(zip(before, carried, strict=True))
         )
-        return bad | ~fits, busy | too_many, *(after[name] for name in tensors)
+        return bad | ~fits, busy | too_many, *(after[name] for name in before)
 
     with dr.suspend_grad():
         none = dr.zeros(arr.Bool, lanes.width)
-        start = [loaded(lanes, tensor) for tensor in tensors.values()]
-        bad, busy, *found = lanes.loop(0, lanes.opaque(len(frames)), body, none, none, *start)
+        bad, busy, *carried = lanes.loop(0, lanes.opaque(len(frames)), body, none, none, *carried)
         wrong = dr.select(bad, arr.UInt32(1), dr.select(busy, arr.UInt32(2), 0))
-        dr.eval(found, wrong, sink.arrays())  # together: a maximum alone runs the loop once more
+        dr.eval(carried, wrong, written)  # together: a maximum alone runs the loop once more
         wrong = dr.max(wrong)
     dr.sync_thread()
     after = {}
-    for (name, like), value in zip(tensors.items(), found, strict=True):
-        whole = like.dtype == torch.int32
-        after[name] = lanes.tensor(arr.Int32(value) if whole else value, like.shape)
+    for (name, like), value in zip(before.items(), carried, strict=True):
+        after[name] = lanes.tensor(
+            arr.Int32(value) if like.dtype == torch.int32 else value, like.shape
+        )
     return after, int(wrong[0])
 
 
 def loaded(lanes, tensor):
     """An array of the type of a tensor, of unsigned numbers where it has whole ones."""
-    arr, dr = lanes.arr, lanes.dr
+    dr, arr = lanes.dr, lanes.arr
+    if tensor.dtype == torch.float64:
+        return load(dr.float64_array_t(arr.Float), tensor)
     if tensor.dtype != torch.int32:
-        kinds = {torch.float32: dr.float32_array_t, torch.float64: dr.float64_array_t}
-        return load(kinds[tensor.dtype](arr.Float), tensor)
+        return load(dr.float32_array_t(arr.Float), tensor)
     bits = arr.UInt32(load(arr.Int32, tensor))
     dr.eval(bits)
     return bits
@@ -334,7 +300,7 @@ def exact_sum(first, second):
     return total, (first - (total - part)) + (second - part)
 
 
-class _Step:
+class Step:
     """One frame of one pixel, as drjit operations. Built once per chunk; every number that changes
     between chunks is opaque or in memory."""
 

@@ -21,7 +21,7 @@ from codesign.events.entry import (
 from codesign.events.intensity import FrontEnd, kernel_levels, log_levels
 from codesign.events.kernels import Lanes
 from codesign.events.sensor import crossing, v2e
-from codesign.events.sensor.crossing import CrossingKeys, DenseCounts, KeyLayout
+from codesign.events.sensor.crossing import DenseCounts, EventKeys, KeyLayout
 from codesign.events.sensor.model import SensorModel, check_generator, check_sensor, draw_keys
 from codesign.events.sensor.state import SensorState, begin, change, check_state, leak_before
 from codesign.events.stream import concatenate, ordered
@@ -199,49 +199,54 @@ def _events(frames, times_s, sensor, generator, state, front_end, layout):
     use meanwhile. A chunk busier than the room made for it is run again with the room it needs."""
     parts = []
     lanes = Lanes(frames, frames[0].numel())
-    kind = _v2e if sensor.timing == "v2e" else _interpolated
+    attempts = _slotted if sensor.timing == "v2e" else _interpolated
     density = EVENTS_PER_PIXEL
-    while len(times_s):
-        size, attempt = kind(lanes, frames, times_s, sensor, generator, state, front_end, layout)
+    while times_s:
+        size, attempt = attempts(lanes, frames, times_s, sensor, generator, state, front_end)
         had_room, total = False, None
         while not had_room:
             trial = replace(state)
-            sink = attempt(trial, density, total)
+            sink = attempt(trial, layout, density, total)
             had_room, found, total = sink.counted()
             density = max(density, 1.25 * found)
         state.__dict__.update(trial.__dict__)
         frames, times_s = frames[size:], times_s[size:]
         parts += sink.sorted()
     columns = layout.columns(lanes, parts)
-    if sensor.timing == "v2e" and layout.meet(parts):
-        return ordered(*columns, layout.height_px, layout.width_px)
-    return EventStream(*columns, layout.height_px, layout.width_px)
+    if sensor.timing == "v2e":  # slots of several frames may have one microsecond
+        ends = torch.tensor([len(keys) for _, keys in parts]).cumsum(0)
+        ends = ends[(ends > 0) & (ends < ends[-1])].to(lanes.device)
+        if bool((columns[0][ends] <= columns[0][ends - 1]).any()):
+            return ordered(*columns, *frames.shape[1:])
+    return EventStream(*columns, *frames.shape[1:])
 
 
-def _interpolated(lanes, frames, times_s, sensor, generator, state, front_end, layout):
-    """How many frames the next kernel takes, and what runs it on a state and gives the events."""
+def _interpolated(lanes, frames, times_s, sensor, generator, state, front_end):
+    """How many frames a kernel takes next, and what moves a state over them and returns the
+    events."""
     size = backend.frames_per_kernel(lanes.width)
     frames, times_s = frames[:size], times_s[:size]
     keys = _random_keys(len(frames), sensor, state, generator)
 
     def attempt(trial, *room):
-        sink = CrossingKeys(lanes, [state.time_s, *times_s[:-1]], times_s, layout, *room)
+        sink = EventKeys(lanes, [trial.time_s, *times_s[:-1]], times_s, *room)
         _advance(lanes, frames, times_s, keys, sensor, trial, front_end, sink)
         return sink
 
     return len(frames), attempt
 
 
-def _v2e(lanes, frames, times_s, sensor, generator, state, front_end, layout):
-    """The same for the slots of v2e."""
+def _slotted(_, frames, times_s, sensor, generator, state, front_end):
+    """The same of v2e."""
     size = v2e.chunk_size(frames, front_end, sensor, state)
     frames, times_s = frames[:size], times_s[:size]
-    chunk = v2e.Chunk(lanes, frames, times_s, front_end, sensor, generator, state)
+    check_frames(frames, 1, non_negative=not front_end.log_input)
+    chunk = v2e.Chunk(frames, times_s, front_end, sensor, generator, state)
     slots, wrong = chunk.slots()
-    _refuse(wrong, frames, front_end)
+    _refuse(wrong)
 
-    def attempt(trial, *room):
-        sink = v2e.SlotKeys(lanes, slots, layout, *room)
+    def attempt(trial, layout, *room):
+        sink = chunk.sink(slots, layout, *room)
         trial.__dict__.update(chunk.run(slots, sink)[0], time_s=times_s[-1])
         return sink
 
@@ -259,19 +264,17 @@ def _random_keys(count, sensor, state, generator):
 def _advance(lanes, frames, times_s, keys, sensor, state, front_end, sink):
     """Run the kernel and move the state on; on bad frames raise before anything has changed."""
     dt_s = torch.tensor([state.time_s, *times_s], dtype=torch.float64).diff()
-    carried, wrong = crossing.run(
-        lanes, frames, front_end, dt_s.to(frames), keys, sensor, state, sink
-    )
-    _refuse(wrong, frames, front_end)
-    for name, tensor in carried.items():
-        setattr(state, name, tensor)
-    state.time_s = times_s[-1]
-
-
-def _refuse(wrong, frames, front_end):
-    """Raise for what a kernel found wrong."""
+    step = crossing.Step(lanes, front_end, dt_s, keys, sensor, state, sink)
+    carried = {name: getattr(state, name) for name in crossing.CARRIED}
+    carried, wrong = crossing.run(lanes, frames, front_end, step, carried, sink.arrays())
     if wrong == 1:
         check_frames(frames, 1, non_negative=not front_end.log_input)
+    _refuse(wrong)
+    state.__dict__.update(carried, time_s=times_s[-1])
+
+
+def _refuse(wrong):
+    """Raise where a kernel found too many events."""
     if wrong:
         many = f"more than {crossing.MOST_EVENTS:.0f} events between two frames"
         raise DomainError(
