@@ -30,6 +30,8 @@ from codesign.types import EventStream
 
 EVENTS_PER_PIXEL = 1.0  # room made at first; on a processor, what no event writes to is no memory
 KEY_BITS = 63
+NEAR = 1 << 22  # pixels of all frames that v2e's comparators get at a time
+MOST_RUNS = 64  # of them over one chunk, each of which settles a frame or more
 
 
 @torch.no_grad()
@@ -236,18 +238,21 @@ def _interpolated(lanes, frames, times_s, sensor, generator, state, front_end):
     return len(frames), attempt
 
 
-def _slotted(_, frames, times_s, sensor, generator, state, front_end):
+def _slotted(lanes, frames, times_s, sensor, generator, state, front_end):
     """The same of v2e."""
-    size = v2e.chunk_size(frames, front_end, sensor, state)
+    most = MOST_RUNS if sensor.refractory_s > 0 else len(times_s)
+    size = min(most, max(1, NEAR // lanes.width))
     frames, times_s = frames[:size], times_s[:size]
     check_frames(frames, 1, non_negative=not front_end.log_input)
-    chunk = v2e.Chunk(frames, times_s, front_end, sensor, generator, state)
-    slots, wrong = chunk.slots()
+    ends_s = torch.tensor([state.time_s, *times_s], dtype=torch.float64)
+    signals = v2e.signals(frames, front_end, times_s, sensor, generator, state)
+    comparators = v2e.Comparators(*signals, ends_s, sensor, state)
+    slots, wrong = comparators.slots()
     _refuse(wrong)
 
-    def attempt(trial, layout, *room):
-        sink = chunk.sink(slots, layout, *room)
-        trial.__dict__.update(chunk.run(slots, sink)[0], time_s=times_s[-1])
+    def attempt(trial, *room):
+        sink = comparators.sink(slots, *room)
+        trial.__dict__.update(comparators.run(slots, sink)[0])
         return sink
 
     return len(frames), attempt

@@ -22,10 +22,7 @@ from codesign.events.sensor.crossing import MOST_EVENTS, EventKeys, loaded, run
 # up to here single-precision seconds resolve a microsecond, and v2e's rounding is repeated; later
 # slots are computed in double
 EXACT_SINGLE_S = 8.0
-CHUNK = 1 << 22  # pixels of all frames of a chunk
-NEAR = 1 << 17  # whose levels in double precision stay near the processor
-MOST_RUNS = 64  # of a chunk with a dead time: each settles a frame or more
-CARRIED = ("reference", "level", "noise", "last_event_s")
+NEAR = 1 << 17  # pixels whose levels in double precision stay near the processor
 
 
 def levels(frames, front_end):
@@ -43,19 +40,64 @@ def levels(frames, front_end):
     return found
 
 
-def chunk_size(frames, front_end, sensor, state):
-    """How many of the frames are a chunk."""
-    if state.reference.dtype != _kind(frames, front_end, sensor, state):
-        return 1
-    most = MOST_RUNS if sensor.refractory_s > 0 else len(frames)
-    return min(most, max(1, CHUNK // frames[0].numel()))
+def signals(frames, front_end, times_s, sensor, generator, state):
+    """What comparators get, frame by frame; moves all of the state on but what events change.
+
+    Args: frames: [T, H, W]. times_s: list, their times.
+    Returns: level seen, leak of the memorised level, noise events (1: ON, 2: OFF, 3: both), [T, H,
+      W] each, or None.
+    """
+    found = []
+    for frame, level, time_s in zip(frames, levels(frames, front_end), times_s, strict=True):
+        dt_s, state.time_s = time_s - state.time_s, time_s
+        light = leak = shots = None
+        if sensor.cutoff_hz > 0 or sensor.has_shots:
+            light = light_share((frame.exp() if front_end.log_input else frame).double())
+        seen = _photoreceptor(level, light, dt_s, sensor, generator, state)
+        if sensor.leaks:
+            rate_hz = state.leak_hz
+            if sensor.leak_jitter > 0:
+                rate_hz = rate_hz * (
+                    1 - sensor.leak_jitter * _drawn(torch.randn, rate_hz, generator)
+                )
+            leak = dt_s * rate_hz * state.theta_on.to(rate_hz)
+        if sensor.has_shots:
+            chance = sensor.shot_rate_hz / 2 * dt_s * (1 - 0.75 * light)
+            draw = _drawn(torch.rand, light, generator)
+            on = draw > 1 - chance * (sensor.theta_on / state.theta_on)
+            off = draw < chance * (sensor.theta_off / state.theta_off)
+            shots = on + 2.0 * off
+        found.append((seen, leak, shots))
+    return [row[0] if row[0] is None else torch.stack(row) for row in zip(*found, strict=True)]
 
 
-def _kind(frames, front_end, sensor, state):
-    """Type of the memorised level once a frame has been seen."""
-    single = not front_end.log_input or frames.dtype == torch.float32
-    single = single and sensor.cutoff_hz == 0 and state.reference.dtype == torch.float32
-    return torch.float32 if single else torch.float64
+def _photoreceptor(level, light, dt_s, sensor, generator, state):
+    """Low-passed level, plus noise; moves both on."""
+    omega = 2 * math.pi * sensor.cutoff_hz
+    if sensor.cutoff_hz > 0:
+        share = (light * (dt_s * omega)).clamp(max=1)
+        state.level = (1 - share) * state.level + share * level
+    else:
+        state.level = level
+    if not sensor.photoreceptor_noise:
+        return state.level
+    share = dt_s * omega
+    if share >= 2:
+        raise DomainError(
+            f"frames {dt_s:g} s apart make v2e's noise filter of {sensor.cutoff_hz:g} Hz unstable; use "
+            f"frames closer than {2 / omega:.3g} s, or timing 'interpolated'."
+        )
+    # the filter lets this part of white noise through
+    strength = sensor.noise_level() / math.sqrt(share / (2 - share))
+    draw = _drawn(torch.randn, state.noise, generator)
+    state.noise = (1 - share) * state.noise + share * strength * draw
+    return state.level + state.noise
+
+
+def _drawn(draw, like, generator):
+    return draw(like.shape, generator=generator, dtype=like.dtype, device=generator.device).to(
+        like.device
+    )
 
 
 class Slots:
@@ -82,12 +124,11 @@ class Slots:
         since_s = self.times_s + (state.start_s - start_us / 1e6)
         self.times_us = start_us + (since_s * 1e6).round().long()
         dead = sensor.refractory_s > slot_s
-        self.wait_s = torch.full_like(now_s, sensor.refractory_s)
-        self.wait_s = self.wait_s.float().double().where(early, self.wait_s)
-        self.wait_s = self.wait_s.where(dead, -math.inf)
-        self.single = early
-        if state.last_event_s is not None and state.last_event_s.dtype == torch.float32:
-            self.single = early | ((dead & ~early).cumsum(0) == 0)
+        wait_s = torch.full_like(now_s, sensor.refractory_s)
+        self.wait_s = wait_s.float().double().where(early, wait_s).where(dead, -math.inf)
+        before = getattr(state.last_event_s, "dtype", None) == torch.float32
+        last_dead = torch.arange(1, len(dead) + 1).where(dead, 0).cummax(0).values
+        self.single = torch.cat((torch.tensor([before]), early))[last_dead]
 
 
 def _spread(first_s, last_s, counts, places):
@@ -106,94 +147,37 @@ def _spread(first_s, last_s, counts, places):
     return torch.where(nth < (count // 2).clamp(min=1), rising, falling).float().double()
 
 
-class Chunk:
-    """Frames with all that is drawn for them, and their steps as drjit operations; the state stays
-    as it is."""
+class Comparators:
+    """The events of what ``signals`` returns, as drjit operations. ends_s: [T+1] times of the frame
+    before and of all."""
 
-    def __init__(self, frames, times_s, front_end, sensor, generator, state):
-        self.sensor, self.state, self.generator = sensor, state, generator
-        self.level = levels(frames, front_end)
-        self.lanes = lanes = Lanes(self.level, frames[0].numel())
-        self.ends_s = torch.tensor([state.time_s, *times_s], dtype=torch.float64)
-        dt_s = self.ends_s.diff()
-        kind = _kind(frames, front_end, sensor, state)
-        # the first leak is subtracted in single precision
-        self.narrow = state.reference.dtype != kind
-        self.carried = {name: getattr(state, name) for name in CARRIED}
-        self.carried["reference"] = state.reference.to(kind)
-        self.carried["level"] = state.level.to(kind if sensor.cutoff_hz > 0 else self.level.dtype)
-        if state.last_event_s is not None:
-            self.carried["last_event_s"] = state.last_event_s.double()
-
-        def load(values, dtype=None):
-            return loaded(lanes, torch.as_tensor(values, dtype=dtype, device=frames.device))
-
-        self.leak_hz = state.leak_hz if state.leak_hz is None else load(state.leak_hz)
-        self.dt_s, self.jitter = (
-            load(dt_s, torch.float32),
-            load([sensor.leak_jitter], torch.float32),
-        )
-        self.pace = load(dt_s * (2 * math.pi * sensor.cutoff_hz))
-        self.chance = load(sensor.shot_rate_hz / 2 * dt_s)
-        if sensor.photoreceptor_noise:
-            self.noise = [load(table, state.noise.dtype) for table in self._noise_filter(dt_s)]
-        if sensor.cutoff_hz > 0 or sensor.has_shots:
-            intensity = frames.exp() if front_end.log_input else frames
-            self.light = load(light_share(intensity.double()))
-        self.drawn = {name: load(numbers) for name, numbers in self._draw(len(frames)).items()}
+    def __init__(self, seen, leak, shots, ends_s, sensor, state):
+        if leak is not None:  # the first one in the precision in which a recording begins
+            state.reference = state.reference - leak[0]
+            leak[0] = 0
+        kind = torch.promote_types(state.reference.dtype, seen.dtype)
+        self.seen, self.ends_s, self.sensor, self.state = seen.to(kind), ends_s, sensor, state
+        self.lanes = lanes = Lanes(self.seen, seen[0].numel())
         thetas = state.theta_on, state.theta_off
         if sensor.theta_sigma == 0:
             thetas = [theta.flatten()[:1] for theta in thetas]
-        self.thetas = [load(theta, kind) for theta in thetas]
-        self.single_thetas = [load(theta, torch.float32) for theta in thetas]
-        nominal = zip((sensor.theta_on, sensor.theta_off), thetas, strict=True)
-        self.shares = [load(one / theta, torch.float64) for one, theta in nominal]
-
-    def _noise_filter(self, dt_s):
-        """What a frame leaves of the photoreceptor noise, and how much it adds."""
-        omega = 2 * math.pi * self.sensor.cutoff_hz
-        share = dt_s * omega
-        if bool((share >= 2).any()):
-            raise DomainError(
-                f"frames {float(dt_s[share >= 2][0]):g} s apart make v2e's noise filter of "
-                f"{self.sensor.cutoff_hz:g} Hz unstable; use frames closer than {2 / omega:.3g} s, or timing "
-                "'interpolated'."
-            )
-        # the filter lets this part of white noise through
-        strength = self.sensor.noise_level() / (share / (2 - share)).sqrt()
-        return 1 - share, share * strength
-
-    def _draw(self, count):
-        """Random numbers of all pixels, one frame after the other."""
-        sensor = self.sensor
-        kinds = {
-            "noise": (
-                sensor.photoreceptor_noise,
-                torch.randn,
-                getattr(self.state.noise, "dtype", None),
-            ),
-            "leak": (sensor.leak_jitters, torch.randn, torch.float32),
-            "shots": (sensor.has_shots, torch.rand, torch.float64),
-        }
-        kinds = {name: how for name, (wanted, *how) in kinds.items() if wanted}
-        place = {"generator": self.generator, "device": self.generator.device}
-        rows = [
-            [draw(self.state.level.shape, dtype=dtype, **place) for draw, dtype in kinds.values()]
-            for _ in range(count)
-        ]
-        return {
-            name: torch.stack(row)
-            for name, row in zip(kinds, zip(*rows, strict=True), strict=False)
-        }
+        self.thetas = [loaded(lanes, theta.to(kind)) for theta in thetas]
+        self.single_thetas = [loaded(lanes, theta.float()) for theta in thetas]
+        self.leak, self.shots = (
+            rows if rows is None else loaded(lanes, rows) for rows in (leak, shots)
+        )
+        self.carried = {"reference": state.reference.to(kind), "last_event_s": None}
+        if state.last_event_s is not None:
+            self.carried["last_event_s"] = state.last_event_s.double()
 
     def slots(self):
         """Slots of the frames, and what is wrong, as ``run`` has it."""
-        counts, found, wrong = None, [1] * len(self.level), 0
+        counts, found, wrong = None, [1] * len(self.seen), 0
         while counts != found and not wrong:
             counts = found
-            fired = self.lanes.fresh(len(self.level), self.lanes.arr.UInt32)
+            fired = self.lanes.fresh(len(self.seen), self.lanes.arr.UInt32)
             _, wrong = self.run(Slots(counts, self.ends_s, self.sensor, self.state), fired=fired)
-            fired = fired.torch().view(torch.int32).reshape(len(self.level), -1)
+            fired = fired.torch().view(torch.int32).reshape(len(self.seen), -1)
             found = fired.amax(1).clamp(min=1).tolist()
             if self.sensor.refractory_s == 0:
                 break
@@ -204,50 +188,31 @@ class Chunk:
         since_us = slots.times_us - layout.origin_us
         ends_us = since_us.cummax(0).values[slots.first[1:] - 1]
         starts_us = torch.cat((since_us[:1] - 1, ends_us[:-1]))
-        whole = (ends.numpy() / 1e6 for ends in (starts_us, ends_us))
-        Whole = self.lanes.dr.int64_array_t(self.lanes.arr.Float)
-        self.since_us = Whole((since_us - starts_us.repeat_interleave(slots.first.diff())).numpy())
+        since_us = since_us - starts_us.repeat_interleave(slots.first.diff())
+        self.since_us = self.lanes.dr.int64_array_t(self.lanes.arr.Float)(since_us.numpy())
         self.lanes.dr.eval(self.since_us)
+        whole = (ends.numpy() / 1e6 for ends in (starts_us, ends_us))
         return EventKeys(self.lanes, *whole, replace(layout, origin_us=0), *room)
 
-    def run(self, slots, sink=None, fired=None):
-        """Run over the frames: all events go to the sink, or how often pixels fire, dead times
-        apart, into an array. Returns the carried tensors and what is wrong, as ``crossing.run``."""
+    def run(self, slots, keys=None, fired=None):
+        """Run over the frames: all events go to keys, or how often pixels fire, dead times apart,
+        into an array. Returns the carried tensors and what is wrong, as ``crossing.run``."""
         tables = slots.first.int(), slots.times_s, slots.wait_s, slots.single.int()
-        self.tables = [loaded(self.lanes, table.to(self.level.device)) for table in tables]
-        self.keys, self.fired = sink, fired
-        written = [fired] if sink is None else sink.arrays()
-        # the frames are checked; levels may be below 0
-        after, wrong = run(
-            self.lanes, self.level, FrontEnd(log_input=True), self._step, self.carried, written
-        )
+        self.tables = [loaded(self.lanes, table.to(self.seen.device)) for table in tables]
+        self.keys, self.fired = keys, fired
+        written = [fired] if keys is None else keys.arrays()
+        # levels may be below 0
+        after, wrong = run(self.lanes, self.seen, FrontEnd(True), self._step, self.carried, written)
         if "last_event_s" in after and bool(slots.single[-1]):
             after["last_event_s"] = after["last_event_s"].float()
         return after, wrong
 
-    def _step(self, index, level, now):
-        dr, lanes, sensor = self.lanes.dr, self.lanes, self.sensor
-        Kind, Single = type(now["reference"]), dr.float32_array_t(lanes.arr.Float)
-
-        def of_frame(table):
-            return dr.gather(type(table), table, index)
-
-        if sensor.cutoff_hz > 0:
-            share = dr.minimum(lanes.at(self.light, index) * of_frame(self.pace), 1)
-            level = (1 - share) * now["level"] + share * Kind(level)
-        now["level"] = level
-        seen = Kind(level)
-        if sensor.photoreceptor_noise:
-            keep, add = map(of_frame, self.noise)
-            now["noise"] = keep * now["noise"] + add * lanes.at(self.drawn["noise"], index)
-            seen = seen + Kind(now["noise"])
+    def _step(self, index, seen, now):
+        dr, lanes = self.lanes.dr, self.lanes
+        Kind, Single = lanes.arr.Float, dr.float32_array_t(lanes.arr.Float)
         base = now["reference"]
-        if self.leak_hz is not None:
-            rate_hz = self.leak_hz
-            if sensor.leak_jitters:
-                rate_hz = rate_hz * (1 - self.jitter * lanes.at(self.drawn["leak"], index))
-            leak = of_frame(self.dt_s) * rate_hz * self.single_thetas[0]
-            base = Kind(Single(base) - leak) if self.narrow else base - Kind(leak)
+        if self.leak is not None:
+            base = base - Kind(lanes.at(self.leak, index))
         rising = seen > base
         theta, beyond = dr.select(rising, *self.thetas), dr.abs(seen - base)
         too_many = ~(beyond <= MOST_EVENTS * theta)
@@ -256,11 +221,9 @@ class Chunk:
         fires = fires - dr.select(dr.fma(-fires, theta, beyond) < 0, Kind(1), 0)
         fires = lanes.arr.UInt32(fires)
         shots = []
-        if sensor.has_shots:
-            draw = lanes.at(self.drawn["shots"], index)
-            chance = of_frame(self.chance) * (1 - 0.75 * lanes.at(self.light, index))
-            on, off = (chance * share for share in self.shares)
-            shots = [draw > 1 - on, draw < off]
+        if self.shots is not None:
+            shot = lanes.at(self.shots, index)
+            shots = [(shot == 1) | (shot == 3), shot >= 2]
         if self.keys is None:
             lanes.put(self.fired, fires, index)
         if self.keys is not None or "last_event_s" in now:
@@ -268,18 +231,18 @@ class Chunk:
         moved = Single(fires) * dr.select(rising, *self.single_thetas)
         base = base + Kind(dr.select(rising, moved, -moved))
         # a noise event sets the memorised level to the level seen
-        now["reference"] = dr.select(shots[0] | shots[1], Kind(level), base) if shots else base
+        now["reference"] = dr.select(shots[0] | shots[1], seen, base) if shots else base
         return now, too_many
 
     def _fire(self, index, fires, rising, shots, now):
-        """Events of a frame, then noise events, at most one of either polarity, in its last slot.
-        Those within the dead time behind the last one kept are not counted, so the next frames see
-        them again. Moves the dead time on. Returns how many are counted."""
+        """Events of a frame, then noise events, in its last slot. Those within the dead time behind
+        the last one kept are not counted, so the next frames see them again. Moves the dead time
+        on. Returns how many are counted."""
         dr, arr = self.lanes.dr, self.lanes.arr
-        firsts, times_s, waits_s, singles = self.tables
-        first, end = (dr.gather(arr.UInt32, firsts, index + k) for k in (0, 1))
-        wait_s = dr.gather(type(waits_s), waits_s, index)
-        single = dr.gather(arr.UInt32, singles, index) != 0
+        first, end = (dr.gather(arr.UInt32, self.tables[0], index + k) for k in (0, 1))
+        times_s = self.tables[1]
+        wait_s = dr.gather(type(times_s), self.tables[2], index)
+        single = dr.gather(arr.UInt32, self.tables[3], index) != 0
         waits = "last_event_s" in now
         many = fires
         for shot in shots:
@@ -291,10 +254,8 @@ class Chunk:
 
         def event(nth, counted, last_s):
             own = ready = nth < fires
-            place, on = first + nth, rising
-            if shots:
-                place = dr.select(own, place, end - 1)
-                on = dr.select(own, rising, shots[0] & (nth == fires))
+            place = dr.select(own, first + nth, end - 1)
+            on = dr.select(own, rising, shots[0] & (nth == fires)) if shots else rising
             if waits:
                 time_s = dr.gather(type(times_s), times_s, place)
                 ready = own & (kept(time_s - last_s) > wait_s)
