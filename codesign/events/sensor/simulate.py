@@ -3,6 +3,7 @@
 from contextlib import contextmanager
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Generator, Tensor
 
@@ -31,7 +32,7 @@ from codesign.types import EventStream
 EVENTS_PER_PIXEL = 1.0  # room made at first; on a processor, what no event writes to is no memory
 KEY_BITS = 63
 NEAR = 1 << 22  # pixels of all frames that v2e's comparators get at a time
-MOST_RUNS = 64  # of them over one chunk, each of which settles a frame or more
+MOST_RUNS = 64  # of them, each of which settles a frame or more
 
 
 @torch.no_grad()
@@ -240,11 +241,10 @@ def _interpolated(lanes, frames, times_s, sensor, generator, state, front_end):
 
 def _slotted(lanes, frames, times_s, sensor, generator, state, front_end):
     """The same of v2e."""
-    most = MOST_RUNS if sensor.refractory_s > 0 else len(times_s)
-    size = min(most, max(1, NEAR // lanes.width))
+    size = min(MOST_RUNS, max(1, NEAR // lanes.width))
     frames, times_s = frames[:size], times_s[:size]
     check_frames(frames, 1, non_negative=not front_end.log_input)
-    ends_s = torch.tensor([state.time_s, *times_s], dtype=torch.float64)
+    ends_s = np.array([state.time_s, *times_s])
     signals = v2e.signals(frames, front_end, times_s, sensor, generator, state)
     comparators = v2e.Comparators(*signals, ends_s, sensor, state)
     slots, wrong = comparators.slots()

@@ -12,6 +12,7 @@ Source: Hu, Liu, Delbruck, "v2e: From Video Frames to Realistic DVS Events", CVP
 import math
 from dataclasses import replace
 
+import numpy as np
 import torch
 
 from codesign.errors import DomainError
@@ -103,53 +104,46 @@ def _drawn(draw, like, generator):
 class Slots:
     """Times of the slots of frames, of each so many.
 
-    first: [T+1] place of each frame's first slot in the lists. times_s: [N] since the first frame.
-    times_us: [N]. wait_s: [T] dead time, below 0 where it is shorter than a slot. single: [T]
-    whether the time of the last event is kept in single precision.
+    ends_s: [T+1] times of the frame before and of all. first: [T+1] place of each frame's first
+    slot in the lists. times_s: [N] since the first frame. times_us: [N]. wait_s: [T] dead time,
+    below 0 where it is shorter than a slot. single: [T] whether the time of the last event is kept
+    in single precision.
     """
 
     def __init__(self, counts, ends_s, sensor, state):
-        counts = torch.tensor(counts)
-        slot_s = ends_s.diff() / counts
-        now_s = ends_s[1:] - state.start_s
-        first_s = ends_s[:-1] - state.start_s + slot_s
-        self.first = torch.cat((counts[:1] * 0, counts.cumsum(0)))
-        early = now_s < EXACT_SINGLE_S
-        self.times_s = _spread(first_s, now_s, counts, self.first)
-        for k in (~early).nonzero().flatten().tolist():
-            at = float(first_s[k]), float(now_s[k]), int(counts[k])
-            exact = torch.linspace(*at, dtype=torch.float64)
-            self.times_s[self.first[k] : self.first[k + 1]] = exact
+        now_s, dt_s = ends_s - state.start_s, np.diff(ends_s)
+        frames = zip(now_s[:-1], now_s[1:], dt_s, counts, strict=True)
+        self.times_s = np.concatenate([_slots(*frame) for frame in frames]).astype(np.float64)
+        self.first = np.cumsum([0, *counts])
         start_us = round(state.start_s * 1e6)
         since_s = self.times_s + (state.start_s - start_us / 1e6)
-        self.times_us = start_us + (since_s * 1e6).round().long()
-        dead = sensor.refractory_s > slot_s
-        wait_s = torch.full_like(now_s, sensor.refractory_s)
-        self.wait_s = wait_s.float().double().where(early, wait_s).where(dead, -math.inf)
+        self.times_us = start_us + np.rint(since_s * 1e6).astype(np.int64)
+        dead, early = sensor.refractory_s > dt_s / counts, now_s[1:] < EXACT_SINGLE_S
+        wait_s = np.where(early, np.float32(sensor.refractory_s), sensor.refractory_s)
+        self.wait_s = np.where(dead, wait_s, -math.inf)
         before = getattr(state.last_event_s, "dtype", None) == torch.float32
-        last_dead = torch.arange(1, len(dead) + 1).where(dead, 0).cummax(0).values
-        self.single = torch.cat((torch.tensor([before]), early))[last_dead]
+        last_dead = np.maximum.accumulate(np.where(dead, np.arange(1, len(dead) + 1), 0))
+        self.single = np.array([before, *early])[last_dead]
 
 
-def _spread(first_s, last_s, counts, places):
-    """Times from the first to the last of every frame.
+def _slots(before_s, now_s, dt_s, count):
+    """[count] times of the frame's slots since the first frame, seconds.
 
-    They are torch.linspace in single precision as v2e's processor made it, from the nearer end and
+    In single precision they are torch.linspace as v2e's processor made it, from the nearer end and
     rounded once (a fused multiply-add); without AVX2 torch rounds twice, and a dead time that ends
     at a slot ends later.
     """
-    first, last = first_s.float(), last_s.float()
-    step = (last - first) / (counts - 1).clamp(min=1)
-    ends = (first.double(), last.double(), step.double(), counts, places[:-1])
-    first, last, step, count, place = (values.repeat_interleave(counts) for values in ends)
-    nth = torch.arange(len(place)) - place
-    rising, falling = first + step * nth, last - step * (count - 1 - nth)
-    return torch.where(nth < (count // 2).clamp(min=1), rising, falling).float().double()
+    if now_s >= EXACT_SINGLE_S:
+        return torch.linspace(before_s + dt_s / count, now_s, count, dtype=torch.float64).numpy()
+    first, last = np.float32(before_s + dt_s / count), np.float32(now_s)
+    step = float((last - first) / np.float32(max(count - 1, 1)))
+    nth = np.arange(count)
+    rising, falling = float(first) + step * nth, float(last) - step * (count - 1 - nth)
+    return np.where(nth < max(count // 2, 1), rising, falling).astype(np.float32)
 
 
 class Comparators:
-    """The events of what ``signals`` returns, as drjit operations. ends_s: [T+1] times of the frame
-    before and of all."""
+    """The events of what ``signals`` returns, as drjit operations. ends_s: as in ``Slots``."""
 
     def __init__(self, seen, leak, shots, ends_s, sensor, state):
         if leak is not None:  # the first one in the precision in which a recording begins
@@ -186,19 +180,20 @@ class Comparators:
     def sink(self, slots, layout, *room):
         """Keys of events, whose intervals end with the last slots of the frames."""
         since_us = slots.times_us - layout.origin_us
-        ends_us = since_us.cummax(0).values[slots.first[1:] - 1]
-        starts_us = torch.cat((since_us[:1] - 1, ends_us[:-1]))
-        since_us = since_us - starts_us.repeat_interleave(slots.first.diff())
-        self.since_us = self.lanes.dr.int64_array_t(self.lanes.arr.Float)(since_us.numpy())
-        self.lanes.dr.eval(self.since_us)
-        whole = (ends.numpy() / 1e6 for ends in (starts_us, ends_us))
-        return EventKeys(self.lanes, *whole, replace(layout, origin_us=0), *room)
+        ends_us = np.maximum.accumulate(since_us)[slots.first[1:] - 1]
+        starts_us = np.append(since_us[0] - 1, ends_us[:-1])
+        since_us = since_us - starts_us.repeat(np.diff(slots.first))
+        self.since_us = self.lanes.dr.int64_array_t(self.lanes.arr.Float)(since_us)
+        layout = replace(layout, origin_us=0)
+        return EventKeys(self.lanes, starts_us / 1e6, ends_us / 1e6, layout, *room)
 
     def run(self, slots, keys=None, fired=None):
         """Run over the frames: all events go to keys, or how often pixels fire, dead times apart,
         into an array. Returns the carried tensors and what is wrong, as ``crossing.run``."""
-        tables = slots.first.int(), slots.times_s, slots.wait_s, slots.single.int()
-        self.tables = [loaded(self.lanes, table.to(self.seen.device)) for table in tables]
+        dr, arr = self.lanes.dr, self.lanes.arr
+        Double = dr.float64_array_t(arr.Float)
+        self.times_s, self.wait_s = Double(slots.times_s), Double(slots.wait_s)
+        self.first, self.single = arr.UInt32(slots.first), arr.UInt32(slots.single)
         self.keys, self.fired = keys, fired
         written = [fired] if keys is None else keys.arrays()
         # levels may be below 0
@@ -239,25 +234,24 @@ class Comparators:
         the last one kept are not counted, so the next frames see them again. Moves the dead time
         on. Returns how many are counted."""
         dr, arr = self.lanes.dr, self.lanes.arr
-        first, end = (dr.gather(arr.UInt32, self.tables[0], index + k) for k in (0, 1))
-        times_s = self.tables[1]
-        wait_s = dr.gather(type(times_s), self.tables[2], index)
-        single = dr.gather(arr.UInt32, self.tables[3], index) != 0
+        Double = type(self.times_s)
+        first, end = (dr.gather(arr.UInt32, self.first, index + k) for k in (0, 1))
+        wait_s = dr.gather(Double, self.wait_s, index)
+        single = dr.gather(arr.UInt32, self.single, index) != 0
         waits = "last_event_s" in now
         many = fires
         for shot in shots:
             many = many + dr.select(shot, arr.UInt32(1), 0)
 
         def kept(time_s):
-            rounded = type(time_s)(dr.float32_array_t(arr.Float)(time_s))
-            return dr.select(single, rounded, time_s)
+            return dr.select(single, Double(dr.float32_array_t(arr.Float)(time_s)), time_s)
 
         def event(nth, counted, last_s):
             own = ready = nth < fires
             place = dr.select(own, first + nth, end - 1)
             on = dr.select(own, rising, shots[0] & (nth == fires)) if shots else rising
             if waits:
-                time_s = dr.gather(type(times_s), times_s, place)
+                time_s = dr.gather(Double, self.times_s, place)
                 ready = own & (kept(time_s - last_s) > wait_s)
                 last_s = dr.select(ready, kept(time_s), last_s)
             if self.keys is not None:
