@@ -49,7 +49,8 @@ def signals(frames, front_end, times_s, sensor, generator, state):
       W] each, or None.
     """
     found = []
-    for frame, level, time_s in zip(frames, levels(frames, front_end), times_s, strict=True):
+    own = levels(frames, front_end)
+    for frame, level, time_s in zip(frames, own, times_s, strict=True):
         dt_s, state.time_s = time_s - state.time_s, time_s
         light = leak = shots = None
         if sensor.cutoff_hz > 0 or sensor.has_shots:
@@ -69,7 +70,10 @@ def signals(frames, front_end, times_s, sensor, generator, state):
             off = draw < chance * (sensor.theta_off / state.theta_off)
             shots = on + 2.0 * off
         found.append((seen, leak, shots))
-    return [row[0] if row[0] is None else torch.stack(row) for row in zip(*found, strict=True)]
+    state.level = state.level.clone()  # not a view of all
+    seen, leak, shots = zip(*found, strict=True)
+    seen = torch.stack(seen) if sensor.cutoff_hz > 0 else own
+    return seen, *(None if row[0] is None else torch.stack(row) for row in (leak, shots))
 
 
 def _photoreceptor(level, light, dt_s, sensor, generator, state):
@@ -96,9 +100,8 @@ def _photoreceptor(level, light, dt_s, sensor, generator, state):
 
 
 def _drawn(draw, like, generator):
-    return draw(like.shape, generator=generator, dtype=like.dtype, device=generator.device).to(
-        like.device
-    )
+    place = {"dtype": like.dtype, "device": generator.device}
+    return draw(like.shape, generator=generator, **place).to(like.device)
 
 
 class Slots:
