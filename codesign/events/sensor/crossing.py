@@ -21,6 +21,8 @@ import numpy as np
 import torch
 
 from codesign.backend import load
+from codesign.errors import DomainError
+from codesign.events.entry import check_frames
 from codesign.events.intensity import light_share
 from codesign.events.low_pass import coefficients, passed
 from codesign.events.stream import sorted_keys
@@ -247,9 +249,9 @@ def run(lanes, frames, front_end, step, carried, written):
       step: (index, value, carried) -> (carried, too many events), of one frame; a ``Step``.
       carried: dict of tensors before the chunk, None for what the sensor has not.
       written: arrays that steps write to.
-    Returns: dict of the carried tensors after the chunk; what was wrong: 0 nothing, 1 a value that
-      is not finite or negative, 2 a pixel with more than ``MOST_EVENTS`` events in an interval
-      (then everything else is void).
+    Returns: dict of the carried tensors after the chunk.
+    Raises: DomainError for a value that is not finite or negative, and a pixel with more than
+      ``MOST_EVENTS`` events in an interval.
     """
     dr, arr = lanes.dr, lanes.arr
     before = {name: tensor for name, tensor in carried.items() if tensor is not None}
@@ -272,12 +274,19 @@ def run(lanes, frames, front_end, step, carried, written):
         dr.eval(carried, wrong, written)  # together: a maximum alone runs the loop once more
         wrong = dr.max(wrong)
     dr.sync_thread()
+    if int(wrong[0]) == 1:
+        check_frames(frames, 1, non_negative=not front_end.log_input)
+    if int(wrong[0]):
+        raise DomainError(
+            f"a pixel would fire more than {MOST_EVENTS:.0f} events between two frames; check the unit of "
+            "the frames (log levels are natural logarithms), the thresholds, the noise rates and the times."
+        )
     after = {}
     for (name, like), value in zip(before.items(), carried, strict=True):
         after[name] = lanes.tensor(
             arr.Int32(value) if like.dtype == torch.int32 else value, like.shape
         )
-    return after, int(wrong[0])
+    return after
 
 
 def loaded(lanes, tensor):

@@ -3,7 +3,6 @@
 from contextlib import contextmanager
 from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Generator, Tensor
 
@@ -31,8 +30,6 @@ from codesign.types import EventStream
 
 EVENTS_PER_PIXEL = 1.0  # room made at first; on a processor, what no event writes to is no memory
 KEY_BITS = 63
-NEAR = 1 << 22  # pixels of all frames that v2e's comparators get at a time
-MOST_RUNS = 64  # of them, each of which settles a frame or more
 
 
 @torch.no_grad()
@@ -202,60 +199,36 @@ def _events(frames, times_s, sensor, generator, state, front_end, layout):
     use meanwhile. A chunk busier than the room made for it is run again with the room it needs."""
     parts = []
     lanes = Lanes(frames, frames[0].numel())
-    attempts = _slotted if sensor.timing == "v2e" else _interpolated
+    slotted = sensor.timing == "v2e"
+    size = (v2e if slotted else backend).frames_per_kernel(lanes.width)
     density = EVENTS_PER_PIXEL
-    while times_s:
-        size, attempt = attempts(lanes, frames, times_s, sensor, generator, state, front_end)
+    for first in range(0, len(frames), size):
+        chunk, ends_s = frames[first : first + size], times_s[first : first + size]
+        if slotted:
+            check_frames(chunk, 1, non_negative=not front_end.log_input)
+            comparators = v2e.Comparators(chunk, front_end, ends_s, sensor, generator, state)
+        else:
+            random_keys = _random_keys(len(chunk), sensor, state, generator)
         had_room, total = False, None
         while not had_room:
+            room = layout, density, total
             trial = replace(state)
-            sink = attempt(trial, layout, density, total)
+            if slotted:
+                sink = comparators.fire(trial, *room)
+            else:
+                sink = EventKeys(lanes, [state.time_s, *ends_s[:-1]], ends_s, *room)
+                _advance(lanes, chunk, ends_s, random_keys, sensor, trial, front_end, sink)
             had_room, found, total = sink.counted()
             density = max(density, 1.25 * found)
         state.__dict__.update(trial.__dict__)
-        frames, times_s = frames[size:], times_s[size:]
         parts += sink.sorted()
     columns = layout.columns(lanes, parts)
-    if sensor.timing == "v2e":  # slots of several frames may have one microsecond
+    if slotted:  # slots of several frames may have one microsecond
         ends = torch.tensor([len(keys) for _, keys in parts]).cumsum(0)
         ends = ends[(ends > 0) & (ends < ends[-1])].to(lanes.device)
         if bool((columns[0][ends] <= columns[0][ends - 1]).any()):
             return ordered(*columns, *frames.shape[1:])
     return EventStream(*columns, *frames.shape[1:])
-
-
-def _interpolated(lanes, frames, times_s, sensor, generator, state, front_end):
-    """How many frames a kernel takes next, and what moves a state over them and returns the
-    events."""
-    size = backend.frames_per_kernel(lanes.width)
-    frames, times_s = frames[:size], times_s[:size]
-    keys = _random_keys(len(frames), sensor, state, generator)
-
-    def attempt(trial, *room):
-        sink = EventKeys(lanes, [trial.time_s, *times_s[:-1]], times_s, *room)
-        _advance(lanes, frames, times_s, keys, sensor, trial, front_end, sink)
-        return sink
-
-    return len(frames), attempt
-
-
-def _slotted(lanes, frames, times_s, sensor, generator, state, front_end):
-    """The same of v2e."""
-    size = min(MOST_RUNS, max(1, NEAR // lanes.width))
-    frames, times_s = frames[:size], times_s[:size]
-    check_frames(frames, 1, non_negative=not front_end.log_input)
-    ends_s = np.array([state.time_s, *times_s])
-    signals = v2e.signals(frames, front_end, times_s, sensor, generator, state)
-    comparators = v2e.Comparators(*signals, ends_s, sensor, state)
-    slots, wrong = comparators.slots()
-    _refuse(wrong)
-
-    def attempt(trial, *room):
-        sink = comparators.sink(slots, *room)
-        trial.__dict__.update(comparators.run(slots, sink)[0])
-        return sink
-
-    return len(frames), attempt
 
 
 def _random_keys(count, sensor, state, generator):
@@ -271,21 +244,8 @@ def _advance(lanes, frames, times_s, keys, sensor, state, front_end, sink):
     dt_s = torch.tensor([state.time_s, *times_s], dtype=torch.float64).diff()
     step = crossing.Step(lanes, front_end, dt_s, keys, sensor, state, sink)
     carried = {name: getattr(state, name) for name in crossing.CARRIED}
-    carried, wrong = crossing.run(lanes, frames, front_end, step, carried, sink.arrays())
-    if wrong == 1:
-        check_frames(frames, 1, non_negative=not front_end.log_input)
-    _refuse(wrong)
+    carried = crossing.run(lanes, frames, front_end, step, carried, sink.arrays())
     state.__dict__.update(carried, time_s=times_s[-1])
-
-
-def _refuse(wrong):
-    """Raise where a kernel found too many events."""
-    if wrong:
-        many = f"more than {crossing.MOST_EVENTS:.0f} events between two frames"
-        raise DomainError(
-            f"a pixel would fire {many}; check the unit of the frames (log levels are natural logarithms), "
-            "the thresholds, the noise rates and the times."
-        )
 
 
 def _check_range(layout, end_s):

@@ -24,6 +24,13 @@ from codesign.events.sensor.crossing import MOST_EVENTS, EventKeys, loaded, run
 # slots are computed in double
 EXACT_SINGLE_S = 8.0
 NEAR = 1 << 17  # pixels whose levels in double precision stay near the processor
+CHUNK = 1 << 22  # pixels of all frames of a chunk
+MOST_FRAMES = 64  # of a chunk: with a dead time each run settles one frame or more
+
+
+def frames_per_kernel(pixels):
+    """How many frames of so many pixels are a chunk."""
+    return min(MOST_FRAMES, max(1, CHUNK // pixels))
 
 
 def levels(frames, front_end):
@@ -104,31 +111,6 @@ def _drawn(draw, like, generator):
     return draw(like.shape, generator=generator, **place).to(like.device)
 
 
-class Slots:
-    """Times of the slots of frames, of each so many.
-
-    ends_s: [T+1] times of the frame before and of all. first: [T+1] place of each frame's first
-    slot in the lists. times_s: [N] since the first frame. times_us: [N]. wait_s: [T] dead time,
-    below 0 where it is shorter than a slot. single: [T] whether the time of the last event is kept
-    in single precision.
-    """
-
-    def __init__(self, counts, ends_s, sensor, state):
-        now_s, dt_s = ends_s - state.start_s, np.diff(ends_s)
-        frames = zip(now_s[:-1], now_s[1:], dt_s, counts, strict=True)
-        self.times_s = np.concatenate([_slots(*frame) for frame in frames]).astype(np.float64)
-        self.first = np.cumsum([0, *counts])
-        start_us = round(state.start_s * 1e6)
-        since_s = self.times_s + (state.start_s - start_us / 1e6)
-        self.times_us = start_us + np.rint(since_s * 1e6).astype(np.int64)
-        dead, early = sensor.refractory_s > dt_s / counts, now_s[1:] < EXACT_SINGLE_S
-        wait_s = np.where(early, np.float32(sensor.refractory_s), sensor.refractory_s)
-        self.wait_s = np.where(dead, wait_s, -math.inf)
-        before = getattr(state.last_event_s, "dtype", None) == torch.float32
-        last_dead = np.maximum.accumulate(np.where(dead, np.arange(1, len(dead) + 1), 0))
-        self.single = np.array([before, *early])[last_dead]
-
-
 def _slots(before_s, now_s, dt_s, count):
     """[count] times of the frame's slots since the first frame, seconds.
 
@@ -146,14 +128,17 @@ def _slots(before_s, now_s, dt_s, count):
 
 
 class Comparators:
-    """The events of what ``signals`` returns, as drjit operations. ends_s: as in ``Slots``."""
+    """Events of the frames of a chunk, as drjit operations, and the slots of the frames."""
 
-    def __init__(self, seen, leak, shots, ends_s, sensor, state):
+    def __init__(self, frames, front_end, times_s, sensor, generator, state):
+        """Moves all of the state on but what events change. Args: as for ``signals``."""
+        self.ends_s = np.array([state.time_s, *times_s])
+        seen, leak, shots = signals(frames, front_end, times_s, sensor, generator, state)
         if leak is not None:  # the first one in the precision in which a recording begins
             state.reference = state.reference - leak[0]
             leak[0] = 0
         kind = torch.promote_types(state.reference.dtype, seen.dtype)
-        self.seen, self.ends_s, self.sensor, self.state = seen.to(kind), ends_s, sensor, state
+        self.seen, self.sensor, self.state = seen.to(kind), sensor, state
         self.lanes = lanes = Lanes(self.seen, seen[0].numel())
         thetas = state.theta_on, state.theta_off
         if sensor.theta_sigma == 0:
@@ -161,49 +146,61 @@ class Comparators:
         self.thetas = [loaded(lanes, theta.to(kind)) for theta in thetas]
         self.single_thetas = [loaded(lanes, theta.float()) for theta in thetas]
         self.leak, self.shots = (
-            rows if rows is None else loaded(lanes, rows) for rows in (leak, shots)
+            None if rows is None else loaded(lanes, rows) for rows in (leak, shots)
         )
         self.carried = {"reference": state.reference.to(kind), "last_event_s": None}
         if state.last_event_s is not None:
             self.carried["last_event_s"] = state.last_event_s.double()
-
-    def slots(self):
-        """Slots of the frames, and what is wrong, as ``run`` has it."""
-        counts, found, wrong = None, [1] * len(self.seen), 0
-        while counts != found and not wrong:
+        self.keys, counts, found = None, None, [1] * len(seen)
+        while counts != found:
             counts = found
-            fired = self.lanes.fresh(len(self.seen), self.lanes.arr.UInt32)
-            _, wrong = self.run(Slots(counts, self.ends_s, self.sensor, self.state), fired=fired)
-            fired = fired.torch().view(torch.int32).reshape(len(self.seen), -1)
+            self._set_slots(counts)
+            self.fired = lanes.fresh(len(seen), lanes.arr.UInt32)
+            self._run([self.fired])
+            fired = self.fired.torch().view(torch.int32).reshape(len(seen), -1)
             found = fired.amax(1).clamp(min=1).tolist()
-            if self.sensor.refractory_s == 0:
+            if sensor.refractory_s == 0:
                 break
-        return Slots(found, self.ends_s, self.sensor, self.state), wrong
+        self._set_slots(found)
 
-    def sink(self, slots, layout, *room):
-        """Keys of events, whose intervals end with the last slots of the frames."""
-        since_us = slots.times_us - layout.origin_us
-        ends_us = np.maximum.accumulate(since_us)[slots.first[1:] - 1]
+    def _set_slots(self, counts):
+        """So many slots of each frame: places of the first ones, times, dead times, below 0 where
+        shorter than a slot; whether the last event's time is then kept in single precision."""
+        lanes, state, refractory_s = self.lanes, self.state, self.sensor.refractory_s
+        Double = lanes.dr.float64_array_t(lanes.arr.Float)
+        now_s, dt_s = self.ends_s - state.start_s, np.diff(self.ends_s)
+        frames = zip(now_s[:-1], now_s[1:], dt_s, counts, strict=True)
+        times_s = np.concatenate([_slots(*frame) for frame in frames]).astype(np.float64)
+        start_us = round(state.start_s * 1e6)
+        since_s = times_s + (state.start_s - start_us / 1e6)
+        self.counts, self.times_us = counts, start_us + np.rint(since_s * 1e6).astype(np.int64)
+        dead, early = refractory_s > dt_s / counts, now_s[1:] < EXACT_SINGLE_S
+        wait_s = np.where(early, np.float32(refractory_s), refractory_s)
+        before = getattr(state.last_event_s, "dtype", None) == torch.float32
+        last_dead = np.maximum.accumulate(np.where(dead, np.arange(1, len(dead) + 1), 0))
+        self.single = lanes.arr.UInt32(np.array([before, *early])[last_dead])
+        self.wait_s = Double(np.where(dead, wait_s, -math.inf))
+        self.times_s, self.first = Double(times_s), lanes.arr.UInt32(np.cumsum([0, *counts]))
+
+    def fire(self, state, layout, *room):
+        """Keys of all events, whose intervals end with the last slots of the frames; moves what
+        events change of a state on."""
+        since_us = self.times_us - layout.origin_us
+        ends_us = np.maximum.accumulate(since_us)[np.cumsum(self.counts) - 1]
         starts_us = np.append(since_us[0] - 1, ends_us[:-1])
-        since_us = since_us - starts_us.repeat(np.diff(slots.first))
+        since_us = since_us - starts_us.repeat(self.counts)
         self.since_us = self.lanes.dr.int64_array_t(self.lanes.arr.Float)(since_us)
         layout = replace(layout, origin_us=0)
-        return EventKeys(self.lanes, starts_us / 1e6, ends_us / 1e6, layout, *room)
+        self.keys = EventKeys(self.lanes, starts_us / 1e6, ends_us / 1e6, layout, *room)
+        state.__dict__.update(self._run(self.keys.arrays()))
+        return self.keys
 
-    def run(self, slots, keys=None, fired=None):
-        """Run over the frames: all events go to keys, or how often pixels fire, dead times apart,
-        into an array. Returns the carried tensors and what is wrong, as ``crossing.run``."""
-        dr, arr = self.lanes.dr, self.lanes.arr
-        Double = dr.float64_array_t(arr.Float)
-        self.times_s, self.wait_s = Double(slots.times_s), Double(slots.wait_s)
-        self.first, self.single = arr.UInt32(slots.first), arr.UInt32(slots.single)
-        self.keys, self.fired = keys, fired
-        written = [fired] if keys is None else keys.arrays()
+    def _run(self, written):
         # levels may be below 0
-        after, wrong = run(self.lanes, self.seen, FrontEnd(True), self._step, self.carried, written)
-        if "last_event_s" in after and bool(slots.single[-1]):
+        after = run(self.lanes, self.seen, FrontEnd(True), self._step, self.carried, written)
+        if "last_event_s" in after and bool(self.single[len(self.counts) - 1]):
             after["last_event_s"] = after["last_event_s"].float()
-        return after, wrong
+        return after
 
     def _step(self, index, seen, now):
         dr, lanes = self.lanes.dr, self.lanes
