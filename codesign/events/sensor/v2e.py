@@ -175,7 +175,7 @@ class Comparators:
         since_s = times_s + (state.start_s - start_us / 1e6)
         self.counts, self.times_us = counts, start_us + np.rint(since_s * 1e6).astype(np.int64)
         dead, early = refractory_s > dt_s / counts, now_s[1:] < EXACT_SINGLE_S
-        wait_s = np.where(early, np.float32(refractory_s), refractory_s)
+        wait_s = np.where(early, float(np.float32(refractory_s)), refractory_s)
         before = getattr(state.last_event_s, "dtype", None) == torch.float32
         last_dead = np.maximum.accumulate(np.where(dead, np.arange(1, len(dead) + 1), 0))
         self.single = lanes.arr.UInt32(np.array([before, *early])[last_dead])
