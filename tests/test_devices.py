@@ -182,7 +182,10 @@ def hard(device):
         stream = events.concatenate(
             [first, events.simulate(parts[1], times()[5:], finer, draw, state)]
         )
-        return [events.to_counts(stream, times()), from_stream(stream, 0, 16_000, 5).counts]
+        slotted = replace(NOISY, leak_jitter=0.1, refractory_s=1e-3, timing="v2e")
+        slots = events.simulate(given, times(), slotted, draw)
+        counts = [events.to_counts(each, times()) for each in (stream, slots)]
+        return [*counts, from_stream(stream, 0, 16_000, 5).counts]
 
     return run
 

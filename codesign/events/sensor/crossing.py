@@ -21,6 +21,8 @@ import numpy as np
 import torch
 
 from codesign.backend import load
+from codesign.errors import DomainError
+from codesign.events.entry import check_frames
 from codesign.events.intensity import light_share
 from codesign.events.low_pass import coefficients, passed
 from codesign.events.stream import sorted_keys
@@ -115,20 +117,26 @@ class EventKeys:
         return self._lanes.arr.UInt32(0)
 
     def take(self, index, when, on, kept, tally):
-        dr, (shift, room) = self._lanes.dr, self._opaque
+        dr = self._lanes.dr
         length, fraction = (dr.gather(self._Time, table, index) for table in self._spans)
-        start, span = (dr.gather(self._Key, table, index) for table in self._whole)
+        span = dr.gather(self._Key, self._whole[1], index)
         # after the start, so that rounding moves no event to the interval before; whole numbers are
         # clipped in less time than floats
         since_us = dr.clip(
             self._Key(dr.round(self._Time(when) * length + fraction)), dr.minimum(span, 1), span
         )
-        key = (start + (since_us << self._bits)) | self._pixel
+        self.put(index, since_us, on, kept)
+        return tally
+
+    def put(self, index, since_us, on, kept):
+        """An event so many microseconds behind the start of its interval."""
+        dr, (shift, room) = self._lanes.dr, self._opaque
+        start = dr.gather(self._Key, self._whole[0], index)
+        key = (start + (self._Key(since_us) << self._bits)) | self._pixel
         slot = dr.scatter_inc(self._counts, (index >> shift) * APART, active=kept)
         key = key | dr.select(on, self._Key(1), 0)
         place = (index >> shift) * room + slot
         dr.scatter(self._keys, key, place, active=kept & (slot < room))
-        return tally
 
     def close(self, index, tally):
         pass
@@ -231,26 +239,23 @@ class DenseCounts:
         return self._counts.torch().reshape(shape)
 
 
-def run(lanes, frames, front_end, dt_s, interval_key, sensor, state, sink):
-    """Run the sensor over a chunk.
+def run(lanes, frames, front_end, step, carried, written):
+    """Run a sensor over a chunk.
 
     Args:
       lanes: of a frame's pixels.
       frames: [T, ...] float32 or float64, not yet checked.
       front_end: FrontEnd.
-      dt_s: [T] length of the interval that ends with each frame.
-      interval_key: [T] int32, random.
-      sensor: SensorModel.
-      state: SensorState (read only).
-      sink: ``EventKeys`` or ``DenseCounts`` of the lanes; takes every event.
-    Returns: dict of the carried tensors after the chunk; what was wrong: 0 nothing, 1 a value that
-      is not finite or negative, 2 a pixel with more than ``MOST_EVENTS`` events in an interval
-      (then everything else is void).
+      step: (index, value, carried) -> (carried, too many events), of one frame; a ``Step``.
+      carried: dict of tensors before the chunk, None for what the sensor has not.
+      written: arrays that steps write to.
+    Returns: dict of the carried tensors after the chunk.
+    Raises: DomainError for a value that is not finite or negative, and a pixel with more than
+      ``MOST_EVENTS`` events in an interval.
     """
     dr, arr = lanes.dr, lanes.arr
-    names = [name for name in CARRIED if getattr(state, name) is not None]
-    carried = [_load(lanes, getattr(state, name)) for name in names]
-    step = _Step(lanes, front_end, dt_s, interval_key, sensor, state, sink)
+    before = {name: tensor for name, tensor in carried.items() if tensor is not None}
+    carried = [loaded(lanes, tensor) for tensor in before.values()]
     values = lanes.load(frames)
 
     def body(index, bad, busy, *carried):
@@ -258,31 +263,41 @@ def run(lanes, frames, front_end, dt_s, interval_key, sensor, state, sink):
         fits = front_end.accepts(dr, value)
         # an infinite level would fire without end
         after, too_many = step(
-            index, dr.select(fits, value, 1), dict(zip(names, carried, strict=True))
+            index, dr.select(fits, value, 1), dict(zip(before, carried, strict=True))
         )
-        return bad | ~fits, busy | too_many, *(after[name] for name in names)
+        return bad | ~fits, busy | too_many, *(after[name] for name in before)
 
     with dr.suspend_grad():
         none = dr.zeros(arr.Bool, lanes.width)
         bad, busy, *carried = lanes.loop(0, lanes.opaque(len(frames)), body, none, none, *carried)
         wrong = dr.select(bad, arr.UInt32(1), dr.select(busy, arr.UInt32(2), 0))
-        dr.eval(carried, wrong, sink.arrays())  # together: a maximum alone runs the loop once more
+        dr.eval(carried, wrong, written)  # together: a maximum alone runs the loop once more
         wrong = dr.max(wrong)
     dr.sync_thread()
+    if int(wrong[0]) == 1:
+        check_frames(frames, 1, non_negative=not front_end.log_input)
+    if int(wrong[0]):
+        raise DomainError(
+            f"a pixel would fire more than {MOST_EVENTS:.0f} events between two frames; check the unit of "
+            "the frames (log levels are natural logarithms), the thresholds, the noise rates and the times."
+        )
     after = {}
-    for name, value in zip(names, carried, strict=True):
-        like = getattr(state, name)
+    for (name, like), value in zip(before.items(), carried, strict=True):
         after[name] = lanes.tensor(
             arr.Int32(value) if like.dtype == torch.int32 else value, like.shape
         )
-    return after, int(wrong[0])
+    return after
 
 
-def _load(lanes, tensor):
+def loaded(lanes, tensor):
+    """An array of the type of a tensor, of unsigned numbers where it has whole ones."""
+    dr, arr = lanes.dr, lanes.arr
+    if tensor.dtype == torch.float64:
+        return load(dr.float64_array_t(arr.Float), tensor)
     if tensor.dtype != torch.int32:
-        return lanes.load(tensor)
-    bits = lanes.arr.UInt32(load(lanes.arr.Int32, tensor))
-    lanes.dr.eval(bits)
+        return load(dr.float32_array_t(arr.Float), tensor)
+    bits = arr.UInt32(load(arr.Int32, tensor))
+    dr.eval(bits)
     return bits
 
 
@@ -294,7 +309,7 @@ def exact_sum(first, second):
     return total, (first - (total - part)) + (second - part)
 
 
-class _Step:
+class Step:
     """One frame of one pixel, as drjit operations. Built once per chunk; every number that changes
     between chunks is opaque or in memory."""
 
@@ -312,11 +327,11 @@ class _Step:
         self.nominal = opaque(sensor.theta_on), opaque(sensor.theta_off)
         self.thetas = self.nominal
         if sensor.theta_sigma > 0:
-            self.thetas = [_load(lanes, theta) for theta in (state.theta_on, state.theta_off)]
-        self.dt_s = _load(lanes, dt_s.to(state.reference))
-        self.interval_key = _load(lanes, interval_key)
-        self.leak_hz = None if state.leak_hz is None else _load(lanes, state.leak_hz)
-        self.key = None if state.key is None else _load(lanes, state.key)
+            self.thetas = [loaded(lanes, theta) for theta in (state.theta_on, state.theta_off)]
+        self.dt_s = loaded(lanes, dt_s.to(state.reference))
+        self.interval_key = loaded(lanes, interval_key)
+        self.leak_hz = None if state.leak_hz is None else loaded(lanes, state.leak_hz)
+        self.key = None if state.key is None else loaded(lanes, state.key)
         self.omega = opaque(2 * math.pi * sensor.cutoff_hz)
         self.jitter = opaque(sensor.leak_jitter)
         self.refractory_s = opaque(sensor.refractory_s)

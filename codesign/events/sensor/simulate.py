@@ -2,7 +2,6 @@
 
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import pairwise
 
 import torch
 from torch import Generator, Tensor
@@ -31,7 +30,6 @@ from codesign.types import EventStream
 
 EVENTS_PER_PIXEL = 1.0  # room made at first; on a processor, what no event writes to is no memory
 KEY_BITS = 63
-NEAR = 1 << 20  # pixels of all frames whose events sort together
 
 
 @torch.no_grad()
@@ -93,13 +91,9 @@ def simulate(
             frames, t_s, sensor, generator, state, front_end
         )
         start_us = round(moved.time_s * 1e6)
-        height_px, width_px = frames.shape[1:]
-        if sensor.timing == "v2e":
-            stream = _v2e_events(frames, times_s, sensor, generator, moved, front_end)
-        else:
-            layout = KeyLayout(start_us, height_px, width_px)
-            _check_range(layout, times_s[-1])
-            stream = _interpolated(frames, times_s, sensor, generator, moved, front_end, layout)
+        layout = KeyLayout(start_us, *frames.shape[1:])
+        _check_range(layout, times_s[-1])
+        stream = _events(frames, times_s, sensor, generator, moved, front_end, layout)
         if at_once is not None:
             # behind the interval before, as all others
             stream = concatenate([_fired(at_once, start_us + 1), stream])
@@ -199,47 +193,42 @@ def _fired(counts, t_us):
     return ordered(torch.full_like(x, t_us), x, y, p, *counts.shape[1:])
 
 
-def _v2e_events(frames, times_s, sensor, generator, state, front_end):
-    """Stream of the events between frames, of a few at a time, whose keys stay near the processor
-    while they sort."""
-    found, streams = [], []
-    for frame, time_s in zip(frames, times_s, strict=True):
-        check_frames(frame[None], 1, non_negative=not front_end.log_input)
-        intensity = frame.exp() if front_end.log_input else frame
-        level = v2e.levels(frame, front_end)
-        found.append(v2e.interval(intensity, level, time_s, sensor, generator, state))
-        if len(found) * frame.numel() >= NEAR or time_s == times_s[-1]:
-            t_us, x, y, p = (torch.cat(column) for column in zip(*found, strict=True))
-            streams.append(ordered(t_us, x, y, p, *frame.shape))
-            found = []
-    if any(a.t_us[-1] >= b.t_us[0] for a, b in pairwise(filter(len, streams))):
-        return concatenate(streams)
-    columns = zip(*((part.t_us, part.x, part.y, part.p) for part in streams), strict=True)
-    t_us, x, y, p = map(torch.cat, columns)
-    return EventStream(t_us, x, y, p, *frames.shape[1:])
-
-
 @exclusive
-def _interpolated(frames, times_s, sensor, generator, state, front_end, layout):
+def _events(frames, times_s, sensor, generator, state, front_end, layout):
     """Stream of the events between frames; keys are views of drjit's memory, which nobody else may
     use meanwhile. A chunk busier than the room made for it is run again with the room it needs."""
     parts = []
     lanes = Lanes(frames, frames[0].numel())
-    size = backend.frames_per_kernel(lanes.width)
+    slotted = sensor.timing == "v2e"
+    size = (v2e if slotted else backend).frames_per_kernel(lanes.width)
     density = EVENTS_PER_PIXEL
     for first in range(0, len(frames), size):
         chunk, ends_s = frames[first : first + size], times_s[first : first + size]
-        random_keys = _random_keys(len(chunk), sensor, state, generator)
+        if slotted:
+            check_frames(chunk, 1, non_negative=not front_end.log_input)
+            comparators = v2e.Comparators(chunk, front_end, ends_s, sensor, generator, state)
+        else:
+            random_keys = _random_keys(len(chunk), sensor, state, generator)
         had_room, total = False, None
         while not had_room:
-            sink = EventKeys(lanes, [state.time_s, *ends_s[:-1]], ends_s, layout, density, total)
+            room = layout, density, total
             trial = replace(state)
-            _advance(lanes, chunk, ends_s, random_keys, sensor, trial, front_end, sink)
+            if slotted:
+                sink = comparators.fire(trial, *room)
+            else:
+                sink = EventKeys(lanes, [state.time_s, *ends_s[:-1]], ends_s, *room)
+                _advance(lanes, chunk, ends_s, random_keys, sensor, trial, front_end, sink)
             had_room, found, total = sink.counted()
             density = max(density, 1.25 * found)
         state.__dict__.update(trial.__dict__)
         parts += sink.sorted()
-    return EventStream(*layout.columns(lanes, parts), layout.height_px, layout.width_px)
+    columns = layout.columns(lanes, parts)
+    if slotted:  # slots of several frames may have one microsecond
+        ends = torch.tensor([len(keys) for _, keys in parts]).cumsum(0)
+        ends = ends[(ends > 0) & (ends < ends[-1])].to(lanes.device)
+        if bool((columns[0][ends] <= columns[0][ends - 1]).any()):
+            return ordered(*columns, *frames.shape[1:])
+    return EventStream(*columns, *frames.shape[1:])
 
 
 def _random_keys(count, sensor, state, generator):
@@ -253,20 +242,10 @@ def _random_keys(count, sensor, state, generator):
 def _advance(lanes, frames, times_s, keys, sensor, state, front_end, sink):
     """Run the kernel and move the state on; on bad frames raise before anything has changed."""
     dt_s = torch.tensor([state.time_s, *times_s], dtype=torch.float64).diff()
-    carried, wrong = crossing.run(
-        lanes, frames, front_end, dt_s.to(frames), keys, sensor, state, sink
-    )
-    if wrong == 1:
-        check_frames(frames, 1, non_negative=not front_end.log_input)
-    if wrong:
-        many = f"more than {crossing.MOST_EVENTS:.0f} events between two frames"
-        raise DomainError(
-            f"a pixel would fire {many}; check the unit of the frames (log levels are natural logarithms), "
-            "the thresholds, the noise rates and the times."
-        )
-    for name, tensor in carried.items():
-        setattr(state, name, tensor)
-    state.time_s = times_s[-1]
+    step = crossing.Step(lanes, front_end, dt_s, keys, sensor, state, sink)
+    carried = {name: getattr(state, name) for name in crossing.CARRIED}
+    carried = crossing.run(lanes, frames, front_end, step, carried, sink.arrays())
+    state.__dict__.update(carried, time_s=times_s[-1])
 
 
 def _check_range(layout, end_s):
