@@ -56,8 +56,9 @@ def photo(source: str | Path, size_px: int = 512) -> np.ndarray:
     if str(source) in PHOTOS:
         import skimage  # whose own reader imports most of scipy
 
-        (path,) = Path(skimage.__file__).parent.glob(f"data/{source}.*")
-        stored = _stored(path)[:size_px, :size_px]
+        found = [*Path(skimage.__file__).parent.glob(f"data/{source}.*")]
+        stored = _stored(found[0]) if found else getattr(skimage.data, str(source))()
+        stored = stored[:size_px, :size_px]
         return _radiance(linear(stored), str(source))
     if Path(source).suffix.lower() in HDR:
         return _scaled(

@@ -331,6 +331,8 @@ def main(
         )
 
     os.environ["MPLBACKEND"] = "Agg"  # figures go to files; no screen is needed
+    if "matplotlib" in sys.modules:
+        sys.modules["matplotlib"].use("Agg")
     torch.set_num_threads(
         1
         # the heavy work is in drjit's own thread pool, which torch's waiting threads only slow down

@@ -3,6 +3,7 @@ timings."""
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -138,3 +139,25 @@ def test_a_noise_event_of_either_polarity_resets_the_memorised_level():
     wanted = torch.full((40, 50), math.log(80))
     wanted[events.y, events.x] += 0.15
     close(state.reference, wanted, atol=1e-6)
+
+
+def test_many_events_of_a_pixel_wait_for_their_slots():
+    """The first run has one slot a frame; a pixel then looks for more. Frame by frame, as v2e works,
+    there are as many events."""
+    level = torch.zeros(40, 1, 1, dtype=D)
+    level[1::2] = 3000.0
+    t_s = torch.arange(40, dtype=D) * 1e-3
+    sensor = SensorModel(0.011, 0.011, refractory_s=1e-5, timing="v2e")
+    assert len(simulate(level, t_s, sensor, log_input=True)) == 3697
+
+
+def test_a_dead_time_may_end_between_chunks():
+    """The sum of the times is that of v2e's way, frame by frame."""
+    frames = 255 * torch.rand(70, 8, 8, generator=seeded(0))
+    t_s = torch.arange(70, dtype=D) * 1e-3
+    waits = SensorModel(0.02, 0.02, refractory_s=1e-3, timing="v2e")
+    for _ in range(3):
+        state = SensorState()
+        simulate(frames[:9], t_s[:9], waits, state=state)
+        found = simulate(frames[9:], t_s[9:], replace(waits, refractory_s=0.0), state=state)
+        assert int(found.t_us.sum()) == 8017549090

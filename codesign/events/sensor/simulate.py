@@ -200,7 +200,10 @@ def _events(frames, times_s, sensor, generator, state, front_end, layout):
     parts = []
     lanes = Lanes(frames, frames[0].numel())
     slotted = sensor.timing == "v2e"
-    size = (v2e if slotted else backend).frames_per_kernel(lanes.width)
+    if slotted:
+        size = v2e.frames_per_kernel(lanes.width, sensor.refractory_s > 0)
+    else:
+        size = backend.frames_per_kernel(lanes.width)
     density = EVENTS_PER_PIXEL
     for first in range(0, len(frames), size):
         chunk, ends_s = frames[first : first + size], times_s[first : first + size]

@@ -25,12 +25,13 @@ from codesign.events.sensor.crossing import MOST_EVENTS, EventKeys, loaded, run
 EXACT_SINGLE_S = 8.0
 NEAR = 1 << 17  # pixels whose levels in double precision stay near the processor
 CHUNK = 1 << 22  # pixels of all frames of a chunk
-MOST_FRAMES = 64  # of a chunk: with a dead time each run settles one frame or more
+WAITING = 1 << 19  # the same with a dead time, which takes several runs
+LEAST_FRAMES, MOST_FRAMES = 4, 64  # of a chunk: with a dead time each run settles one or more
 
 
-def frames_per_kernel(pixels):
-    """How many frames of so many pixels are a chunk."""
-    return min(MOST_FRAMES, max(1, CHUNK // pixels))
+def frames_per_kernel(pixels, waits):
+    """How many frames of so many pixels are a chunk; waits: behind a dead time."""
+    return min(MOST_FRAMES, max(LEAST_FRAMES, (WAITING if waits else CHUNK) // pixels))
 
 
 def levels(frames, front_end):
@@ -248,7 +249,8 @@ class Comparators:
 
         def event(nth, counted, last_s):
             own = ready = nth < fires
-            place = dr.select(own, first + nth, end - 1)
+            # a run with too few slots tells that they are too few, not when
+            place = dr.select(own, dr.minimum(first + nth, end - 1), end - 1)
             on = dr.select(own, rising, shots[0] & (nth == fires)) if shots else rising
             if waits:
                 time_s = dr.gather(Double, self.times_s, place)
