@@ -92,6 +92,7 @@ def test_a_fresh_network_is_the_closed_form(size):
         assert torch.equal(made(given, **options).flow_px, closed)
 
 
+@pytest.mark.bits
 def test_the_flow_is_that_after_the_last_correction():
     given = in_even_bins(drawn(1, 2, 8, 32, 24, rate=0.3, seed=2))
     made = network()
