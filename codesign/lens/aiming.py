@@ -19,6 +19,7 @@ from codesign.lens.glass import D_UM
 from codesign.lens.paraxial import field_angles
 from codesign.lens.trace import Prescription, Status, across, trace
 from codesign.lens.traced import TracedLens, in_float64
+from codesign.searching import is_searched
 
 NEWTON_STEPS = 12
 HALVINGS = 6
@@ -61,7 +62,7 @@ def aim_at_stop(
         radii give it its size on the stop and on the pupil plane.
     Returns: Aim. Gradient: point_mm to every tensor behind ``rays``, ``until_stop`` and the radii,
       by the implicit function theorem.
-    Warns: when some rays cannot be aimed; they keep their guess.
+    Warns: when some rays cannot be aimed, and nobody searches; they keep their guess.
     """
     target_mm = pupil * stop_radius_mm
     with torch.no_grad():
@@ -75,17 +76,22 @@ def aim_at_stop(
             at[lost], found[lost] = _from_the_axis(rays, fixed, target_mm, guess_mm, lost, scale)
             if not bool(found.all()):
                 at[~found] = guess_mm[~found]
-                warnings.warn(
-                    f"{int((~found).sum())} of {found.numel()} rays cannot be aimed at the stop (no light "
-                    "takes that way); they keep their paraxial aim.",
-                    stacklevel=3,
-                )
+                _tell_lost(found)
     met, _ = _meet(rays, until_stop, at, full)
     jacobian = _jacobian(rays, fixed, at, full, slice(None))
     still = ~found | (torch.linalg.det(jacobian).abs() <= SINGULAR)
     jacobian = _or_identity(jacobian, still)
     change = torch.linalg.solve(jacobian, torch.where(still[:, None], 0, met - target_mm))
     return Aim(at - change, found)
+
+
+def _tell_lost(found):
+    if not is_searched():
+        warnings.warn(
+            f"{int((~found).sum())} of {found.numel()} rays cannot be aimed at the stop (no light takes "
+            "that way); they keep their paraxial aim.",
+            stacklevel=4,
+        )
 
 
 def area_at_stop(

@@ -2,7 +2,6 @@
 
 import copy
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -15,6 +14,7 @@ from codesign.backend import differentiable_once
 from codesign.checks import check_finite, check_kind, check_seed, check_whole
 from codesign.errors import DomainError, ShapeError
 from codesign.render.film import Film, check_memory, coarse_pixels, film_pupil_pattern
+from codesign.searching import searching
 from codesign.types import Rays
 
 _NEWTON_STEPS = 12
@@ -423,8 +423,7 @@ def images(
     rows = torch.arange(len(at), device=at.device)
     for _ in range(_NEWTON_STEPS):
         film_px = (at[rows] - step[rows] + shifts[:, None]).reshape(-1, 2)
-        with warnings.catch_warnings():  # a search looks where no light passes, too
-            warnings.filterwarnings("ignore", ".* rays cannot be aimed", UserWarning)
+        with searching():
             rays = camera.coloured_rays(film_px, pupil[rows].repeat(3, 1), colour[rows].repeat(3))
         origin, direction = (v.reshape(3, -1, 3) for v in (rays.origin_m, rays.direction))
         passes = ((rays.weight.reshape(3, -1) > 0) & (direction[..., 2] > 1e-6)).all(0)

@@ -2,6 +2,8 @@
 the area of the image-space cone."""
 
 import math
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
@@ -13,6 +15,7 @@ from codesign.lens.aiming import aimed_rays
 from codesign.lens.analysis import field_rays, pupil_grid
 from codesign.lens.analysis.field_curves import relative_illumination
 from codesign.lens.trace import trace
+from codesign.searching import searching
 from tests.lens.systems import NAMES, PLANE, close, half_field
 from tests.numbers import D, f64
 
@@ -93,6 +96,19 @@ def test_rays_that_cannot_be_aimed_are_told_and_keep_their_paraxial_aim():
     )
     guess = pupil * first.entrance_pupil_diameter_mm.detach() / 2
     close(crossing[lost, :2], guess[lost], atol=1e-9)
+
+
+def test_a_search_is_not_told_of_lost_rays_and_other_threads_still_are():
+    geo, angle, pupil = wide_angle(), math.radians(85.0), pupil_grid(4)
+    with warnings.catch_warnings(record=True) as told, ThreadPoolExecutor(1) as others:
+        warnings.simplefilter("always")
+        with searching():
+            aimed_rays(geo, angle, pupil)
+            assert not told
+            others.submit(aimed_rays, geo, angle, pupil).result()
+        assert len(told) == 1
+        aimed_rays(geo, angle, pupil)
+    assert len(told) == 2
 
 
 def cone_area(geo, field):

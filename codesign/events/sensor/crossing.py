@@ -20,11 +20,14 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from codesign import backend
 from codesign.backend import load
 from codesign.errors import DomainError
 from codesign.events.entry import check_frames
 from codesign.events.intensity import light_share
+from codesign.events.kernels import Lanes
 from codesign.events.low_pass import coefficients, passed
+from codesign.events.sensor.model import draw_keys
 from codesign.events.stream import sorted_keys
 
 # of a pixel in one interval: beyond it a unit is wrong, and single precision would soon stop
@@ -237,6 +240,42 @@ class DenseCounts:
     def tensor(self, shape):
         """The counts as a tensor; call once, it takes the memory over."""
         return self._counts.torch().reshape(shape)
+
+
+class Crossings:
+    """Events of the frames of a chunk, which threshold crossings time. What ``fire`` needs to run
+    once more is drawn here."""
+
+    @staticmethod
+    def frames_per_kernel(pixels, sensor):
+        """How many frames of so many pixels are a chunk."""
+        return backend.frames_per_kernel(pixels)
+
+    def __init__(self, frames, front_end, times_s, sensor, generator, state):
+        """Args: frames: [T, ...]. times_s: list, their times. state: before the first of them."""
+        self.lanes = Lanes(frames, frames[0].numel())
+        self.frames, self.front_end, self.times_s, self.sensor = frames, front_end, times_s, sensor
+        numbers = torch.zeros(len(frames), dtype=torch.int32)
+        if sensor.photoreceptor_noise or sensor.leak_jitters:
+            # one at a time, so that chunks draw what the whole draws
+            numbers = torch.stack([draw_keys((), generator) for _ in frames])
+        self.numbers = numbers.to(state.level.device)
+
+    def fire(self, state, layout, *room):
+        """Keys of all events; moves a state on."""
+        sink = EventKeys(
+            self.lanes, [state.time_s, *self.times_s[:-1]], self.times_s, layout, *room
+        )
+        self.advance(state, sink)
+        return sink
+
+    def advance(self, state, sink):
+        """Run the kernel and move a state on; on bad frames raise before anything has changed."""
+        dt_s = torch.tensor([state.time_s, *self.times_s], dtype=torch.float64).diff()
+        step = Step(self.lanes, self.front_end, dt_s, self.numbers, self.sensor, state, sink)
+        carried = {name: getattr(state, name) for name in CARRIED}
+        after = run(self.lanes, self.frames, self.front_end, step, carried, sink.arrays())
+        state.__dict__.update(after, time_s=self.times_s[-1])
 
 
 def run(lanes, frames, front_end, step, carried, written):

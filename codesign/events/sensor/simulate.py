@@ -6,7 +6,6 @@ from dataclasses import replace
 import torch
 from torch import Generator, Tensor
 
-from codesign import backend
 from codesign.checks import FLOATS, check
 from codesign.errors import DomainError
 from codesign.events.entry import (
@@ -20,10 +19,11 @@ from codesign.events.entry import (
 )
 from codesign.events.intensity import FrontEnd, kernel_levels, log_levels
 from codesign.events.kernels import Lanes
-from codesign.events.sensor import crossing, v2e
-from codesign.events.sensor.crossing import DenseCounts, EventKeys, KeyLayout
-from codesign.events.sensor.model import SensorModel, check_generator, check_sensor, draw_keys
+from codesign.events.sensor import v2e
+from codesign.events.sensor.crossing import Crossings, DenseCounts, KeyLayout
+from codesign.events.sensor.model import SensorModel, check_generator, check_sensor
 from codesign.events.sensor.state import SensorState, begin, change, check_state, leak_before
+from codesign.events.sensor.v2e import Comparators
 from codesign.events.stream import concatenate, ordered
 from codesign.exclusive import exclusive
 from codesign.types import EventStream
@@ -128,10 +128,9 @@ def dense_counts(
         moved, frames, times_s, generator, at_once = _open(
             frames, t_s, sensor, generator, state, front_end
         )
-        lanes = Lanes(frames, frames[0].numel())
-        sink = DenseCounts(lanes, len(frames))
-        keys = _random_keys(len(frames), sensor, moved, generator)
-        _advance(lanes, frames, times_s, keys, sensor, moved, front_end, sink)
+        crossings = Crossings(frames, front_end, times_s, sensor, generator, moved)
+        sink = DenseCounts(crossings.lanes, len(frames))
+        crossings.advance(moved, sink)
     state.__dict__.update(moved.__dict__)
     counts = sink.tensor((len(frames), 2, *frames.shape[1:]))
     if at_once is not None:
@@ -197,58 +196,27 @@ def _fired(counts, t_us):
 def _events(frames, times_s, sensor, generator, state, front_end, layout):
     """Stream of the events between frames; keys are views of drjit's memory, which nobody else may
     use meanwhile. A chunk busier than the room made for it is run again with the room it needs."""
-    parts = []
-    lanes = Lanes(frames, frames[0].numel())
-    slotted = sensor.timing == "v2e"
-    if slotted:
-        size = v2e.frames_per_kernel(lanes.width, sensor.refractory_s > 0)
-    else:
-        size = backend.frames_per_kernel(lanes.width)
-    density = EVENTS_PER_PIXEL
+    timing = Comparators if sensor.timing == "v2e" else Crossings
+    size = timing.frames_per_kernel(frames[0].numel(), sensor)
+    parts, density = [], EVENTS_PER_PIXEL
     for first in range(0, len(frames), size):
         chunk, ends_s = frames[first : first + size], times_s[first : first + size]
-        if slotted:
-            check_frames(chunk, 1, non_negative=not front_end.log_input)
-            comparators = v2e.Comparators(chunk, front_end, ends_s, sensor, generator, state)
-        else:
-            random_keys = _random_keys(len(chunk), sensor, state, generator)
+        source = timing(chunk, front_end, ends_s, sensor, generator, state)
         had_room, total = False, None
         while not had_room:
-            room = layout, density, total
             trial = replace(state)
-            if slotted:
-                sink = comparators.fire(trial, *room)
-            else:
-                sink = EventKeys(lanes, [state.time_s, *ends_s[:-1]], ends_s, *room)
-                _advance(lanes, chunk, ends_s, random_keys, sensor, trial, front_end, sink)
-            had_room, found, total = sink.counted()
+            keys = source.fire(trial, layout, density, total)
+            had_room, found, total = keys.counted()
             density = max(density, 1.25 * found)
         state.__dict__.update(trial.__dict__)
-        parts += sink.sorted()
-    columns = layout.columns(lanes, parts)
-    if slotted:  # slots of several frames may have one microsecond
-        ends = torch.tensor([len(keys) for _, keys in parts]).cumsum(0)
-        ends = ends[(ends > 0) & (ends < ends[-1])].to(lanes.device)
-        if bool((columns[0][ends] <= columns[0][ends - 1]).any()):
-            return ordered(*columns, *frames.shape[1:])
+        parts += keys.sorted()
+    columns = layout.columns(Lanes(frames, frames[0].numel()), parts)
+    # slots of several frames of v2e may have one microsecond
+    ends = torch.tensor([len(keys) for _, keys in parts]).cumsum(0)
+    ends = ends[(ends > 0) & (ends < ends[-1])].to(frames.device)
+    if bool((columns[0][ends] <= columns[0][ends - 1]).any()):
+        return ordered(*columns, *frames.shape[1:])
     return EventStream(*columns, *frames.shape[1:])
-
-
-def _random_keys(count, sensor, state, generator):
-    """One random number per interval, where something is drawn per frame."""
-    if not (sensor.photoreceptor_noise or sensor.leak_jitters):
-        return torch.zeros(count, dtype=torch.int32, device=state.level.device)
-    # one at a time, so that chunks draw what the whole draws
-    return torch.stack([draw_keys((), generator) for _ in range(count)]).to(state.level.device)
-
-
-def _advance(lanes, frames, times_s, keys, sensor, state, front_end, sink):
-    """Run the kernel and move the state on; on bad frames raise before anything has changed."""
-    dt_s = torch.tensor([state.time_s, *times_s], dtype=torch.float64).diff()
-    step = crossing.Step(lanes, front_end, dt_s, keys, sensor, state, sink)
-    carried = {name: getattr(state, name) for name in crossing.CARRIED}
-    carried = crossing.run(lanes, frames, front_end, step, carried, sink.arrays())
-    state.__dict__.update(carried, time_s=times_s[-1])
 
 
 def _check_range(layout, end_s):

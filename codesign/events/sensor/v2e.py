@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from codesign.errors import DomainError
+from codesign.events.entry import check_frames
 from codesign.events.intensity import DARK_SLOPE, JOINT, FrontEnd, light_share
 from codesign.events.kernels import Lanes
 from codesign.events.sensor.crossing import MOST_EVENTS, EventKeys, loaded, run
@@ -27,11 +28,6 @@ NEAR = 1 << 17  # pixels whose levels in double precision stay near the processo
 CHUNK = 1 << 22  # pixels of all frames of a chunk
 WAITING = 1 << 19  # the same with a dead time, which takes several runs
 LEAST_FRAMES, MOST_FRAMES = 4, 64  # of a chunk: with a dead time each run settles one or more
-
-
-def frames_per_kernel(pixels, waits):
-    """How many frames of so many pixels are a chunk; waits: behind a dead time."""
-    return min(MOST_FRAMES, max(LEAST_FRAMES, (WAITING if waits else CHUNK) // pixels))
 
 
 def levels(frames, front_end):
@@ -131,8 +127,16 @@ def _slots(before_s, now_s, dt_s, count):
 class Comparators:
     """Events of the frames of a chunk, as drjit operations, and the slots of the frames."""
 
+    @staticmethod
+    def frames_per_kernel(pixels, sensor):
+        """How many frames of so many pixels are a chunk."""
+        chunk = WAITING if sensor.refractory_s > 0 else CHUNK
+        return min(MOST_FRAMES, max(LEAST_FRAMES, chunk // pixels))
+
     def __init__(self, frames, front_end, times_s, sensor, generator, state):
         """Moves all of the state on but what events change. Args: as for ``signals``."""
+        # levels do not tell intensities below 0
+        check_frames(frames, 1, non_negative=not front_end.log_input)
         self.ends_s = np.array([state.time_s, *times_s])
         seen, leak, shots = signals(frames, front_end, times_s, sensor, generator, state)
         if leak is not None:  # the first one in the precision in which a recording begins
