@@ -97,7 +97,9 @@ STAGES = {
 }
 
 
-def make_world(name: str, light: str = "emissive") -> tuple[MitsubaScene, Stage]:
+def make_world(
+    name: str, light: str = "emissive", device: str = "cpu"
+) -> tuple[MitsubaScene, Stage]:
     """Scene and Stage of a world.
 
     Args:
@@ -111,7 +113,7 @@ def make_world(name: str, light: str = "emissive") -> tuple[MitsubaScene, Stage]
     if light != "emissive" and "light" not in inspect.signature(build).parameters:
         raise DomainError(f"the world '{name}' has no lamps; only the light 'emissive' suits it.")
     options = {} if light == "emissive" else {"light": LEVELS[light]}
-    return build(**options), STAGES[name]
+    return build(device=device, **options), STAGES[name]
 
 
 def motion(family, stage, scene, camera, duration_s, generator):
@@ -181,6 +183,7 @@ def _keeps_clear(T_world_cam, scene, camera):
     """Whether a coarse grid of chief rays meets something, but nothing too near, at every pose."""
     pixels = camera.film.pixels()
     rays = camera.chief_rays(pixels[:: max(1, len(pixels) // 97)])
+    T_world_cam = T_world_cam.to(rays.origin_m.device)
     with torch.no_grad():
         hits = first_hits(rays.origin_m, rays.direction, rays.weight > 0, scene, T_world_cam[None])
     seen = (hits.part >= 0).double().mean(1)

@@ -47,7 +47,12 @@ LIMITS = ROOT / "docs" / "speed.md"
 TABLE = "<!--limits-->"  # before and after it
 PAGE = ROOT / "docs" / "speed_cuda.md"
 WORSE = 1.2  # of the committed ratio fails
-TESTS = ("tests/test_devices.py", "tests/events/test_layers.py", "tests/flow/test_lk_kernels.py")
+TESTS = (
+    "tests/test_devices.py",
+    "tests/events/test_layers.py",
+    "tests/flow/test_lk_kernels.py",
+    "tests/studies/test_on_a_device.py",
+)
 MOVED, SUMS = 2**29, 9 * 32 * 32 * 256**2  # bytes of the copy, multiply-adds of the convolution
 SURFACES = 11  # of the double Gauss
 EVENT = 13  # bytes: 2 + 2 of the place, 1 of the polarity, 8 of the time

@@ -3,8 +3,11 @@ GPU refuses to compute with them, or to hand to numpy, is refused here too.
 
     with second_device():
         run()      # inputs made before count as on the device; values are those of the processor
+
+    python -m tests.second_device STUDY OPTIONS    # a whole study, its device the second one
 """
 
+import importlib
 import sys
 from contextlib import ExitStack, contextmanager
 from unittest import mock
@@ -15,6 +18,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 
 from codesign import backend
+from studies.frame import run as frame
 
 MAKERS = (
     *(torch.zeros, torch.ones, torch.empty, torch.full, torch.eye, torch.arange, torch.linspace),
@@ -50,6 +54,16 @@ class _Second(TorchFunctionMode):
             found = func(*args, **kwargs)
         if func == Tensor.device.__get__:
             return torch.device("cpu") if hosts else THERE
+        if (
+            func is torch._has_compatible_shallow_copy_type
+        ):  # a Module that moves has new Parameters
+            return False
+        if func is torch.autograd.grad:  # a gradient stands where its tensor does
+            with torch._C.DisableTorchFunctionSubclass():
+                return tuple(
+                    slope if slope is None else slope.as_subclass(type(leaf))
+                    for slope, leaf in zip(found, tree_leaves(_leaves(args, kwargs)), strict=True)
+                )
         if func is Tensor.__getitem__ and isinstance(args[0], Host) and there:
             raise MixedDevices("a tensor on the host at places on the device")
         if func in TO_NUMPY and there:
@@ -78,9 +92,14 @@ class _Second(TorchFunctionMode):
             )
 
 
+def _leaves(args, kwargs):
+    return args[1] if len(args) > 1 else kwargs["inputs"]
+
+
 @contextmanager
-def second_device():
-    """Everything made before counts as on the device."""
+def second_device(kernels_on_host=False):
+    """Everything made before counts as on the device. kernels_on_host: those of the host's tensors
+    alone run, on the host."""
     load = backend.load
 
     def loaded(array, tensor):
@@ -88,11 +107,38 @@ def second_device():
             raise MixedDevices(f"a kernel reads {tuple(tensor.shape)} from the host")
         return load(array, tensor)
 
+    def applied(kernel, shapes, *inputs):
+        if not (kernels_on_host and all(isinstance(tensor, Host) for tensor in inputs)):
+            return apply(kernel, shapes, *inputs)
+        found = apply(kernel, shapes, *(tensor.as_subclass(Tensor) for tensor in inputs))
+        return tuple(tensor.as_subclass(Host) for tensor in found)
+
     from_numpy = torch.from_numpy  # asks no mode
+    apply = backend._Kernel.apply
     made = mock.patch.object(torch, "from_numpy", lambda x: from_numpy(x).as_subclass(Host))
     with ExitStack() as patched:
         for module in [m for m in sys.modules.values() if getattr(m, "load", None) is load]:
             patched.enter_context(mock.patch.object(module, "load", loaded))
         patched.enter_context(made)
+        patched.enter_context(mock.patch.object(backend._Kernel, "apply", applied))
         patched.enter_context(_Second())
         yield
+
+
+def constants_on_host():
+    """What modules hold from their import on is the host's."""
+    for module in list(sys.modules.values()):
+        if module.__name__.startswith(("codesign", "scenes", "studies")):
+            for name, value in list(vars(module).items()):
+                if type(value) is Tensor:
+                    setattr(module, name, value.as_subclass(Host))
+
+
+if __name__ == "__main__":
+    study = importlib.import_module(f"studies.{sys.argv[1]}.__main__")
+    constants_on_host()
+    with (
+        second_device(kernels_on_host=True),
+        mock.patch.object(frame, "_device", return_value=THERE),
+    ):
+        sys.exit(frame.main(study.study, study.Config, sys.argv[2:]))

@@ -77,7 +77,10 @@ def assign(parameters: Sequence[Tensor], gradient: Tensor, felt: Sequence[bool])
     ``felt``, which they then leave alone, weight decay included."""
     sizes = [p.numel() for p in parameters]
     for parameter, part, known in zip(parameters, gradient.split(sizes), felt, strict=True):
-        parameter.grad = part.reshape(parameter.shape).to(parameter) if known else None
+        # laid out as the parameter is, as torch wants it
+        parameter.grad = (
+            torch.empty_like(parameter).copy_(part.reshape(parameter.shape)) if known else None
+        )
 
 
 @contextmanager

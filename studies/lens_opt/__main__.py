@@ -40,11 +40,12 @@ from studies.lens_opt.descend import (
     prepare,
 )
 from studies.lens_opt.page import label
-from studies.lens_opt.task import HELD_OUT, LIGHT, draw_case, make_worlds
+from studies.lens_opt.task import HELD_OUT, LIGHT, draw_case, make_task, make_worlds
 
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    GPU: ClassVar = True
     QUICK: ClassVar = {
         "steps": 10,
         "after_steps": 2,
@@ -55,6 +56,8 @@ class Config(StudyConfig):
         "spot_steps": 8,
         "spot_starts": 1,
     }
+    device: Literal["auto", "cpu", "cuda"] = "cpu"
+    """Where rays, events and flow are computed; auto takes CUDA where there is one."""
     lens: str = "cooke-triplet"
     """Lens to start from: cooke-triplet, double-gauss, la1509, or a lens file (.zmx, .seq, .json)."""
     objective: Literal["flow", "edge"] = "flow"
@@ -138,7 +141,7 @@ class Course:
 def study(run: Run[Config]):
     config = run.config
     _check(config)
-    job = prepare(config)
+    job = prepare(config, make_task(config.lens, config.seed, config.detuned_px, run.device))
     course = Course(run)
     if course.fresh:
         lens.save(job.task.nominal, run.path("lens_nominal.json"))
@@ -277,7 +280,7 @@ def _finish(run, course, lenses, seconds):
     for name, design, rival in pairs_of(lenses):
         pair = log_ratio(*(column(found[n], "flow_error_mrad") for n in (design, rival)))
         run.record(**pair.metrics(f"log_ratio_{name}"))
-    blank = draw_case([lens_opt_page.blank_wall()], JUDGED, frames=17)
+    blank = draw_case([lens_opt_page.blank_wall(task.device)], JUDGED, 17, task.device)
     for name in ("detuned", "optimised"):
         error = task.judge(lenses[name], blank, job.system.flow)["flow_error_mrad"]
         run.record(**{f"flow_error_mrad_hard_control_{name}": error})
@@ -313,16 +316,17 @@ def judge_all(course, lenses):
     (see LensTask.judge)."""
     run = course.run
     job = course.jobs["optimised"]
-    pool = make_worlds(HELD_OUT)
+    task = course.jobs["optimised"].task
+    pool = make_worlds(HELD_OUT, task.device)
     found = course.found
     done = min((len(found.get(name, [])) for name in lenses), default=0)
     with run.progress(
         run.config.judged, "judging on held-out textures and motions", done=done
     ) as bar:
         for i in range(done, run.config.judged):
-            case = draw_case(pool, JUDGED + i, frames=17)
+            case = draw_case(pool, JUDGED + i, 17, task.device)
             for name, optics in lenses.items():
-                row = job.task.judge(optics, case, job.system.flow, 2 * run.config.samples)
+                row = task.judge(optics, case, job.system.flow, 2 * run.config.samples)
                 found.setdefault(name, []).append(row)
             course.save()
             bar.advance()

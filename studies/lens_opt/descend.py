@@ -3,10 +3,12 @@ its way so far."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from statistics import fmean
 from typing import Any
 
 import torch
+from torch import nn
 
 from codesign import lens
 from codesign.events import HardSensor
@@ -20,7 +22,6 @@ from studies.lens_opt.task import (
     DesignedCamera,
     LensTask,
     draw_case,
-    make_task,
     make_worlds,
 )
 
@@ -74,7 +75,7 @@ class Job:
 
 def prepare(
     config: Any,
-    task: LensTask | None = None,
+    task: LensTask,
     objective: str | None = None,
     stage: Any = None,
     part: float = 1.0,
@@ -83,34 +84,35 @@ def prepare(
 
     Args:
       config: Config of lens_opt.
-      task: where to start from, by default the detuned lens.
+      task: where to start from.
       objective: "flow" or "edge", by default that of config.
       stage: flow stage to share.
       part: of the step size.
     Raises: DomainError for an event layer and an estimator that make no sense together, with the
       reason.
     """
-    layer = event_layer(config.events)
+    layer = event_layer(config.events).to(task.device)
     if stage is None:
         stage = estimator(
             config.flow, config.train_network, config.objective, config.weights, config.seed
         )
-    task = task or make_task(config.lens, config.seed, config.detuned_px)
+        stage = stage.to(task.device) if isinstance(stage, nn.Module) else stage
     chosen: str = objective or config.objective
-    pool = make_worlds(TRAINING)
+    pool = make_worlds(TRAINING, task.device)
     camera = DesignedCamera(task, config.samples)
     train = config.train_network and chosen == "flow"
     every_px = 2 if train else 8  # a network is taught at more pixels than a lens needs
     system = task.system(camera, layer, stage, chosen, every_px)
     hard = system.replaced(events=HardSensor(SENSOR, system.bins))
-    scored = [draw_case(pool, TRAINED + i) for i in range(config.scored)]
+    drawn = partial(draw_case, pool, device=task.device)
+    scored = [drawn(TRAINED + i) for i in range(config.scored)]
 
     def penalty():
         return PENALTY * task.design.penalty(camera.optics())
 
     def samples(step):
         first = (config.seed + 1) * PER_SEED + step * config.cases
-        return (system(draw_case(pool, first + k)).loss + penalty() for k in range(config.cases))
+        return (system(drawn(first + k)).loss + penalty() for k in range(config.cases))
 
     def score():
         return fmean(float(hard(case).loss) for case in scored) + float(penalty())
@@ -149,8 +151,8 @@ def development_error(
     samples: int,
 ) -> Callable[[lens.GeoLens], float]:
     """Function of a lens to its geometric mean hard flow error on the development cases, mrad."""
-    pool = make_worlds(DEVELOPMENT)
-    drawn = [draw_case(pool, DEVELOPED + i, frames=17) for i in range(cases)]
+    pool = make_worlds(DEVELOPMENT, task.device)
+    drawn = [draw_case(pool, DEVELOPED + i, 17, task.device) for i in range(cases)]
 
     def error(optics):
         found = [task.judge(optics, case, flow, samples)["flow_error_mrad"] for case in drawn]

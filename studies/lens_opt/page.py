@@ -71,9 +71,10 @@ def verdict(design: str, rivals: Mapping[str, Interval]) -> str:
     return sentence[0].upper() + sentence[1:]
 
 
-def blank_wall():
+def blank_wall(device):
     """A wall without texture: the negative control."""
-    return worlds.wall(np.full((64, 64), 60.0, dtype=np.float32), texel_m=0.003)
+    even = np.full((64, 64), 60.0, dtype=np.float32)
+    return worlds.wall(even, texel_m=0.003, device=torch.device(device).type)
 
 
 def write(run, course, lenses, junctions):
@@ -235,9 +236,11 @@ def _seen_by_the_sensor(run, job, shown):
     for title, optics in shown.items():
         with torch.no_grad():
             camera = job.task.camera(optics, run.config.samples, case.seed)
-            frames = seen[title] = render.frames(camera, case.scene, case.T_world_body)
+            frames = render.frames(camera, case.scene, case.T_world_body)
             on, off = events.memory(frames, SENSOR.theta_on, SENSOR.theta_off)[0].sum(0)
-        for h, frame, count in zip(FIELDS, frames[0].numpy(), (on - off).numpy(), strict=True):
+        seen[title] = frames.cpu()
+        balance = (on - off).cpu().numpy()
+        for h, frame, count in zip(FIELDS, seen[title][0].numpy(), balance, strict=True):
             rows.setdefault(title, {}).update({f"field {h:g}": frame, f"events {h:g}": count})
     run.section(
         "What the sensor sees",

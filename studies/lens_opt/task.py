@@ -74,13 +74,15 @@ class LensTask:
     (variables = 0), which is in best focus.
 
     nominal: the published lens scaled to the sensor and focused on the wall. defocused: the detuned
-      lens with the focus error that its curvature errors make.
+      lens with the focus error that its curvature errors make. device: where rays, events and flow
+      are computed; the lens's numbers stay on the processor.
     """
 
     nominal: lens.GeoLens
     defocused: lens.GeoLens
     design: LensDesign
     fields_rad: tuple[float, ...]
+    device: torch.device | str = "cpu"
 
     def around(self, optics: lens.GeoLens) -> LensDesign:
         """The same free variables and limits, in steps around another lens."""
@@ -88,7 +90,14 @@ class LensTask:
 
     def camera(self, optics, samples: int, seed: int = 0) -> render.Camera:
         return render.Camera(
-            optics, WINDOW_PX, WINDOW_PX, PITCH_MM, samples, seed, film(), spectrum=LIGHT
+            optics.replace().to(self.device),
+            WINDOW_PX,
+            WINDOW_PX,
+            PITCH_MM,
+            samples,
+            seed,
+            film(),
+            spectrum=LIGHT,
         )
 
     def rms_spot_um(self, optics) -> torch.Tensor:
@@ -157,7 +166,7 @@ def bins_of(flow) -> int:
     return getattr(flow, "config", {}).get("bins", BINS)
 
 
-def make_task(source, seed, detuned_px=1.5):
+def make_task(source, seed, detuned_px=1.5, device="cpu"):
     """Load a lens, scale it so that its published field fills the sensor's diagonal, focus it on
     the wall, and detune its curvatures by ``seed``.
 
@@ -191,7 +200,8 @@ def make_task(source, seed, detuned_px=1.5):
         floor_mm=torch.minimum(around.floor_mm, FLOOR_SHARE * start.thickness_mm),
         edge_floor_mm=torch.minimum(around.edge_floor_mm, edge_thickness_mm(start)),
     )
-    return LensTask(nominal, defocused, make_design(start, fields, PITCH_MM, floors), fields)
+    design = make_design(start, fields, PITCH_MM, floors)
+    return LensTask(nominal, defocused, design, fields, device)
 
 
 def _detuned(around, fields, target_mm, generator):
@@ -221,7 +231,7 @@ def in_focus(optics, fields_rad):
     return refocused(optics, fields_rad, DISTANCE_M, LIGHT)
 
 
-def make_worlds(names):
+def make_worlds(names, device="cpu"):
     """A wall per texture name: photographs at 3 mm a texel (about a pixel) or, as "name:2", twice
     as coarse; band-limited "speckle-SEED".
 
@@ -236,11 +246,17 @@ def make_worlds(names):
             if name.startswith("speckle-")
             else textures.photo(name)
         )
-        found.append(worlds.wall(textures.shrunk(pattern, 2), texel_m=0.003 * float(zoom or 1)))
+        found.append(
+            worlds.wall(
+                textures.shrunk(pattern, 2),
+                texel_m=0.003 * float(zoom or 1),
+                device=torch.device(device).type,
+            )
+        )
     return found
 
 
-def draw_case(pool, seed, frames=9):
+def draw_case(pool, seed, frames=9, device="cpu"):
     """A world out of ``pool``, a place before it and a motion, all from one seed."""
     generator = torch.Generator().manual_seed(seed)
     world = pool[int(torch.randint(len(pool), (1,), generator=generator))]
@@ -248,7 +264,7 @@ def draw_case(pool, seed, frames=9):
     motion = torch.randn(6, generator=generator, dtype=torch.float64)
     t_s = torch.linspace(0, DURATION_S, frames, dtype=torch.float64)
     drive = trajectories.body_twist(start, MOTION * motion / DURATION_S, t_s)
-    return Batch(drive, t_s, world, seed)
+    return Batch(drive.to(device), t_s, world, seed)
 
 
 def drawn_place(generator):

@@ -59,8 +59,11 @@ LONGEST_S = 4000.0  # event times are 32-bit microseconds
 
 @dataclass(frozen=True)
 class Config(Tolerant):
+    GPU: ClassVar = True
     QUICK: ClassVar = {"trajectories": 2, "frames": 40, "size": 64, "samples": 4}
     ANEW: ClassVar = ("processes",)
+    device: Literal["auto", "cpu", "cuda"] = "cpu"
+    """Where rays, truth and events are computed; auto takes CUDA where there is one."""
     trajectories: int = 5
     """Number of sequences; the families orbital, radial, vertical, driving, flying take turns."""
     frames: int = 600
@@ -117,11 +120,11 @@ def study(run: Run[Config]) -> None:
     require("h5py", "event-files", "a data set")
     start = time.perf_counter()
     config = checked(run.config)
-    maker = Maker(config)
+    maker = Maker(config, run.device)
     fidelity = None
     if config.tolerance:
         fidelity = cheapest(run, maker)
-        maker = Maker(config, fidelity)
+        maker = Maker(config, run.device, fidelity)
     names = [
         f"sequence_{index:03d}_{FAMILIES[index % len(FAMILIES)]}"
         for index in range(config.trajectories)
@@ -174,7 +177,8 @@ def made(folder: str, index: int, fidelity: dict[str, Any] | None) -> dict[str, 
     Returns: memory that is held, and seconds ``spent``."""
     workers.with_threads(1)
     config = read_config(Path(folder).parent / "config.json", "make_dataset", Config)
-    maker = Maker(config, Fidelity(**fidelity) if fidelity else None)
+    device = torch.device(config.device)
+    maker = Maker(config, device, Fidelity(**fidelity) if fidelity else None)
     parent = os.getppid()
 
     def go_on(**_):
@@ -205,6 +209,10 @@ def checked(config):
             f"--rate-hz is {config.rate_hz:g}: above 0, at most 100000, and such that {config.frames} "
             f"frames last at most {LONGEST_S:g} s."
         )
+    if config.tolerance and config.device == "cuda":
+        raise DomainError(
+            "--tolerance chooses by processor time, which says nothing of a GPU; leave it or --device cuda out."
+        )
     if not 0.1 <= config.focal_length_mm <= 1000:
         raise DomainError(
             f"--focal-length-mm is {config.focal_length_mm:g}; 0.1 to 1000 are possible."
@@ -212,7 +220,7 @@ def checked(config):
     return config
 
 
-def make_camera(config):
+def make_camera(config, device="cpu"):
     """The camera of a configuration: the lens scaled to its focal length, the film to FIELD_SHARE
     of its field."""
     geo = lens.load(config.lens)
@@ -232,9 +240,8 @@ def make_camera(config):
         "thin": geo.thin,
         "pinhole": lambda: lens.Pinhole(config.focal_length_mm),
     }
-    return Camera(
-        levels[config.level](), config.size, config.size, pitch_mm, config.samples, config.seed
-    )
+    optics = levels[config.level]().to(device)
+    return Camera(optics, config.size, config.size, pitch_mm, config.samples, config.seed)
 
 
 def cheapest(run, maker):
@@ -252,15 +259,19 @@ def cheapest(run, maker):
 class Maker:
     """What all sequences share: world, camera, sensor, the tables of truth, and the clock.
 
-    fidelity: whose camera it is, in place of that of the options."""
+    device: where rays, truth and events are computed. fidelity: whose camera it is, in place of that
+      of the options."""
 
-    def __init__(self, config: Config, fidelity: Fidelity | None = None) -> None:
-        self.camera = make_camera(config)
+    def __init__(
+        self, config: Config, device: torch.device, fidelity: Fidelity | None = None
+    ) -> None:
+        self.device = device
+        self.camera = make_camera(config, device)
         if fidelity:
             self.camera = camera_at(self.camera, fidelity)
             config = replace(config, level=fidelity.camera, samples=fidelity.samples)
         self.config = config
-        self.scene, self.stage = make_world(config.world, config.light)
+        self.scene, self.stage = make_world(config.world, config.light, device.type)
         self.sensor = SensorModel(
             config.theta, config.theta, config.theta_sigma, shot_rate_hz=config.shot_rate_hz
         )
@@ -332,13 +343,14 @@ class Maker:
         aside = torch.tensor(
             [[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]], dtype=torch.float64
         )
-        beside = self.camera.chief_rays(film.middle_px + aside).direction.double()
-        x, y = (beside[:, :2] / beside[:, 2:]).T
+        beside = self.camera.chief_rays(film.middle_px + aside.to(self.device)).direction.double()
+        x, y = (beside[:, :2] / beside[:, 2:]).T.cpu()
         cx, cy = film.middle_px.tolist()
         content = io.BytesIO()
         with store.h5(content, "w") as file:
-            file["direction"] = self.chief.direction.reshape(*film.shape, 3).double().numpy()
-            file["origin_m"] = self.chief.origin_m.reshape(*film.shape, 3).double().numpy()
+            for name in ("direction", "origin_m"):
+                rays = getattr(self.chief, name).reshape(*film.shape, 3)
+                file[name] = rays.double().cpu().numpy()
             file["K"] = np.array(
                 [[float(1 / (x[0] - x[1])), 0, cx], [0, float(1 / (y[2] - y[3])), cy], [0, 0, 1.0]]
             )
@@ -368,7 +380,7 @@ class Sequence:
         self.t_s = times(config.frames, config.rate_hz)
         self.noise = maker.drawn(2 * index + 1)
         self.path = maker.path(index)
-        self.poses = self.path(LEAD_S + self.t_s).detach()
+        self.poses = self.path(LEAD_S + self.t_s).detach().to(maker.device)
         self.state = None
 
     def make(self, chunk):
@@ -380,7 +392,8 @@ class Sequence:
         if chunk == 0:
             self.state = SensorState(generator=self.noise)
         elif self.state is None:  # at the start of a session
-            self.state = store.read_state(store.part_path(self.folder, chunk - 1))
+            part = store.part_path(self.folder, chunk - 1)
+            self.state = store.read_state(part, maker.device)
         with clock.on("frames"):
             frames = maker.frames(self.poses, first, last)
         with clock.on("truth"):
@@ -404,9 +417,9 @@ class Sequence:
         maker = self.maker
         with maker.clock.on("writing"):
             velocity = self.path.velocity(LEAD_S + self.t_s).detach()
-            extra = {"poses": self.poses.numpy(), "velocity": velocity.numpy()}
+            extra = {"poses": self.poses.cpu().numpy(), "velocity": velocity.numpy()}
             store.join(self.folder, maker.chunks, self.t_s.numpy(), extra)
-            write_tum(self.folder / "poses.txt", self.t_s, self.poses)
+            write_tum(self.folder / "poses.txt", self.t_s, self.poses.cpu())
             maker.calibration(self.folder)
             us = np.rint(self.t_s.numpy() * 1e6).astype(np.int64)
             lines = [

@@ -27,7 +27,7 @@ class Segments:
         H, W] is the number of the part that is met first. scene: as it is in these frames.
         T_world_cam: [F, 4, 4]."""
         owner = object_id.flatten(1)
-        found = torch.full(owner.shape, -1)
+        found = torch.full_like(owner, -1, dtype=torch.int64)
         cameras = views_of(scene, T_world_cam).cameras[:, :, None]
         for number, ((part, shapes, first), pose) in enumerate(
             zip(self._parts, cameras, strict=True)
@@ -64,4 +64,4 @@ def _shape_of(part, shapes, origin_m, direction):
     index = mi.Int32(0)
     for number, shape in enumerate(shapes):
         index = dr.select(met == mi.ShapePtr(shape), number, index)
-    return torch.as_tensor(index.numpy()).long()
+    return torch.as_tensor(index.numpy()).long().to(origin_m.device)

@@ -70,14 +70,14 @@ def write_part(
         ):
             file[name] = values.cpu().numpy().astype(EVENT_TYPES[name])
         for name, tensor in state.tensors().items():
-            file[f"state/{name}"] = tensor.contiguous().numpy()
-        file["state/generator"] = generator.get_state().numpy()
+            file[f"state/{name}"] = tensor.contiguous().cpu().numpy()
+        file["state/generator"] = generator.get_state().cpu().numpy()
         file["state/start_s"], file["state/time_s"] = state.start_s, state.time_s
     write_atomic(path, content.getvalue())
 
 
-def read_state(path: Path):
-    """The sensor's state that a part ends with. Raises: FileFormatError when the part is
+def read_state(path: Path, device: torch.device | str = "cpu"):
+    """The sensor's state that a part ends with, on a device. Raises: FileFormatError when the part is
     damaged."""
     with (
         reading(f"'{path}'", "remove it and go on again with --resume"),
@@ -88,7 +88,7 @@ def read_state(path: Path):
         generator = torch.Generator()
         generator.set_state(torch.from_numpy(stored.pop("generator")))
         return SensorState(
-            **{name: torch.from_numpy(values) for name, values in stored.items()},
+            **{name: torch.from_numpy(values).to(device) for name, values in stored.items()},
             start_s=start_s,
             time_s=time_s,
             generator=generator,

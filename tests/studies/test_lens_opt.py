@@ -138,9 +138,9 @@ def test_networks_come_trained_or_to_be_trained():
 
 
 @pytest.mark.parametrize("layer", ["sigmoid", "srm", "physical"])
-def test_every_event_layer_hands_the_lens_a_gradient(layer):
+def test_every_event_layer_hands_the_lens_a_gradient(layer, task):
     options = configured(lens_opt.Config, True, events=layer, cases=1, scored=1)
-    job = lens_opt.prepare(options)
+    job = lens_opt.prepare(options, task)
     (slope,) = torch.autograd.grad(job.system(job.probe).loss, job.camera.variables)
     assert int((slope != 0).sum()) == slope.numel()
     assert layer in events.LAYERS
