@@ -175,13 +175,14 @@ def mitsuba(device: str = "cpu") -> Any:
 
 
 @contextmanager
-def two_threads() -> Iterator[None]:
-    """drjit with two threads at least: with one, Mitsuba waits without end for another that reads
-    or writes OpenEXR."""
+def threads(least: int = 1, most: int = 1 << 16) -> Iterator[None]:
+    """drjit with so many threads: two at least, or Mitsuba waits without end for another that reads
+    or writes OpenEXR; one at most for many kernels of a few thousand lanes, in which others have no
+    part, though they busy-wait in between."""
     import drjit as dr
 
     count = dr.thread_count()
-    dr.set_thread_count(max(count, 2))
+    dr.set_thread_count(min(max(count, least), most))
     try:
         yield
     finally:

@@ -324,7 +324,7 @@ def _quiet(mi) -> Iterator[None]:
     level = mi.logger().log_level()
     mi.set_log_level(mi.LogLevel.Error)
     try:
-        with backend.two_threads():
+        with backend.threads(least=2):
             yield
     finally:
         mi.set_log_level(level)

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign import shipped
+from codesign import backend, shipped
 from codesign.errors import DomainError, FileFormatError
 from codesign.mount import VelocityHead
 from codesign.mount.requirements import first_missed
@@ -69,6 +69,7 @@ def start(space: Space, seed: int, near: Sequence[float] | None = None) -> Tenso
     )
 
 
+@backend.threads(most=1)
 def kept(space: Space, share: Tensor, requirements: Sequence[Any]) -> bool:
     """Whether a design keeps what is required, by the hard answer."""
     whole = space.made(share)

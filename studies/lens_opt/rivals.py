@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign import lens
+from codesign import backend, lens
 from codesign.errors import CodesignError, DomainError
 from codesign.grad.jacobian import by_differences
 from codesign.lens.design.modes import sizes_of
@@ -176,5 +176,6 @@ def _solved(task, size, weights, start, steps):
         by_differences(DIFFERENCE),
         stop=StopRules(steps=steps, loss=SETTLED),
     )
-    solver.run()
+    with backend.threads(most=1):
+        solver.run()
     return solver

@@ -9,7 +9,7 @@ from functools import cache
 import torch
 from torch import Tensor, nn
 
-from codesign import events, lens, pose, render
+from codesign import backend, events, lens, pose, render
 from codesign.errors import DomainError
 from codesign.events import HardSensor
 from codesign.lens.design import LensDesign, detune, edge_thickness_mm, make_design
@@ -166,6 +166,7 @@ def bins_of(flow) -> int:
     return getattr(flow, "config", {}).get("bins", BINS)
 
 
+@backend.threads(most=1)
 def make_task(source, seed, detuned_px=1.5, device="cpu"):
     """Load a lens, scale it so that its published field fills the sensor's diagonal, focus it on
     the wall, and detune its curvatures by ``seed``.

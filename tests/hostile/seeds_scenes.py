@@ -72,7 +72,7 @@ def exr() -> bytes:
 
     mi = backend.mitsuba()
     stream = mi.MemoryStream()
-    with backend.two_threads():
+    with backend.threads(least=2):
         mi.Bitmap(LIGHT.astype(np.float32)).write(stream, mi.Bitmap.FileFormat.OpenEXR)
     stream.seek(0)
     return stream.read(stream.size())

@@ -25,7 +25,7 @@ EVEN = np.ones((4, 4))
 def test_pictures_in_linear_light_hold_what_mitsuba_reads(tmp_path, name):
     made = {"new.hdr": seeds_scenes.hdr(), "flat.hdr": FLAT, "sky.exr": seeds_scenes.exr()}
     (tmp_path / name).write_bytes(made[name])
-    with backend.two_threads():
+    with backend.threads(least=2):
         theirs = np.array(backend.mitsuba().Bitmap(str(tmp_path / name)))[..., :3]
     np.testing.assert_array_equal(
         rgbe.read(tmp_path / name).astype(np.float32), theirs.astype(np.float32)

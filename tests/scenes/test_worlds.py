@@ -190,7 +190,7 @@ def test_a_sky_from_a_file_has_its_mean_and_its_east_in_the_east(tmp_path):
     picture = np.full((32, 64, 3), 1.0, dtype=np.float32)
     picture[14:18, 15:18] = 50.0  # a lamp just about the horizon, a quarter of the way round: +x
     for kind in ("exr", "hdr"):
-        with backend.two_threads():
+        with backend.threads(least=2):
             mi.Bitmap(picture).write(str(tmp_path / f"sky.{kind}"))
         values = textures.environment(tmp_path / f"sky.{kind}", mean=30.0)
         weight = np.cos((np.arange(32) + 0.5 - 16) * np.pi / 32)[:, None]
@@ -215,7 +215,7 @@ def test_skies_that_cannot_be_are_refused(tmp_path):
         textures.environment(tmp_path / "nowhere.exr")
     for level, sentence in ((-1.0, "negative"), (0.0, "black")):
         picture = np.full((4, 8, 3), level, dtype=np.float32)
-        with backend.two_threads():
+        with backend.threads(least=2):
             backend.mitsuba().Bitmap(picture).write(str(tmp_path / "sky.exr"))
         with pytest.raises(DomainError, match=sentence):
             textures.environment(tmp_path / "sky.exr")
