@@ -3,9 +3,11 @@
 
 import sys
 
-import codesign  # noqa: F401  (sets the wait policy of OpenMP, which must happen before torch is imported)
+# sets the wait policy of OpenMP, which must happen before torch is imported
+from codesign import shipped
 
 if sys.argv[0] == "-m":  # Python is about to run a module of this package, and looks for it
     from studies.frame import listing
 
+    shipped.importing(True)
     listing.refuse_parts(sys.orig_argv)

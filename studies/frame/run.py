@@ -330,6 +330,7 @@ def main(
             args=arguments,
         )
 
+    shipped.importing(False)
     os.environ["MPLBACKEND"] = "Agg"  # figures go to files; no screen is needed
     if "matplotlib" in sys.modules:
         sys.modules["matplotlib"].use("Agg")
