@@ -190,6 +190,21 @@ def softened(texture: np.ndarray, texels: float, mode: str = "nearest") -> np.nd
     ).astype(np.float32)
 
 
+def _blurred(values, texels, axis, mode):
+    """``values`` blurred by a Gaussian along ``axis``, beyond the border as NumPy's ``mode`` says; to
+    the last bit what scipy.ndimage.gaussian_filter1d gives, whose import takes ten times as long."""
+    reach = int(4 * texels + 0.5)
+    share = np.exp(-0.5 / texels**2 * np.arange(-reach, 1) ** 2)
+    share /= np.concatenate([share, share[-2::-1]]).sum()
+    around = [(reach, reach) if each == axis else (0, 0) for each in range(values.ndim)]
+    wide = np.moveaxis(np.pad(values, around, mode=mode), axis, 0)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    size = values.shape[axis]
+    found = wide[reach : reach + size] * share[reach]
+    for k in range(reach):
+        found += (wide[k : k + size] + wide[2 * reach - k :][:size]) * share[k]
+    return np.ascontiguousarray(np.moveaxis(found, 0, axis))
+
+
 def speckle(
     seed: int,
     size_px: int = 512,
@@ -314,11 +329,8 @@ def sky(
     width = 2 * height_px
     elevation = np.pi / 2 - (np.arange(height_px)[:, None] + 0.5) * np.pi / height_px
     azimuth = (np.arange(width) + 0.5) * 2 * np.pi / width
-    noise = scipy.ndimage.gaussian_filter(
-        np.random.default_rng(seed).standard_normal((height_px, width)),
-        (height_px / 48, height_px / 20),
-        mode=["nearest", "wrap"],  # pyright: ignore[reportArgumentType]
-    )
+    noise = np.random.default_rng(seed).standard_normal((height_px, width))
+    noise = _blurred(_blurred(noise, height_px / 48, 0, "edge"), height_px / 20, 1, "wrap")
     clouds = 25 * np.tanh(1.5 * noise / noise.std()) * np.clip(2 * elevation, 0, 1)
     up = np.clip(elevation / (np.pi / 2), 0, 1)
     clear = HORIZON + (ZENITH - HORIZON) * up**0.6 + clouds

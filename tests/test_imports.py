@@ -153,9 +153,11 @@ def test_mitsuba_is_for_pictures_and_worlds():
 
 def test_studies_start_without_what_their_first_frame_does_not_need():
     names = ("lens_opt", "codesign", "placement", "gradient_flow", "make_dataset", "chain_picture")
-    late = {"matplotlib", "kornia", "scipy.stats", "sympy", "skimage", "torch._dynamo"}
+    late = {"matplotlib", "kornia", "scipy._lib._util", "sympy", "torch._dynamo"}
     script = "import sys\nfrom importlib import import_module\n"
     script += f"for name in {names}: import_module(f'studies.{{name}}.__main__')\n"
+    script += "from scenes.robots.pairs import PAIRS\npair = PAIRS['outdoors']()\n"
+    script += "made = pair.requirements(), pair.world(0)\n"
     done = python("-c", f"{script}print({late} & sys.modules.keys())")
     assert done.stdout == "set()\n", done.stderr
 

@@ -208,26 +208,20 @@ def solids_of(vertices_m: Any, faces: Any) -> list[Tensor]:
 
 def _components(corners):
     """Which connected component each face [F, 3] belongs to, and whether each of them is closed."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     count = int(corners.max()) + 1
     edges = np.stack([corners, np.roll(corners, -1, 1)], -1)
     # of faces that are not folded to a line
     whole = np.repeat((edges[..., 0] != edges[..., 1]).all(1), 3)
     edges = edges.reshape(-1, 2)
-    ones = np.ones(len(edges))
-    of_vertex = connected_components(coo_matrix((ones, edges.T), (count, count)), directed=False)[1]
+    of_vertex = _least_connected(edges, count)
+    names, component = np.unique(of_vertex[corners[:, 0]], return_inverse=True)
     edges = edges[whole]
     forth = np.where(edges[:, 0] < edges[:, 1], 1.0, -1.0)
-    place = np.sort(edges, 1).T
     # closed where each edge is run through as often one way as the other
-    runs = coo_matrix((forth, place), (count, count)).tocsr()
-    used = coo_matrix((np.ones(len(edges)), place), (count, count)).tocsr()
-    names, component = np.unique(of_vertex[corners[:, 0]], return_inverse=True)
-    where = np.searchsorted(names, of_vertex[used.nonzero()[0]])
-    uses = np.asarray(used[used.nonzero()]).reshape(-1)
-    balance = np.asarray(runs[used.nonzero()]).reshape(-1)
+    name = edges.min(1) * count + edges.max(1)
+    used, which, uses = np.unique(name, return_inverse=True, return_counts=True)
+    where = np.searchsorted(names, of_vertex[used // count])
+    balance = np.bincount(which, forth, len(used))
     unbalanced = np.bincount(where, balance != 0, len(names)) > 0
     paired = np.bincount(where, uses != 2, len(names)) == 0
     if bool((unbalanced & paired).any()):
@@ -236,6 +230,18 @@ def _components(corners):
             "alike, as by trimesh.repair.fix_winding."
         )
     return component, ~unbalanced
+
+
+def _least_connected(edges, count):
+    """The least vertex [count] that edges [E, 2] connect each with."""
+    least = np.arange(count)
+    while True:
+        ends = least[edges]
+        if (ends[:, 0] == ends[:, 1]).all():
+            return least
+        np.minimum.at(least, ends.max(1), ends.min(1))
+        while (least != least[least]).any():
+            least = least[least]
 
 
 def _outward(triangles):

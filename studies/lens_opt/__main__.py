@@ -28,7 +28,6 @@ from studies.frame.compare import log_ratio
 from studies.frame.config import check_least, check_unused
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.sweep import column
-from studies.lens_motion import __main__ as lens_motion
 from studies.lens_opt import page as lens_opt_page
 from studies.lens_opt import rivals
 from studies.lens_opt.descend import (
@@ -337,6 +336,8 @@ def start(arguments: list[str] | None = None) -> int:
     """The command line; with --motion it is that of lens_motion. Returns: exit code."""
     words = sys.argv[1:] if arguments is None else arguments
     if any(word.split("=")[0] == "--motion" for word in words):
+        from studies.lens_motion import __main__ as lens_motion
+
         return main(lens_motion.study, lens_motion.Config, arguments)
     return main(study, Config, arguments)
 

@@ -11,6 +11,7 @@ import torch
 from codesign import events, flow, lens
 from codesign.lens.analysis import polychromatic_spot, spot_radius_mm
 from codesign.lens.design import edge_thickness_mm
+from codesign.lens.spectrum import daylight_d65, silicon_response
 from studies.frame.compare import log_ratio
 from studies.frame.config import configured
 from studies.frame.run import QUICK
@@ -33,6 +34,12 @@ SMALL = (
 @pytest.fixture(scope="module")
 def task():
     return make_task("cooke-triplet", 0)
+
+
+def test_the_light_is_daylight_as_silicon_sees_it():
+    light = lens.Spectrum.from_curves(silicon_response(), daylight_d65(), 4)
+    assert light.weights == LIGHT.weights
+    assert light.wavelengths_um == pytest.approx(LIGHT.wavelengths_um, rel=1e-14)
 
 
 def squared_spot(optics, shift_mm, task):
