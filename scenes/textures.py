@@ -3,6 +3,7 @@
 import io
 import math
 import warnings
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -54,17 +55,22 @@ def photo(source: str | Path, size_px: int = 512) -> np.ndarray:
     Raises: FileFormatError when there is no such picture.
     """
     if str(source) in PHOTOS:
-        import skimage  # whose own reader imports most of scipy
-
-        found = [*Path(skimage.__file__).parent.glob(f"data/{source}.*")]
-        stored = _stored(found[0]) if found else getattr(skimage.data, str(source))()
-        stored = stored[:size_px, :size_px]
-        return _radiance(linear(stored), str(source))
+        return _known(str(source), size_px).copy()
     if Path(source).suffix.lower() in HDR:
         return _scaled(
             reduced(_unscaled(source, "texture"), size_px), 1.0, HDR_MEAN, f"texture {source}"
         )
     return _radiance(reduced(linear(_stored(source)), size_px), str(source))
+
+
+@lru_cache(maxsize=2 * len(PHOTOS))
+def _known(name, size_px):
+    """A picture out of PHOTOS, which worlds are painted with again and again."""
+    import skimage  # whose own reader imports most of scipy
+
+    found = [*Path(skimage.__file__).parent.glob(f"data/{name}.*")]
+    stored = _stored(found[0]) if found else getattr(skimage.data, name)()
+    return _radiance(linear(stored[:size_px, :size_px]), name)
 
 
 def file_size(source: str | Path) -> tuple[int, int] | None:
@@ -215,13 +221,17 @@ def speckle(
     """Random pattern with equal power per octave between two periods (texels), exp of a Gaussian
     field:
     [size, size] float32."""
+    noise = np.fft.fft2(np.random.default_rng(seed).standard_normal((size_px, size_px)))
+    field = np.fft.ifft2(noise * _octaves(size_px, finest_px, coarsest_px)).real
+    return check_texture(60.0 * np.exp(contrast * field / field.std()), f"speckle {seed}")
+
+
+@lru_cache(maxsize=4)
+def _octaves(size_px, finest_px, coarsest_px):
+    """Amplitude [size, size] of equal power per octave between two periods (texels)."""
     frequency = np.fft.fftfreq(size_px)
     radius = np.hypot(frequency[:, None], frequency)
-    band = ((radius >= 1 / coarsest_px) & (radius <= 1 / finest_px)) / np.maximum(radius, 1e-6)
-    field = np.fft.ifft2(
-        np.fft.fft2(np.random.default_rng(seed).standard_normal((size_px, size_px))) * band
-    ).real
-    return check_texture(60.0 * np.exp(contrast * field / field.std()), f"speckle {seed}")
+    return ((radius >= 1 / coarsest_px) & (radius <= 1 / finest_px)) / np.maximum(radius, 1e-6)
 
 
 def checkerboard(
