@@ -9,7 +9,7 @@ import pytest
 from tests.processes import ROOT, python
 
 FLOORS = (
-    {"errors", "former", "shipped", "waiting"},
+    {"errors", "former", "searching", "shipped", "waiting"},
     {"doors", "checks"},
     {"types", "optional", "reading", "exclusive", "atomic"},
     {"pose", "arrays", "backend", "plain_yaml", "interrupt", "grad"},
