@@ -20,7 +20,7 @@ BUDGETS = {
     "codesign/report": 7_710,  # unknown flow, paths from above, wheels beside flow, corners without light, samples beside frames, directions of a sphere in any order
     "codesign/system": 9_840,  # libraries imported late, truth of what is read, a lens in its camera, bins that were asked for, one colour handed over, truth of another interval, refusals that lose nothing
     "codesign/train": 5_870,  # bins of windows, ends of sources, losses by what is in them
-    "scenes": 15_790,  # worlds on devices, pictures read once, a sky without SciPy, libraries imported late, polygons with inward corners, colours of materials, mesh files that are read in part, tints colour by colour, wrap is checked
+    "scenes": 15_790,  # worlds on devices, pictures read once, a sky without SciPy, polygons with inward corners, colours of materials, tints colour by colour, wrap is checked
     "scenes/robots": 9_520,  # held joints, directions of axes, colours by name
     "scenes/trajectories": 3_030,  # numbers that are finite, directions that lead somewhere
     "scenes/windows": 8_710,  # what estimators are judged on, told twice in studies before
