@@ -21,7 +21,7 @@ from torch.nn.functional import avg_pool2d, interpolate, pad
 
 from codesign.flow.lk.lanes import Grid
 from codesign.flow.lk.level import along_path, blurred_to
-from codesign.flow.lk.slopes import cell_sums
+from codesign.flow.lk.slopes import sums_along
 from codesign.flow.lk.warp import moving
 from codesign.flow.warp import pixel_grid, read_at
 from codesign.types import EventVolume
@@ -91,10 +91,8 @@ class Evidence:
         solved = []
         for (blur, grid, counts, density), sizes in zip(self.levels, WINDOWS, strict=True):
             there = larger(flow, CELL // blur) if blur < CELL else flow
-            mean, slope, seen = moving(
-                counts, there, self.time, self.contrast, grid, fade_px=1.0 + blur
-            )
-            sums = cell_sums(mean, slope, seen, density, grid, CELL // blur)
+            bins = self.time, self.contrast, grid, 1.0 + blur
+            sums = sums_along(counts, there, density, *bins, cell=CELL // blur)
             for size in sizes:
                 wide = _around(sums, size) * size**2
                 here, sure, trust = self._solved(wide, blur, variance)

@@ -223,8 +223,7 @@ class Descent:
         # in units of the prior: parameters = unit @ found
         self.found = torch.zeros(batch, 2 * shape.terms, dtype=torch.float64, device=like.device)
         self.expected: Tensor | None = None
-        self.one = torch.eye(2 * shape.terms, dtype=torch.float64, device=like.device)
-        self.precision = self.one.expand(batch, -1, -1)
+        self.precision = shape.one.expand(batch, -1, -1)
         self.local = local
         self.cells = Cells(batch, shape.height, shape.width, prior_px, like.device)
 
@@ -267,7 +266,7 @@ class Descent:
         for step in range(steps):
             products = level.products(self.flow(level))
             evidence, pull = level.evidence(products)
-            self.precision = self.one + evidence
+            self.precision = self.shape.one + evidence
             change = torch.linalg.solve(self.precision, pull + centre - self.found)
             moved = self.shape.mean_square(change @ self.shape.unit.T)
             change = change * (1 + moved / (2 * level.sigma) ** 2).rsqrt()[:, None]

@@ -15,16 +15,17 @@ of sigma
 """
 
 import math
+from functools import lru_cache
 
 import torch
-from torch import Tensor
+from torch import Tensor, bmm
 from torch.nn.functional import pad
 
 from codesign.flow.lk.blur import blurred, pooled
-from codesign.flow.lk.lanes import Grid
+from codesign.flow.lk.lanes import Grid, in_graph, plain_wanted
 from codesign.flow.lk.path import Path, even, path
 from codesign.flow.lk.polynomials import Moments, Polynomials
-from codesign.flow.lk.slopes import cell_sums
+from codesign.flow.lk.slopes import sums_along
 from codesign.flow.lk.warp import moving
 from codesign.types import EventVolume
 
@@ -72,8 +73,29 @@ def weighed_down(counts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     around = torch.relu(_boxes(events) - events) / (pixels - 1)
     excess = torch.relu(events - LONELY * around - HOT_EVENTS) / (around + HOT_EVENTS)
     weights = 1 / (1 + excess.square())
-    on, off = counts.unbind(1)
-    return weights[:, None] * (on - off), weights * events, weights
+    return _signed(counts, weights), weights * events, weights
+
+
+def _signed(counts, weights):
+    """Weights [B, H, W] times ON less OFF [B, n, H, W]."""
+    if plain_wanted():
+        return weights[:, None] * (counts[:, 0] - counts[:, 1])
+    return in_graph(_weighed, _weighed_back, (), counts, weights)[0]
+
+
+def _weighed(counts, weights):
+    signed = counts[:, 0] - counts[:, 1]
+    if not (counts.requires_grad or weights.requires_grad):
+        return [signed.mul_(weights[:, None])], ()
+    return [weights[:, None] * signed], [signed]
+
+
+def _weighed_back(counts, weights, signed, grads, wanted):
+    """In few passes over memory: whole images of all bins are larger than what is near."""
+    by_counts = torch.empty_like(counts)
+    torch.mul(grads[0], weights[:, None], out=by_counts[:, 0])
+    torch.neg(by_counts[:, 0], out=by_counts[:, 1])
+    return by_counts, (grads[0] * signed).sum(1)
 
 
 def _boxes(images):
@@ -135,27 +157,22 @@ class Level:
         self.contrast = torch.stack([torch.ones_like(weight), self.place / spread])
         self.gain = (spread / way.spread).to(density)
         self.slope_noise = 1 / (way.spread * OVERLAP * sigma_px**2)
-        self.texture_noise = _slope_of_noise(_whole_kernel(sigma_px, self.stride), self.stride)
+        self.texture_noise = _taps(sigma_px, self.stride)[1]
 
     def products(self, flow: Tensor) -> Tensor:
-        """[B, 8, h, w] as of ``cell_sums``, per sample, at a flow [B, 2, h, w] px per way."""
-        mean, slope, seen = self._moving(flow)
-        return cell_sums(mean, slope, seen, self.density, self.grid)
+        """[B, 8, h, w] as of ``sums_along``, per sample, at a flow [B, 2, h, w] px per way."""
+        bins = self.place, self.contrast, self.grid, 1 + self.sigma
+        return sums_along(self.counts, flow, self.density, *bins, self.gain)
 
     def contrast_along(self, flow: Tensor) -> Tensor:
         """Mean square [B] of the rate over the level's samples, in units of what scattered events
         give it, times how many independent samples there are."""
-        mean, _, seen = self._moving(flow)
+        bins = self.place, self.contrast, self.grid, 1 + self.sigma
+        mean, _, seen = moving(self.counts, flow, *bins)
         square = (seen * mean.square()).sum((1, 2)) / (seen.sum((1, 2)) + TINY)
         noise = (self.density.mean((1, 2)) + TINY) / (OVERLAP * self.sigma**2)
         samples = mean[0].numel() * self.stride**2 / (CALIBRATION * OVERLAP * self.sigma**2)
         return (samples * square / noise).double()
-
-    def _moving(self, flow):
-        mean, slope, seen = moving(
-            self.counts, flow, self.place, self.contrast, self.grid, fade_px=1 + self.sigma
-        )
-        return mean, self.gain[:, None, None] * slope, seen
 
     def evidence(self, products: Tensor) -> tuple[Tensor, Tensor]:
         """Precision [B, 2K, 2K] that the data add where their products were taken, and their pull
@@ -168,6 +185,7 @@ class Level:
             slopes.unflatten(1, (side, side)),
             self.texture_noise * scattered.unflatten(1, (side, side)),
             right,
+            self.shape.one,
         )
         scale = (CALIBRATION * OVERLAP * self.sigma**2 / self.stride**2) * self._noise(
             explained, events[:, 0], energy[:, 0]
@@ -184,35 +202,35 @@ class Level:
         return self.slope_noise * (left + self.noise_floor * expected + few) / (expected + few)
 
 
-def _trusted(normal, scattered, right):
+def _trusted(normal, scattered, right, unit):
     """What of the normal equations N p = r is texture (see above), and how much of the slopes'
     energy it explains.
 
-    Args: N, Z [B, 2K, 2K], r [B, 2K], float64, in units in which all parameters are expected to be
-      alike. A ridge, relative to N + Z, counts as noise: directions in which nothing was seen are
-      not trusted.
+    Args: N, Z [B, 2K, 2K], r [B, 2K], 1 [2K, 2K], float64, in units in which all parameters are
+      expected to be alike. A ridge, relative to N + Z, counts as noise: directions in which nothing
+      was seen are not trusted.
     Returns: with N + Z = L L^T, S = L^-1 Z L^-T, whose eigenvalues z are the shares of noise, and
       t(z) the trust: L t(S) (1 - S) L^T (symmetric, no eigenvalue below 0), L t(S) L^-1 r, and what
       a step x = (N + Z)^-1 r takes off the energy, 2 r x - x N x.
     """
-    unit = torch.eye(normal.shape[-1], dtype=normal.dtype, device=normal.device)
     ridge = (RIDGE * (normal + scattered).diagonal(dim1=1, dim2=2).mean(1) + TINY)[
         :, None, None
     ] * unit
     root = torch.linalg.cholesky(normal + scattered + ridge)
     inverse = torch.linalg.solve_triangular(root, unit, upper=False)
-    noise = inverse @ (scattered + ridge) @ inverse.mT
+    # bmm: operator @ looks at shapes for as long as small matrices take
+    noise = bmm(bmm(inverse, scattered + ridge), inverse.mT)
     doubt = DOUBT * noise
     texture = unit - noise
     trust = texture
     for _ in range(DOUBLINGS):
-        trust = trust @ trust
-        doubt = doubt @ doubt
+        trust = trust @ trust  # bmm adds the gradients of ``texture`` up in another order
+        doubt = bmm(doubt, doubt)
     trust = torch.linalg.solve(trust + doubt, trust)
-    seen = inverse @ right[:, :, None]
-    explained = (seen * (seen + noise @ seen)).sum((1, 2))
-    kept = root @ (trust @ texture) @ root.mT
-    return (kept + kept.mT) / 2, (root @ (trust @ seen))[..., 0], explained
+    seen = bmm(inverse, right[:, :, None])
+    explained = (seen * (seen + bmm(noise, seen))).sum((1, 2))
+    kept = bmm(bmm(root, bmm(trust, texture)), root.mT)
+    return (kept + kept.mT) / 2, bmm(root, bmm(trust, seen))[..., 0], explained
 
 
 def gaussian(sigma_px: float, step: int) -> Tensor:
@@ -230,8 +248,15 @@ def gaussian(sigma_px: float, step: int) -> Tensor:
 def blurred_to(images: Tensor, sigma_px: float, grid: Grid) -> Tensor:
     """Images [B, n, H, W] on the samples of ``grid``: averaged over squares, then through a
     Gaussian, together of standard deviation sigma; mirrored at the border."""
-    taps = gaussian(sigma_px, grid.stride)
-    return blurred(images, grid, taps[len(taps) // 2 :].tolist())
+    return blurred(images, grid, _taps(sigma_px, grid.stride)[0])
+
+
+@lru_cache(64)
+def _taps(sigma_px, step):
+    """What ``blurred`` takes of a Gaussian, and the ``_slope_of_noise`` that it leaves."""
+    taps = gaussian(sigma_px, step)
+    noise = _slope_of_noise(_whole_kernel(sigma_px, step), step)
+    return tuple(taps[len(taps) // 2 :].tolist()), noise
 
 
 def _whole_kernel(sigma_px, step):

@@ -29,7 +29,8 @@ FIXED_POINT_STEPS = 4  # each gains a factor of half the flow's gradient, some 0
 class Polynomials:
     """Fields of one model over an image of height x width pixels.
 
-    unit: [2K, 2K], equations (``_equations``): float64.
+    unit: [2K, 2K], equations (``_equations``), second_moments: [2K, 2K] of the basis over the square
+      [-1, 1]^2, for both components, one: the unit matrix [2K, 2K]; float64.
     """
 
     def __init__(
@@ -40,6 +41,7 @@ class Polynomials:
         prior_px: float = 1.0,
         device: torch.device | None = None,
     ) -> None:
+        self.model = model
         self.terms = TERMS[model]
         self.powers = torch.tensor(POWERS[: self.terms], device=device)
         self.degree = int(self.powers.sum(1).max())
@@ -47,7 +49,7 @@ class Polynomials:
         self.width = width
         self.half = max(height, width) / 2
         # unit [2K, 2K]: parameters = unit @ numbers that are independent and of variance 1
-        self.unit, self.equations = (
+        self.unit, self.equations, self.second_moments, self.one = (
             torch.from_numpy(each).to(device=device) for each in _by_prior(model, float(prior_px))
         )
 
@@ -58,13 +60,6 @@ class Polynomials:
     def basis(self, u: Tensor, v: Tensor, dim: int = 0) -> Tensor:
         """[..., K at dim, ...]."""
         return torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v][: self.terms], dim)
-
-    @cached_property
-    def second_moments(self) -> Tensor:
-        """[2K, 2K] of the basis over the square [-1, 1]^2, for both components."""
-        sums = self.powers[:, None] + self.powers
-        one = (sums % 2 == 0).all(2) / (sums + 1).prod(2).double()
-        return torch.block_diag(one, one)
 
     def mean_square(self, parameters: Tensor) -> Tensor:
         """Mean squared length [B] of the flow over the square [-1, 1]^2."""
@@ -86,9 +81,7 @@ class Polynomials:
         normal = design.mT @ design
         ridge = RIDGE * normal.diagonal(dim1=1, dim2=2).mean(1)[:, None, None]
         right = design.mT @ flow.flatten(1)[:, :, None]
-        return torch.linalg.solve(normal + ridge * torch.eye(2 * self.terms).to(normal), right)[
-            ..., 0
-        ]
+        return torch.linalg.solve(normal + ridge * self.one, right)[..., 0]
 
     @cached_property
     def of_squares(self) -> tuple[tuple[int, int], ...]:
@@ -109,11 +102,14 @@ class Polynomials:
 
 @lru_cache(maxsize=64)
 def _by_prior(model, prior_px):
-    """``unit`` and ``equations`` of a model, float64, as arrays: no mode of torch that a caller is
-    in stays with them."""
+    """What ``Polynomials`` hold of a model, as arrays: no mode of torch that a caller is in stays
+    with them."""
     powers = torch.tensor(POWERS[: TERMS[model]])
     unit = torch.linalg.cholesky(torch.linalg.inv(_prior_precision(len(powers), prior_px)))
-    return unit.cpu().numpy(), _equations(powers, unit).cpu().numpy()
+    sums = powers[:, None] + powers
+    moments = (sums % 2 == 0).all(2) / (sums + 1).prod(2).double()
+    found = unit, _equations(powers, unit), torch.block_diag(moments, moments), torch.eye(len(unit))
+    return [each.double().cpu().numpy() for each in found]
 
 
 def _prior_precision(k, prior_px):
@@ -144,7 +140,7 @@ def _equations(powers, unit):
     """Sums over an image to normal equations, which are linear in them:
     [8 s^2, 8 K^2 + 2 K + 2], float64.
 
-    Rows: the sums of ``slopes.cell_sums`` times y^i x^j, i, j < s = 2 degree + 1. Columns: in
+    Rows: the sums of ``slopes.sums_along`` times y^i x^j, i, j < s = 2 degree + 1. Columns: in
     units of the prior the matrix of the slopes and that of events as slopes along x and y, [2K,
     2K] each, and the pull [2K]; then energy of the temporal slopes, and events.
     """
@@ -169,19 +165,10 @@ class Moments:
     def __init__(self, shape: Polynomials, grid: Grid, like: Tensor) -> None:
         """Args: like: tells precision and device."""
         self.side = shape.degree + 1
-        rows, columns = (
-            torch.arange(count).to(like) * grid.stride + (grid.stride - 1) / 2
-            for count in grid.shape
+        self.x, self.y, self.of_x, self.of_y, self.place = (
+            torch.from_numpy(each).to(like.device)
+            for each in _powers(shape.model, grid, like.dtype, like.device)
         )
-        u, v = shape.scaled(columns, rows)
-        exponents = torch.arange(2 * shape.degree + 1, device=like.device)
-        self.x = u[:, None] ** exponents
-        self.y = v[:, None] ** exponents
-        self.of_x = self.x[:, : self.side].T.contiguous()
-        self.of_y = self.y[:, : self.side].contiguous()
-        # where each parameter stands in a table of powers of y and x
-        x, y = shape.powers.T
-        self.place = torch.eye(self.side**2).to(like)[self.side * y + x]
 
     def flow(self, parameters: Tensor) -> Tensor:
         """[B, 2, h, w] of parameters [B, 2K]."""
@@ -191,3 +178,22 @@ class Moments:
     def sums(self, images: Tensor) -> Tensor:
         """[B, m s^2] of images [B, m, h, w]: sums times y^i x^j, i, j < s = 2 degree + 1."""
         return ((self.y.T @ images) @ self.x).flatten(1)
+
+
+@lru_cache(maxsize=64)
+def _powers(model, grid, dtype, device):
+    """What ``Moments`` hold, as arrays: powers of x and y at the samples of ``grid``, those of the
+    basis once more, and where each parameter stands in a table of powers of y and x."""
+    shape = Polynomials(model, grid.height, grid.width, device=device)
+    side = shape.degree + 1
+    rows, columns = (
+        torch.arange(count, device=device).to(dtype) * grid.stride + (grid.stride - 1) / 2
+        for count in grid.shape
+    )
+    u, v = shape.scaled(columns, rows)
+    exponents = torch.arange(2 * shape.degree + 1, device=device)
+    x, y = u[:, None] ** exponents, v[:, None] ** exponents
+    across, down = shape.powers.T
+    place = torch.eye(side**2, device=device).to(dtype)[side * down + across]
+    found = x, y, x[:, :side].T.contiguous(), y[:, :side].contiguous(), place
+    return [each.cpu().numpy() for each in found]

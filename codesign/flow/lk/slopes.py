@@ -1,4 +1,4 @@
-"""Products of the slopes of an image, summed over cells: in drjit, and as operations of torch."""
+"""Products of the slopes of bins along a flow, summed over cells: in drjit, and as operations of torch."""
 
 import torch
 from torch import Tensor
@@ -6,32 +6,48 @@ from torch.nn.functional import pad
 
 from codesign.backend import pull_back
 from codesign.exclusive import exclusive
+from codesign.flow.lk import warp
 from codesign.flow.lk.blur import ends
 from codesign.flow.lk.lanes import Form, Grid, Lanes, in_graph, plain_wanted, recorded, tensors
 
 PRODUCTS = 8
 
 
-def cell_sums(
-    mean: Tensor, slope: Tensor, seen: Tensor, density: Tensor, grid: Grid, cell: int = 1
+def sums_along(
+    rate: Tensor,
+    flow_px: Tensor,
+    density: Tensor,
+    time: Tensor,
+    contrast: Tensor,
+    grid: Grid,
+    fade_px: float,
+    gain: Tensor | None = None,
+    cell: int = 1,
 ) -> Tensor:
-    """Products of slopes, summed over squares of cell x cell samples.
+    """Products of the slopes of bins carried back along a flow, summed over squares of cell x cell
+    samples.
 
     Args:
-      mean, slope, seen: [B, h, w] as from ``warp.moving``, on the samples of ``grid``.
+      rate, flow_px, time, contrast, grid, fade_px: as of ``warp.moving``, which gives mean, slope
+        over time and ``seen``.
       density: [B, h, w].
+      gain: [B] that the slope over time is multiplied by; 1 where None.
       cell: side of the squares in samples, >= 1; those at the lower and right border hold what is
         left.
     Returns: [B, 8, ceil(h / cell), ceil(w / cell)], sums over samples of seen times x x, x y, y y,
       x s, y s, s s, 1, density, where x and y are the slopes of the mean per px (central
       differences, one-sided at the border; 0 where there is one sample) and s is the slope over
       time.
-    Gradient: mean, slope, seen, density; exact, the first one.
+    Gradient: rate, flow_px, density, gain; exact, the first one, as of ``warp.moving``.
     Raises: GradientError for a second derivative.
     """
+    if gain is None:
+        gain = rate.new_ones(len(rate))
     if plain_wanted():
-        return _plain(mean, slope, seen, density, grid, cell)
-    return in_graph(_forward, _adjoint, (grid, cell), mean, slope, seen, density)[0]
+        mean, slope, seen = warp.moving(rate, flow_px, time, contrast, grid, fade_px)
+        return _plain(mean, gain[:, None, None] * slope, seen, density, grid, cell)
+    settings = grid, fade_px, cell, warp.numbers(time, contrast, rate)
+    return in_graph(_forward, _adjoint, settings, rate, flow_px, gain, density)[0]
 
 
 def _plain(mean, slope, seen, density, grid, cell):
@@ -50,27 +66,36 @@ def _plain(mean, slope, seen, density, grid, cell):
 
 
 @exclusive
-def _forward(grid, cell, mean, slope, seen, density):
-    form = Form.of(mean, grid)
+def _forward(grid, fade_px, cell, weights, rate, flow_px, gain, density):
+    form = Form.of(rate, grid)
     rows, columns = grid.shape
-    found = _sums_of_columns(form, cell, *form.load(mean, slope, seen, density))
-    (sums,) = tensors((len(mean), PRODUCTS, -(-rows // cell), columns), found)
-    return [
-        sums if cell == 1 else pad(sums, (0, -columns % cell)).unflatten(3, (-1, cell)).sum(4)
-    ], ()
+    # twice: a kernel of one image would be another
+    arrays = form.load(rate, flow_px, gain.expand(2, -1), density)
+    sums, *read = _sums(form, fade_px, cell, *arrays, form.scalars(weights))
+    (sums,) = tensors((form.images, PRODUCTS, -(-rows // cell), columns), sums)
+    if cell > 1:
+        sums = pad(sums, (0, -columns % cell)).unflatten(3, (-1, cell)).sum(4)
+    wanted = any(given.requires_grad for given in (rate, flow_px, gain, density))
+    return [sums], tensors((form.images, *grid.shape), *read) if wanted else []
 
 
 @exclusive
-def _adjoint(grid, cell, mean, slope, seen, density, grads, wanted):
-    form = Form.of(mean, grid)
-    return tensors(
-        mean.shape, *_gradients(form, cell, *form.load(mean, slope, seen, density, *grads))
-    )
+def _adjoint(grid, fade_px, cell, weights, rate, flow_px, gain, density, *rest):
+    *read, grads, wanted = rest
+    form = Form.of(rate, grid)
+    arrays = form.load(rate, flow_px, gain.expand(2, -1), density, *read, *grads)
+    bins = warp.together(form, wanted[0])
+    settings = form, fade_px, cell, bins, wanted[2]
+    *of_bins, by_gain, by_density = _gradients(*settings, *arrays, form.scalars(weights))
+    (by_density,) = tensors(density.shape, by_density)
+    by_gain = tensors(density.shape, by_gain)[0].sum((1, 2)) if wanted[2] else None
+    return *warp.given_back(rate, flow_px, *of_bins), by_gain, by_density
 
 
 @recorded
-def _sums_of_columns(form, cell, mean, slope, seen, density):
-    """[B, 8, ceil(h / cell), w]."""
+def _sums(form, fade_px, cell, rate, flow, gain, density, weights):
+    """[B, 8, ceil(h / cell), w]; mean, slope and windows."""
+    mean, slope, seen = warp.read(form, fade_px, rate, flow, weights)
     image = _Slopes(form, cell, mean)
     dr = image.dr
     rows = image.cell_rows
@@ -83,17 +108,20 @@ def _sums_of_columns(form, cell, mean, slope, seen, density):
 
     def body(y, *sums):
         at = start + y * image.across + x
-        maps = [image.take(values, at) for values in (slope, seen, density)]
-        terms = _products(*image.slopes(start, y, x), *maps)
+        maps = slope, seen, density  # of a square of one sample, lanes are samples
+        over_time, *maps = maps if cell == 1 else (image.take(values, at) for values in maps)
+        terms = _products(*image.slopes(start, y, x), gain * over_time, *maps)
         return [dr.fma(a, b, total) for (a, b), total in zip(terms, sums, strict=True)]
 
-    sums = image.loop(first, end, body, *([dr.zeros(image.arr.Float, width)] * PRODUCTS))
+    gain = image.take(gain, number)
+    none = [image.number(0) if cell == 1 else dr.zeros(image.arr.Float, width)] * PRODUCTS
+    sums = body(row, *none) if cell == 1 else image.loop(first, end, body, *none)
     target = image.empty(PRODUCTS * width)
     plane = image.count(rows * image.columns)
     for k, total in enumerate(sums):
         image.put(target, total, (number * PRODUCTS + k) * plane + place)
     dr.eval(target)
-    return target
+    return target, mean, slope, seen
 
 
 def _products(x, y, slope, seen, density):
@@ -114,7 +142,9 @@ def _products(x, y, slope, seen, density):
 
 
 @recorded
-def _gradients(form, cell, mean, slope, seen, density, grad):
+def _gradients(form, fade_px, cell, bins, wants_gain, *arrays):
+    """Of rate, flow, gain (parts of it, of each sample) and density."""
+    rate, flow, gain, density, mean, slope, seen, grad, weights = arrays
     image = _Slopes(form, cell, mean)
     dr = image.dr
     across = -(-image.columns // cell)
@@ -129,21 +159,22 @@ def _gradients(form, cell, mean, slope, seen, density, grad):
         + image.split(x, cell)[0]
     )
     seeds = [image.take(grad, of_cell + k * plane) for k in range(PRODUCTS)]
-    given = [
-        *image.slopes(start, y, x),
-        *(image.take(values, at) for values in (slope, seen, density)),
-    ]
-    grad_x, grad_y, *others = pull_back(
-        lambda *given: [a * b for a, b in _products(*given)], given, seeds
+    gain = image.take(gain, number)
+    grad_x, grad_y, by_slope, by_seen, by_density = pull_back(
+        lambda *given: [a * b for a, b in _products(*given)],
+        [*image.slopes(start, y, x), gain * slope, seen, density],
+        seeds,
     )
+    by_gain = by_slope * slope if wants_gain else None
+    by_slope *= gain
     grad_x *= image.factor(x, image.edge)
     grad_y *= image.factor(y, image.bottom)
-    dr.eval(grad_x, grad_y, *others)
+    dr.eval(grad_x, grad_y, by_slope, by_seen, by_density, by_gain)
     grad_mean = _back(image, grad_x, start + y * image.across, x, image.edge, 1) + _back(
         image, grad_y, start + x, y, image.bottom, image.across
     )
-    dr.eval(grad_mean)
-    return grad_mean, *others
+    found = warp.gradients(form, fade_px, bins, rate, flow, grad_mean, by_slope, by_seen, weights)
+    return *found, by_gain, by_density
 
 
 class _Slopes(Lanes):

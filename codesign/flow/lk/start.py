@@ -98,16 +98,17 @@ def at_start(
 @exclusive
 def _forward(grid, setting, of_flow, of_rest, value, covariance):
     form = Form.of(of_flow, grid)
-    given = torch.cat([of_flow, of_rest], 1), torch.cat([value, covariance], 1)
-    (found,) = tensors(
-        (form.images, OUT, *grid.shape), _outcomes(form, setting, *form.load(*given))
-    )
-    return [found[:, :2].clone(), found[:, 2:].clone()], given
+    cells = torch.cat([value, covariance], 1)
+    corners = torch.stack([cells[part] for part in _corners(setting)], 4)
+    given = torch.cat([of_flow, of_rest], 1), corners
+    flow, rest = _outcomes(form, setting, *form.load(*given))
+    shapes = [(form.images, parts, *grid.shape) for parts in (2, OUT - 2)]
+    return [*tensors(shapes[0], flow), *tensors(shapes[1], rest)], given
 
 
 @exclusive
 def _adjoint(
-    grid, setting, of_flow, of_rest, value, covariance, coefficients, cells, grads, wanted
+    grid, setting, of_flow, of_rest, value, covariance, coefficients, corners, grads, wanted
 ):
     """Most who follow a gradient follow that of the flow alone: what it does not depend on has
     none."""
@@ -115,20 +116,24 @@ def _adjoint(
     by_flow = torch.zeros_like(by_rest[:, :2]) if by_flow is None else by_flow
     form = Form.of(of_flow, grid)
     live = form.load(by_flow) if by_rest is None else form.load(by_flow, by_rest)
-    sums, slots = _gradients(form, setting, *form.load(coefficients, cells), *live)
+    sums, slots = _gradients(form, setting, *form.load(coefficients, corners), *live)
     numbers = setting.of_flow if by_rest is None else setting.numbers
     (sums,) = tensors((numbers, form.images, -(-grid.height // ROWS) * grid.width), sums)
-    rows, columns = max(setting.rows - 1, 1), max(setting.columns - 1, 1)
-    (slots,) = tensors((form.images, OF_CELL, rows, columns, 4), slots)
-    of_cells = torch.zeros_like(cells)
-    for corner, slot in enumerate(slots.unbind(4)):
-        y = min(corner // 2, setting.rows - 1)
-        x = min(corner % 2, setting.columns - 1)
-        of_cells[:, :, y : y + rows, x : x + columns] += slot
+    (slots,) = tensors(corners.shape, slots)
+    of_cells = corners.new_zeros(form.images, OF_CELL, setting.rows, setting.columns)
+    for part, slot in zip(_corners(setting), slots.unbind(4), strict=True):
+        of_cells[part] += slot
     by_coefficients = sums.sum(2).T
     if by_rest is None:
         return by_coefficients, None, of_cells[:, :2] if setting.joined else None, None
     return *by_coefficients.tensor_split([setting.of_flow], 1), *of_cells.tensor_split([2], 1)
+
+
+def _corners(setting):
+    """Where the four cells around places are: the upper left one's neighbours as slices."""
+    sizes = setting.rows, setting.columns
+    first, second = ((slice(0, max(size - 1, 1)), slice(min(1, size - 1), size)) for size in sizes)
+    return [(..., y, x) for y in first for x in second]
 
 
 @recorded
@@ -136,16 +141,19 @@ def _outcomes(form, setting, coefficients, cells):
     pixels = _Pixels(form, setting, cells)
     dr = pixels.dr
     given = pixels.coefficients(coefficients)
-    target = pixels.empty(OUT * pixels.images * pixels.samples)
+    flow, rest = (pixels.empty(parts * pixels.images * pixels.samples) for parts in (2, OUT - 2))
 
     def body(y):
-        for part, value in enumerate(pixels.outcome(given, pixels.arr.Float(y), None)):
-            pixels.put(target, value, pixels.at(part, y, OUT))
+        values = pixels.outcome(given, pixels.arr.Float(y), None)
+        for part, value in enumerate(values[:2]):
+            pixels.put(flow, value, pixels.at(part, y, 2))
+        for part, value in enumerate(values[2:]):
+            pixels.put(rest, value, pixels.at(part, y, OUT - 2))
         return ()
 
     pixels.loop(pixels.top, pixels.end, body)
-    dr.eval(target)
-    return target
+    dr.eval(flow, rest)
+    return flow, rest
 
 
 @recorded
@@ -279,6 +287,7 @@ class _Pixels(_Outcome, Lanes):
     """Parts of columns of images, and what is found at a pixel of them."""
 
     def __init__(self, form, setting, cells):
+        """Args: cells: [B, 5, slots, 4], the four values around a place of each slot."""
         super().__init__(form)
         self.setting = setting
         self.cells = cells
@@ -296,15 +305,10 @@ class _Pixels(_Outcome, Lanes):
         self.per_half = self.number(2 / max(self.rows, self.columns))
         self.per_cell = self.number(1 / setting.cell_px)
         self.first = self.number((1 - setting.cell_px) / (2 * setting.cell_px))
-        self.plane = self.count(setting.rows * setting.columns)
-        self.wide = self.count(setting.columns)
         self.slots_wide = self.count(max(setting.columns - 1, 1))
         self.slot_plane = self.count(self.slots)
         self.last = [self.number(size - 1) for size in (setting.columns, setting.rows)]
         self.last_lower = [self.count(max(size, 2) - 2) for size in (setting.columns, setting.rows)]
-        right = self.count(min(setting.columns - 1, 1))
-        below = self.count(setting.columns if setting.rows > 1 else 0)
-        self.corners = 0, right, below, below + right
 
     def coefficients(self, array):
         start = self.image * self.setting.numbers
@@ -329,13 +333,12 @@ class _Pixels(_Outcome, Lanes):
         )
         found = []
         for part in parts:
-            plane = self.image * OF_CELL + part
-            start = plane * self.plane + y * self.wide + x
-            four = [self.take(self.cells, start + corner) for corner in self.corners]
+            slot = (self.image * OF_CELL + part) * self.slot_plane + y * self.slots_wide + x
+            four = list(dr.gather(self.arr.Array4, self.cells, slot))
             if read is not None:
                 four = [dr.detach(value) + 0 for value in four]
                 dr.enable_grad(four)
-                read.slots.append(plane * self.slot_plane + y * self.slots_wide + x)
+                read.slots.append(slot)
                 read.values.extend(four)
             upper = dr.fma(a, four[1] - four[0], four[0])
             lower = dr.fma(a, four[3] - four[2], four[2])

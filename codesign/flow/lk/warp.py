@@ -7,6 +7,8 @@ pass collects what belongs to a sample. That is a third of the time of four addi
 processors do one by one.
 """
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -47,8 +49,13 @@ def moving(
     """
     if plain_wanted():
         return _plain(rate, flow_px, time, contrast, grid, fade_px)
-    weights = torch.cat([time[None], contrast]).to(rate).T.flatten().tolist()
+    weights = numbers(time, contrast, rate)
     return in_graph(_forward, _adjoint, (grid, fade_px, weights), rate, flow_px)
+
+
+def numbers(time: Tensor, contrast: Tensor, like: Tensor) -> list[float]:
+    """For each bin its time, share in the mean, share in the slope, in the precision of ``like``."""
+    return torch.cat([time[None], contrast]).to(like).T.flatten().tolist()
 
 
 def _plain(rate, flow_px, time, contrast, grid, fade_px):
@@ -68,27 +75,34 @@ def _plain(rate, flow_px, time, contrast, grid, fade_px):
 @exclusive
 def _forward(grid, fade_px, weights, rate, flow_px):
     form = Form.of(rate, grid)
-    found = _read(form, fade_px, *form.load(rate, flow_px), form.scalars(weights))
+    found = read(form, fade_px, *form.load(rate, flow_px), form.scalars(weights))
     return tensors((len(rate), *grid.shape), *found), ()
 
 
 @exclusive
 def _adjoint(grid, fade_px, weights, rate, flow_px, grads, wanted):
     form = Form.of(rate, grid)
-    rows, columns = grid.shape
-    of_bin = 4 * len(rate) * (rows + 1) * (columns + 1) if wanted[0] else 1
-    together = min(max(MOST_VALUES // of_bin, 1), BINS)
     grads = [torch.zeros_like(flow_px[:, 0]) if grad is None else grad for grad in grads]
     arrays = form.load(rate, flow_px, *grads)
-    grad_rate, grad_flow = _gradients(
-        form, fade_px, wanted[0], together, *arrays, form.scalars(weights)
-    )
-    (grad_flow,) = tensors(flow_px.shape, grad_flow)
-    return (tensors(rate.shape, grad_rate)[0] if wanted[0] else None), grad_flow
+    found = gradients(form, fade_px, together(form, wanted[0]), *arrays, form.scalars(weights))
+    return given_back(rate, flow_px, *found)
+
+
+def together(form: Form, wants_rate: bool) -> int:
+    """How many bins the adjoint takes at a time; 0 where the rate wants no gradient."""
+    rows, columns = Grid(*form[3:]).shape
+    of_bin = 4 * form.images * (rows + 1) * (columns + 1)
+    return min(max(MOST_VALUES // of_bin, 1), BINS) if wants_rate else 0
+
+
+def given_back(rate: Tensor, flow_px: Tensor, by_rate: Any, by_flow: Any) -> list[Tensor | None]:
+    """What ``gradients`` found, as tensors."""
+    by_rate = [None] if by_rate is None else tensors(rate.shape, by_rate)
+    return [*by_rate, *tensors(flow_px.shape, by_flow)]
 
 
 @recorded
-def _read(form, fade_px, rate, flow, weights):
+def read(form, fade_px, rate, flow, weights):
     warp = _Warp(form, fade_px, rate, flow, weights)
     dr = warp.dr
     mean = slope = dr.zeros(warp.arr.Float, warp.width)
@@ -105,13 +119,16 @@ def _read(form, fade_px, rate, flow, weights):
 
 
 @recorded
-def _gradients(
-    form, fade_px, wants_rate, together, rate, flow, by_mean, by_slope, by_seen, weights
-):
+def gradients(form, fade_px, together, rate, flow, by_mean, by_slope, by_seen, weights):
+    """Of rate (None where not wanted) and flow, from those of mean, slope and windows."""
     warp = _Warp(form, fade_px, rate, flow, weights)
     dr = warp.dr
-    by_mean, by_slope, by_seen = (warp.take(by, warp.lane) for by in (by_mean, by_slope, by_seen))
-    grad_rate = warp.empty(warp.bins * warp.width) if wants_rate else None
+    wants_rate = together > 0
+    together = together or BINS
+    grad_rate = None
+    if together < warp.bins:
+        dr.eval(by_mean, by_slope, by_seen)
+        grad_rate = warp.empty(warp.bins * warp.width) if wants_rate else None
     grad_flow = pull_back(lambda *flow: [warp.seen(*flow)], warp.flow, [by_seen])
     # processors need no locks where each thread has a copy; with several, this kernel is one for
     # each size
@@ -130,7 +147,7 @@ def _gradients(
                 dr.scatter_add(added, warp.arr.Array4(*four), slot, mode=mode)
         dr.eval(*grad_flow, *([] if added is None else [added]))
         if wants_rate:
-            warp.collect(start, bins, added, grad_rate)
+            grad_rate = warp.collect(start, bins, added, grad_rate)
     target = warp.empty(2 * warp.width)
     warp.put(target, grad_flow[0], warp.at_flow)
     warp.put(target, grad_flow[1], warp.at_flow + warp.area)
@@ -234,14 +251,20 @@ class _Warp(Lanes):
         return image_bin * self.count(self.slots) + (y + 1) * self.count(self.columns + 1) + x + 1
 
     def collect(self, start, count, added, grad_rate):
-        """Gradient of ``count`` bins from their slots."""
+        """Gradient of the rate from the slots of ``count`` bins; where these are not all, put into
+        that of the others."""
         image_bin, place = self.split(self.lanes(count * self.width), self.samples)
         y, x = self.split(place, self.columns)
-        image, k = self.split(image_bin, count)
         here = 4 * self.slot(image_bin, y, x)
         above = here - 4 * self.count(self.columns + 1)
         found = (self.take(added, here) + self.take(added, here - 3)) + (
             self.take(added, above + 2) + self.take(added, above - 1)
         )
-        self.put(grad_rate, found, (image * self.n + k + self.count(start)) * self.area + place)
+        if grad_rate is None:
+            grad_rate = found
+        else:
+            image, k = self.split(image_bin, count)
+            at = (image * self.n + k + self.count(start)) * self.area + place
+            self.put(grad_rate, found, at)
         self.dr.eval(grad_rate)
+        return grad_rate
