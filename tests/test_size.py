@@ -38,7 +38,7 @@ BUDGETS = {
     "studies/make_dataset": 4_370,  # devices, sequences side by side
     "studies/placement": 7_910,  # options without effect
     "studies/sensor_fit": 2_140,  # the best step, rates beside correlation
-    "studies/speed_error": 8_940,  # growth of the whole chain, inverse search beside live flow, first frames and gradients of a process, programs
+    "studies/speed_error": 9_000,  # growth of the whole chain, inverse search beside live flow, first frames and gradients of a process, programs
     "studies/spike_esim": 2_940,
     "studies/stability": 8_220,
     "studies/train_flow": 5_180,  # steps of a race, options without effect, windows that reach into one another
