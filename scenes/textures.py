@@ -63,7 +63,7 @@ def photo(source: str | Path, size_px: int = 512) -> np.ndarray:
     return _radiance(reduced(linear(_stored(source)), size_px), str(source))
 
 
-@lru_cache(maxsize=2 * len(PHOTOS))
+@lru_cache(maxsize=2 * len(PHOTOS), typed=True)
 def _known(name, size_px):
     """A picture out of PHOTOS, which worlds are painted with again and again."""
     import skimage  # whose own reader imports most of scipy
@@ -221,8 +221,9 @@ def speckle(
     """Random pattern with equal power per octave between two periods (texels), exp of a Gaussian
     field:
     [size, size] float32."""
+    octaves = _octaves(size_px, finest_px, coarsest_px)
     noise = np.fft.fft2(np.random.default_rng(seed).standard_normal((size_px, size_px)))
-    field = np.fft.ifft2(noise * _octaves(size_px, finest_px, coarsest_px)).real
+    field = np.fft.ifft2(noise * octaves).real
     return check_texture(60.0 * np.exp(contrast * field / field.std()), f"speckle {seed}")
 
 

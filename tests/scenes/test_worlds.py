@@ -228,3 +228,11 @@ def test_pictures_by_name_and_array():
         textures.picture(-np.eye(4))
     with pytest.raises(FileFormatError, match="neither a file"):
         worlds.room(photos=["nowhere.png"])
+
+
+def test_sizes_that_cannot_be_are_refused_whatever_was_made_before():
+    textures.photo("brick", 2)
+    with pytest.raises(DomainError, match="whole number"):
+        textures.photo("brick", 2.0)
+    with pytest.raises(DomainError, match="size_px = 0"):
+        textures.speckle(0, 0)
