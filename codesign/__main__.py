@@ -72,7 +72,7 @@ def _run(name, options, refusal):
         return 2
     # what a study starts by `python -m studies.…` imports nothing of the folder it runs in
     os.environ["PYTHONSAFEPATH"] = "1"
-    shipped.importing(True)
+    shipped.begin_imports()
     sys.argv = [f"studies.{name}", *options]
     runpy.run_module(f"studies.{name}", run_name="__main__", alter_sys=True)
     return 0

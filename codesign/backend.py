@@ -6,6 +6,7 @@ import os
 import platform
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -174,19 +175,34 @@ def mitsuba(device: str = "cpu") -> Any:
     return mi
 
 
+_threads_lock = threading.Lock()
+_threads_asked: list[tuple[int, int]] = []
+_threads_own = [1]  # where nobody asks
+
+
 @contextmanager
 def threads(least: int = 1, most: int = 1 << 16) -> Iterator[None]:
-    """drjit with so many threads: two at least, or Mitsuba waits without end for another that reads
-    or writes OpenEXR; one at most for many kernels of a few thousand lanes, in which others have no
-    part, though they busy-wait in between."""
+    """drjit with so many threads. Python's threads may ask at once; who needs more prevails.
+
+    One alone is quicker for many kernels of a few thousand lanes: others have no part in them, but
+    busy-wait in between. With one Mitsuba waits without end for another where OpenEXR is read or
+    written.
+    """
     import drjit as dr
 
-    count = dr.thread_count()
-    dr.set_thread_count(min(max(count, least), most))
+    def ask(change):
+        with _threads_lock:
+            if not _threads_asked:
+                _threads_own[0] = dr.thread_count()
+            change((least, most))
+            lows, highs = zip((1, _threads_own[0]), *_threads_asked, strict=True)
+            dr.set_thread_count(max(*lows, min(highs)))
+
+    ask(_threads_asked.append)
     try:
         yield
     finally:
-        dr.set_thread_count(count)
+        ask(_threads_asked.remove)
 
 
 @dataclass(frozen=True)

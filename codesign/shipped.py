@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 _INSIDE = Path(__file__).with_name("_shipped")
-COLLECTED = gc.get_threshold()
+_collected: list[tuple[int, int, int]] = []  # thresholds before imports
 FOLDER = _INSIDE if _INSIDE.is_dir() else Path(__file__).parents[1]
 
 
@@ -27,12 +27,18 @@ def on_path() -> None:
     os.environ["PYTHONPATH"] = os.pathsep.join([folder, *others])
 
 
-def importing(begins: bool) -> None:
-    """Look for garbage a thousandth as often while a study is imported, for there is none; then as
-    before, but not among what was imported, which stays."""
-    if not begins and gc.get_threshold() != COLLECTED:
+def begin_imports() -> None:
+    """Look for garbage a thousandth as often while a study is imported, for there is none."""
+    if not _collected:
+        _collected.append(gc.get_threshold())
+        gc.set_threshold(1000 * _collected[0][0], *_collected[0][1:])
+
+
+def end_imports() -> None:
+    """As before, where they began, but look for none among what was imported, which stays."""
+    if _collected:
         gc.freeze()
-    gc.set_threshold(COLLECTED[0] * (1000 if begins else 1), *COLLECTED[1:])
+        gc.set_threshold(*_collected.pop())
 
 
 def command(study: str) -> str:

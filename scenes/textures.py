@@ -203,7 +203,8 @@ def _blurred(values, texels, axis, mode):
     share = np.exp(-0.5 / texels**2 * np.arange(-reach, 1) ** 2)
     share /= np.concatenate([share, share[-2::-1]]).sum()
     around = [(reach, reach) if each == axis else (0, 0) for each in range(values.ndim)]
-    wide = np.moveaxis(np.pad(values, around, mode=mode), axis, 0)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    wide = np.pad(values, around, mode=mode)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    wide = np.ascontiguousarray(np.moveaxis(wide, axis, 0))
     size = values.shape[axis]
     found = wide[reach : reach + size] * share[reach]
     for k in range(reach):
@@ -227,7 +228,7 @@ def speckle(
     return check_texture(60.0 * np.exp(contrast * field / field.std()), f"speckle {seed}")
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=1)
 def _octaves(size_px, finest_px, coarsest_px):
     """Amplitude [size, size] of equal power per octave between two periods (texels)."""
     frequency = np.fft.fftfreq(size_px)

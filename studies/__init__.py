@@ -9,5 +9,5 @@ from codesign import shipped
 if sys.argv[0] == "-m":  # Python is about to run a module of this package, and looks for it
     from studies.frame import listing
 
-    shipped.importing(True)
+    shipped.begin_imports()
     listing.refuse_parts(sys.orig_argv)

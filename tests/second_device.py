@@ -56,7 +56,7 @@ class _Second(TorchFunctionMode):
             return torch.device("cpu") if hosts else THERE
         if (
             func is torch._has_compatible_shallow_copy_type
-        ):  # a Module that moves has new Parameters
+        ):  # classes do not change in place as memory does
             return False
         if func is torch.autograd.grad:  # a gradient stands where its tensor does
             with torch._C.DisableTorchFunctionSubclass():

@@ -1,6 +1,7 @@
 """The torch-drjit bridge: right derivatives, the same at every pass, memory of its own, clear
 refusals."""
 
+import drjit as dr
 import pytest
 import torch
 
@@ -175,3 +176,24 @@ def test_a_tensor_on_another_gpu_is_refused():
 
     with pytest.raises(DomainError, match="CUDA_VISIBLE_DEVICES chooses"):
         backend.load(None, There())
+
+
+def test_who_needs_more_threads_of_drjit_prevails_in_whatever_order_they_leave():
+    dr.set_thread_count(2)
+    one, two, other = (
+        backend.threads(**asked) for asked in ({"most": 1}, {"least": 2}, {"most": 1})
+    )
+    one.__enter__()
+    assert dr.thread_count() == 1
+    two.__enter__()
+    assert dr.thread_count() == 2
+    other.__enter__()
+    one.__exit__(None, None, None)
+    assert dr.thread_count() == 2
+    two.__exit__(None, None, None)
+    assert dr.thread_count() == 1
+    other.__exit__(None, None, None)
+    assert dr.thread_count() == 2
+    with pytest.raises(ZeroDivisionError), backend.threads(most=1):
+        divmod(1, 0)
+    assert dr.thread_count() == 2

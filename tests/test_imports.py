@@ -156,6 +156,7 @@ def test_studies_start_without_what_their_first_frame_does_not_need():
     late = {"matplotlib", "kornia", "scipy._lib._util", "sympy", "torch._dynamo"}
     script = "import sys\nfrom importlib import import_module\n"
     script += f"for name in {names}: import_module(f'studies.{{name}}.__main__')\n"
+    script += "assert 'skimage' not in sys.modules\n"
     script += "from scenes.robots.pairs import PAIRS\npair = PAIRS['outdoors']()\n"
     script += "made = pair.requirements(), pair.world(0)\n"
     done = python("-c", f"{script}print({late} & sys.modules.keys())")

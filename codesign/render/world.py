@@ -49,6 +49,11 @@ class MitsubaScene:
     dtype = torch.float32
     both_sides = False  # whether surfaces glow on both sides; see ``two_sided``
 
+    @property
+    def mi(self) -> Any:
+        """Mitsuba, its variant that of the scene's device: another world may have set another."""
+        return backend.mitsuba(self._device)
+
     def __deepcopy__(self, memo):
         return self  # a scene is never changed, so copies of what holds it share it
 
@@ -61,7 +66,7 @@ class MitsubaScene:
         merge: bool = True,
         emissive: bool = True,
     ):
-        self.mi = backend.mitsuba(device)
+        self._device = device
         self._outline = self._bodies = None
         if isinstance(description, self.mi.Scene):
             self.scene: Any = description

@@ -294,6 +294,10 @@ def open_run(
         if begun.exists():
             files.check_same(read_json(begun), files.digests(files.given(stored), config.resume))
         # earlier versions stored what "auto" found, whether the study used it or not
+        if stored.GPU and stored.device == "cuda" and not torch.cuda.is_available():
+            raise DomainError(
+                "the run to resume was begun on a GPU; go on on a machine that has one, or start a new run."
+            )
         device = _device(stored) if stored.GPU else torch.device("cpu")
         return Run(study, stored, config.resume, device, True, interruption)
     device = _device(config)
@@ -330,7 +334,7 @@ def main(
             args=arguments,
         )
 
-    shipped.importing(False)
+    shipped.end_imports()
     os.environ["MPLBACKEND"] = "Agg"  # figures go to files; no screen is needed
     if "matplotlib" in sys.modules:
         sys.modules["matplotlib"].use("Agg")

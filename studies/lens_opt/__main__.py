@@ -315,7 +315,7 @@ def judge_all(course, lenses):
     (see LensTask.judge)."""
     run = course.run
     job = course.jobs["optimised"]
-    task = course.jobs["optimised"].task
+    task = job.task
     pool = make_worlds(HELD_OUT, task.device)
     found = course.found
     done = min((len(found.get(name, [])) for name in lenses), default=0)

@@ -31,7 +31,7 @@ DIRECTIONS = 10  # of detuning that are tried
 NO_FIELD_DEG = 20.0  # half field of a lens that names none: that of the Cooke triplet
 FLOOR_SHARE = 0.6  # of the thicknesses of the published lens, which no design may go below
 SENSOR = events.SensorModel(theta_on=0.2, theta_off=0.2, theta_sigma=0.03, shot_rate_hz=1.0)
-# daylight as a silicon sensor sees it, in four wavelengths of equal weight
+# daylight as a silicon sensor sees it, in four wavelengths of equal weight:
 # Spectrum.from_curves(silicon_response(), daylight_d65(), 4), whose import of SciPy takes longer than a frame
 LIGHT = lens.Spectrum(
     (0.4310065670078028, 0.518511483138606, 0.6040904811281692, 0.7262419614738713), (0.25,) * 4

@@ -189,3 +189,13 @@ def test_wrong_options_exit_with_two_and_help_explains_them(command, capsys, mon
     code, complaint = command("--device", "cuda")
     assert code == 2
     assert "no CUDA device" in complaint
+
+
+def test_what_was_begun_on_a_gpu_goes_on_where_there_is_one(out, command, monkeypatch):
+    assert command("--out", out)[0] == 0
+    begun = out / "config.json"
+    begun.write_text(begun.read_text().replace('"device": "cpu"', '"device": "cuda"'))
+    monkeypatch.setattr(Config, "GPU", True)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    said = "error: the run to resume was begun on a GPU; go on on a machine that has one, or start a new run.\n"
+    assert command("--resume", out) == (2, said)

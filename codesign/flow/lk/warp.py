@@ -102,7 +102,8 @@ def given_back(rate: Tensor, flow_px: Tensor, by_rate: Any, by_flow: Any) -> lis
 
 
 @recorded
-def read(form, fade_px, rate, flow, weights):
+def read(form: Form, fade_px: float, rate: Any, flow: Any, weights: Any) -> Any:
+    """Mean, slope and windows, as of ``moving``."""
     warp = _Warp(form, fade_px, rate, flow, weights)
     dr = warp.dr
     mean = slope = dr.zeros(warp.arr.Float, warp.width)
@@ -119,7 +120,17 @@ def read(form, fade_px, rate, flow, weights):
 
 
 @recorded
-def gradients(form, fade_px, together, rate, flow, by_mean, by_slope, by_seen, weights):
+def gradients(
+    form: Form,
+    fade_px: float,
+    together: int,
+    rate: Any,
+    flow: Any,
+    by_mean: Any,
+    by_slope: Any,
+    by_seen: Any,
+    weights: Any,
+) -> Any:
     """Of rate (None where not wanted) and flow, from those of mean, slope and windows."""
     warp = _Warp(form, fade_px, rate, flow, weights)
     dr = warp.dr
