@@ -1,8 +1,13 @@
 """One small family of exceptions. Every message says what was given, what is allowed, and what to
-do."""
+do. A search is not told of what it does not find."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import PurePath
 from typing import Any
+
+_searched = ContextVar("searched", default=False)
 
 
 class CodesignError(Exception):
@@ -51,3 +56,18 @@ def shown(value: Any) -> str:
         value, (str, bytes, int, float, complex, list, tuple, dict, PurePath)
     )
     return " ".join(repr(value).split())[:80] if plain else f"a {type(value).__name__}"
+
+
+@contextmanager
+def searching() -> Iterator[None]:
+    """Within it, in this thread alone, rays may be looked for where no light passes."""
+    before = _searched.set(True)
+    try:
+        yield
+    finally:
+        _searched.reset(before)
+
+
+def is_searched() -> bool:
+    """Whether a search asks."""
+    return _searched.get()

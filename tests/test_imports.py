@@ -9,7 +9,7 @@ import pytest
 from tests.processes import ROOT, python
 
 FLOORS = (
-    {"errors", "former", "searching", "shipped", "waiting"},
+    {"errors", "former", "shipped", "waiting"},
     {"doors", "checks"},
     {"types", "optional", "reading", "exclusive", "atomic"},
     {"pose", "arrays", "backend", "plain_yaml", "interrupt", "grad"},

@@ -11,7 +11,7 @@ BUDGETS = {
     "codesign": 10_530,  # threads that wait for one another, imports without garbage, searches quiet in their own thread, a pose out of its rotation and place, what is differentiable once
     "codesign/events": 50_300,  # leaks that have begun before, kinds of TIFFs, noise of all intervals at once, times too coarse, keys of 32 bits by groups, what moved the play, slots of v2e found by kernels
     "codesign/fidelity": 3_030,  # stages without a level, levels that are told wrong
-    "codesign/flow": 45_060,  # slopes and blur by kernels, programs recorded once, libraries imported late, unknown truth, windows that share no event, polarities told two ways, truths without a time
+    "codesign/flow": 45_080,  # slopes and blur by kernels, programs recorded once, libraries imported late, unknown truth, windows that share no event, polarities told two ways, truths without a time
     "codesign/grad": 3_370,  # stairs of single precision in double
     "codesign/lens": 48_430,  # makers of glass, fans of single precision, stops and apertures in their own axes, forecasts of nothing, what a line says beside a name, cones at a distance, a stop that cuts a pupil
     "codesign/mount": 14_980,  # rays traced once for several depths, films looked at all over, angles in degrees, blur of the whole pupil, points that stand alone, a mount prints where it is, two nearnesses at once

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from codesign.errors import is_searched
 from codesign.lens.glass import D_UM
 from codesign.lens.paraxial import field_angles
 from codesign.lens.trace import Prescription, Status, across, trace
 from codesign.lens.traced import TracedLens, in_float64
-from codesign.searching import is_searched
 
 NEWTON_STEPS = 12
 HALVINGS = 6

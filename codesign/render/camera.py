@@ -12,9 +12,8 @@ from torch import Tensor
 
 from codesign.backend import differentiable_once
 from codesign.checks import check_finite, check_kind, check_seed, check_whole
-from codesign.errors import DomainError, ShapeError
+from codesign.errors import DomainError, ShapeError, searching
 from codesign.render.film import Film, check_memory, coarse_pixels, film_pupil_pattern
-from codesign.searching import searching
 from codesign.types import Rays
 
 _NEWTON_STEPS = 12

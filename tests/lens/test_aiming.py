@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from codesign import lens, render
+from codesign.errors import searching
 from codesign.lens import GeoLens, Glass, Pinhole, Spectrum, Surface, ThinLens
 from codesign.lens.aiming import aimed_rays
 from codesign.lens.analysis import field_rays, pupil_grid
 from codesign.lens.analysis.field_curves import relative_illumination
 from codesign.lens.trace import trace
-from codesign.searching import searching
 from tests.lens.systems import NAMES, PLANE, close, half_field
 from tests.numbers import D, f64
 

@@ -34,7 +34,7 @@ def rms(field):
 def flows(config, tries):
     """Flow that events without noise of a data set's camera tell on paths of the configuration's
     seed, in families that --tolerance did not look at."""
-    maker = make_dataset.Maker(config)
+    maker = make_dataset.Maker(config, torch.device("cpu"))
     sensor = events.HardSensor(events.SensorModel(config.theta, config.theta), make_dataset.BINS)
     t_s = torch.arange(9, dtype=torch.float64) / config.rate_hz
     found = []
