@@ -92,14 +92,16 @@ ZERO, TINY = Span(0, 0, (6,)), Span(1e-320, 1e-9, (6,), log=True)
 TWIST, PLACE = Span(0.2, 1, (6,)), {"place": Span(0, 1)}
 PI = Span(math.pi - 1e-6, math.pi + 1e-6)
 HALF_TURN = {"shift": Span(-3, 3, (3,)), "axis": Span(0.2, 1, (3,)), "angle": PI}
+# the gradient to the distance adds entries up that cancel for some twists
 FAR = {"twist": TWIST, "distance": Span(1e-9, 1e9, log=True)}
+TURNS = ("twist",)
 DEPTH = {"depth": Span(1e-6, 1e9, log=True)}
 EXACT, FIRST_ORDER = (1e-15, 1e-15, 1e-6), (1e-15, 1e-8, 1e-6)
 CASES = [
     Case("identity rotation", "pose", {"twist": ZERO}, pose.se3_exp, small, EXACT),
     Case("denormals", "pose", {"twist": TINY}, pose.se3_exp, small, FIRST_ORDER),
     Case("half turn", "pose", HALF_TURN, exp_turned, by_formula),
-    Case("huge, tiny coordinates", "pose", FAR, far_inverse, transposed, unit=0.0),
+    Case("huge, tiny coordinates", "pose", FAR, far_inverse, transposed, learn=TURNS, unit=0.0),
     Case("1e5 frames", "pose", {"twist": TWIST}, many_steps, one_motion, learn=(), slow=True),
     Case("NaN or infinity", "pose", PLACE, spoilt_pose, "poses must be finite"),
     Case("mirrored shapes", "pose", PLACE, mirrored_pose, "mirrors"),
