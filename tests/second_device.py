@@ -54,9 +54,8 @@ class _Second(TorchFunctionMode):
             found = func(*args, **kwargs)
         if func == Tensor.device.__get__:
             return torch.device("cpu") if hosts else THERE
-        if (
-            func is torch._has_compatible_shallow_copy_type
-        ):  # classes do not change in place as memory does
+        # a Module that moves has new Parameters here: classes do not change in place, as memory does
+        if func is torch._has_compatible_shallow_copy_type:
             return False
         if func is torch.autograd.grad:  # a gradient stands where its tensor does
             with torch._C.DisableTorchFunctionSubclass():

@@ -2,7 +2,7 @@
 
 import pytest
 
-from studies.frame import run
+from codesign.errors import DomainError
 from tests import second_device
 from tests.processes import python
 from tests.studies.runs import contents, module_of, numbers, ran
@@ -48,9 +48,8 @@ def test_on_a_gpu_a_study_finds_the_same(name, tmp_path):
         assert found["cuda"][key] == pytest.approx(found["cpu"][key], rel=0.02), key
 
 
-def test_a_choice_by_processor_time_is_refused_on_a_gpu(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(run, "_device", lambda config: second_device.THERE)
-    monkeypatch.setattr(run.dataclasses, "replace", lambda config, **_: config)
-    asked = f"--quick --tolerance 0.3 --device cuda --out {tmp_path / 'it'}"
-    assert ran(module_of("make_dataset"), asked) == 2
-    assert "--tolerance chooses by processor time" in capsys.readouterr().err
+def test_a_choice_by_processor_time_is_refused_on_a_gpu():
+    study = module_of("make_dataset")
+    with pytest.raises(DomainError, match=r"^--tolerance chooses by processor time"):
+        study.checked(study.Config(tolerance=0.3, device="cuda"))
+    assert study.checked(study.Config(tolerance=0.3)).tolerance == 0.3
